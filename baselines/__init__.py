@@ -1,0 +1,1 @@
+"""Baselines of HWP bench: one method directory each."""

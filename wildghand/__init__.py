@@ -1,0 +1,1 @@
+"""WildGHand: anti-perturbation Gaussian hand avatars, the reference method of HWP bench."""
