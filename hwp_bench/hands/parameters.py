@@ -1,0 +1,60 @@
+"""Hand parameters over a clip: pose, shape and translation, frame by frame."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hwp_bench.errors import BadInput
+from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT
+
+
+@dataclass(frozen=True, eq=False)
+class HandParameters:
+    """What poses one hand in F frames; checked when made.
+
+    Raises:
+        BadInput: a field has the wrong shape or type, or is not finite in a valid frame; the
+            error names the field.
+    """
+
+    #: (F, 16, 3) axis-angle rad: global rotation about the wrist, then the 15 finger joints.
+    pose: np.ndarray
+    #: (10,) shape, in standard deviations; one for the whole clip.
+    betas: np.ndarray
+    #: (F, 3) m, added after posing.
+    transl: np.ndarray
+    #: (F,) bool, false where the frame has no such hand.
+    valid: np.ndarray
+
+    def __post_init__(self) -> None:
+        frames = np.shape(self.pose)[0] if np.ndim(self.pose) else 0
+        shapes = {
+            "pose": (frames, JOINT_COUNT, 3),
+            "betas": (SHAPE_COUNT,),
+            "transl": (frames, 3),
+            "valid": (frames,),
+        }
+        for field, shape in shapes.items():
+            array = np.asarray(getattr(self, field))
+            if array.shape != shape:
+                raise BadInput(f"shape is {array.shape}, expected {shape}", field=field)
+            if field == "valid":
+                if array.dtype != np.bool_:
+                    raise BadInput(f"type is {array.dtype}, expected bool", field=field)
+                continue
+            if array.dtype.kind not in "fiu":
+                raise BadInput(f"type is {array.dtype}, expected numbers", field=field)
+            object.__setattr__(self, field, array.astype(np.float64))
+        object.__setattr__(self, "valid", np.asarray(self.valid))
+        for field in ("pose", "transl", "betas"):
+            array = getattr(self, field)
+            checked = array if field == "betas" else array[self.valid]
+            if not np.isfinite(checked).all():
+                raise BadInput("holds NaN or infinity", field=field)
+
+    @property
+    def frame_count(self) -> int:
+        """Number of frames F."""
+        return len(self.valid)

@@ -1,0 +1,181 @@
+"""Posing a hand: shape, pose correctives, forward kinematics and linear blend skinning."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from hwp_bench.errors import ShapeMismatch
+from hwp_bench.hands.landmarks import landmark_order
+from hwp_bench.hands.rotations import axis_angle_to_matrix
+from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, HandTemplate
+
+# The joints at each distance from the wrist; every template has this tree.
+_LEVELS = ((1, 4, 7, 10, 13), (2, 5, 8, 11, 14), (3, 6, 9, 12, 15))
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateTensors:
+    """The arrays of a `HandTemplate` that posing reads, on one device and in one type."""
+
+    #: (V, 3) rest vertices, m.
+    vertices: torch.Tensor
+    #: (F, 3) int64 vertex indices.
+    faces: torch.Tensor
+    #: (V, 3, 10).
+    shape_basis: torch.Tensor
+    #: (V, 3, 135) or None.
+    pose_basis: torch.Tensor | None
+    #: (16, 3) rest joints, m.
+    joints: torch.Tensor
+    #: (16, 3, 10).
+    joint_basis: torch.Tensor
+    #: (V, 16).
+    weights: torch.Tensor
+    #: (15, 3) axis-angle rad.
+    mean_pose: torch.Tensor
+    #: (5,) int64.
+    fingertips: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class PosedHand:
+    """A posed hand in B frames, in the frame that `transl` is given in; metres."""
+
+    #: (B, V, 3) vertices.
+    vertices: torch.Tensor
+    #: (B, 16, 3) joints, MANO order.
+    joints: torch.Tensor
+    #: (B, 21, 3) joints and finger tips, OpenPose order.
+    landmarks: torch.Tensor
+    #: (B, 16, 4, 4) rigid motion of each joint: shaped rest space to posed space.
+    transforms: torch.Tensor
+
+
+def tensors_from_template(
+    template: HandTemplate,
+    dtype: torch.dtype | None = None,
+    device: torch.device | str | None = None,
+) -> TemplateTensors:
+    """Copy a template's arrays to tensors; float32 on the CPU unless told otherwise."""
+    dtype = dtype or torch.float32
+
+    def real(array: object) -> torch.Tensor:
+        return torch.as_tensor(array, dtype=dtype, device=device)
+
+    return TemplateTensors(
+        vertices=real(template.vertices),
+        faces=torch.as_tensor(template.faces, device=device),
+        shape_basis=real(template.shape_basis),
+        pose_basis=None if template.pose_basis is None else real(template.pose_basis),
+        joints=real(template.joints),
+        joint_basis=real(template.joint_basis),
+        weights=real(template.weights),
+        mean_pose=real(template.mean_pose.reshape(-1, 3)),
+        fingertips=torch.as_tensor(template.fingertips, device=device),
+    )
+
+
+def pose_hand(
+    template: TemplateTensors,
+    pose: torch.Tensor,
+    betas: torch.Tensor,
+    transl: torch.Tensor,
+    *,
+    flat_hand_mean: bool = True,
+) -> PosedHand:
+    """Pose a hand in B frames; differentiable in pose, betas and transl.
+
+    Args:
+        template: tensors of the type and on the device of the other arguments.
+        pose: (B, 16, 3) axis-angle rad; joint 0 turns the whole hand about its rest wrist.
+        betas: (10,) or (B, 10) shape parameters.
+        transl: (B, 3) m, added last.
+        flat_hand_mean: True, `pose` is the pose itself and zero is the rest mesh; False, the
+            template's mean pose is added to the 15 finger joints first (MANO's
+            `flat_hand_mean=False`, the convention of InterHand2.6M and of the HWP release).
+
+    Returns:
+        Vertices, joints, landmarks and joint motions.
+
+    Raises:
+        ShapeMismatch: the arguments do not describe the same frames.
+
+    Source: Romero et al., "Embodied Hands" (MANO), equations 2-5; the root joint's rest place
+    stays where it is when the hand turns, as in the authors' code.
+    """
+    betas = _checked_betas(pose, betas, transl)
+    if not flat_hand_mean:
+        pose = torch.cat([pose[:, :1], pose[:, 1:] + template.mean_pose], dim=1)
+    rotations = axis_angle_to_matrix(pose)
+    rest = template.vertices + torch.einsum("vck,bk->bvc", template.shape_basis, betas)
+    rest_joints = template.joints + torch.einsum("jck,bk->bjc", template.joint_basis, betas)
+    if template.pose_basis is not None:
+        identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
+        feature = (rotations[:, 1:] - identity).flatten(start_dim=1)
+        rest = rest + torch.einsum("vck,bk->bvc", template.pose_basis, feature)
+    turns, joints = _forward_kinematics(rotations, rest_joints)
+    joints = joints + transl[:, None]
+    shifts = joints - (turns @ rest_joints[..., None])[..., 0]
+    vertices = _blend_skin(rest, turns, shifts, template.weights)
+    points = torch.cat([joints, vertices[:, template.fingertips]], dim=1)
+    return PosedHand(
+        vertices=vertices,
+        joints=joints,
+        landmarks=points[:, list(landmark_order())],
+        transforms=_homogeneous(turns, shifts),
+    )
+
+
+def _checked_betas(pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> torch.Tensor:
+    frames = pose.shape[0] if pose.dim() else 0
+    if betas.dim() == 1:
+        betas = betas.expand(frames, -1)
+    expected = {
+        "pose": (pose, (frames, JOINT_COUNT, 3)),
+        "betas": (betas, (frames, SHAPE_COUNT)),
+        "transl": (transl, (frames, 3)),
+    }
+    for field, (value, shape) in expected.items():
+        if tuple(value.shape) != shape:
+            raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
+    return betas
+
+
+def _forward_kinematics(
+    rotations: torch.Tensor, rest_joints: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """World rotation (B, 16, 3, 3) and place (B, 16, 3) of every joint, level by level."""
+    turn = rotations[:, :1]
+    place = rest_joints[:, :1]
+    parents_of = [0] * len(_LEVELS[0])
+    turns, places = [turn], [place]
+    parent_rest = rest_joints[:, parents_of]
+    for level in _LEVELS:
+        index = list(level)
+        offset = (rest_joints[:, index] - parent_rest)[..., None]
+        place = place + (turn @ offset)[..., 0]
+        turn = turn @ rotations[:, index]
+        parent_rest = rest_joints[:, index]
+        turns.append(turn)
+        places.append(place)
+    order = torch.argsort(
+        torch.tensor([0, *(joint for level in _LEVELS for joint in level)])
+    ).tolist()
+    return torch.cat(turns, dim=1)[:, order], torch.cat(places, dim=1)[:, order]
+
+
+def _blend_skin(
+    rest: torch.Tensor, turns: torch.Tensor, shifts: torch.Tensor, weights: torch.Tensor
+) -> torch.Tensor:
+    motions = torch.cat([turns, shifts[..., None]], dim=-1).flatten(start_dim=2)  # (B, 16, 12)
+    blended = (weights @ motions).unflatten(-1, (3, 4))
+    return (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
+
+
+def _homogeneous(turns: torch.Tensor, shifts: torch.Tensor) -> torch.Tensor:
+    top = torch.cat([turns, shifts[..., None]], dim=-1)
+    bottom = torch.zeros_like(top[..., :1, :])
+    bottom[..., 3] = 1.0
+    return torch.cat([top, bottom], dim=-2)
