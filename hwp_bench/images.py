@@ -72,7 +72,8 @@ def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
         # OpenImageIO fills what a truncated file lacks with zeros and only sets an error.
         problem = source.geterror().strip()
         if pixels is None or problem:
-            raise BadImage(f"is damaged or truncated ({problem or 'no pixels'})", where=path)
+            reason = problem.splitlines()[0] if problem else "no pixels"
+            raise BadImage(f"is damaged or truncated ({reason})", where=path)
     finally:
         source.close()
     return np.asarray(pixels, dtype=np.uint8).reshape(height, width, -1)

@@ -1,0 +1,197 @@
+"""Check everything about a capture folder and say what is wrong, where, and how to mend it."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.capture.layout import IMAGE_FOLDERS, image_path
+from hwp_bench.capture.reader import Capture, open_capture
+from hwp_bench.capture.tracks import arrays_digest, hand_arrays
+from hwp_bench.capture.writer import combine
+from hwp_bench.errors import HwpError
+from hwp_bench.images import pixel_digest
+
+#: A visible hand smaller than this share of the frame is reported.
+SMALL_HAND = 0.002
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One thing that is wrong (`error`) or worth a look (`warning`)."""
+
+    #: `error` or `warning`.
+    level: str
+    #: File or folder.
+    where: str
+    #: Field or array in it, if any.
+    field: str | None
+    #: What is wrong.
+    problem: str
+    #: What to do.
+    remedy: str | None = None
+
+
+@dataclass(frozen=True)
+class CheckReport:
+    """What `check_capture` found."""
+
+    #: The folder.
+    path: str
+    #: Facts about the capture, empty when it could not be opened.
+    facts: dict[str, Any]
+    #: Everything found, errors first.
+    findings: tuple[Finding, ...]
+
+    @property
+    def ok(self) -> bool:
+        """Whether nothing is wrong (warnings do not count)."""
+        return not any(finding.level == "error" for finding in self.findings)
+
+
+def check_capture(path: str | os.PathLike[str]) -> CheckReport:
+    """Check a capture: metadata, numbers, every image, geometry, digests.
+
+    Never raises for what is wrong with the capture: it all goes into the report.
+    """
+    try:
+        capture = open_capture(path)
+    except HwpError as error:
+        return CheckReport(os.fspath(path), {}, (_finding(error),))
+    findings = [*_images(capture), *_geometry(capture), *_numbers(capture)]
+    findings.sort(key=lambda finding: finding.level)
+    return CheckReport(os.fspath(path), _facts(capture), tuple(findings))
+
+
+def _finding(error: HwpError) -> Finding:
+    return Finding("error", error.where or "", error.field, error.problem, error.remedy)
+
+
+def _facts(capture: Capture) -> dict[str, Any]:
+    info = capture.info
+    return {
+        "id": info.id,
+        "hands": info.hands,
+        "action": info.action,
+        "device": info.device,
+        "frame_count": info.frame_count,
+        "size": [info.width, info.height],
+        "fps": info.fps,
+        "hand_model": info.hand_model.name,
+        "perturbed_frames": {
+            name: None if values is None else sum(value > 0 for value in values)
+            for name, values in info.perturbations.items()
+        },
+        "valid_frames": {side: int(hand.valid.sum()) for side, hand in capture.hands.items()},
+        "truth": [
+            name
+            for name, present in (
+                ("clean frames", capture.has_clean),
+                ("exact masks", capture.has_true_masks),
+                ("hand parameters", capture.true_hands is not None),
+            )
+            if present
+        ],
+        "licence": info.licence,
+        "digest": capture.digest,
+    }
+
+
+def _images(capture: Capture) -> Iterator[Finding]:
+    for kind in IMAGE_FOLDERS:
+        folder = capture.root / IMAGE_FOLDERS[kind]
+        if kind in ("clean", "true_masks") and not folder.is_dir():
+            continue
+        yield from _one_kind(capture, kind, folder)
+
+
+def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
+    read = {
+        "frames": capture.frame,
+        "masks": capture.mask,
+        "clean": capture.clean,
+        "true_masks": capture.true_mask,
+    }[kind]
+
+    def inspect(frame: int) -> tuple[str | None, Finding | None]:
+        try:
+            pixels = read(frame)
+        except HwpError as error:
+            return None, _finding(error)
+        finding = None
+        if kind == "masks" and (pixels > 127).mean() < SMALL_HAND:
+            finding = Finding(
+                "warning",
+                os.fspath(image_path(capture.root, kind, frame)),
+                None,
+                f"covers {100 * (pixels > 127).mean():.2f} % of the frame",
+                "A frame without a visible hand teaches a method nothing.",
+            )
+        return pixel_digest(pixels), finding
+
+    with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
+        results = list(pool.map(inspect, range(len(capture))))
+    yield from (finding for _, finding in results if finding is not None)
+    known = {image_path(capture.root, kind, frame).name for frame in range(len(capture))}
+    strangers = sorted(
+        item.name
+        for item in (folder.iterdir() if folder.is_dir() else ())
+        if item.name not in known
+    )
+    if strangers:
+        yield Finding(
+            "warning",
+            os.fspath(folder),
+            None,
+            f"holds {len(strangers)} further files (first: {strangers[0]})",
+            "They are ignored.",
+        )
+    digests = [digest for digest, _ in results]
+    if all(digests):
+        yield from _compare(capture, kind, combine(digest for digest in digests if digest))
+
+
+def _compare(capture: Capture, part: str, digest: str) -> Iterator[Finding]:
+    stored = (capture.info.digests or {}).get(part)
+    if stored != digest:
+        yield Finding(
+            "error",
+            os.fspath(capture.root / "capture.json"),
+            f"digests.{part}",
+            "does not match the content" if stored else "is missing",
+            "The content was changed after the capture was written; get it again.",
+        )
+
+
+def _geometry(capture: Capture) -> Iterator[Finding]:
+    for side, hand in capture.hands.items():
+        points = np.concatenate([hand.transl, np.ones((len(hand.transl), 1))], axis=1)
+        depth = np.einsum("fi,fi->f", capture.cameras.viewmats[:, 2], points)
+        behind = np.flatnonzero((depth <= 0) & hand.valid)
+        if len(behind):
+            yield Finding(
+                "error",
+                os.fspath(capture.root / "hands.npz"),
+                f"{side}_transl",
+                f"frame {behind[0]} lies behind its camera ({len(behind)} frames do)",
+                "Mark such frames as not valid, or correct the translation.",
+            )
+
+
+def _numbers(capture: Capture) -> Iterator[Finding]:
+    yield from _compare(capture, "hands", arrays_digest(hand_arrays(capture.hands)))
+    cameras = {"Ks": capture.cameras.Ks, "viewmats": capture.cameras.viewmats}
+    yield from _compare(capture, "cameras", arrays_digest(cameras))
+    try:
+        truth = capture.true_hands
+    except HwpError as error:
+        yield _finding(error)
+        return
+    if truth is not None:
+        yield from _compare(capture, "true_hands", arrays_digest(hand_arrays(truth)))
