@@ -1,0 +1,222 @@
+"""The rasterizer in plain PyTorch, brute force: the truth that the tests compare with.
+
+Every pixel looks at every Gaussian, so it is for tiny scenes. It takes any floating dtype and
+its gradients are PyTorch's own.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+
+from wildghand.splat import conventions as rules
+from wildghand.splat.scene import Options, Scene, channels_with_depth, expected_depth, per_image
+
+#: Elements of a (pixels, Gaussians) matrix that are worked on at a time.
+CHUNK = 1 << 22
+
+
+def rasterize_reference(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Draws the scene; see `wildghand.splat.rasterize` for shapes and units.
+
+    Returns:
+        channels (I, H, W, X), alphas (I, H, W, 1) and the flat part of `info`.
+
+    Source: Kerbl et al. 2023, equations 3-6; Zwicker et al. 2001 for the projection; order and
+    limits as in gsplat (see `conventions`).
+    """
+    dtype = scene.means.dtype
+    images = scene.images
+    means, quats, scales, opacities, colors = (
+        per_image(tensor, images)
+        for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.colors)
+    )
+    options = scene.options
+    results: list[dict[str, torch.Tensor]] = []
+    drawn: list[torch.Tensor] = []
+    alphas: list[torch.Tensor] = []
+    for i in range(images):
+        keep = usable(means[i], quats[i], scales[i], opacities[i], colors[i])
+        keep &= camera_usable(scene.viewmats[i], scene.Ks[i])
+        index = keep.nonzero().squeeze(-1)
+        projected = project(
+            means[i][index], quats[i][index], scales[i][index], scene.viewmats[i], scene.Ks[i],
+            options,
+        )
+        opacity = opacities[i][index]
+        if options.antialiased:
+            opacity = opacity * projected["compensations"]
+        seen = projected["seen"] & (opacity.detach() >= rules.MIN_ALPHA)
+        index = index[seen]
+        projected = {name: value[seen] for name, value in projected.items()}
+        depths = means.new_zeros(means.shape[1]).index_copy(0, index, projected["depths"])
+        one = Scene(
+            *(tensor[i : i + 1] for tensor in (means, quats, scales, opacities, colors)),
+            viewmats=scene.viewmats[i : i + 1],
+            Ks=scene.Ks[i : i + 1],
+            backgrounds=None if scene.backgrounds is None else scene.backgrounds[i : i + 1],
+            options=options,
+        )
+        channels, backgrounds = channels_with_depth(colors[i : i + 1], depths[None], one)
+        background = means.new_zeros(channels.shape[-1]) if backgrounds is None else backgrounds[0]
+        background = torch.where(background.isfinite(), background, torch.zeros((), dtype=dtype))
+        image, alpha, pairs = blend(
+            projected["means2d"], projected["conics"], projected["depths"], opacity[seen],
+            channels[0][index], background, options,
+        )
+        drawn.append(image)
+        alphas.append(alpha)
+        results.append(
+            _info(means.shape[1], index, projected, opacity[seen], depths, pairs)
+        )
+    if not images:
+        channels = 1 if options.render_mode in ("D", "ED") else colors.shape[-1] + len(
+            options.render_mode[4:5] or ""
+        )
+        empty = means.new_zeros(0, options.height, options.width, channels)
+        return empty, empty[..., :1], {}
+    stacked_alphas = torch.stack(alphas)
+    stacked = expected_depth(torch.stack(drawn), stacked_alphas, options.render_mode)
+    info = {name: torch.stack([result[name] for result in results]) for name in results[0]}
+    return stacked, stacked_alphas, info
+
+
+def usable(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    opacities: torch.Tensor,
+    colors: torch.Tensor,
+) -> torch.Tensor:
+    """Which Gaussians have finite values, a rotation, and a colour within `MAX_COLOR`. (N,)."""
+    keep = means.isfinite().all(-1) & scales.isfinite().all(-1) & opacities.isfinite()
+    keep &= quats.isfinite().all(-1) & (quats != 0).any(-1)
+    return keep & (colors.abs() <= rules.MAX_COLOR).all(-1)
+
+
+def camera_usable(viewmat: torch.Tensor, K: torch.Tensor) -> torch.Tensor:
+    """Whether a camera can see: finite, with positive focal lengths. ()."""
+    return viewmat.isfinite().all() & K.isfinite().all() & (K[0, 0] > 0) & (K[1, 1] > 0)
+
+
+def rotation(quats: torch.Tensor) -> torch.Tensor:
+    """Rotation matrices (..., 3, 3) from quaternions (..., 4), wxyz, any norm but 0."""
+    quats = quats / quats.detach().abs().amax(-1, keepdim=True)  # squares of tiny ones vanish
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = (
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    )  # fmt: skip
+    return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def project(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    scales: torch.Tensor,
+    viewmat: torch.Tensor,
+    K: torch.Tensor,
+    options: Options,
+) -> dict[str, torch.Tensor]:
+    """Gaussians on the image plane of one camera.
+
+    Returns:
+        `means2d` (N, 2) px, `depths` (N,), `conics` (N, 3): the inverse covariance as
+        (1 / variance along a pixel row, shear of the rows, 1 / variance across the rows), so
+        that its exponent is -1/2 (a (dx + s dy)^2 + c dy^2); `covars2d` (N, 3) px^2: xx, xy, yy
+        with the low-pass filter; `compensations` (N,); `seen` (N,) bool.
+
+    The determinant is that of a Gram matrix, written as a sum of squares: the plain A C - B^2
+    loses every digit for a needle.
+    """
+    R, t = viewmat[:3, :3], viewmat[:3, 3]
+    in_camera = means @ R.T + t
+    depth = in_camera[:, 2]
+    seen = (depth.detach() > options.near_plane) & (depth.detach() < options.far_plane)
+    x, y, z = torch.where(seen[:, None], in_camera, torch.ones_like(in_camera)).unbind(-1)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    width, height, margin = options.width, options.height, rules.FRUSTUM_MARGIN
+    tan_x = (x / z).clamp(-(cx + margin * width) / fx, (width - cx + margin * width) / fx)
+    tan_y = (y / z).clamp(-(cy + margin * height) / fy, (height - cy + margin * height) / fy)
+    zero = torch.zeros_like(z)
+    J = torch.stack((fx / z, zero, -fx / z * tan_x, zero, fy / z, -fy / z * tan_y), -1)
+    U = J.reshape(-1, 2, 3) @ R @ (rotation(quats) * scales[:, None, :])
+    u, v = U.unbind(1)
+    eps = options.eps2d
+    trace_x, trace_y = (u * u).sum(-1), (v * v).sum(-1)
+    area = torch.linalg.cross(u, v).square().sum(-1)
+    A, B, C = trace_x + eps, (u * v).sum(-1), trace_y + eps
+    det = area + eps * (trace_x + trace_y) + eps * eps
+    conics = torch.stack((C / det, -B / C, 1 / C), -1)
+    means2d = torch.stack((fx * x / z + cx, fy * y / z + cy), -1)
+    finite = means2d.isfinite().all(-1) & conics.isfinite().all(-1) & det.isfinite()
+    compensations = (area / det).clamp_min(0).sqrt() if options.antialiased else zero
+    return {
+        "means2d": means2d,
+        "depths": z,
+        "conics": conics,
+        "covars2d": torch.stack((A, B, C), -1),
+        "compensations": compensations,
+        "seen": seen & finite & (det > 0),
+    }
+
+
+def blend(
+    means2d: torch.Tensor,
+    conics: torch.Tensor,
+    depths: torch.Tensor,
+    opacities: torch.Tensor,
+    channels: torch.Tensor,
+    background: torch.Tensor,
+    options: Options,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Front-to-back blending of one image: (H, W, X), alpha (H, W, 1), blended pairs ().
+
+    The order is that of float32 depth, ties by index, as every backend sorts.
+    """
+    order = torch.argsort(depths.detach().to(torch.float32), stable=True)
+    means2d, conics, opacities = means2d[order], conics[order], opacities[order]
+    channels = channels[order]
+    kind = means2d.dtype
+    rows = torch.arange(options.height, dtype=kind, device=means2d.device) + 0.5
+    columns = torch.arange(options.width, dtype=kind, device=means2d.device) + 0.5
+    pixels = torch.cartesian_prod(rows, columns).flip(-1)
+    image, remaining = [], []
+    pairs = torch.zeros((), dtype=torch.int64)
+    for some in pixels.split(max(1, CHUNK // max(1, len(means2d)))):
+        dx, dy = (some[:, None] - means2d).unbind(-1)
+        a, shear, c = conics.unbind(-1)
+        power = -0.5 * (a * (dx + shear * dy) ** 2 + c * dy * dy)
+        alpha = (opacities * power.exp()).clamp_max(rules.MAX_ALPHA)
+        alpha = torch.where(alpha >= rules.MIN_ALPHA, alpha, torch.zeros_like(alpha))
+        after = torch.cumprod(1 - alpha.detach(), 1)
+        alpha = torch.where(after > rules.MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
+        pairs += (alpha > 0).sum()
+        after = torch.cumprod(1 - alpha, 1)
+        before = torch.cat((torch.ones_like(after[:, :1]), after), 1)
+        image.append((alpha * before[:, :-1]) @ channels + before[:, -1:] * background)
+        remaining.append(before[:, -1])
+    shape = (options.height, options.width, -1)
+    return torch.cat(image).reshape(shape), 1 - torch.cat(remaining).reshape(shape), pairs
+
+
+def _info(
+    count: int,
+    index: torch.Tensor,
+    projected: dict[str, torch.Tensor],
+    opacities: torch.Tensor,
+    depths: torch.Tensor,
+    pairs: torch.Tensor,
+) -> dict[str, torch.Tensor]:
+    means2d = projected["means2d"]
+    reach = 2 * (opacities.detach() / rules.MIN_ALPHA).log().clamp_min(0)
+    extent = (reach[:, None] * projected["covars2d"].detach()[:, ::2]).sqrt()
+    radii = extent.ceil().clamp_max(2.0**30).to(torch.int32)
+    return {
+        "means2d": means2d.new_zeros(count, 2).index_copy(0, index, means2d),
+        "depths": depths,
+        "radii": radii.new_zeros(count, 2).index_copy(0, index, radii),
+        "pairs": pairs,
+    }
