@@ -139,11 +139,8 @@ def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
         results = list(pool.map(inspect, range(len(capture))))
     yield from (finding for _, finding in results if finding is not None)
     known = {image_path(capture.root, kind, frame).name for frame in range(len(capture))}
-    strangers = sorted(
-        item.name
-        for item in (folder.iterdir() if folder.is_dir() else ())
-        if item.name not in known
-    )
+    present = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
+    strangers = sorted(present - known)
     if strangers:
         yield Finding(
             "warning",

@@ -99,7 +99,7 @@ class Split:
         if not isinstance(value, dict):
             raise BadSplit("must be a JSON object", where=where)
         name, count = value.get("capture"), value.get("frame_count")
-        if not isinstance(name, str) or not _whole(count):
+        if not isinstance(name, str) or not isinstance(count, int) or not _whole(count):
             raise BadSplit("needs a capture id and a frame count", where=where)
         ranges = {}
         for part in PARTS:

@@ -55,7 +55,7 @@ def read_splits(path: str | os.PathLike[str]) -> Mapping[str, Split]:
 
 
 def write_splits(path: str | os.PathLike[str], splits: Iterable[Split]) -> Path:
-    """Write a split file, one line for each capture so that a change is readable in a diff."""
+    """Write a split file atomically."""
     return write_json(path, {"schema": SCHEMA, "splits": [split.to_json() for split in splits]})
 
 

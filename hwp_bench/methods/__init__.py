@@ -1,0 +1,19 @@
+"""The method contract, method directories, and the runner that keeps test frames away."""
+
+from hwp_bench.methods.contract import Avatar, Budget, Camera, HandPose, Method, Report
+from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
+from hwp_bench.methods.request import TrainingCapture, open_request
+
+__all__ = [
+    "Avatar",
+    "Budget",
+    "Camera",
+    "HandPose",
+    "Method",
+    "MethodManifest",
+    "Report",
+    "TrainingCapture",
+    "find_method",
+    "open_request",
+    "read_manifest",
+]
