@@ -1,0 +1,105 @@
+"""The contact sheet of a capture: frames with mask outline and projected hand."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import cv2
+import numpy as np
+
+from hwp_bench.capture.reader import Capture
+from hwp_bench.report.drawing import fitted, labelled, outlined, sheet
+
+#: Colour of the projected hand, by side.
+COLOURS = {"right": (255, 160, 0), "left": (0, 170, 255)}
+#: The 20 bones between the 21 landmarks: wrist to each finger's base, then outwards.
+BONES = tuple(
+    (0 if joint == 0 else 4 * finger + joint, 4 * finger + joint + 1)
+    for finger in range(5)
+    for joint in range(4)
+)
+
+
+def contact_sheet(capture: Capture, *, count: int = 24, edge: int = 256) -> np.ndarray:
+    """Draw frames of a capture, evenly spaced, each with its mask and hands.
+
+    Args:
+        capture: the capture.
+        count: number of frames.
+        edge: larger side of a frame on the sheet, px.
+
+    Returns:
+        (H, W, 3) uint8. Green outline: the mask that methods are given; coloured skeleton: the
+        estimated hand (orange right, blue left), left out where it is not valid.
+    """
+    frames = np.unique(np.linspace(0, len(capture) - 1, min(count, len(capture))).round())
+    chosen = [int(frame) for frame in frames]
+    tiles = [
+        labelled(
+            fitted(draw_hands(outlined(capture.frame(f), capture.mask(f)), points), edge),
+            _caption(capture, f),
+        )
+        for f, points in zip(chosen, project_landmarks(capture, chosen), strict=True)
+    ]
+    return sheet(tiles, columns=6)
+
+
+def project_landmarks(capture: Capture, frames: list[int]) -> Iterator[dict[str, np.ndarray]]:
+    """Yield, for each frame, the projected landmarks (21, 2) px of every valid hand, by side."""
+    import torch
+
+    from hwp_bench.hands import load_template, pose_hand, project
+
+    Ks = torch.from_numpy(capture.cameras.Ks[frames])
+    viewmats = torch.from_numpy(capture.cameras.viewmats[frames])
+    pixels: dict[str, np.ndarray] = {}
+    for side, hand in capture.hands.items():
+        tensors = load_template(capture.info.hand_model.source, side).to_torch(torch.float64)
+        posed = pose_hand(
+            tensors,
+            torch.from_numpy(hand.pose[frames]),
+            torch.from_numpy(hand.betas).expand(len(frames), -1),
+            torch.from_numpy(hand.transl[frames]),
+        )
+        pixels[side] = project(posed.landmarks, viewmats, Ks)[0].numpy()
+    for index, frame in enumerate(frames):
+        yield {
+            side: points[index]
+            for side, points in pixels.items()
+            if capture.hands[side].valid[frame]
+        }
+
+
+def draw_hands(image: np.ndarray, points: dict[str, np.ndarray]) -> np.ndarray:
+    """Draw skeletons into a copy of an image.
+
+    Args:
+        image: (H, W, 3) uint8.
+        points: (21, 2) px by side, pixel centres at +0.5.
+    """
+    canvas = image.copy()
+    for side, landmarks in points.items():
+        # OpenCV counts pixel centres from 0, in fixed point with 3 fractional bits here.
+        spots = np.clip((landmarks - 0.5) * 8, -1e6, 1e6).round().astype(int)
+        for first, last in BONES:
+            cv2.line(
+                canvas,
+                tuple(spots[first].tolist()),
+                tuple(spots[last].tolist()),
+                COLOURS[side],
+                1,
+                cv2.LINE_AA,
+                3,
+            )
+    return canvas
+
+
+def _caption(capture: Capture, frame: int) -> str:
+    parts = [str(frame)]
+    for name, severity in capture.info.severity(frame).items():
+        if severity:
+            short = "".join(word[0] for word in name.split("_"))
+            parts.append(f"{short}{severity}")
+    invalid = [side for side, hand in capture.hands.items() if not hand.valid[frame]]
+    parts += [f"no {side}" for side in invalid]
+    return " ".join(parts)

@@ -1,0 +1,1 @@
+"""The command line: light parsers here, heavy imports only when a command runs."""

@@ -1,0 +1,1 @@
+"""Evaluate a method on captures: run, check, score, put on record."""

@@ -1,0 +1,247 @@
+"""A table and its spellings: Markdown, LaTeX, CSV, JSON, terminal."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from dataclasses import dataclass
+from typing import Any
+
+#: Spellings of a table by file ending.
+FORMATS = ("md", "tex", "csv", "json")
+
+Cell = str | float | int | None
+
+
+@dataclass(frozen=True)
+class Column:
+    """One column of a table."""
+
+    #: Heading; an arrow for the better direction is added by `heading`.
+    title: str
+    #: Digits after the decimal point of numbers.
+    digits: int = 2
+    #: True or False where larger or smaller is better; None for text and counts.
+    higher_is_better: bool | None = None
+    #: Text over a group of columns; neighbours of equal text share it.
+    group: str = ""
+
+    @property
+    def heading(self) -> str:
+        """The title with its arrow."""
+        arrow = {True: " ↑", False: " ↓", None: ""}[self.higher_is_better]
+        return self.title + arrow
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows under columns; a cell is a text, a number, or None for "not measured"."""
+
+    #: What the table shows.
+    caption: str
+    #: Its columns.
+    columns: tuple[Column, ...]
+    #: Its rows, as long as `columns`.
+    rows: tuple[tuple[Cell, ...], ...]
+    #: Lines under the table.
+    notes: tuple[str, ...] = ()
+    #: Rank the rows of each scored column (best bold, second underlined).
+    ranked: bool = True
+
+    def text(self, row: int, column: int) -> str:
+        """Return a cell as it is printed."""
+        value = self.rows[row][column]
+        if value is None:
+            return "–"
+        if isinstance(value, float):
+            return f"{value:.{self.columns[column].digits}f}"
+        return str(value)
+
+    def rank(self, row: int, column: int) -> int | None:
+        """Return 0 for the best and 1 for the second best of a scored column, else None.
+
+        Equal printed values share a rank; a column of a single value has none.
+        """
+        better = self.columns[column].higher_is_better
+        values = [cells[column] for cells in self.rows]
+        numbers = {
+            round(value, self.columns[column].digits)
+            for value in values
+            if isinstance(value, float)
+        }
+        value = values[row]
+        if not self.ranked or better is None or not isinstance(value, float) or len(numbers) < 2:
+            return None
+        order = sorted(numbers, reverse=better)
+        place = order.index(round(value, self.columns[column].digits))
+        return place if place < 2 else None
+
+
+def spell(table: Table, form: str) -> str:
+    """Return a table as text.
+
+    Args:
+        table: the table.
+        form: `md`, `tex`, `csv` or `json`.
+    """
+    return {"md": to_markdown, "tex": to_latex, "csv": to_csv, "json": to_json}[form](table)
+
+
+def to_markdown(table: Table) -> str:
+    """Return GitHub Markdown: best bold, second underlined, numbers to the right."""
+    marks = {0: ("**", "**"), 1: ("<u>", "</u>"), None: ("", "")}
+
+    def cell(row: int, column: int) -> str:
+        before, after = marks[table.rank(row, column)]
+        return before + _markdown_text(table.text(row, column)) + after
+
+    heads = [_markdown_text(f"{column.group} {column.heading}".strip()) for column in table.columns]
+    rules = [
+        "---:" if any(isinstance(cells[index], int | float) for cells in table.rows) else "---"
+        for index in range(len(table.columns))
+    ]
+    lines = [f"**{_markdown_text(table.caption)}**", "", _bar(heads), _bar(rules)]
+    count = len(table.columns)
+    lines += [_bar([cell(row, c) for c in range(count)]) for row in range(len(table.rows))]
+    lines += [line for note in table.notes for line in ("", _markdown_text(note))]
+    return "\n".join(lines) + "\n"
+
+
+def _bar(cells: list[str]) -> str:
+    return "| " + " | ".join(cells) + " |"
+
+
+def _markdown_text(text: str) -> str:
+    for char in "\\|*_`<>[]":
+        text = text.replace(char, "\\" + char)
+    return text.replace("\n", " ")
+
+
+def to_latex(table: Table) -> str:
+    """Return a booktabs table: best bold, second underlined."""
+    marks = {0: r"\textbf{%s}", 1: r"\underline{%s}", None: "%s"}
+
+    def cell(row: int, column: int) -> str:
+        return marks[table.rank(row, column)] % _latex_text(table.text(row, column))
+
+    count = len(table.columns)
+    alignment = "".join(
+        "r" if any(isinstance(cells[index], int | float) for cells in table.rows) else "l"
+        for index in range(count)
+    )
+    lines = [
+        r"\begin{table}[t]",
+        r"  \centering",
+        rf"  \caption{{{_latex_text(table.caption)}}}",
+        rf"  \begin{{tabular}}{{{alignment}}}",
+        r"    \toprule",
+        *_latex_groups(table),
+        "    " + " & ".join(_latex_text(c.heading) for c in table.columns) + r" \\",
+        r"    \midrule",
+    ]
+    lines += [
+        "    " + " & ".join(cell(row, column) for column in range(count)) + r" \\"
+        for row in range(len(table.rows))
+    ]
+    lines += [r"    \bottomrule", r"  \end{tabular}"]
+    lines += [rf"  \\ \footnotesize {_latex_text(note)}" for note in table.notes]
+    return "\n".join([*lines, r"\end{table}"]) + "\n"
+
+
+def _latex_groups(table: Table) -> list[str]:
+    if not any(column.group for column in table.columns):
+        return []
+    spans: list[tuple[str, int]] = []
+    for column in table.columns:
+        if spans and spans[-1][0] == column.group:
+            spans[-1] = (column.group, spans[-1][1] + 1)
+        else:
+            spans.append((column.group, 1))
+    cells, rules, first = [], [], 1
+    for group, width in spans:
+        cells.append(rf"\multicolumn{{{width}}}{{c}}{{{_latex_text(group)}}}")
+        if group:
+            rules.append(rf"\cmidrule(lr){{{first}-{first + width - 1}}}")
+        first += width
+    return ["    " + " & ".join(cells) + r" \\", "    " + " ".join(rules)]
+
+
+def _latex_text(text: str) -> str:
+    escapes = {
+        "\\": r"\textbackslash{}",
+        "&": r"\&",
+        "%": r"\%",
+        "$": r"\$",
+        "#": r"\#",
+        "_": r"\_",
+        "{": r"\{",
+        "}": r"\}",
+        "~": r"\textasciitilde{}",
+        "^": r"\textasciicircum{}",
+        "↑": r"$\uparrow$",
+        "↓": r"$\downarrow$",
+        "–": "--",
+        "×": r"$\times$",
+        "≤": r"$\leq$",
+        "\n": " ",
+    }
+    return "".join(escapes.get(char, char) for char in text)
+
+
+def to_csv(table: Table) -> str:
+    """Return CSV with full precision; an empty cell was not measured."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow([f"{c.group} {c.title}".strip() for c in table.columns])
+    writer.writerows([["" if cell is None else cell for cell in row] for row in table.rows])
+    return stream.getvalue()
+
+
+def to_json(table: Table) -> str:
+    """Return JSON with full precision."""
+    return json.dumps(to_object(table), indent=1, allow_nan=False) + "\n"
+
+
+def to_object(table: Table) -> dict[str, Any]:
+    """Return the JSON object of a table."""
+    names = [f"{column.group} {column.title}".strip() for column in table.columns]
+    return {
+        "caption": table.caption,
+        "columns": [
+            {"name": name, "higher_is_better": column.higher_is_better}
+            for name, column in zip(names, table.columns, strict=True)
+        ],
+        "rows": [dict(zip(names, row, strict=True)) for row in table.rows],
+        "notes": list(table.notes),
+    }
+
+
+def print_table(table: Table) -> None:
+    """Print a table on standard output: colours and lines on a terminal, plain text elsewhere."""
+    import shutil
+    import sys
+
+    from rich.console import Console
+    from rich.table import Table as RichTable
+    from rich.text import Text
+
+    # Without a terminal rich assumes 80 columns and would fold the numbers.
+    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 400
+    console = Console(width=width)
+    grid = RichTable(title=Text(table.caption), title_justify="left", expand=False)
+    for index, column in enumerate(table.columns):
+        numeric = any(isinstance(cells[index], int | float) for cells in table.rows)
+        head = "\n".join(part for part in (column.group, column.heading) if part)
+        grid.add_column(Text(head), justify="right" if numeric else "left")
+    styles = {0: "bold", 1: "underline", None: ""}
+    for row in range(len(table.rows)):
+        grid.add_row(
+            *(
+                Text(table.text(row, column), style=styles[table.rank(row, column)])
+                for column in range(len(table.columns))
+            )
+        )
+    console.print(grid)
+    for note in table.notes:
+        console.print(Text(note, style="dim"))

@@ -1,0 +1,21 @@
+"""Results: one JSON file with every frame's scores, and all that is needed to trust them."""
+
+from hwp_bench.results.schema import (
+    CaptureResult,
+    CurvePoint,
+    FrameResult,
+    MethodId,
+    Results,
+    read_results,
+    write_results,
+)
+
+__all__ = [
+    "CaptureResult",
+    "CurvePoint",
+    "FrameResult",
+    "MethodId",
+    "Results",
+    "read_results",
+    "write_results",
+]

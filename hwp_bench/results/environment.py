@@ -1,0 +1,53 @@
+"""What a result was made on: versions, processor, system."""
+
+from __future__ import annotations
+
+import os
+import platform
+from importlib import metadata
+from typing import Any
+
+#: Packages whose version can move a number.
+PACKAGES = (
+    "numpy",
+    "torch",
+    "numba",
+    "opencv-contrib-python-headless",
+    "scikit-image",
+    "OpenImageIO",
+    "scipy",
+    "trimesh",
+    "embreex",
+    "anny",
+    "gsplat",
+)
+
+
+def environment() -> dict[str, Any]:
+    """Return the versions, the processor and the system; no host name and no path."""
+    versions = {}
+    for package in PACKAGES:
+        try:
+            versions[package] = metadata.version(package)
+        except metadata.PackageNotFoundError:
+            continue
+    return {
+        "python": platform.python_version(),
+        "system": f"{platform.system()} {platform.machine()}",
+        "processor": _processor(),
+        "cores": len(os.sched_getaffinity(0))
+        if hasattr(os, "sched_getaffinity")
+        else os.cpu_count(),
+        "packages": versions,
+    }
+
+
+def _processor() -> str:
+    try:
+        with open("/proc/cpuinfo", encoding="utf-8") as stream:
+            for line in stream:
+                if line.startswith("model name"):
+                    return line.split(":", 1)[1].strip()
+    except OSError:
+        pass
+    return platform.processor() or "unknown"

@@ -1,0 +1,227 @@
+"""The result file: dataclasses, and reading that checks what it is given."""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields
+from pathlib import Path
+from types import UnionType
+from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+
+from hwp_bench.errors import BadResult
+from hwp_bench.files import read_json, write_json
+
+#: Version of the result file.
+SCHEMA = "hwp-results/1"
+
+Record = TypeVar("Record")
+
+
+@dataclass(frozen=True)
+class FrameResult:
+    """The scores of one test frame."""
+
+    #: Index in the capture.
+    frame: int
+    #: Score by metric; a failed frame has the declared penalties.
+    scores: dict[str, float]
+    #: Why the frame could not be scored, or None.
+    failure: str | None
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """The state of a fit at one checkpoint."""
+
+    #: Optimiser steps done.
+    step: int
+    #: Seconds on the method's clock.
+    seconds: float
+    #: Peak memory of the method's process until then, bytes.
+    peak_memory: int
+    #: Mean score over the validation frames that were rendered.
+    scores: dict[str, float]
+
+
+@dataclass(frozen=True)
+class CaptureResult:
+    """What one method did on one capture."""
+
+    #: Id of the capture.
+    id: str
+    #: Digest of the capture.
+    digest: str
+    #: `right`, `left` or `both`.
+    hands: str
+    #: Names of the perturbations that it declares.
+    perturbations: list[str]
+    #: Digest of the split.
+    split_digest: str
+    #: Whether the scoring masks are exact coverage, or estimates.
+    exact_masks: bool
+    #: Digest of everything that decides the scores; equal keys need no second run.
+    key: str
+    #: Every frame that the split lists, in order.
+    frames: list[FrameResult]
+    #: Why the method failed on the whole capture, or None.
+    failure: str | None
+    #: SHA-256 over the decoded pixels of the predictions, in frame order.
+    predictions_digest: str
+    #: Seconds on the method's clock.
+    fit_seconds: float | None
+    #: Seconds to render the test frames.
+    render_seconds: float | None
+    #: Seconds to score them.
+    score_seconds: float
+    #: Seconds of the method's process from start to end.
+    wall_seconds: float
+    #: Optimiser steps.
+    steps: int | None
+    #: Peak memory of the method's process, bytes.
+    peak_memory: int | None
+    #: Device that the method says it ran on.
+    device: str | None
+    #: Validation scores over time.
+    curve: list[CurvePoint]
+
+    @property
+    def failed_frames(self) -> int:
+        """How many frames could not be scored."""
+        return sum(frame.failure is not None for frame in self.frames)
+
+
+@dataclass(frozen=True)
+class MethodId:
+    """Which method, in which state."""
+
+    #: Short name.
+    name: str
+    #: Name in tables.
+    title: str
+    #: Digest of the method directory's text files.
+    digest: str
+    #: Preset that was asked for, `default` if none.
+    preset: str
+    #: The settings that it was run with.
+    settings: dict[str, Any]
+
+
+@dataclass(frozen=True)
+class Results:
+    """One evaluation: a method on a set of captures."""
+
+    #: The method.
+    method: MethodId
+    #: Name of the suite, or `captures` when captures were named one by one.
+    suite: str
+    #: Seed of everything random.
+    seed: int
+    #: Limits of the fit: `seconds`, `steps`, either may be None.
+    budget: dict[str, Any]
+    #: Settings of every protocol that was scored, by name.
+    protocols: dict[str, Any]
+    #: Versions, processor, system.
+    environment: dict[str, Any]
+    #: When the evaluation started, ISO 8601, UTC.
+    started: str
+    #: One entry a capture.
+    captures: list[CaptureResult]
+    #: Version of the toolkit.
+    toolkit: str
+
+    @property
+    def metrics(self) -> list[str]:
+        """Names of the metrics that every frame has."""
+        for capture in self.captures:
+            for frame in capture.frames:
+                return list(frame.scores)
+        return []
+
+
+def write_results(path: str | os.PathLike[str], results: Results) -> Path:
+    """Write a result file atomically."""
+    return write_json(path, {"schema": SCHEMA, **asdict(results)})
+
+
+def read_results(path: str | os.PathLike[str]) -> Results:
+    """Read a result file, or the `results.json` of a results folder.
+
+    Raises:
+        BadInput: missing or no JSON.
+        BadResult: of another version, a field is missing, unknown, of the wrong type, or a
+            score is not finite; the field is named.
+    """
+    path = Path(path)
+    if path.is_dir():
+        path = path / "results.json"
+    value = read_json(path)
+    if not isinstance(value, dict) or value.get("schema") != SCHEMA:
+        raise BadResult(f"is no result file of schema {SCHEMA}", where=path)
+    value = {key: item for key, item in value.items() if key != "schema"}
+    return parse_record(Results, value, where=os.fspath(path))
+
+
+def parse_record(kind: type[Record], value: Any, *, where: str, field: str = "") -> Record:
+    """Make a dataclass of the result file out of JSON, checking every field by its annotation.
+
+    Raises:
+        BadResult: what `read_results` lists.
+    """
+    if not isinstance(value, dict):
+        raise BadResult("must be a JSON object", where=where, field=field or None)
+    hints = get_type_hints(kind)
+    names = {item.name for item in fields(kind)}  # type: ignore[arg-type]
+    for name in sorted(names ^ value.keys()):
+        problem = "is missing" if name in names else "is no field of a result"
+        raise BadResult(problem, where=where, field=f"{field}{name}")
+    converted = {
+        name: _convert(hints[name], item, where, f"{field}{name}") for name, item in value.items()
+    }
+    return kind(**converted)
+
+
+def _convert(hint: Any, value: Any, where: str, field: str) -> Any:
+    origin, arguments = get_origin(hint), get_args(hint)
+    if origin is UnionType:
+        if value is None and type(None) in arguments:
+            return None
+        return _convert(arguments[0], value, where, field)
+    if origin is list:
+        if isinstance(value, list):
+            return [
+                _convert(arguments[0], item, where, f"{field}[{index}].")
+                for index, item in enumerate(value)
+            ]
+    elif origin is dict:
+        if isinstance(value, dict):
+            return {
+                key: _convert(arguments[1], item, where, f"{field}.{key}")
+                for key, item in value.items()
+            }
+    elif hint is Any:
+        return value
+    elif hint is float:
+        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
+            return float(value)
+    elif hint in (int, str, bool):
+        if isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
+            return value
+    else:
+        prefix = field if field.endswith(".") else f"{field}."
+        return parse_record(hint, value, where=where, field=prefix)
+    raise BadResult(f"is {str(value)[:60]!r}, of the wrong type", where=where, field=field)
+
+
+def score_rows(results: Results) -> list[Mapping[str, Any]]:
+    """Return the captures as `hwp_bench.metrics.aggregate` takes them."""
+    return [
+        {
+            "id": capture.id,
+            "hands": capture.hands,
+            "perturbations": capture.perturbations,
+            "frames": {frame.frame: frame.scores for frame in capture.frames},
+        }
+        for capture in results.captures
+    ]
