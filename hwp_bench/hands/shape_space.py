@@ -6,11 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hwp_bench.hands.landmarks import FINGERS, finger_joints
 from hwp_bench.hands.template import SHAPE_COUNT
-
-#: Rows are the rest directions of a right hand in MANO's axes: from the wrist to the middle
-#: knuckle is -x, out of the back of the hand is +y, towards the thumb's side is +z.
-MANO_DIRECTIONS = np.array([[-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, 1.0]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,51 +28,73 @@ class ShapeSpace:
     explained: np.ndarray
 
 
-def align_hands(
-    vertices: np.ndarray, joints: np.ndarray, palm: np.ndarray, directions: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Move right hands so that the wrist is the origin and the palm has one orientation.
+def align_hands(vertices: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Move right hands to MANO's directions: the wrist at the origin, fingers along -x.
+
+    The middle knuckle lies on the -x axis, the little and the index knuckle at the same height
+    y, the back of the hand towards +y, the index finger's side towards +z.
 
     Args:
         vertices: (S, V, 3) m.
-        joints: (S, J, 3) m.
-        palm: (S, 5, 3) wrist, then the knuckles of index, middle, little and ring finger.
-        directions: (3, 3) rows: where fingers, back of the hand and thumb's side shall point.
+        joints: (S, 16, 3) m, MANO order.
 
     Returns:
         The moved vertices and joints.
     """
-    wrist = palm[:, :1]
-    forward = _unit(palm[:, 2] - palm[:, 0])
-    across = palm[:, 1] - palm[:, 3]
-    across = _unit(across - (across * forward).sum(axis=-1, keepdims=True) * forward)
-    back = np.cross(forward, across)
-    turn = np.einsum("sic,id->sdc", np.stack([forward, back, across], axis=1), directions)
-    return (
-        np.einsum("sdc,svc->svd", turn, vertices - wrist),
-        np.einsum("sdc,sjc->sjd", turn, joints - wrist),
-    )
+    wrist, index, middle, little = (joints[:, [joint]] for joint in (0, 1, 4, 7))
+    x = _unit(wrist - middle)
+    z = index - little
+    z = _unit(z - (z * x).sum(axis=-1, keepdims=True) * x)
+    axes = np.concatenate([x, np.cross(z, x), z], axis=1)
+    return (vertices - wrist) @ axes.swapaxes(1, 2), (joints - wrist) @ axes.swapaxes(1, 2)
+
+
+def stretch_fingers(
+    vertices: np.ndarray, joints: np.ndarray, weights: np.ndarray, factors: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Make each finger longer or shorter along its own axis, its knuckle staying in place.
+
+    Args:
+        vertices: (S, V, 3) m.
+        joints: (S, 16, 3) m, MANO order.
+        weights: (V, 16) skinning weights; they say how far a vertex follows its finger.
+        factors: (S, 5) length factors in the order of `FINGERS`.
+
+    Returns:
+        The changed vertices and joints.
+    """
+    vertices, joints = vertices.copy(), joints.copy()
+    for finger, factor in zip(FINGERS, factors.T, strict=True):
+        chain = list(finger_joints(finger))
+        base = joints[:, chain[:1]].copy()
+        axis = _unit(joints[:, chain[-1:]] - base)
+        follow = np.append(weights[:, chain].sum(axis=1), np.ones(len(chain)))
+        points = np.concatenate([vertices, joints[:, chain]], axis=1)
+        along = np.maximum(((points - base) * axis).sum(axis=-1), 0.0)
+        points += ((factor[:, None] - 1.0) * along * follow)[..., None] * axis
+        vertices, joints[:, chain] = points[:, : -len(chain)], points[:, -len(chain) :]
+    return vertices, joints
 
 
 def shape_components(vertices: np.ndarray, joints: np.ndarray) -> ShapeSpace:
     """Principal components of aligned hands, scaled to unit deviation, with a fixed sign.
 
-    The sign makes the component's largest coordinate change positive, so that two machines
-    agree.
+    The sign makes a positive parameter a larger hand (seen from the wrist), so that two
+    machines agree.
 
     Args:
-        vertices: (S, V, 3) m, S at least 11.
+        vertices: (S, V, 3) m; more samples than components.
         joints: (S, J, 3) m.
     """
     samples = len(vertices)
     mean_vertices, mean_joints = vertices.mean(axis=0), joints.mean(axis=0)
     centred = (vertices - mean_vertices).reshape(samples, -1)
-    values, vectors = np.linalg.eigh(centred.T @ centred / samples)
+    # Far fewer samples than coordinates: the samples' own product has the same spectrum.
+    values, vectors = np.linalg.eigh(centred @ centred.T / samples)
     order = np.argsort(values)[::-1][:SHAPE_COUNT]
-    basis = vectors[:, order]
-    largest = basis[np.argmax(np.abs(basis), axis=0), np.arange(SHAPE_COUNT)]
-    basis = basis * np.sign(largest)
     deviation = np.sqrt(values[order])
+    basis = centred.T @ vectors[:, order] / (deviation * np.sqrt(samples))
+    basis = basis * np.where(mean_vertices.reshape(-1) @ basis < 0.0, -1.0, 1.0)
     scores = centred @ basis / deviation
     joint_offsets = (joints - mean_joints).reshape(samples, -1)
     # The scores are uncorrelated with unit variance: least squares is one product.
