@@ -1,0 +1,1 @@
+"""Captures from elsewhere: a video with tracked landmarks."""
