@@ -54,7 +54,10 @@ def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
         raise BadImage("does not exist", where=path)
     if path.stat().st_size == 0:
         raise BadImage("is empty (0 bytes)", where=path)
-    source = oiio.ImageInput.open(os.fspath(path))
+    config = oiio.ImageSpec()
+    # Otherwise colours come multiplied by alpha, and a submission's alpha would act as a mask.
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(os.fspath(path), config)
     if source is None:
         raise BadImage(f"is no image that can be read ({oiio.geterror().strip()})", where=path)
     try:
@@ -105,6 +108,7 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], oiio.UINT8)
     spec.attribute("oiio:ColorSpace", "sRGB")
     spec.attribute("png:compressionLevel", PNG_LEVEL)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
     written = output.open(os.fspath(temporary), spec) and output.write_image(
         np.ascontiguousarray(array)
     )

@@ -1,0 +1,105 @@
+"""Fixtures for every test: small captures that need no simulator and no hand model."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hwp_bench.capture import (
+    Cameras,
+    Capture,
+    CaptureInfo,
+    CaptureWriter,
+    HandModelId,
+    open_capture,
+)
+from hwp_bench.hands.parameters import HandParameters
+
+CaptureMaker = Callable[..., Capture]
+
+
+def hand_parameters(frames: int, seed: int = 0) -> HandParameters:
+    """A hand half a metre in front of the camera that moves a little."""
+    rng = np.random.default_rng(seed)
+    transl = np.zeros((frames, 3))
+    transl[:, 0] = np.linspace(-0.01, 0.01, frames)
+    transl[:, 2] = 0.5
+    return HandParameters(
+        pose=rng.normal(0, 0.1, (frames, 16, 3)),
+        betas=rng.normal(0, 1, 10),
+        transl=transl,
+        valid=np.ones(frames, dtype=bool),
+    )
+
+
+def cameras(frames: int, size: int) -> Cameras:
+    """A camera at the origin that sees about 60 degrees."""
+    K = np.array([[size * 0.9, 0, size / 2], [0, size * 0.9, size / 2], [0, 0, 1.0]])
+    return Cameras(np.repeat(K[None], frames, 0), np.repeat(np.eye(4)[None], frames, 0))
+
+
+def hand_picture(frame: int, size: int, seed: int = 0) -> tuple[np.ndarray, np.ndarray]:
+    """A textured disc that moves to the right over a textured background, and its mask."""
+    rng = np.random.default_rng(seed)
+    rows, columns = np.mgrid[:size, :size]
+    centre = size * 0.4 + frame * 0.25
+    inside = (rows - size / 2) ** 2 + (columns - centre) ** 2 < (size * 0.3) ** 2
+    background = rng.integers(0, 60, (size, size, 3))
+    waves = 60 * np.sin(columns / 3.0 + frame * 0.1) + 20 * np.sin(rows / 2.0)
+    texture = np.clip(150 + waves, 0, 255)
+    skin = np.stack([texture, texture * 0.8, texture * 0.7], axis=2)
+    picture = np.where(inside[:, :, None], skin, background).astype(np.uint8)
+    return picture, (inside * 255).astype(np.uint8)
+
+
+@pytest.fixture
+def make_capture(tmp_path: Path) -> CaptureMaker:
+    """Return a function that writes a capture and opens it."""
+
+    def make(
+        name: str = "tiny",
+        *,
+        frames: int = 20,
+        size: int = 32,
+        hands: str = "right",
+        perturbations: dict[str, tuple[int, ...] | None] | None = None,
+        truth: bool = False,
+        folder: Path | None = None,
+    ) -> Capture:
+        if perturbations is None:
+            perturbations = {"motion_blur": tuple(3 if f % 4 == 1 else 0 for f in range(frames))}
+            last = frames - frames * 9 // 10
+            severities = perturbations["motion_blur"][: frames - last] + (0,) * last
+            perturbations = {"motion_blur": severities}
+        info = CaptureInfo(
+            id=name,
+            hands=hands,
+            action="Waving",
+            device="Test",
+            fps=30.0,
+            width=size,
+            height=size,
+            frame_count=frames,
+            hand_model=HandModelId("anny-1", "0" * 64),
+            perturbations=perturbations,
+            source={"kind": "test"},
+            licence="CC0",
+        )
+        parameters = {side: hand_parameters(frames, i) for i, side in enumerate(info.sides)}
+        path = (folder or tmp_path) / name
+        with CaptureWriter(path, info, parameters, cameras(frames, size)) as writer:
+            for frame in range(frames):
+                picture, mask = hand_picture(frame, size)
+                writer.frame(frame, picture)
+                writer.mask(frame, mask)
+                if truth:
+                    writer.clean(frame, picture)
+                    writer.true_mask(frame, mask)
+            if truth:
+                writer.true_hands(parameters)
+        return open_capture(path)
+
+    return make

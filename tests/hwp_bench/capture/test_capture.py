@@ -1,0 +1,207 @@
+"""The capture format: what is written is read, and what is damaged is named."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import CaptureMaker, cameras, hand_parameters, hand_picture
+
+from hwp_bench.capture import Cameras, CaptureWriter, open_capture
+from hwp_bench.capture.check import check_capture
+from hwp_bench.errors import BadCapture, BadInput, HwpError, ShapeMismatch, UsageError
+
+
+@pytest.mark.parametrize("hands", ["right", "left", "both"])
+def test_a_capture_round_trips(make_capture: CaptureMaker, hands: str) -> None:
+    capture = make_capture(hands=hands, frames=12, truth=True)
+    picture, mask = hand_picture(7, 32)
+    np.testing.assert_array_equal(capture.frame(7), picture)
+    np.testing.assert_array_equal(capture.mask(7), mask)
+    np.testing.assert_array_equal(capture.clean(7), picture)
+    assert capture.scoring_mask(7)[1] is True
+    assert set(capture.hands) == set(capture.info.sides)
+    for index, side in enumerate(capture.info.sides):
+        np.testing.assert_array_equal(capture.hands[side].pose, hand_parameters(12, index).pose)
+        np.testing.assert_array_equal(capture.true_hands[side].betas, capture.hands[side].betas)
+    assert capture.info.interacting == (hands == "both")
+    report = check_capture(capture.root)
+    assert report.ok
+    assert report.findings == ()
+    assert report.facts["truth"] == ["clean frames", "exact masks", "hand parameters"]
+
+
+def test_equal_content_has_equal_digest_and_a_changed_pixel_another(
+    make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    first = make_capture(folder=tmp_path / "a")
+    second = make_capture(folder=tmp_path / "b")
+    assert first.digest == second.digest
+    from hwp_bench.images import write_image
+
+    picture = second.frame(3)
+    picture[0, 0, 0] ^= 1
+    write_image(second.root / "frames" / "000003.png", picture)
+    report = check_capture(second.root)
+    assert not report.ok
+    assert [finding.field for finding in report.findings] == ["digests.frames"]
+
+
+def test_an_interrupted_writer_leaves_nothing(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    info = make_capture(frames=10).info
+    target = tmp_path / "half"
+    with (
+        pytest.raises(RuntimeError),
+        CaptureWriter(target, info, {"right": hand_parameters(10)}, cameras(10, 32)) as writer,
+    ):
+        writer.frame(0, hand_picture(0, 32)[0])
+        raise RuntimeError
+    with (
+        pytest.raises(BadCapture, match=r"10 of 10 images were not given \(first: 0\)"),
+        CaptureWriter(target, info, {"right": hand_parameters(10)}, cameras(10, 32)) as writer,
+    ):
+        for frame in range(10):
+            writer.frame(frame, hand_picture(frame, 32)[0])
+    assert not target.exists()
+    assert {item.name for item in tmp_path.iterdir()} == {"tiny"}
+
+
+def test_the_writer_refuses_what_contradicts(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    info = make_capture(frames=10).info
+    hands, track = {"right": hand_parameters(10)}, cameras(10, 32)
+    with pytest.raises(BadCapture, match="parameters of"):
+        CaptureWriter(tmp_path / "x", info, {"left": hands["right"]}, track)
+    with pytest.raises(BadCapture, match="9 poses for 10 frames"):
+        CaptureWriter(tmp_path / "x", info, {"right": hand_parameters(9)}, track)
+    with pytest.raises(BadCapture, match="9 cameras"):
+        CaptureWriter(tmp_path / "x", info, hands, cameras(9, 32))
+    with pytest.raises(BadCapture, match="no capture id"):
+        CaptureWriter(tmp_path / "x", replace(info, id="../up"), hands, track)
+    with (
+        pytest.raises(UsageError, match="exists"),
+        CaptureWriter(tmp_path / "tiny", info, hands, track),
+    ):
+        pass
+    with (
+        pytest.raises(ShapeMismatch, match=r"frames\[3\]"),
+        CaptureWriter(tmp_path / "x", info, hands, track) as writer,
+    ):
+        writer.frame(3, np.zeros((31, 32, 3), np.uint8))
+    with (
+        pytest.raises(BadInput, match="leads out"),
+        CaptureWriter(tmp_path / "x", info, hands, track) as writer,
+    ):
+        writer.extra("../../file", b"")
+
+
+def _edit(root: Path, **changes: object) -> None:
+    path = root / "capture.json"
+    value = {**json.loads(path.read_text()), **changes}
+    path.write_text(json.dumps({k: v for k, v in value.items() if v != "DELETE"}))
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"schema": "hwp-capture/9"}, "schema: is 'hwp-capture/9'"),
+        ({"fps": "DELETE"}, "fps: is missing"),
+        ({"fps": -1}, "fps: is '-1'"),
+        ({"width": 1.5}, "width: is '1.5'"),
+        ({"frame_count": True}, "frame_count"),
+        ({"frame_count": 10**9}, "frame_count"),
+        ({"hands": "three"}, "not one of right, left, both"),
+        ({"id": "a/b"}, "no capture id"),
+        ({"perturbations": {"fog": None}}, "no perturbation 'fog'"),
+        ({"perturbations": {"motion_blur": [0]}}, "list of 12 severities"),
+        ({"perturbations": {"motion_blur": [9] * 12}}, "severity 9 of frame 0"),
+        ({"hand_model": {"name": "anny-1"}}, "hand_model.digest: is missing"),
+        ({"source": []}, "source"),
+    ],
+)
+def test_damaged_metadata_is_named(
+    make_capture: CaptureMaker, changes: dict[str, object], problem: str
+) -> None:
+    root = make_capture(frames=12).root
+    _edit(root, **changes)
+    with pytest.raises(HwpError) as caught:
+        open_capture(root)
+    assert problem in str(caught.value)
+    assert not check_capture(root).ok
+
+
+def _arrays(root: Path, file: str, **changes: np.ndarray) -> None:
+    with np.load(root / file) as archive:
+        arrays = {**archive, **changes}
+    np.savez(root / file, **arrays)
+
+
+def test_damaged_numbers_are_named(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    bad = hand_parameters(12).pose
+    bad[5, 3, 1] = np.nan
+    root = make_capture("a", frames=12).root
+    _arrays(root, "hands.npz", right_pose=bad)
+    with pytest.raises(BadInput, match=r"right_pose: holds NaN or infinity \(first in row 5\)"):
+        open_capture(root)
+    _arrays(root, "hands.npz", right_pose=bad[:11])
+    with pytest.raises(BadInput, match=r"has shape \(11, 16, 3\) where \(12, 16, 3\)"):
+        open_capture(root)
+    (root / "hands.npz").write_bytes(b"no zip")
+    with pytest.raises(BadInput, match="no readable array file"):
+        open_capture(root)
+    root = make_capture("b", frames=12).root
+    Ks = cameras(12, 32).Ks.copy()
+    Ks[4, 1, 1] = 0
+    _arrays(root, "cameras.npz", Ks=Ks)
+    with pytest.raises(BadInput, match="Ks: frame 4 has a focal length that is not above 0"):
+        open_capture(root)
+    viewmats = cameras(12, 32).viewmats.copy()
+    viewmats[2, 0, 0] = 2
+    with pytest.raises(BadInput, match="frame 2 has a rotation that is not orthonormal"):
+        Cameras(cameras(12, 32).Ks, viewmats)
+
+
+def test_an_array_file_with_pickled_objects_is_refused(make_capture: CaptureMaker) -> None:
+    root = make_capture(frames=12).root
+    np.savez(root / "hands.npz", right_pose=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(BadInput, match="no readable array file"):
+        open_capture(root)
+
+
+def test_the_check_names_damaged_images_and_strangers(make_capture: CaptureMaker) -> None:
+    root = make_capture(frames=12).root
+    (root / "frames" / "000004.png").write_bytes(b"")
+    (root / "masks" / "000002.png").unlink()
+    (root / "frames" / "notes.txt").write_text("x")
+    report = check_capture(root)
+    assert not report.ok
+    problems = {Path(f.where).name: f.problem for f in report.findings}
+    assert problems["000004.png"] == "is empty (0 bytes)"
+    assert problems["000002.png"] == "does not exist"
+    assert problems["frames"] == "holds 1 further files (first: notes.txt)"
+
+
+def test_a_hand_behind_the_camera_and_an_empty_mask_are_found(
+    make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    info = make_capture(frames=10).info
+    hands = hand_parameters(10)
+    hands.transl[6, 2] = -0.5
+    with CaptureWriter(tmp_path / "x", info, {"right": hands}, cameras(10, 32)) as writer:
+        for frame in range(10):
+            picture, mask = hand_picture(frame, 32)
+            writer.frame(frame, picture)
+            writer.mask(frame, mask * (frame != 3))
+    findings = check_capture(tmp_path / "x").findings
+    assert [(f.level, f.field) for f in findings] == [("error", "right_transl"), ("warning", None)]
+    assert "frame 6 lies behind its camera" in findings[0].problem
+    assert "covers 0.00 %" in findings[1].problem
+
+
+def test_frames_out_of_range_are_refused(make_capture: CaptureMaker) -> None:
+    capture = make_capture(frames=10)
+    for frame in (-1, 10):
+        with pytest.raises(UsageError, match="there is no frame"):
+            capture.frame(frame)

@@ -1,0 +1,100 @@
+"""Images in and out. Oracle: OpenCV's own PNG reader and writer, exact."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hwp_bench.errors import BadImage, HwpError, ShapeMismatch
+from hwp_bench.images import pixel_digest, read_gray, read_rgb, write_image
+
+
+@pytest.fixture
+def picture() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+
+
+def test_opencv_reads_what_is_written_and_the_other_way(tmp_path: Path, picture) -> None:
+    path = write_image(tmp_path / "ours.png", picture)
+    np.testing.assert_array_equal(cv2.imread(str(path))[:, :, ::-1], picture)
+    cv2.imwrite(str(tmp_path / "theirs.png"), picture[:, :, ::-1])
+    np.testing.assert_array_equal(read_rgb(tmp_path / "theirs.png", (30, 40)), picture)
+    write_image(tmp_path / "mask.png", picture[:, :, 0])
+    np.testing.assert_array_equal(read_gray(tmp_path / "mask.png"), picture[:, :, 0])
+    assert sorted(item.name for item in tmp_path.iterdir()) == [
+        "mask.png",
+        "ours.png",
+        "theirs.png",
+    ]
+
+
+def test_gray_becomes_rgb_and_alpha_is_dropped(tmp_path: Path, picture) -> None:
+    write_image(tmp_path / "gray.png", picture[:, :, 0])
+    gray = read_rgb(tmp_path / "gray.png")
+    assert all((gray[:, :, c] == picture[:, :, 0]).all() for c in range(3))
+    alpha = np.zeros((30, 40, 1), np.uint8)
+    write_image(tmp_path / "rgba.png", np.concatenate([picture, alpha], axis=2))
+    # Transparent pixels keep their colour: alpha is dropped, not composited.
+    np.testing.assert_array_equal(read_rgb(tmp_path / "rgba.png"), picture)
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "text", "truncated", "size", "16-bit"])
+def test_bad_images_are_named(tmp_path: Path, picture, kind: str) -> None:
+    path = tmp_path / "image.png"
+    whole = write_image(tmp_path / "whole.png", picture).read_bytes()
+    problem = {
+        "missing": "does not exist",
+        "empty": "is empty",
+        "text": "is no image",
+        "truncated": "is damaged or truncated",
+        "size": "40x30 pixels where 32x32 is expected",
+        "16-bit": "uint16 samples",
+    }[kind]
+    if kind == "16-bit":
+        cv2.imwrite(str(path), picture.astype(np.uint16) * 256)
+    elif kind != "missing":
+        content = {"empty": b"", "text": b"no image", "truncated": whole[: len(whole) // 2]}
+        path.write_bytes(content.get(kind, whole))
+    with pytest.raises(BadImage, match=problem) as caught:
+        read_rgb(path, (32, 32) if kind == "size" else (30, 40))
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_header_that_claims_gigabytes_is_refused_before_decoding(tmp_path: Path) -> None:
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        body = kind + data
+        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
+
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    path = tmp_path / "bomb.png"
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 100))
+        + chunk(b"IEND", b"")
+    )
+    with pytest.raises(BadImage, match="above the limit|malicious"):
+        read_rgb(path)
+
+
+def test_what_cannot_be_written_is_one_error(tmp_path: Path, picture) -> None:
+    with pytest.raises(ShapeMismatch):
+        write_image(tmp_path / "float.png", picture / 255.0)
+    with pytest.raises(HwpError, match="no image format"):
+        write_image(tmp_path / "file.nothing", picture)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_digest_sees_pixels_and_shape_not_compression(picture) -> None:
+    assert pixel_digest(picture) == pixel_digest(picture.copy())
+    changed = picture.copy()
+    changed[3, 4, 1] ^= 1
+    assert pixel_digest(picture) != pixel_digest(changed)
+    assert pixel_digest(picture) != pixel_digest(picture.reshape(40, 30, 3))
