@@ -6,26 +6,14 @@ import resource
 import sys
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 
 from hwp_bench.files import write_json
 from hwp_bench.methods.contract import Avatar, Budget
+from hwp_bench.methods.facts import Checkpoint
 
 #: Seconds between two writes of the progress file.
 PROGRESS_INTERVAL = 0.5
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """One moment of a fit that was put on record."""
-
-    #: Optimiser steps done.
-    step: int
-    #: Seconds on the method's clock.
-    seconds: float
-    #: Peak memory of the process until then, bytes.
-    peak_memory: int
 
 
 def schedule(budget: Budget) -> list[float]:

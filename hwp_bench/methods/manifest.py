@@ -50,26 +50,27 @@ class MethodManifest:
     #: Settings by preset.
     presets: Mapping[str, Mapping[str, Any]]
 
-    def settings(self, preset: str | None, fallback: str | None = None) -> dict[str, Any]:
-        """Return the settings of a preset.
+    def preset(self, name: str | None, suite: str = "") -> str:
+        """Return the name of the preset to use.
 
         Args:
-            preset: its name; None takes `fallback` where the method has it, else `default`.
-            fallback: preset of the suite's name.
+            name: what was asked for; None takes the one named like the suite where the method
+                has it, else `default`.
+            suite: name of the suite.
 
         Raises:
             BadMethod: there is no such preset.
         """
-        if preset is None:
-            preset = fallback if fallback and fallback in self.presets else DEFAULT_PRESET
-        if preset not in self.presets and preset != DEFAULT_PRESET:
+        if name is None:
+            return suite if suite in self.presets else DEFAULT_PRESET
+        if name not in self.presets and name != DEFAULT_PRESET:
             raise BadMethod(
-                f"has no preset {preset!r}",
+                f"has no preset {name!r}",
                 where=self.root / MANIFEST,
                 field="presets",
                 remedy=f"It has: {', '.join(self.presets) or DEFAULT_PRESET}.",
             )
-        return dict(self.presets.get(preset, {}))
+        return name
 
     @property
     def digest(self) -> str:

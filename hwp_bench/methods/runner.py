@@ -13,10 +13,11 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO
 
 from hwp_bench.errors import BadInput, BadMethod, MethodFailed
 from hwp_bench.files import read_json
+from hwp_bench.methods.facts import RunFacts, read_facts
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.methods.worker import FAILURE, PREDICTIONS, PROGRESS, RUN
 
@@ -53,9 +54,8 @@ class RunRecord:
 
     #: Folder of the predicted frames.
     predictions: Path
-    #: What `run.json` says (fit and render seconds, steps, memory, checkpoints); empty for
-    #: commands that write none and for submitted predictions.
-    facts: dict[str, Any]
+    #: What `run.json` says; says nothing for submitted predictions.
+    facts: RunFacts
     #: Wall time of the whole process, start-up included, seconds.
     wall_seconds: float
 
@@ -94,7 +94,7 @@ def run_method(
                 where=folder,
                 remedy=f"Put the frames into {manifest.entry}/{capture_id}/.",
             )
-        return RunRecord(folder, {}, 0.0)
+        return RunRecord(folder, RunFacts(), 0.0)
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
     log = output / "log.txt"
@@ -113,7 +113,14 @@ def run_method(
             where=log,
             remedy="The log holds what it printed.",
         )
-    return RunRecord(output / PREDICTIONS, _facts(output), wall)
+    try:
+        facts = read_facts(output / RUN)
+    except BadInput as error:
+        raise MethodFailed(
+            f"{manifest.name} wrote a {RUN} that cannot be read: {error.field or ''} {error.problem}",
+            where=log,
+        ) from error
+    return RunRecord(output / PREDICTIONS, facts, wall)
 
 
 def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]:
@@ -208,13 +215,3 @@ def _reason(output: Path, status: int) -> str:
         with contextlib.suppress(ValueError):
             return f"killed by {signal.Signals(-status).name}"
     return f"exit status {status}"
-
-
-def _facts(output: Path) -> dict[str, Any]:
-    path = output / RUN
-    if not path.is_file():
-        return {}
-    value = read_json(path, max_bytes=10 * 1024 * 1024)
-    if not isinstance(value, dict):
-        raise BadInput("must be a JSON object", where=path)
-    return value

@@ -21,6 +21,7 @@ from hwp_bench.files import write_json
 from hwp_bench.images import write_image
 from hwp_bench.methods.clock import ReportClock, peak_memory
 from hwp_bench.methods.contract import Avatar, MethodFactory
+from hwp_bench.methods.facts import RunFacts
 from hwp_bench.methods.request import TrainingCapture, open_request
 
 #: Folder of the predicted test frames inside the output folder.
@@ -107,19 +108,16 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
         pixels = render(avatar, training, frame)
         render_seconds += time.perf_counter() - started
         write_image(output / PREDICTIONS / frame_name(frame), pixels)
-    write_json(
-        output / RUN,
-        {
-            "fit_seconds": fit_seconds,
-            "render_seconds": render_seconds,
-            "frames_rendered": len(training.targets),
-            "steps": final_step,
-            "peak_memory": peak_memory(),
-            "device": device_name(avatar),
-            "checkpoint_frames": frames,
-            "checkpoints": [asdict(checkpoint) for checkpoint in report.checkpoints],
-        },
+    facts = RunFacts(
+        fit_seconds=fit_seconds,
+        render_seconds=render_seconds,
+        steps=final_step,
+        peak_memory=peak_memory(),
+        device=device_name(avatar),
+        checkpoint_frames=frames,
+        checkpoints=report.checkpoints,
     )
+    write_json(output / RUN, asdict(facts))
 
 
 def checkpoint_frames(validation: np.ndarray) -> list[int]:

@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-import math
 import os
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from types import UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any
 
 from hwp_bench.errors import BadResult
 from hwp_bench.files import read_json, write_json
+from hwp_bench.records import parse_record
 
 #: Version of the result file.
 SCHEMA = "hwp-results/1"
-
-Record = TypeVar("Record")
 
 
 @dataclass(frozen=True)
@@ -161,57 +158,6 @@ def read_results(path: str | os.PathLike[str]) -> Results:
         raise BadResult(f"is no result file of schema {SCHEMA}", where=path)
     value = {key: item for key, item in value.items() if key != "schema"}
     return parse_record(Results, value, where=os.fspath(path))
-
-
-def parse_record(kind: type[Record], value: Any, *, where: str, field: str = "") -> Record:
-    """Make a dataclass of the result file out of JSON, checking every field by its annotation.
-
-    Raises:
-        BadResult: what `read_results` lists.
-    """
-    if not isinstance(value, dict):
-        raise BadResult("must be a JSON object", where=where, field=field or None)
-    hints = get_type_hints(kind)
-    names = {item.name for item in fields(kind)}  # type: ignore[arg-type]
-    for name in sorted(names ^ value.keys()):
-        problem = "is missing" if name in names else "is no field of a result"
-        raise BadResult(problem, where=where, field=f"{field}{name}")
-    converted = {
-        name: _convert(hints[name], item, where, f"{field}{name}") for name, item in value.items()
-    }
-    return kind(**converted)
-
-
-def _convert(hint: Any, value: Any, where: str, field: str) -> Any:
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is UnionType:
-        if value is None and type(None) in arguments:
-            return None
-        return _convert(arguments[0], value, where, field)
-    if origin is list:
-        if isinstance(value, list):
-            return [
-                _convert(arguments[0], item, where, f"{field}[{index}].")
-                for index, item in enumerate(value)
-            ]
-    elif origin is dict:
-        if isinstance(value, dict):
-            return {
-                key: _convert(arguments[1], item, where, f"{field}.{key}")
-                for key, item in value.items()
-            }
-    elif hint is Any:
-        return value
-    elif hint is float:
-        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-            return float(value)
-    elif hint in (int, str, bool):
-        if isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
-            return value
-    else:
-        prefix = field if field.endswith(".") else f"{field}."
-        return parse_record(hint, value, where=where, field=prefix)
-    raise BadResult(f"is {str(value)[:60]!r}, of the wrong type", where=where, field=field)
 
 
 def score_rows(results: Results) -> list[Mapping[str, Any]]:

@@ -1,0 +1,193 @@
+"""Evaluate one method on one capture, and put the result on record before anything else."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+from hwp_bench.capture import Capture
+from hwp_bench.errors import BadMethod, HwpError, MethodFailed
+from hwp_bench.evaluate.pictures import write_pictures
+from hwp_bench.evaluate.scoring import (
+    keep_predictions,
+    mean_scores,
+    predictions_digest,
+    read_targets,
+    score_predictions,
+)
+from hwp_bench.files import read_json, sha256_json, write_json
+from hwp_bench.methods.facts import RunFacts
+from hwp_bench.methods.manifest import MethodManifest
+from hwp_bench.methods.predictions import Prediction, read_predictions
+from hwp_bench.methods.request import RunSettings, write_request
+from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
+from hwp_bench.methods.worker import CHECKPOINTS
+from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.records import parse_record
+from hwp_bench.results import CaptureResult, CurvePoint
+from hwp_bench.splits import Split
+
+#: Version of what a stored capture result depends on besides its inputs.
+RECIPE = 1
+
+
+@dataclass(frozen=True)
+class Job:
+    """One method on one capture."""
+
+    #: The method.
+    manifest: MethodManifest
+    #: The capture.
+    capture: Capture
+    #: Its split.
+    split: Split
+    #: Settings, seed, budget.
+    run: RunSettings
+    #: Seconds after which the method is killed.
+    time_limit: float = DEFAULT_TIME_LIMIT
+    #: LPIPS backbones whose weights are at hand.
+    networks: tuple[str, ...] = ()
+
+    @property
+    def key(self) -> str:
+        """Digest (hex) of everything that decides the scores."""
+        return sha256_json(
+            {
+                "recipe": RECIPE,
+                "method": [self.manifest.name, self.manifest.digest],
+                "capture": self.capture.digest,
+                "split": self.split.digest,
+                "settings": dict(self.run.settings),
+                "seed": self.run.seed,
+                "budget": asdict(self.run.budget),
+                "protocols": [protocol.as_dict() for protocol in PROTOCOLS],
+                "networks": list(self.networks),
+            }
+        )
+
+
+def evaluate_capture(
+    job: Job, folder: Path, on_progress: Callable[[int, int], None] | None = None
+) -> CaptureResult:
+    """Run a method on a capture and score it; a stored result of the same job is taken as it is.
+
+    Args:
+        job: what to run.
+        folder: where result, predictions, pictures and log go.
+        on_progress: called with (done, total) steps of the fit.
+
+    Returns:
+        The result, which `folder/result.json` then holds. A method that fails gives a result
+        with the reason and penalties, not an error.
+
+    Raises:
+        BadCapture, BadImage: the capture itself is damaged.
+    """
+    stored = _stored(job, folder)
+    if stored is not None:
+        return stored
+    targets = read_targets(job.capture, job.split.test.tolist())
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    output = folder / "run"
+    record, failure = _run(job, output, on_progress)
+    started = time.perf_counter()
+    frames = [target.frame for target in targets]
+    source = record.predictions if record else output / "none"
+    predictions = read_predictions(source, frames, job.capture.size)
+    scores = score_predictions(targets, predictions, job.networks)
+    score_seconds = time.perf_counter() - started
+    facts = record.facts if record else RunFacts()
+    result = CaptureResult(
+        id=job.capture.info.id,
+        digest=job.capture.digest,
+        hands=job.capture.info.hands,
+        perturbations=list(job.capture.info.perturbations),
+        split_digest=job.split.digest,
+        exact_masks=all(target.exact for target in targets),
+        key=job.key,
+        frames=scores,
+        failure=failure,
+        predictions_digest=predictions_digest(predictions),
+        fit_seconds=facts.fit_seconds,
+        render_seconds=facts.render_seconds,
+        score_seconds=score_seconds,
+        wall_seconds=record.wall_seconds if record else 0.0,
+        steps=facts.steps,
+        peak_memory=facts.peak_memory,
+        device=facts.device[:100] if facts.device else None,
+        curve=_curve(job, output, facts),
+    )
+    _keep(job, folder, output, source, predictions, result)
+    write_json(folder / "result.json", asdict(result))
+    return result
+
+
+def _stored(job: Job, folder: Path) -> CaptureResult | None:
+    path = folder / "result.json"
+    # What a submission predicts may change without its method.toml, so it is always scored.
+    if not path.is_file() or job.manifest.kind == "predictions":
+        return None
+    try:
+        result = parse_record(CaptureResult, read_json(path), where=str(path))
+    except HwpError:
+        return None
+    return result if result.key == job.key and result.failure is None else None
+
+
+def _run(
+    job: Job, output: Path, on_progress: Callable[[int, int], None] | None
+) -> tuple[RunRecord | None, str | None]:
+    """Run the method on a copy of what it may see; returns the record, or why there is none."""
+    with tempfile.TemporaryDirectory(prefix="hwp-request-") as temporary:
+        request = Path(temporary) / "request"
+        try:
+            if job.manifest.kind != "predictions":
+                write_request(request, job.capture, job.split, job.run)
+            record = run_method(
+                job.manifest,
+                job.capture.info.id,
+                request,
+                output,
+                time_limit=job.time_limit,
+                on_progress=on_progress,
+            )
+        except (MethodFailed, BadMethod) as error:
+            return None, str(error)
+    return record, None
+
+
+def _curve(job: Job, output: Path, facts: RunFacts) -> list[CurvePoint]:
+    validation = set(job.split.validation.tolist())
+    frames = [frame for frame in facts.checkpoint_frames if frame in validation]
+    if not frames:
+        return []
+    targets = read_targets(job.capture, frames)
+    curve = []
+    for index, checkpoint in enumerate(facts.checkpoints):
+        folder = output / CHECKPOINTS / f"{index:03d}"
+        predictions = read_predictions(folder, frames, job.capture.size)
+        scores = mean_scores(score_predictions(targets, predictions))
+        curve.append(CurvePoint(**asdict(checkpoint), scores=scores))
+    return curve
+
+
+def _keep(
+    job: Job,
+    folder: Path,
+    output: Path,
+    source: Path,
+    predictions: list[Prediction],
+    result: CaptureResult,
+) -> None:
+    """Keep predictions, log and pictures; drop what can be made again."""
+    keep_predictions(folder / "predictions", source, [p.frame for p in predictions])
+    if (output / "log.txt").is_file():
+        shutil.copyfile(output / "log.txt", folder / "log.txt")
+    shutil.rmtree(output, ignore_errors=True)
+    if result.failed_frames < len(result.frames):
+        write_pictures(folder / "pictures", job.capture, result.frames, predictions)

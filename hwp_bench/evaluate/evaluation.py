@@ -1,0 +1,125 @@
+"""Evaluate a method on a set of captures."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from hwp_bench import __version__
+from hwp_bench.capture import open_capture
+from hwp_bench.errors import BadCapture
+from hwp_bench.evaluate.capture_run import Job, evaluate_capture
+from hwp_bench.evaluate.scoring import available_networks
+from hwp_bench.methods.contract import Budget
+from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
+from hwp_bench.methods.request import RunSettings
+from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT
+from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.results import CaptureResult, MethodId, Results, write_results
+from hwp_bench.results.environment import environment
+from hwp_bench.splits import Split, split_for
+
+#: Called when a capture's work begins, with (index, count, capture id); returns what is to be
+#: called with (done, total) steps meanwhile.
+OnCapture = Callable[[int, int, str], Callable[[int, int], None] | None]
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """How a method is evaluated."""
+
+    #: Name of the suite, for the record and as the name of the preset that fits it.
+    suite: str = "captures"
+    #: Preset of the method; None takes the one named like the suite, else `default`.
+    preset: str | None = None
+    #: Single settings that override the preset.
+    overrides: Mapping[str, Any] = field(default_factory=dict)
+    #: Seed of everything random.
+    seed: int = 0
+    #: When to stop fitting.
+    budget: Budget = field(default_factory=Budget)
+    #: Seconds after which a method is killed on one capture.
+    time_limit: float = DEFAULT_TIME_LIMIT
+
+
+def evaluate(
+    method: str,
+    captures: Sequence[Path],
+    out: Path,
+    settings: EvaluationSettings,
+    *,
+    splits: Mapping[str, Split] | None = None,
+    on_capture: OnCapture | None = None,
+) -> Results:
+    """Evaluate a method.
+
+    Every capture is opened and checked before the method runs on the first one. A capture's
+    result is on disk before the next begins, and an evaluation that is started again takes
+    finished captures as they are.
+
+    Args:
+        method: method directory, or the name of one that ships with the toolkit.
+        captures: capture folders.
+        out: results folder.
+        settings: suite, preset, seed, budget, limits.
+        splits: splits by capture id; None applies the 80/10/10 rule.
+        on_capture: hook for showing progress.
+
+    Returns:
+        The results, which `out/results.json` then holds.
+
+    Raises:
+        BadMethod: the method directory is wrong.
+        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
+    """
+    manifest = read_manifest(find_method(method))
+    preset = manifest.preset(settings.preset, settings.suite)
+    chosen = {**manifest.presets.get(preset, {}), **settings.overrides}
+    run = RunSettings(chosen, settings.seed, settings.budget)
+    networks = available_networks()
+    jobs = _jobs(captures, splits, manifest, run, settings, networks)
+    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    finished: list[CaptureResult] = []
+    for index, job in enumerate(jobs):
+        name = job.capture.info.id
+        update = on_capture(index, len(jobs), name) if on_capture else None
+        finished.append(evaluate_capture(job, out / "captures" / name, update))
+    results = Results(
+        method=MethodId(manifest.name, manifest.title, manifest.digest, preset, chosen),
+        suite=settings.suite,
+        seed=settings.seed,
+        budget={"seconds": settings.budget.seconds, "steps": settings.budget.steps},
+        protocols={protocol.name: protocol.as_dict() for protocol in PROTOCOLS},
+        environment=environment(),
+        started=started,
+        captures=finished,
+        toolkit=__version__,
+    )
+    write_results(out / "results.json", results)
+    return results
+
+
+def _jobs(
+    captures: Sequence[Path],
+    splits: Mapping[str, Split] | None,
+    manifest: MethodManifest,
+    run: RunSettings,
+    settings: EvaluationSettings,
+    networks: tuple[str, ...],
+) -> list[Job]:
+    jobs: list[Job] = []
+    for path in captures:
+        capture = open_capture(path)
+        if any(job.capture.info.id == capture.info.id for job in jobs):
+            raise BadCapture(
+                f"another capture has the id {capture.info.id!r} too",
+                where=path,
+                field="id",
+                remedy="Evaluate them one by one, each into its own folder.",
+            )
+        split = split_for(capture.info.id, len(capture), splits)
+        jobs.append(Job(manifest, capture, split, run, settings.time_limit, networks))
+    return jobs

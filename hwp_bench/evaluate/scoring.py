@@ -1,0 +1,128 @@
+"""From predictions to scores: every frame that the split lists is scored, failures included."""
+
+from __future__ import annotations
+
+import hashlib
+import shutil
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.capture import Capture
+from hwp_bench.capture.layout import frame_name
+from hwp_bench.errors import BadCapture
+from hwp_bench.images import pixel_digest
+from hwp_bench.methods.predictions import Prediction
+from hwp_bench.metrics import PROTOCOLS, penalty
+from hwp_bench.metrics.protocol import HWP_V1
+from hwp_bench.metrics.region import scored_pixels
+from hwp_bench.results import FrameResult
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """The truth of one frame."""
+
+    #: Index in the capture.
+    frame: int
+    #: (H, W, 3) uint8 sRGB.
+    pixels: np.ndarray
+    #: (H, W) uint8, the data set's own visible-hand mask.
+    mask: np.ndarray
+    #: Whether the mask is exact coverage.
+    exact: bool
+
+
+def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
+    """Read the truth of the given frames, before any method runs.
+
+    Raises:
+        BadImage: a frame or mask is missing or damaged.
+        BadCapture: a frame shows no hand that could be scored; no method can be blamed for it.
+    """
+    targets = []
+    for frame in frames:
+        mask, exact = capture.scoring_mask(frame)
+        if not scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact).any():
+            raise BadCapture(
+                f"the mask of test frame {frame} leaves no pixel to score",
+                where=capture.root,
+                field=f"masks[{frame}]",
+                remedy="The test clip must show the hand in every frame.",
+            )
+        targets.append(Target(frame, capture.frame(frame), mask, exact))
+    return targets
+
+
+def score_predictions(
+    targets: Sequence[Target],
+    predictions: Sequence[Prediction],
+    networks: Sequence[str] = (),
+) -> list[FrameResult]:
+    """Score predictions in every protocol.
+
+    Args:
+        targets: the truth.
+        predictions: one for each target, in the same order.
+        networks: LPIPS backbones whose weights are at hand.
+
+    Returns:
+        One result a target; a prediction that failed has the declared penalties.
+    """
+    from hwp_bench.metrics.score import score_frames
+
+    sound = [i for i, prediction in enumerate(predictions) if prediction.pixels is not None]
+    scores = score_frames(
+        (
+            (predictions[i].pixels, targets[i].pixels, targets[i].mask, targets[i].exact)
+            for i in sound
+        ),
+        networks=networks,
+    )
+    by_position = dict(zip(sound, scores, strict=True))
+    worst = penalty(PROTOCOLS, networks)
+    return [
+        FrameResult(target.frame, dict(by_position.get(index, worst)), prediction.failure)
+        for index, (target, prediction) in enumerate(zip(targets, predictions, strict=True))
+    ]
+
+
+def mean_scores(frames: Sequence[FrameResult]) -> dict[str, float]:
+    """Return the mean of every metric over frames."""
+    return {
+        name: float(np.mean([frame.scores[name] for frame in frames])) for name in frames[0].scores
+    }
+
+
+def predictions_digest(predictions: Sequence[Prediction]) -> str:
+    """Return the SHA-256 (hex) over the decoded pixels of predictions, in order.
+
+    A failed frame enters with its name, so that a later repair changes the digest.
+    """
+    total = hashlib.sha256()
+    for prediction in predictions:
+        content = (
+            f"failed {prediction.frame}"
+            if prediction.pixels is None
+            else pixel_digest(prediction.pixels)
+        )
+        total.update(content.encode())
+    return total.hexdigest()
+
+
+def available_networks() -> tuple[str, ...]:
+    """Return the LPIPS backbones whose weights the user has."""
+    from hwp_bench.metrics.lpips_weights import lpips_available
+
+    return tuple(net for net in ("alex", "vgg") if lpips_available(net) is None)
+
+
+def keep_predictions(folder: Path, source: Path, frames: Sequence[int]) -> None:
+    """Copy the predicted frames that exist into a results folder; nothing else is copied."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for frame in frames:
+        path = source / frame_name(frame)
+        if path.is_file():
+            shutil.copyfile(path, folder / path.name)
