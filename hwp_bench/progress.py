@@ -6,7 +6,10 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
+
+if TYPE_CHECKING:
+    from rich.progress import Progress
 
 Item = TypeVar("Item")
 
@@ -14,6 +17,29 @@ Item = TypeVar("Item")
 def notice(text: str) -> None:
     """Print one line for a person on standard error."""
     print(text, file=sys.stderr, flush=True)
+
+
+def _bar() -> Progress:
+    from rich.console import Console
+    from rich.progress import (
+        BarColumn,
+        MofNCompleteColumn,
+        Progress,
+        TextColumn,
+        TimeElapsedColumn,
+        TimeRemainingColumn,
+    )
+
+    return Progress(
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        TextColumn("elapsed,"),
+        TimeRemainingColumn(),
+        TextColumn("left"),
+        console=Console(stderr=True),
+    )
 
 
 @contextlib.contextmanager
@@ -34,28 +60,38 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
         yield lambda done: None
         notice(f"{description}: {total} in {time.perf_counter() - start:.1f} s")
         return
-    from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
-
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        TextColumn("elapsed,"),
-        TimeRemainingColumn(),
-        TextColumn("left"),
-    )
-    with Progress(*columns, console=Console(stderr=True)) as bar:
+    with _bar() as bar:
         task = bar.add_task(description, total=total)
         yield lambda done: bar.update(task, completed=done)
+
+
+class JobProgress:
+    """Shows a list of jobs, one bar each, with elapsed and remaining time.
+
+    A context manager; elsewhere than on a terminal it prints one line as each job starts.
+    """
+
+    def __init__(self) -> None:
+        self._bar = _bar() if sys.stderr.isatty() else None
+
+    def __enter__(self) -> JobProgress:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
+
+    def start(self, index: int, count: int, name: str) -> Callable[[int, int], None]:
+        """Begin job `index` of `count`; returns what takes (done, total) steps of it."""
+        description = f"[{index + 1}/{count}] {name}"
+        bar = self._bar
+        if bar is None:
+            notice(description)
+            return lambda done, total: None
+        task = bar.add_task(description, total=None)
+        return lambda done, total: bar.update(task, completed=done, total=total)
 
 
 def track(items: Iterable[Item], description: str, total: int | None = None) -> Iterator[Item]:

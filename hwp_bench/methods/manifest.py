@@ -187,3 +187,10 @@ def _presets(value: Any, where: Path) -> dict[str, dict[str, Any]]:
     if not isinstance(value, dict) or not all(isinstance(item, dict) for item in value.values()):
         raise BadMethod("must be tables of settings", where=where, field="presets")
     return value
+
+
+def shipped_methods() -> list[MethodManifest]:
+    """Return the methods that ship with the toolkit: the reference entry and the baselines."""
+    package = Path(__file__).resolve().parents[2]
+    folders = [package / "wildghand", *sorted((package / "baselines").iterdir())]
+    return [read_manifest(folder) for folder in folders if (folder / MANIFEST).is_file()]

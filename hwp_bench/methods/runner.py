@@ -116,10 +116,8 @@ def run_method(
     try:
         facts = read_facts(output / RUN)
     except BadInput as error:
-        raise MethodFailed(
-            f"{manifest.name} wrote a {RUN} that cannot be read: {error.field or ''} {error.problem}",
-            where=log,
-        ) from error
+        problem = f"{manifest.name} wrote a {RUN} that cannot be read ({error.problem})"
+        raise MethodFailed(problem, where=log, field=error.field) from error
     return RunRecord(output / PREDICTIONS, facts, wall)
 
 

@@ -1,0 +1,143 @@
+"""`hwp-bench evaluate`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hwp_bench.evaluate.evaluation import EvaluationSettings
+
+_EXAMPLES = """examples:
+  hwp-bench evaluate baselines/plain --suite smoke
+  hwp-bench evaluate baselines/plain --capture my_capture --out runs/plain-mine
+  hwp-bench evaluate my_method --suite mini --budget 60 --seed 1
+  hwp-bench evaluate my_method --suite mini --set gaussians=20000 --json
+
+An evaluation that is started again with the same arguments takes finished captures as they are.
+Exit status 0: every frame was scored; 1: the method failed on a capture or left out frames
+(they get the protocol's penalty); 2: the command was given wrongly.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    parser.add_argument(
+        "method", metavar="METHOD_DIR", help="method directory, or the name of a shipped method"
+    )
+    what = parser.add_mutually_exclusive_group()
+    what.add_argument(
+        "--suite",
+        choices=("smoke", "mini", "full"),
+        default="mini",
+        help="simulated captures, rendered on first use (default mini)",
+    )
+    what.add_argument(
+        "--capture", nargs="+", metavar="PATH", help="capture folders, instead of a suite"
+    )
+    parser.add_argument("--out", help="results folder (default runs/METHOD-SUITE)")
+    parser.add_argument("--splits", help="split file (default: the 80/10/10 rule)")
+    parser.add_argument("--preset", help="preset of the method (default: the suite's, if any)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="override one setting of the preset; may be given again",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
+    parser.add_argument("--budget", type=float, metavar="SECONDS", help="limit of the fit's time")
+    parser.add_argument("--steps", type=int, help="limit of the fit's optimiser steps")
+    parser.add_argument(
+        "--time-limit",
+        type=float,
+        default=3600.0,
+        metavar="SECONDS",
+        help="kill the method after this time on one capture (default 3600)",
+    )
+    parser.add_argument("--json", action="store_true", help="print the result file")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from dataclasses import asdict
+
+    from hwp_bench.evaluate.evaluation import evaluate
+    from hwp_bench.progress import JobProgress, notice
+    from hwp_bench.report.summary import all_tables, write_tables
+    from hwp_bench.report.table import print_table
+    from hwp_bench.splits import read_splits
+
+    settings = _settings(args)
+    captures = [Path(path) for path in args.capture] if args.capture else _suite(args.suite)
+    method = Path(args.method.rstrip("/")).name
+    out = Path(args.out or f"runs/{method}-{settings.suite}")
+    splits = read_splits(args.splits) if args.splits else None
+    with JobProgress() as jobs:
+        results = evaluate(
+            args.method, captures, out, settings, splits=splits, on_capture=jobs.start
+        )
+    tables = all_tables([results])
+    write_tables(out / "tables", tables)
+    if args.json:
+        json.dump(asdict(results), sys.stdout, indent=1)
+        print()
+    else:
+        for name in ("overall", "captures"):
+            print_table(tables[name])
+    failed = [capture for capture in results.captures if capture.failed_frames]
+    for capture in failed:
+        reason = capture.failure or next(f.failure for f in capture.frames if f.failure)
+        notice(
+            f"failed: {capture.id}: {capture.failed_frames} of {len(capture.frames)} frames: "
+            f"{reason}"
+        )
+    notice(f"results: {out / 'results.json'}; tables: {out / 'tables'}")
+    for capture in results.captures:
+        picture = out / "captures" / capture.id / "pictures" / "comparison.png"
+        if picture.is_file():
+            notice(f"picture: {picture}")
+    return 1 if failed else 0
+
+
+def _settings(args: argparse.Namespace) -> EvaluationSettings:
+    from hwp_bench.errors import UsageError
+    from hwp_bench.evaluate.evaluation import EvaluationSettings
+    from hwp_bench.methods.contract import Budget
+
+    for name in ("budget", "steps", "time_limit"):
+        value = getattr(args, name)
+        if value is not None and not 0 < value < float("inf"):
+            raise UsageError(f"{value} is not above 0", field=f"--{name.replace('_', '-')}")
+    return EvaluationSettings(
+        suite="captures" if args.capture else args.suite,
+        preset=args.preset,
+        overrides=dict(_override(text) for text in args.set),
+        seed=args.seed,
+        budget=Budget(args.budget, args.steps),
+        time_limit=args.time_limit,
+    )
+
+
+def _override(text: str) -> tuple[str, Any]:
+    import tomllib
+
+    from hwp_bench.errors import UsageError
+
+    name, equals, value = text.partition("=")
+    if not equals or not name.isidentifier():
+        raise UsageError(f"{text!r} is not NAME=VALUE", field="--set")
+    try:
+        return name, tomllib.loads(f"value = {value}")["value"]
+    except tomllib.TOMLDecodeError:
+        return name, value
+
+
+def _suite(name: str) -> list[Path]:
+    from hwp_bench.sim import ensure_suite
+
+    return ensure_suite(name)
