@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hwp_bench.evaluate.evaluation import EvaluationSettings
+    from hwp_bench.results import Results
 
 _EXAMPLES = """examples:
   hwp-bench evaluate baselines/plain --suite smoke
@@ -67,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from hwp_bench.evaluate.evaluation import evaluate
-    from hwp_bench.progress import JobProgress, notice
+    from hwp_bench.progress import JobProgress
     from hwp_bench.report.summary import all_tables, write_tables
     from hwp_bench.report.table import print_table
     from hwp_bench.splits import read_splits
@@ -89,6 +90,13 @@ def run(args: argparse.Namespace) -> int:
     else:
         for name in ("overall", "captures"):
             print_table(tables[name])
+    return report_outcome(out, results)
+
+
+def report_outcome(out: Path, results: Results) -> int:
+    """Tell a person where the results lie and what failed; returns the exit status."""
+    from hwp_bench.progress import notice
+
     failed = [capture for capture in results.captures if capture.failed_frames]
     for capture in failed:
         reason = capture.failure or next(f.failure for f in capture.frames if f.failure)

@@ -5,8 +5,8 @@ from __future__ import annotations
 import shutil
 import tempfile
 import time
-from collections.abc import Callable
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 from hwp_bench.capture import Capture
@@ -27,6 +27,7 @@ from hwp_bench.methods.request import RunSettings, write_request
 from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.methods.worker import CHECKPOINTS
 from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.metrics.score import Network
 from hwp_bench.records import parse_record
 from hwp_bench.results import CaptureResult, CurvePoint
 from hwp_bench.splits import Split
@@ -49,8 +50,8 @@ class Job:
     run: RunSettings
     #: Seconds after which the method is killed.
     time_limit: float = DEFAULT_TIME_LIMIT
-    #: LPIPS backbones whose weights are at hand.
-    networks: tuple[str, ...] = ()
+    #: LPIPS by backbone, where the weights are at hand.
+    networks: Mapping[str, Network] = field(default_factory=dict)
 
     @property
     def key(self) -> str:
@@ -65,7 +66,7 @@ class Job:
                 "seed": self.run.seed,
                 "budget": asdict(self.run.budget),
                 "protocols": [protocol.as_dict() for protocol in PROTOCOLS],
-                "networks": list(self.networks),
+                "networks": sorted(self.networks),
             }
         )
 

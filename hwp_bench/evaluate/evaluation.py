@@ -12,12 +12,13 @@ from hwp_bench import __version__
 from hwp_bench.capture import open_capture
 from hwp_bench.errors import BadCapture
 from hwp_bench.evaluate.capture_run import Job, evaluate_capture
-from hwp_bench.evaluate.scoring import available_networks
 from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
 from hwp_bench.methods.request import RunSettings
 from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT
 from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.metrics.lpips_weights import available_networks
+from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results, write_results
 from hwp_bench.results.environment import environment
 from hwp_bench.splits import Split, split_for
@@ -108,7 +109,7 @@ def _jobs(
     manifest: MethodManifest,
     run: RunSettings,
     settings: EvaluationSettings,
-    networks: tuple[str, ...],
+    networks: Mapping[str, Network],
 ) -> list[Job]:
     jobs: list[Job] = []
     for path in captures:

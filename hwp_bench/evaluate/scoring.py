@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import shutil
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,12 +12,13 @@ import numpy as np
 
 from hwp_bench.capture import Capture
 from hwp_bench.capture.layout import frame_name
-from hwp_bench.errors import BadCapture
+from hwp_bench.errors import BadCapture, BadPrediction
 from hwp_bench.images import pixel_digest
 from hwp_bench.methods.predictions import Prediction
-from hwp_bench.metrics import PROTOCOLS, penalty
+from hwp_bench.metrics.batch import Frame, score_frames
 from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.metrics.region import scored_pixels
+from hwp_bench.metrics.score import Network
 from hwp_bench.results import FrameResult
 
 
@@ -59,33 +60,32 @@ def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
 def score_predictions(
     targets: Sequence[Target],
     predictions: Sequence[Prediction],
-    networks: Sequence[str] = (),
+    networks: Mapping[str, Network] | None = None,
 ) -> list[FrameResult]:
     """Score predictions in every protocol.
 
     Args:
         targets: the truth.
         predictions: one for each target, in the same order.
-        networks: LPIPS backbones whose weights are at hand.
+        networks: LPIPS by backbone, where the weights are at hand.
 
     Returns:
         One result a target; a prediction that failed has the declared penalties.
     """
-    from hwp_bench.metrics.score import score_frames
-
-    sound = [i for i, prediction in enumerate(predictions) if prediction.pixels is not None]
-    scores = score_frames(
-        (
-            (predictions[i].pixels, targets[i].pixels, targets[i].mask, targets[i].exact)
-            for i in sound
-        ),
-        networks=networks,
-    )
-    by_position = dict(zip(sound, scores, strict=True))
-    worst = penalty(PROTOCOLS, networks)
+    frames = [
+        Frame(
+            BadPrediction(prediction.failure or "")
+            if prediction.pixels is None
+            else prediction.pixels,
+            target.pixels,
+            target.mask,
+            coverage=target.exact,
+        )
+        for target, prediction in zip(targets, predictions, strict=True)
+    ]
     return [
-        FrameResult(target.frame, dict(by_position.get(index, worst)), prediction.failure)
-        for index, (target, prediction) in enumerate(zip(targets, predictions, strict=True))
+        FrameResult(target.frame, dict(score.values), score.failure)
+        for target, score in zip(targets, score_frames(frames, networks=networks), strict=True)
     ]
 
 
@@ -110,13 +110,6 @@ def predictions_digest(predictions: Sequence[Prediction]) -> str:
         )
         total.update(content.encode())
     return total.hexdigest()
-
-
-def available_networks() -> tuple[str, ...]:
-    """Return the LPIPS backbones whose weights the user has."""
-    from hwp_bench.metrics.lpips_weights import lpips_available
-
-    return tuple(net for net in ("alex", "vgg") if lpips_available(net) is None)
 
 
 def keep_predictions(folder: Path, source: Path, frames: Sequence[int]) -> None:

@@ -1,0 +1,192 @@
+"""The tables of an evaluation: overall, per capture, per perturbation, in both protocols."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+from hwp_bench.errors import UsageError
+from hwp_bench.files import atomic_write
+from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
+from hwp_bench.metrics.aggregate import Aggregate, aggregate
+from hwp_bench.report.table import FORMATS, Cell, Column, Table, spell
+from hwp_bench.results import Results
+from hwp_bench.results.schema import score_rows
+from hwp_bench.taxonomy import PERTURBATIONS, perturbation
+
+#: Metrics of the headline tables, where an evaluation has them.
+HEADLINE = ("psnr", "ssim", "oriented_distance", "lpips_alex", "lpips_vgg")
+#: Metrics of the tables in the paper's protocol.
+PAPER = ("paper_psnr", "paper_ssim", "paper_lpips")
+
+_PAPER_NOTE = (
+    "Protocol paper-wildghand: the released evaluator's settings with the data set's mask; "
+    "these numbers are not comparable with the headline's."
+)
+
+
+def all_tables(results: Sequence[Results]) -> dict[str, Table]:
+    """Return every table of one or several evaluations, by name.
+
+    `overall` (single, interacting and all captures, with cost), `captures`, `perturbations`,
+    `details` (every metric of protocol hwp-v1) and `paper` (protocol paper-wildghand).
+
+    Raises:
+        UsageError: evaluations of one name were made on different data.
+    """
+    _same_data(results)
+    means = [aggregate(score_rows(result)) for result in results]
+    return {
+        "overall": overall_table(results, means, HEADLINE),
+        "captures": capture_table(results, means),
+        "perturbations": perturbation_table(results, means),
+        "details": overall_table(results, means, _of_protocol(HWP_V1), cost=False),
+        "paper": overall_table(results, means, PAPER, cost=False, note=_PAPER_NOTE),
+    }
+
+
+def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
+    """Write every table in every spelling: `overall.md`, `overall.tex`, ..."""
+    for name, table in tables.items():
+        for form in FORMATS:
+            atomic_write(folder / f"{name}.{form}", spell(table, form))
+
+
+def overall_table(
+    results: Sequence[Results],
+    means: Sequence[Aggregate],
+    metrics: Sequence[str],
+    *,
+    cost: bool = True,
+    note: str = "",
+) -> Table:
+    """Return one row a method: means over single-hand, interacting and all captures.
+
+    Args:
+        results: the evaluations.
+        means: their aggregates.
+        metrics: which metrics; those that an evaluation lacks are left out.
+        cost: add seconds of fitting, frames rendered a second, and failed frames.
+        note: a line under the table.
+    """
+    names = _present(results, metrics)
+    groups = [
+        (title, key)
+        for title, key in (("Single", "single"), ("Interacting", "interacting"))
+        if any(getattr(mean, key) for mean in means)
+    ]
+    if len(groups) != 1:
+        groups.append(("All captures", "macro"))
+    columns = [Column("Method")]
+    columns += [_column(name, title) for title, _ in groups for name in names]
+    if cost:
+        columns += [
+            Column("Fit [s]", 1, group="Cost"),
+            Column("Render [frames/s]", 1, group="Cost"),
+            Column("Failed frames", 0, group="Cost"),
+        ]
+    rows = []
+    for label, result, mean in zip(_labels(results), results, means, strict=True):
+        cells: list[Cell] = [label]
+        cells += [getattr(mean, key).get(name) for _, key in groups for name in names]
+        rows.append(tuple(cells + _cost(result) if cost else cells))
+    notes = [note] if note else []
+    notes.append(f"Means over captures of means over test frames; {_scope(results)}.")
+    return Table("All captures", tuple(columns), tuple(rows), tuple(notes))
+
+
+def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Table:
+    """Return one row a method and capture."""
+    names = _present(results, HEADLINE)
+    columns = [Column("Capture"), Column("Hands"), Column("Method")]
+    columns += [_column(name) for name in names]
+    columns += [Column("Fit [s]", 1), Column("Failed frames", 0)]
+    rows = []
+    for identifier in dict.fromkeys(c.id for result in results for c in result.captures):
+        for label, result, mean in zip(_labels(results), results, means, strict=True):
+            for capture in result.captures:
+                if capture.id == identifier:
+                    scores = [mean.captures[identifier].get(name) for name in names]
+                    hands = "interacting" if capture.hands == "both" else "single"
+                    tail = (capture.fit_seconds, capture.failed_frames)
+                    rows.append((identifier, hands, label, *scores, *tail))
+    # Captures are of unequal difficulty: ranks over all rows would compare what cannot be.
+    return Table("Per capture", tuple(columns), tuple(rows), ranked=False)
+
+
+def perturbation_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Table:
+    """Return one row a method, one group of columns a perturbation, as the paper's table."""
+    names = _present(results, HEADLINE[:3])
+    present = [p for p in PERTURBATIONS if any(p in mean.perturbations for mean in means)]
+    columns = [Column("Method")]
+    columns += [_column(name, perturbation(p).heading) for p in present for name in names]
+    rows = [
+        (label, *(mean.perturbations.get(p, {}).get(name) for p in present for name in names))
+        for label, mean in zip(_labels(results), means, strict=True)
+    ]
+    note = "Mean over the captures that carry the perturbation; a capture may carry several."
+    return Table("Per perturbation", tuple(columns), tuple(rows), (note,))
+
+
+def _same_data(results: Sequence[Results]) -> None:
+    seen: dict[str, tuple[str, str]] = {}
+    for result in results:
+        for capture in result.captures:
+            data = (capture.digest, capture.split_digest)
+            if seen.setdefault(capture.id, data) != data:
+                raise UsageError(
+                    "results on different data cannot stand in one table",
+                    where=capture.id,
+                    remedy="Evaluate the methods on the same captures with the same splits.",
+                )
+
+
+def _column(name: str, group: str = "") -> Column:
+    facts = metric(name)
+    title = f"{facts.label} [{facts.unit}]" if facts.unit else facts.label
+    return Column(title, facts.digits, facts.higher_is_better, group)
+
+
+def _present(results: Sequence[Results], metrics: Sequence[str]) -> list[str]:
+    measured = {name for result in results for name in result.metrics}
+    return [name for name in metrics if name in measured]
+
+
+def _of_protocol(protocol: Protocol) -> tuple[str, ...]:
+    return tuple(facts.name for facts in METRICS if facts.protocol == protocol.name)
+
+
+def _labels(results: Sequence[Results]) -> list[str]:
+    """Return a title for each evaluation, told apart by what differs where titles repeat."""
+    titles = [result.method.title for result in results]
+    labels = []
+    for result in results:
+        title = result.method.title
+        if titles.count(title) > 1:
+            title += f" ({result.method.preset}, seed {result.seed})"
+        labels.append(title)
+    return labels
+
+
+def _cost(result: Results) -> list[Cell]:
+    fits = [c.fit_seconds for c in result.captures if c.fit_seconds is not None]
+    renders = [
+        (len(c.frames), c.render_seconds) for c in result.captures if c.render_seconds is not None
+    ]
+    seconds = sum(spent for _, spent in renders)
+    return [
+        sum(fits) / len(fits) if fits else None,
+        sum(count for count, _ in renders) / seconds if seconds else None,
+        sum(capture.failed_frames for capture in result.captures),
+    ]
+
+
+def _scope(results: Sequence[Results]) -> str:
+    counts = {
+        (result.suite, len(result.captures), sum(len(c.frames) for c in result.captures))
+        for result in results
+    }
+    return "; ".join(
+        f"{suite}: {captures} captures, {frames} test frames"
+        for suite, captures, frames in sorted(counts)
+    )
