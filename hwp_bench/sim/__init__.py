@@ -1,0 +1,28 @@
+"""HWP-Sim: from a scene description to a capture, with everything that a real one hides.
+
+Heavy imports happen when a name is first asked for.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+_HOMES = {
+    "Scene": "scene",
+    "SuiteItem": "suites",
+    "ensure_suite": "suites",
+    "load_scene": "scene",
+    "render_capture": "production",
+    "render_frame": "frame",
+    "scene_names": "scene",
+    "suite": "suites",
+}
+
+__all__ = sorted(_HOMES)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)

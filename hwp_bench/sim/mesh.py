@@ -1,0 +1,119 @@
+"""Triangle mesh arithmetic: subdivision as a matrix, normals, boundary loops."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+
+def subdivision(faces: np.ndarray, vertex_count: int) -> tuple[csr_matrix, np.ndarray]:
+    """One midpoint subdivision, written as a matrix.
+
+    Args:
+        faces: (F, 3).
+        vertex_count: V.
+
+    Returns:
+        (V', V) sparse matrix that turns per-vertex values into those of the finer mesh, the
+        first V rows unchanged, and its (4F, 3) faces.
+    """
+    from scipy.sparse import csr_matrix
+
+    edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+    middle = (vertex_count + inverse.reshape(3, -1).T).astype(faces.dtype)
+    a, b, c = faces.T
+    ab, bc, ca = middle.T
+    fine = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]], axis=0)
+    count = len(unique)
+    rows = np.concatenate([np.arange(vertex_count), np.repeat(vertex_count + np.arange(count), 2)])
+    columns = np.concatenate([np.arange(vertex_count), unique.reshape(-1)])
+    values = np.concatenate([np.ones(vertex_count), np.full(2 * count, 0.5)])
+    matrix = csr_matrix((values, (rows, columns)), shape=(vertex_count + count, vertex_count))
+    return matrix, fine.transpose(0, 2, 1).reshape(-1, 3)
+
+
+def smoothing(faces: np.ndarray, vertex_count: int, rounds: int) -> csr_matrix:
+    """Taubin smoothing as one matrix: rounds facets off without shrinking.
+
+    The boundary stays where it is.
+
+    Source: Taubin, "A signal processing approach to fair surface design" (lambda 0.5, mu -0.53).
+    """
+    from scipy.sparse import diags, identity
+
+    adjacency = _adjacency(faces, vertex_count)
+    degree = np.asarray(adjacency.sum(axis=1)).reshape(-1)
+    free = np.ones(vertex_count)
+    free[boundary_vertices(faces)] = 0.0
+    laplacian = diags(free) @ (diags(1.0 / np.maximum(degree, 1.0)) @ adjacency) - diags(free)
+    one = identity(vertex_count, format="csr")
+    step = (one - 0.53 * laplacian) @ (one + 0.5 * laplacian)
+    matrix = one
+    for _ in range(rounds):
+        matrix = step @ matrix
+    return matrix.tocsr()
+
+
+def normal_operator(faces: np.ndarray, vertex_count: int) -> csr_matrix:
+    """(V, F) matrix that adds the faces' vectors up at their corners."""
+    from scipy.sparse import csr_matrix
+
+    rows = faces.reshape(-1)
+    columns = np.repeat(np.arange(len(faces)), 3)
+    return csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(vertex_count, len(faces)))
+
+
+def vertex_normals(vertices: np.ndarray, faces: np.ndarray, operator: csr_matrix) -> np.ndarray:
+    """Unit normals, weighted by area: (V, 3)."""
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return unit(operator @ np.cross(b - a, c - a))
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors at length 1; zero stays zero."""
+    length = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
+    return vectors / np.maximum(length, 1e-12)
+
+
+def boundary_vertices(faces: np.ndarray) -> np.ndarray:
+    """Vertices on edges that only one face has."""
+    return np.unique(_boundary_edges(faces))
+
+
+def boundary_loop(faces: np.ndarray) -> np.ndarray:
+    """The longest loop of boundary vertices, in order."""
+    edges = _boundary_edges(faces)
+    following = dict(edges.tolist())
+    loops = []
+    while following:
+        start = next(iter(following))
+        loop = [start]
+        step = following.pop(start)
+        while step != start and step in following:
+            loop.append(step)
+            step = following.pop(step)
+        loops.append(loop)
+    return np.array(max(loops, key=len, default=[]), dtype=np.int64)
+
+
+def _boundary_edges(faces: np.ndarray) -> np.ndarray:
+    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, inverse, counts = np.unique(
+        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    return edges[counts[inverse.reshape(-1)] == 1]
+
+
+def _adjacency(faces: np.ndarray, vertex_count: int) -> csr_matrix:
+    from scipy.sparse import csr_matrix
+
+    rows = np.concatenate([faces[:, i] for i in (0, 1, 2, 1, 2, 0)])
+    columns = np.concatenate([faces[:, i] for i in (1, 2, 0, 0, 1, 2)])
+    matrix = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(vertex_count,) * 2)
+    matrix.data[:] = 1.0
+    return matrix

@@ -1,0 +1,84 @@
+"""A process that renders some frames of a capture into a folder; started by `production`.
+
+Frames are kept as one file each, so that an interrupted render goes on where it stopped.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import pickle
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.arrays import read_npz
+from hwp_bench.errors import BadInput
+from hwp_bench.files import atomic_write
+from hwp_bench.sim.scene import Scene
+
+
+def frame_file(folder: Path, frame: int) -> Path:
+    """Where a rendered frame waits."""
+    return folder / f"{frame:06d}.npz"
+
+
+def read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
+    """Read a rendered frame; None where there is none or it is damaged."""
+    try:
+        return read_npz(frame_file(folder, frame))
+    except BadInput:
+        return None
+
+
+def render_frames(
+    scene: Scene, frames: Iterable[int], frame_count: int, size: int, folder: Path
+) -> None:
+    """Render frames into a folder.
+
+    Args:
+        scene: the scene.
+        frames: which.
+        frame_count: frames over which the capture is spread.
+        size: edge of the picture in pixels.
+        folder: where they go.
+    """
+    from hwp_bench.sim.frame import render_frame
+
+    for frame in frames:
+        result = render_frame(scene, frame, frame_count, size)
+        cost = {
+            "seconds": dict(result.ledger.seconds),
+            "rays": dict(result.ledger.rays),
+            "subframes": result.plan.subframes,
+        }
+        buffer = io.BytesIO()
+        np.savez(
+            buffer,
+            rgb=result.rgb,
+            clean=result.clean,
+            coverage=result.coverage.astype(np.float32),
+            clean_coverage=result.clean_coverage.astype(np.float32),
+            cost=np.frombuffer(json.dumps(cost).encode(), dtype=np.uint8),
+        )
+        atomic_write(frame_file(folder, frame), buffer.getvalue())
+
+
+def main() -> int:
+    """Read one job from standard input and do it."""
+    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        os.environ.setdefault(name, "1")
+    import torch
+
+    torch.set_num_threads(1)
+    # The job comes from our own parent process through a pipe.
+    scene, frames, frame_count, size, folder = pickle.load(sys.stdin.buffer)
+    render_frames(scene, frames, frame_count, size, Path(folder))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())
