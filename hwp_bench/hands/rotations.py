@@ -63,3 +63,61 @@ def _cross_matrix(vector: torch.Tensor) -> torch.Tensor:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(
         *vector.shape[:-1], 3, 3
     )
+
+
+def matrix_to_axis_angle(matrix: torch.Tensor) -> torch.Tensor:
+    """Axis-angle vectors of rotation matrices, stable at zero and at half a turn.
+
+    Args:
+        matrix: (..., 3, 3) rotation matrices.
+
+    Returns:
+        (..., 3) rad, of length at most pi; differentiable short of half a turn.
+
+    Source: the quaternion is the largest of its four algebraically equal forms (Shepperd).
+    """
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    x, y, z = diagonal.unbind(dim=-1)
+    skew = torch.stack(
+        [
+            matrix[..., 2, 1] - matrix[..., 1, 2],
+            matrix[..., 0, 2] - matrix[..., 2, 0],
+            matrix[..., 1, 0] - matrix[..., 0, 1],
+        ],
+        dim=-1,
+    )
+    # 4 q q^T: each row is the quaternion (w, x, y, z) times four of its own entries.
+    symmetric = matrix + matrix.mT
+    off = [symmetric[..., 0, 1], symmetric[..., 0, 2], symmetric[..., 1, 2]]
+    trace = x + y + z
+    rows = [
+        torch.stack([1.0 + trace, skew[..., 0], skew[..., 1], skew[..., 2]], dim=-1),
+        torch.stack([skew[..., 0], 1.0 + 2.0 * x - trace, off[0], off[1]], dim=-1),
+        torch.stack([skew[..., 1], off[0], 1.0 + 2.0 * y - trace, off[2]], dim=-1),
+        torch.stack([skew[..., 2], off[1], off[2], 1.0 + 2.0 * z - trace], dim=-1),
+    ]
+    products = torch.stack(rows, dim=-2)
+    largest = products.diagonal(dim1=-2, dim2=-1).argmax(dim=-1)
+    index = largest[..., None, None].expand(*largest.shape, 1, 4)
+    quaternion = products.gather(-2, index).squeeze(-2)
+    quaternion = quaternion / quaternion.norm(dim=-1, keepdim=True)
+    quaternion = torch.where(quaternion[..., :1] < 0.0, -quaternion, quaternion)
+    real, imaginary = quaternion[..., :1], quaternion[..., 1:]
+    squared = (imaginary * imaginary).sum(dim=-1, keepdim=True)
+    small = squared < _SERIES_BELOW
+    series_of = torch.where(small, squared, torch.zeros_like(squared))
+    sine = torch.where(small, torch.ones_like(squared), squared).sqrt()
+    ratio = torch.where(
+        small, 2.0 * _arcsine_series(series_of), 2.0 * torch.atan2(sine, real) / sine
+    )
+    return ratio * imaginary
+
+
+def _arcsine_series(squared: torch.Tensor) -> torch.Tensor:
+    """arcsin(s) / s as a series in s^2."""
+    term = torch.ones_like(squared)
+    for order in range(8, 0, -1):
+        odd = 2 * order - 1
+        # Ratio of consecutive coefficients of the arcsine series.
+        term = 1.0 + squared * term * odd * odd / (2.0 * order * (2.0 * order + 1.0))
+    return term

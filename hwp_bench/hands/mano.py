@@ -1,0 +1,185 @@
+"""Read MANO from the file that the user has, without chumpy and without trusting the file."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.errors import BadHandModel
+from hwp_bench.hands.landmarks import PARENTS
+from hwp_bench.hands.template import (
+    JOINT_COUNT,
+    POSE_FEATURE_COUNT,
+    SHAPE_COUNT,
+    HandTemplate,
+    make_template,
+)
+from hwp_bench.hands.uv_charts import two_chart_uv
+from hwp_bench.unpickle import StandIn, load_pickle
+
+#: Size of the MANO mesh.
+VERTEX_COUNT = 778
+FACE_COUNT = 1538
+
+#: Finger tip vertices: thumb, index, middle, ring, little.
+FINGERTIPS = (744, 320, 443, 554, 671)
+
+#: The file has 4 MB.
+MAX_FILE_BYTES = 64 * 1024 * 1024
+
+_STAND_INS = (
+    "chumpy.*",
+    "scipy.sparse.csc.csc_matrix",
+    "scipy.sparse._csc.csc_matrix",
+)
+_REMEDY = "Use MANO_RIGHT.pkl or MANO_LEFT.pkl of mano_v1_2, as downloaded."
+
+# The left file as published has the right hand's sign in x of its shape basis. Like every
+# MANO layer we tell by the summed difference from the right file (m).
+_SAME_SHAPES_BELOW = 1.0
+
+
+def load_mano(path: str | os.PathLike[str], side: str) -> HandTemplate:
+    """Read one MANO hand.
+
+    The left file's shape basis has the wrong sign in x as published; it is mended, unless the
+    right file lies beside it and shows that it has been mended already.
+
+    Args:
+        path: the folder that holds MANO_RIGHT.pkl and MANO_LEFT.pkl, or one of the files.
+        side: "right" or "left".
+
+    Raises:
+        BadHandModel: no such file, or it is no MANO hand; the error names the field.
+        UnsafePickle: the file asks for something that is not plain data.
+        BadInput: the file is damaged.
+
+    Source: Romero et al., "Embodied Hands" (SIGGRAPH Asia 2017); the sign of the left hand is
+    issue 48 of the `smplx` repository.
+    """
+    file = _find(Path(path), side)
+    content = _read(file)
+    vertices = _dense(content, "v_template", (VERTEX_COUNT, 3), file)
+    faces = _dense(content, "f", (FACE_COUNT, 3), file).astype(np.int64)
+    shape_basis = _shape_basis(content, file)
+    if side == "left" and _needs_mending(shape_basis, file):
+        shape_basis = shape_basis * np.array([-1.0, 1.0, 1.0])[:, None]
+    regressor = _dense(content, "J_regressor", (JOINT_COUNT, VERTEX_COUNT), file)
+    _check_tree(content, file)
+    joints = regressor @ vertices
+    if not np.isfinite(joints).all():
+        raise BadHandModel("holds NaN or infinity", where=file, field="J_regressor")
+    uv, face_uv = two_chart_uv(vertices, faces, joints, side)
+    return make_template(
+        name="mano",
+        side=side,
+        vertices=vertices,
+        faces=faces,
+        shape_basis=shape_basis,
+        pose_basis=_dense(content, "posedirs", (VERTEX_COUNT, 3, POSE_FEATURE_COUNT), file),
+        joints=joints,
+        joint_basis=np.einsum("jv,vck->jck", regressor, shape_basis),
+        weights=_dense(content, "weights", (VERTEX_COUNT, JOINT_COUNT), file),
+        mean_pose=_dense(content, "hands_mean", (3 * (JOINT_COUNT - 1),), file),
+        uv=uv,
+        face_uv=face_uv,
+        fingertips=np.array(FINGERTIPS),
+        where=os.fspath(file),
+    )
+
+
+def _find(path: Path, side: str) -> Path:
+    """The file of one side in a folder, or beside a file of the other side."""
+    wanted = f"MANO_{side.upper()}.pkl"
+    if path.is_file():
+        named = re.search("right|left", path.name, re.IGNORECASE)
+        if named is None or named.group().lower() == side:
+            return path
+        path = path.parent
+    for file in (path / wanted, path / "models" / wanted):
+        if file.is_file():
+            return file
+    raise BadHandModel(
+        f"holds no {wanted}",
+        where=path,
+        remedy="Download MANO from its own site (its licence forbids us to pass it on).",
+    )
+
+
+def _read(file: Path) -> dict[str, Any]:
+    content = load_pickle(file, stand_ins=_STAND_INS, max_bytes=MAX_FILE_BYTES)
+    if not isinstance(content, dict):
+        raise BadHandModel("holds no table of named arrays", where=file, remedy=_REMEDY)
+    return content
+
+
+def _shape_basis(content: dict[str, Any], file: Path) -> np.ndarray:
+    return _dense(content, "shapedirs", (VERTEX_COUNT, 3, SHAPE_COUNT), file)
+
+
+def _needs_mending(shape_basis: np.ndarray, left: Path) -> bool:
+    try:
+        right = _find(left.parent, "right")
+    except BadHandModel:
+        return True
+    other = _shape_basis(_read(right), right)
+    return bool(np.abs(shape_basis[:, 0] - other[:, 0]).sum() < _SAME_SHAPES_BELOW)
+
+
+def _check_tree(content: dict[str, Any], file: Path) -> None:
+    tree = _dense(content, "kintree_table", (2, JOINT_COUNT), file)
+    # The root's parent is -1 in an unsigned type.
+    if tuple(tree[0, 1:].astype(np.int64)) != PARENTS[1:]:
+        raise BadHandModel("is not MANO's joint tree", where=file, field="kintree_table")
+
+
+def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Path) -> np.ndarray:
+    """A field as a float64 array of the wanted shape, whatever it was stored as."""
+    if field not in content:
+        raise BadHandModel("is missing", where=file, field=field, remedy=_REMEDY)
+    try:
+        array = np.asarray(_unwrap(content[field]), dtype=np.float64)
+        # chumpy selections are stored flat.
+        return array.reshape(shape) if array.ndim == 1 else _of_shape(array, shape)
+    except (TypeError, ValueError, KeyError, IndexError, RecursionError) as error:
+        raise BadHandModel(
+            f"cannot be read as an array of shape {shape} ({error})",
+            where=file,
+            field=field,
+            remedy=_REMEDY,
+        ) from error
+
+
+def _of_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
+    if array.shape != shape:
+        raise ValueError(f"its shape is {array.shape}")
+    return array
+
+
+def _unwrap(value: Any) -> Any:
+    """The numbers inside chumpy's and scipy's objects."""
+    if not isinstance(value, StandIn):
+        return value
+    state = value.state
+    if value.origin.endswith("csc_matrix"):
+        return _densify(state)
+    if "idxs" in state:
+        return np.asarray(_unwrap(state["a"])).ravel()[np.asarray(state["idxs"])]
+    return state["x"]
+
+
+def _densify(state: dict[str, Any]) -> np.ndarray:
+    from scipy.sparse import csc_matrix
+
+    shape = state["_shape"] if "_shape" in state else state["shape"]
+    rows, columns = (int(length) for length in shape)
+    if rows > JOINT_COUNT or columns > VERTEX_COUNT:
+        raise ValueError(f"its shape is {shape}")
+    data, indices, indptr = (np.asarray(state[key]) for key in ("data", "indices", "indptr"))
+    matrix = csc_matrix((data, indices, indptr), shape=(rows, columns))
+    matrix.check_format(full_check=True)
+    return matrix.toarray()
