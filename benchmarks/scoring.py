@@ -1,0 +1,93 @@
+"""How long scoring takes: every weight-free metric in both protocols, beside scikit-image.
+
+Run from the repository: `python -m benchmarks.scoring [--frames 1000] [--size 256]`.
+The plain loop computes one PSNR and one full-frame SSIM per frame with scikit-image, which is
+what most evaluation scripts do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from collections.abc import Iterator
+
+import numpy as np
+from skimage.metrics import peak_signal_noise_ratio, structural_similarity
+
+from hwp_bench.metrics.batch import Frame, score_frames
+
+#: Different frames that are made; the list of frames goes round them.
+DISTINCT = 16
+
+
+def make_frames(size: int, share: float) -> list[Frame]:
+    """Noisy predictions of a textured disc (or, for share 1, of the whole frame)."""
+    rng = np.random.default_rng(0)
+    rows, columns = np.mgrid[:size, :size] - (size - 1) / 2
+    radius = np.sqrt(share / np.pi) * size
+    mask = (rows**2 + columns**2 <= radius**2) | (share >= 1.0)
+    frames = []
+    for _ in range(DISTINCT):
+        target = rng.integers(0, 256, (size, size, 3), dtype=np.uint8)
+        noise = rng.normal(0.0, 12.0, target.shape)
+        prediction = np.clip(np.rint(target + noise), 0, 255).astype(np.uint8)
+        frames.append(Frame(prediction, target, mask.astype(np.uint8) * 255))
+    return frames
+
+
+def cycle(frames: list[Frame], count: int) -> Iterator[Frame]:
+    for index in range(count):
+        yield frames[index % len(frames)]
+
+
+def time_ours(frames: list[Frame], count: int, workers: int) -> float:
+    start = time.perf_counter()
+    for _ in score_frames(cycle(frames, count), workers=workers):
+        pass
+    return time.perf_counter() - start
+
+
+def time_scikit_image(frames: list[Frame], count: int) -> float:
+    start = time.perf_counter()
+    for frame in cycle(frames, count):
+        assert isinstance(frame.prediction, np.ndarray)
+        x, y = frame.prediction / 255.0, frame.target / 255.0
+        peak_signal_noise_ratio(y, x, data_range=1.0)
+        structural_similarity(
+            y,
+            x,
+            channel_axis=2,
+            gaussian_weights=True,
+            sigma=1.5,
+            use_sample_covariance=False,
+            data_range=1.0,
+        )
+    return time.perf_counter() - start
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("--frames", type=int, default=1000, help="frames to score (1000)")
+    parser.add_argument("--size", type=int, default=256, help="side of a frame, px (256)")
+    parser.add_argument("--workers", type=int, default=os.cpu_count() or 1, help="threads")
+    args = parser.parse_args()
+
+    print(f"{args.frames} frames of {args.size} px, {args.workers} threads, both protocols")
+    print("| hand fills | time | frames/s | plain scikit-image loop | ratio |")
+    print("| --- | --- | --- | --- | --- |")
+    plain_count = max(1, args.frames // 10)
+    for share in (0.25, 1.0):
+        frames = make_frames(args.size, share)
+        time_ours(frames, 8, args.workers)
+        ours = time_ours(frames, args.frames, args.workers)
+        plain = time_scikit_image(frames, plain_count) * args.frames / plain_count
+        rate = args.frames / ours
+        print(
+            f"| {share:.0%} of the frame | {ours:.1f} s | {rate:.0f} "
+            f"| {plain:.1f} s (from {plain_count}) | {plain / ours:.1f}x |"
+        )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,126 @@
+"""Structural similarity with every convention stated (Wang et al., 2004)."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from hwp_bench.errors import ShapeMismatch
+from hwp_bench.metrics.pixels import check_same_shape
+from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, SsimSettings
+from hwp_bench.metrics.region import bounding_box, composite, crop
+
+
+def ssim_map(x: np.ndarray, y: np.ndarray, settings: SsimSettings = HWP_V1.ssim) -> np.ndarray:
+    """SSIM of every window that lies inside the image.
+
+    Variances are clamped at 0 and the covariance to what they allow, so that rounding can
+    neither leave [-1, 1] nor make identical images differ from 1.
+
+    Args:
+        x: (H, W, 3) float64.
+        y: (H, W, 3) float64.
+        settings: window, covariance and data range.
+
+    Returns:
+        (H - 2r, W - 2r) float64 in [-1, 1], mean over channels, r = `settings.radius`; entry
+        (0, 0) belongs to the window centred on pixel (r, r).
+
+    Raises:
+        ShapeMismatch: shapes differ, or the image is smaller than the window.
+    """
+    check_same_shape(x, y)
+    if min(x.shape[:2]) < settings.size:
+        raise ShapeMismatch(f"an image of {x.shape[:2]} is smaller than the window")
+    mean_x, mean_y = _window_mean(x, settings), _window_mean(y, settings)
+    mean_xx, mean_yy, mean_xy = mean_x * mean_x, mean_y * mean_y, mean_x * mean_y
+    variance_x = np.maximum(_window_mean(x * x, settings) - mean_xx, 0.0)
+    variance_y = np.maximum(_window_mean(y * y, settings) - mean_yy, 0.0)
+    bound = np.sqrt(variance_x * variance_y)
+    covariance = _window_mean(x * y, settings) - mean_xy
+    covariance = cv2.max(cv2.min(covariance, bound), -bound)
+
+    pixels = settings.size**2
+    correction = pixels / (pixels - 1) if settings.sample_covariance else 1.0
+    c1 = (settings.k1 * settings.data_range) ** 2
+    c2 = (settings.k2 * settings.data_range) ** 2
+    numerator = (2.0 * mean_xy + c1) * (2.0 * correction * covariance + c2)
+    denominator = (mean_xx + mean_yy + c1) * (correction * (variance_x + variance_y) + c2)
+    similarity = cv2.transform(numerator / denominator, np.full((1, 3), 1.0 / 3.0))
+    r = settings.radius
+    return similarity[r : similarity.shape[0] - r, r : similarity.shape[1] - r]
+
+
+def ssim(
+    prediction: np.ndarray,
+    target: np.ndarray,
+    mask: np.ndarray,
+    settings: SsimSettings = HWP_V1.ssim,
+) -> float:
+    """SSIM averaged over the windows whose centre lies in `mask`.
+
+    Both images are put on black outside `mask`, and the black goes on beyond the frame, so
+    every pixel of the mask has its whole window.
+
+    Args:
+        prediction: (H, W, 3) float in [0, 1], sRGB.
+        target: (H, W, 3) float in [0, 1], sRGB.
+        mask: (H, W) bool, the scored pixels.
+        settings: window, covariance and data range.
+
+    Returns:
+        the mean, in [-1, 1].
+
+    Raises:
+        ShapeMismatch: the three do not describe the same image.
+        EmptyMask: no pixel to score.
+
+    Source: protocol hwp-v1; the oracle in the tests is scikit-image's
+    `structural_similarity(..., full=True)` with the same window.
+    """
+    check_same_shape(prediction, target, mask)
+    tight = bounding_box(mask)
+    box = tight.grown(settings.radius)
+    x, y = (crop(composite(image, mask), box) for image in (prediction, target))
+    return float(ssim_map(x, y, settings)[crop(mask, tight)].mean())
+
+
+def ssim_full(
+    prediction: np.ndarray,
+    target: np.ndarray,
+    mask: np.ndarray,
+    settings: SsimSettings = HWP_V1.ssim,
+) -> float:
+    """SSIM averaged over all windows inside the frame, black outside `mask`.
+
+    Windows that see no pixel of the mask count 1, so a small hand scores high whatever it
+    looks like. Arguments and errors are those of `ssim`; frames smaller than the window are a
+    `ShapeMismatch`.
+    """
+    check_same_shape(prediction, target, mask)
+    return float(ssim_map(composite(prediction, mask), composite(target, mask), settings).mean())
+
+
+def ssim_box(
+    prediction: np.ndarray,
+    target: np.ndarray,
+    mask: np.ndarray,
+    settings: SsimSettings = PAPER_WILDGHAND.ssim,
+) -> float:
+    """SSIM averaged over all windows inside the tight box of `mask`, black outside it.
+
+    The released evaluator's form. A box smaller than the window is grown to its size.
+    Arguments and errors are those of `ssim`.
+    """
+    check_same_shape(prediction, target, mask)
+    box = bounding_box(mask).at_least(settings.size)
+    x, y = (crop(composite(image, mask), box) for image in (prediction, target))
+    return float(ssim_map(x, y, settings).mean())
+
+
+def _window_mean(image: np.ndarray, settings: SsimSettings) -> np.ndarray:
+    """Weighted mean of the window around every pixel; the border is cut off by the caller."""
+    if settings.window == "gaussian":
+        kernel = cv2.getGaussianKernel(settings.size, settings.sigma)
+        return cv2.sepFilter2D(image, cv2.CV_64F, kernel, kernel)
+    return cv2.boxFilter(image, cv2.CV_64F, (settings.size, settings.size))
