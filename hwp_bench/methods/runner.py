@@ -113,6 +113,10 @@ def run_method(
             where=log,
             remedy="The log holds what it printed.",
         )
+    if manifest.kind == "python" and not (output / RUN).is_file():
+        raise MethodFailed(
+            f"{manifest.name} ended before it had rendered every frame of {capture_id}", where=log
+        )
     try:
         facts = read_facts(output / RUN)
     except BadInput as error:

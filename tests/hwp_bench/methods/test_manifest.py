@@ -1,0 +1,89 @@
+"""method.toml: what is accepted, and what every fault is called."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hwp_bench.errors import BadMethod, HwpError
+from hwp_bench.methods.manifest import find_method, read_manifest, shipped_methods
+
+GOOD = """
+schema = "hwp-method/1"
+name = "mine"
+title = "My method"
+[entry]
+python = "package.module:Make"
+[presets.default]
+steps = 100
+[presets.smoke]
+steps = 5
+"""
+
+
+def _write(folder: Path, text: str) -> Path:
+    (folder / "method.toml").write_text(text)
+    return folder
+
+
+def test_a_manifest_is_read(tmp_path: Path) -> None:
+    manifest = read_manifest(_write(tmp_path, GOOD))
+    assert (manifest.name, manifest.title, manifest.kind) == ("mine", "My method", "python")
+    assert manifest.entry == "package.module:Make"
+    assert manifest.preset(None, "smoke") == "smoke"
+    assert manifest.preset(None, "mini") == "default"
+    assert manifest.preset("smoke") == "smoke"
+    with pytest.raises(BadMethod, match=r"no preset 'fast'. It has: default, smoke"):
+        manifest.preset("fast")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("hwp-method/1", "hwp-method/9", "schema: is 'hwp-method/9'"),
+        ('name = "mine"', 'name = "a/b"', "'a/b' is no method name"),
+        ('name = "mine"', "name = 3", "name: must be one line"),
+        ('title = "My method"', 'title = "a\\nb"', "title: must be one line"),
+        ('title = "My method"', f'title = "{"x" * 2000}"', "title: must be one line"),
+        ("title", "titel", "titel: is no field of a method. Did you mean 'title'?"),
+        ("package.module:Make", "package/module", "is not module:callable"),
+        ("python =", "pyhton =", "entry.pyhton: is no field of a method. Did you mean 'python'"),
+        ("python =", 'command = ["x"]\npython =', "exactly one of python, command, predictions"),
+        ("[presets.smoke]\nsteps = 5", "[presets]\nsmoke = 5", "must be tables of settings"),
+        ("[entry]", "[entry", "no valid TOML"),
+    ],
+)
+def test_faults_are_named(tmp_path: Path, old: str, new: str, problem: str) -> None:
+    assert old in GOOD
+    with pytest.raises(BadMethod) as caught:
+        read_manifest(_write(tmp_path, GOOD.replace(old, new)))
+    assert problem in str(caught.value)
+    assert "method.toml" in str(caught.value)
+
+
+def test_a_huge_manifest_and_paths_out_of_the_folder_are_refused(tmp_path: Path) -> None:
+    with pytest.raises(BadMethod, match="larger than 65536 bytes"):
+        read_manifest(_write(tmp_path, GOOD + "#" * 70_000))
+    text = GOOD.replace('python = "package.module:Make"', 'predictions = "../elsewhere"')
+    with pytest.raises(HwpError, match="leads out of the folder"):
+        read_manifest(_write(tmp_path, text))
+
+
+def test_no_method_directory_is_one_clear_error(tmp_path: Path) -> None:
+    with pytest.raises(BadMethod, match=r"has no method\.toml"):
+        find_method(str(tmp_path))
+
+
+def test_shipped_methods_are_found_by_name_and_by_path() -> None:
+    names = {manifest.name for manifest in shipped_methods()}
+    assert "plain" in names
+    assert find_method("plain") == find_method("baselines/plain")
+
+
+def test_the_digest_follows_the_code_and_nothing_else(tmp_path: Path) -> None:
+    first = read_manifest(_write(tmp_path, GOOD)).digest
+    (tmp_path / "notes.txt").write_text("x")
+    assert read_manifest(tmp_path).digest == first
+    (tmp_path / "code.py").write_text("x = 1")
+    assert read_manifest(tmp_path).digest != first

@@ -1,0 +1,69 @@
+"""What a method is given holds no test pixel, no truth and no word about perturbations."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import CaptureMaker
+
+from hwp_bench.errors import BadImage, BadInput, HwpError
+from hwp_bench.methods.contract import Budget
+from hwp_bench.methods.request import RunSettings, open_request, write_request
+from hwp_bench.splits import contiguous_split
+
+RUN = RunSettings({"steps": 3}, seed=7, budget=Budget(seconds=5.0))
+
+
+def test_a_request_holds_what_a_method_may_see(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    capture = make_capture(frames=20, truth=True, hands="both")
+    split = contiguous_split("tiny", 20)
+    root = write_request(tmp_path / "request", capture, split, RUN)
+    training = open_request(root)
+    for frame in [*split.train, *split.validation]:
+        np.testing.assert_array_equal(training.frame(frame), capture.frame(frame))
+        np.testing.assert_array_equal(training.mask(frame), capture.mask(frame))
+    assert set(training.hand_poses(19)) == {"right", "left"}
+    np.testing.assert_array_equal(
+        training.hand_poses(19)["left"].transl, capture.hands["left"].transl[19]
+    )
+    np.testing.assert_array_equal(training.camera(19).K, capture.cameras.Ks[19])
+    assert training.run == RUN
+    assert list(training.targets) == [18, 19]
+
+
+def test_no_test_pixel_no_truth_no_link_and_no_word_about_perturbations(
+    make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    capture = make_capture(frames=20, truth=True)
+    root = write_request(tmp_path / "request", capture, contiguous_split("tiny", 20), RUN)
+    files = sorted(path.relative_to(root).as_posix() for path in root.rglob("*") if path.is_file())
+    pixels = [f"{kind}/{frame:06d}.png" for kind in ("frames", "masks") for frame in range(18)]
+    assert files == sorted([*pixels, "cameras.npz", "hands.npz", "request.json"])
+    assert not any(path.is_symlink() for path in root.rglob("*"))
+    assert all(path.stat().st_nlink == 1 for path in root.rglob("*") if path.is_file())
+    text = (root / "request.json").read_text()
+    for word in ("motion_blur", "perturbations", str(capture.root), str(tmp_path)):
+        assert word not in text
+    for frame in (18, 19):
+        with pytest.raises(BadImage, match="does not exist"):
+            open_request(root).frame(frame)
+
+
+def test_a_damaged_training_image_is_named_before_the_method_runs(
+    make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    capture = make_capture(frames=20)
+    (capture.root / "frames" / "000003.png").write_bytes(b"")
+    with pytest.raises(BadImage, match=r"000003\.png: is empty"):
+        write_request(tmp_path / "request", capture, contiguous_split("tiny", 20), RUN)
+    assert not (tmp_path / "request").exists()
+
+
+def test_a_request_that_is_none_is_refused(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="does not exist"):
+        open_request(tmp_path)
+    (tmp_path / "request.json").write_text('{"schema": "hwp-request/1"}')
+    with pytest.raises(HwpError, match="lacks or has a wrong field"):
+        open_request(tmp_path)
