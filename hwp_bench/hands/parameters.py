@@ -12,7 +12,10 @@ from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT
 
 @dataclass(frozen=True, eq=False)
 class HandParameters:
-    """What poses one hand in F frames; checked when made.
+    """What poses one hand in F frames; checked when made, and copied.
+
+    In a frame without this hand the values mean nothing: NaN there (as estimators write it)
+    becomes zero, so that whole arrays can be computed with.
 
     Raises:
         BadInput: a field has the wrong shape or type, or is not finite in a valid frame; the
@@ -47,12 +50,16 @@ class HandParameters:
             if array.dtype.kind not in "fiu":
                 raise BadInput(f"type is {array.dtype}, expected numbers", field=field)
             object.__setattr__(self, field, array.astype(np.float64))
-        object.__setattr__(self, "valid", np.asarray(self.valid))
-        for field in ("pose", "transl", "betas"):
+        valid = np.array(self.valid)
+        object.__setattr__(self, "valid", valid)
+        for field in ("pose", "transl"):
             array = getattr(self, field)
-            checked = array if field == "betas" else array[self.valid]
-            if not np.isfinite(checked).all():
-                raise BadInput("holds NaN or infinity", field=field)
+            array[~valid] = np.nan_to_num(array[~valid], nan=0.0, posinf=0.0, neginf=0.0)
+        for field in ("pose", "betas", "transl"):
+            bad = ~np.isfinite(getattr(self, field))
+            if bad.any():
+                place = "" if field == "betas" else f" in frame {np.argwhere(bad)[0, 0]}"
+                raise BadInput(f"holds NaN or infinity{place}", field=field)
 
     @property
     def frame_count(self) -> int:

