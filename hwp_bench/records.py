@@ -26,7 +26,7 @@ def parse_record(kind: type[Record], value: Any, *, where: str, field: str = "")
         BadResult: a field is missing, unknown, of the wrong type, or not finite; it is named.
     """
     if not isinstance(value, dict):
-        raise BadResult("must be a JSON object", where=where, field=field or None)
+        raise BadResult("must be a JSON object", where=where, field=field.rstrip(".") or None)
     hints = get_type_hints(kind)
     names = {item.name for item in fields(kind)}  # type: ignore[arg-type]
     for name in sorted(names ^ value.keys()):

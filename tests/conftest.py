@@ -17,6 +17,7 @@ from hwp_bench.capture import (
     open_capture,
 )
 from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.results import CaptureResult, CurvePoint, FrameResult, MethodId, Results
 
 CaptureMaker = Callable[..., Capture]
 
@@ -103,3 +104,45 @@ def make_capture(tmp_path: Path) -> CaptureMaker:
         return open_capture(path)
 
     return make
+
+
+def results_example(name: str = "plain", psnr: float = 20.0, digest: str = "d") -> Results:
+    """One method on one capture of two test frames."""
+    frames = [FrameResult(18 + i, {"psnr": psnr + i, "ssim": 0.5}, None) for i in range(2)]
+    capture = CaptureResult(
+        id="capture2",
+        digest=digest,
+        hands="right",
+        perturbations=["illumination"],
+        split_digest="s",
+        exact_masks=True,
+        key="k",
+        frames=frames,
+        failure=None,
+        predictions_digest="p",
+        fit_seconds=2.0,
+        render_seconds=0.5,
+        score_seconds=0.1,
+        wall_seconds=4.0,
+        steps=10,
+        peak_memory=10**8,
+        device="cpu",
+        curve=[CurvePoint(5, 1.0, 10**8, {"psnr": 15.0})],
+    )
+    return Results(
+        method=MethodId(name, name.title(), "m", "default", {"steps": 10}),
+        suite="smoke",
+        seed=0,
+        budget={"seconds": None, "steps": None},
+        protocols={},
+        environment={},
+        started="2026-01-01T00:00:00+00:00",
+        captures=[capture],
+        toolkit="0.1.0",
+    )
+
+
+@pytest.fixture
+def make_results() -> Callable[..., Results]:
+    """Return a function that makes results without an evaluation."""
+    return results_example

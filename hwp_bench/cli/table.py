@@ -20,7 +20,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument(
         "--by",
-        choices=("overall", "captures", "perturbations", "details", "paper"),
+        choices=("overall", "captures", "perturbations", "details", "micro", "paper"),
         default="overall",
         help="which table (default overall)",
     )

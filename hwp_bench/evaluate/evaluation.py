@@ -17,7 +17,7 @@ from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifes
 from hwp_bench.methods.request import RunSettings
 from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT
 from hwp_bench.metrics import PROTOCOLS
-from hwp_bench.metrics.lpips_weights import available_networks
+from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results, write_results
 from hwp_bench.results.environment import environment
@@ -80,7 +80,7 @@ def evaluate(
     preset = manifest.preset(settings.preset, settings.suite)
     chosen = {**manifest.presets.get(preset, {}), **settings.overrides}
     run = RunSettings(chosen, settings.seed, settings.budget)
-    networks = available_networks()
+    networks = load_available()
     jobs = _jobs(captures, splits, manifest, run, settings, networks)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     finished: list[CaptureResult] = []

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from hwp_bench.errors import UsageError
 from hwp_bench.files import atomic_write
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
-from hwp_bench.metrics.aggregate import Aggregate, aggregate
+from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
 from hwp_bench.report.table import FORMATS, Cell, Column, Table, spell
 from hwp_bench.results import Results
 from hwp_bench.results.schema import score_rows
@@ -18,6 +19,8 @@ from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 HEADLINE = ("psnr", "ssim", "oriented_distance", "lpips_alex", "lpips_vgg")
 #: Metrics of the tables in the paper's protocol.
 PAPER = ("paper_psnr", "paper_ssim", "paper_lpips")
+#: Heading of the mean over perturbations.
+MACRO = "Macro"
 
 _PAPER_NOTE = (
     "Protocol paper-wildghand: the released evaluator's settings with the data set's mask; "
@@ -28,20 +31,23 @@ _PAPER_NOTE = (
 def all_tables(results: Sequence[Results]) -> dict[str, Table]:
     """Return every table of one or several evaluations, by name.
 
-    `overall` (single, interacting and all captures, with cost), `captures`, `perturbations`,
-    `details` (every metric of protocol hwp-v1) and `paper` (protocol paper-wildghand).
+    `overall` (single, interacting, macro mean, with cost), `captures`, `perturbations`,
+    `details` (every metric of protocol hwp-v1), `micro` (every frame counts the same) and
+    `paper` (protocol paper-wildghand).
 
     Raises:
         UsageError: evaluations of one name were made on different data.
     """
     _same_data(results)
     means = [aggregate(score_rows(result)) for result in results]
+    groups = _groups(means)
     return {
-        "overall": overall_table(results, means, HEADLINE),
+        "overall": overall_table(results, groups, HEADLINE),
         "captures": capture_table(results, means),
         "perturbations": perturbation_table(results, means),
-        "details": overall_table(results, means, _of_protocol(HWP_V1), cost=False),
-        "paper": overall_table(results, means, PAPER, cost=False, note=_PAPER_NOTE),
+        "details": mean_table(results, groups, _of_protocol(HWP_V1)),
+        "micro": mean_table(results, {"All frames": [m.overall.micro for m in means]}, HEADLINE),
+        "paper": mean_table(results, groups, PAPER, _PAPER_NOTE),
     }
 
 
@@ -53,46 +59,56 @@ def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
 
 
 def overall_table(
-    results: Sequence[Results],
-    means: Sequence[Aggregate],
-    metrics: Sequence[str],
-    *,
-    cost: bool = True,
-    note: str = "",
+    results: Sequence[Results], groups: Mapping[str, Sequence[Scores]], metrics: Sequence[str]
 ) -> Table:
-    """Return one row a method: means over single-hand, interacting and all captures.
+    """Return one row a method: means, and what they cost.
 
     Args:
         results: the evaluations.
-        means: their aggregates.
+        groups: for each group of columns, the means of every evaluation.
         metrics: which metrics; those that an evaluation lacks are left out.
-        cost: add seconds of fitting, frames rendered a second, and failed frames.
-        note: a line under the table.
     """
-    names = _present(results, metrics)
-    groups = [
-        (title, key)
-        for title, key in (("Single", "single"), ("Interacting", "interacting"))
-        if any(getattr(mean, key) for mean in means)
+    table = mean_table(results, groups, metrics)
+    columns = [
+        Column("Fit [s]", 1, group="Cost"),
+        Column("Render [frames/s]", 1, group="Cost"),
+        Column("Failed frames", 0, group="Cost"),
     ]
-    if len(groups) != 1:
-        groups.append(("All captures", "macro"))
+    rows = [(*row, *_cost(result)) for row, result in zip(table.rows, results, strict=True)]
+    return replace(table, columns=(*table.columns, *columns), rows=tuple(rows))
+
+
+def mean_table(
+    results: Sequence[Results],
+    groups: Mapping[str, Sequence[Scores]],
+    metrics: Sequence[str],
+    note: str = "",
+) -> Table:
+    """Return one row a method: means of `metrics` in each group of columns."""
+    names = _present(results, metrics)
     columns = [Column("Method")]
-    columns += [_column(name, title) for title, _ in groups for name in names]
-    if cost:
-        columns += [
-            Column("Fit [s]", 1, group="Cost"),
-            Column("Render [frames/s]", 1, group="Cost"),
-            Column("Failed frames", 0, group="Cost"),
-        ]
-    rows = []
-    for label, result, mean in zip(_labels(results), results, means, strict=True):
-        cells: list[Cell] = [label]
-        cells += [getattr(mean, key).get(name) for _, key in groups for name in names]
-        rows.append(tuple(cells + _cost(result) if cost else cells))
-    notes = [note] if note else []
-    notes.append(f"Means over captures of means over test frames; {_scope(results)}.")
-    return Table("All captures", tuple(columns), tuple(rows), tuple(notes))
+    columns += [_column(name, title) for title in groups for name in names]
+    rows = [
+        (label, *(means[index].get(name) for means in groups.values() for name in names))
+        for index, label in enumerate(_labels(results))
+    ]
+    scope = f"Every mean is over captures of means over test frames; {_scope(results)}."
+    if MACRO in groups:
+        scope += " Macro: the mean over perturbations, each that of the captures that carry it."
+    notes = (note, scope) if note else (scope,)
+    return Table("All captures", tuple(columns), tuple(rows), notes)
+
+
+def _groups(means: Sequence[Aggregate]) -> dict[str, list[Scores]]:
+    """Return the groups of columns that the captures call for."""
+    groups = {}
+    for title, key in (("Single", "single"), ("Interacting", "interacting")):
+        summaries: list[Summary | None] = [getattr(mean, key) for mean in means]
+        if any(summaries):
+            groups[title] = [item.capture_mean if item else {} for item in summaries]
+    if all(mean.overall.macro for mean in means):
+        groups[MACRO] = [mean.overall.macro for mean in means]
+    return groups
 
 
 def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Table:
@@ -106,7 +122,7 @@ def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Tab
         for label, result, mean in zip(_labels(results), results, means, strict=True):
             for capture in result.captures:
                 if capture.id == identifier:
-                    scores = [mean.captures[identifier].get(name) for name in names]
+                    scores = [mean.overall.captures[identifier].get(name) for name in names]
                     hands = "interacting" if capture.hands == "both" else "single"
                     tail = (capture.fit_seconds, capture.failed_frames)
                     rows.append((identifier, hands, label, *scores, *tail))
@@ -117,11 +133,14 @@ def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Tab
 def perturbation_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Table:
     """Return one row a method, one group of columns a perturbation, as the paper's table."""
     names = _present(results, HEADLINE[:3])
-    present = [p for p in PERTURBATIONS if any(p in mean.perturbations for mean in means)]
+    present = [p for p in PERTURBATIONS if any(p in mean.overall.perturbations for mean in means)]
     columns = [Column("Method")]
     columns += [_column(name, perturbation(p).heading) for p in present for name in names]
     rows = [
-        (label, *(mean.perturbations.get(p, {}).get(name) for p in present for name in names))
+        (
+            label,
+            *(mean.overall.perturbations.get(p, {}).get(name) for p in present for name in names),
+        )
         for label, mean in zip(_labels(results), means, strict=True)
     ]
     note = "Mean over the captures that carry the perturbation; a capture may carry several."

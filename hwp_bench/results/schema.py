@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from hwp_bench.errors import BadResult
 from hwp_bench.files import read_json, write_json
+from hwp_bench.metrics.aggregate import CaptureScores
 from hwp_bench.records import parse_record
 
 #: Version of the result file.
@@ -160,14 +160,14 @@ def read_results(path: str | os.PathLike[str]) -> Results:
     return parse_record(Results, value, where=os.fspath(path))
 
 
-def score_rows(results: Results) -> list[Mapping[str, Any]]:
+def score_rows(results: Results) -> list[CaptureScores]:
     """Return the captures as `hwp_bench.metrics.aggregate` takes them."""
     return [
-        {
-            "id": capture.id,
-            "hands": capture.hands,
-            "perturbations": capture.perturbations,
-            "frames": {frame.frame: frame.scores for frame in capture.frames},
-        }
+        CaptureScores(
+            id=capture.id,
+            hands=capture.hands,
+            perturbations=tuple(capture.perturbations),
+            frames={frame.frame: frame.scores for frame in capture.frames},
+        )
         for capture in results.captures
     ]
