@@ -1,0 +1,1 @@
+"""The plain baseline; `method.toml` is its entry."""

@@ -1,0 +1,79 @@
+"""The plain baseline: fit anchored Gaussians to every training frame alike.
+
+It is the non-robust reference that everything else is compared with: no frame is judged, no
+residual is weighted down, no pose, shape or exposure is refined. The hand parameters are taken
+as they are given.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import torch
+
+from baselines.plain.frames import load_frames
+from baselines.plain.model import PlainAvatar, make_model
+from baselines.plain.optimise import fit_model
+from baselines.plain.settings import read_settings
+from hwp_bench.errors import MissingDependency
+from hwp_bench.methods.contract import Budget, Report
+from hwp_bench.methods.request import TrainingCapture
+
+
+class PlainMethod:
+    """See `hwp_bench.methods.contract.Method`.
+
+    Args:
+        settings: any of the fields of `baselines.plain.settings.PlainSettings`.
+        seed: of the anchors and of the order of the frames; on one machine's CPU the same seed
+            and number of steps give the same avatar bit for bit.
+
+    Raises:
+        BadMethod: a setting is unknown or out of range.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
+        self.settings = read_settings(settings)
+        self.seed = seed
+
+    def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> PlainAvatar:
+        """Fit an avatar to the training frames (the validation frames are left alone).
+
+        Args:
+            training: what the method may see of the capture.
+            budget: when to stop; without steps the settings' number holds.
+            report: where checkpoints are offered.
+
+        Raises:
+            BadInput: no training frame can be used.
+            DidNotConverge: the fit never got better than its start.
+            MissingDependency: CUDA was asked for and is not there.
+        """
+        device = _device(self.settings.device)
+        frames = load_frames(training)
+        model = make_model(
+            {side: training.template(side) for side in training.sides},
+            frames.mean_color(),
+            gaussians=self.settings.gaussians,
+            opacity=self.settings.initial_opacity,
+            degree=self.settings.shading_degree,
+            seed=self.seed,
+            device=device,
+        )
+        return fit_model(model, training, frames, self.settings, budget, report, self.seed)
+
+
+def _device(name: str) -> torch.device:
+    if name == "cpu":
+        return torch.device("cpu")
+    import importlib.util
+
+    ready = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+    if name == "cuda" and not ready:
+        raise MissingDependency(
+            "a CUDA GPU and the package gsplat are not both there",
+            field="device",
+            remedy="Use device = auto or cpu, or install the extra `cuda`.",
+        )
+    return torch.device("cuda" if ready else "cpu")

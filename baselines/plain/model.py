@@ -1,0 +1,191 @@
+"""The plain avatar: Gaussians anchored on one or two hands, lit by spherical harmonics."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from baselines.plain.clip import join_hands
+from hwp_bench.errors import UsageError
+from hwp_bench.hands import HandTemplate
+from hwp_bench.methods.contract import Camera, HandPose
+from wildghand.anchored import AnchoredGaussians, flat_gaussians
+from wildghand.quaternions import quat_third_axis
+from wildghand.rig import AnchorPoses, HandRig, make_rig
+from wildghand.shading import sh_basis, sh_count
+from wildghand.splat import rasterize
+
+
+@dataclass(frozen=True, eq=False)
+class PlainModel:
+    """Everything that is fitted, and the rigs that carry it."""
+
+    #: The rig of each hand, by side; the Gaussians of the hands follow in this order.
+    rigs: Mapping[str, HandRig]
+    #: Gaussians of all hands.
+    gaussians: AnchoredGaussians
+    #: (K, 3) coefficients of the log light by colour, the constant one left out: it could not
+    #: be told from the Gaussians' colours.
+    light: torch.Tensor
+    #: Degree of the spherical harmonics.
+    degree: int
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """The fitted tensors by name, in a fixed order."""
+        return {**self.gaussians.parameters(), "light": self.light}
+
+    def with_parameters(self, values: Mapping[str, torch.Tensor]) -> PlainModel:
+        """The same rigs with other values, named as in `parameters`."""
+        rest = {name: value for name, value in values.items() if name != "light"}
+        return replace(self, gaussians=AnchoredGaussians(**rest), light=values["light"])
+
+    def snapshot(self) -> PlainModel:
+        """A copy that the fit no longer changes."""
+        copies = {name: value.detach().clone() for name, value in self.parameters().items()}
+        return self.with_parameters(copies)
+
+    def sections(self, sides: Sequence[str]) -> Iterator[slice]:
+        """Where the Gaussians of the given hands lie, in the order of the rigs."""
+        start = 0
+        for side, rig in self.rigs.items():
+            if side in sides:
+                yield slice(start, start + len(rig))
+            start += len(rig)
+
+    def render(
+        self, poses: AnchorPoses, viewmats: torch.Tensor, Ks: torch.Tensor, width: int, height: int
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw B frames over black; differentiable in the parameters.
+
+        Args:
+            poses: the anchors of all Gaussians in B frames.
+            viewmats: (B, 4, 4) world to camera.
+            Ks: (B, 3, 3) px.
+            width, height: px.
+
+        Returns:
+            (B, H, W, 3) sRGB colour, premultiplied, and (B, H, W, 1) coverage in [0, 1].
+        """
+        placed = self.gaussians.place(poses.positions, poses.orientations)
+        # The light is multiplied on in sRGB: the encoding is close to a power, and a power of a
+        # product is the product of the powers.
+        colors = self.gaussians.logit_colors.sigmoid()
+        if self.degree:
+            normals = quat_third_axis(poses.orientations)
+            log_light = sh_basis(normals, self.degree)[..., 1:] @ self.light
+            colors = colors * log_light.exp()
+        else:
+            colors = colors.expand(len(viewmats), -1, -1)
+        image, coverage, _ = rasterize(
+            placed.means,
+            placed.quats,
+            placed.scales,
+            placed.opacities,
+            colors,
+            viewmats,
+            Ks,
+            width,
+            height,
+        )
+        return image, coverage
+
+
+def make_model(
+    templates: Mapping[str, HandTemplate],
+    mean_color: torch.Tensor,
+    *,
+    gaussians: int,
+    opacity: float,
+    degree: int,
+    seed: int,
+    device: torch.device,
+) -> PlainModel:
+    """Cover the hands with flat Gaussians of one colour under even light.
+
+    Args:
+        templates: by side.
+        mean_color: (3,) sRGB in [0, 1].
+        gaussians: number on each hand.
+        opacity: of each Gaussian, in (0, 1).
+        degree: of the light's spherical harmonics.
+        seed: of the anchors.
+        device: where the tensors live.
+    """
+    rigs = {
+        side: make_rig(template, gaussians, seed, device) for side, template in templates.items()
+    }
+    spacing = torch.cat([torch.full((len(rig),), rig.spacing) for rig in rigs.values()]).to(device)
+    return PlainModel(
+        rigs=rigs,
+        gaussians=flat_gaussians(spacing, mean_color.to(device), opacity=opacity),
+        light=torch.zeros(sh_count(degree) - 1, 3, device=device),
+        degree=degree,
+    )
+
+
+class PlainAvatar:
+    """A fitted model that can be drawn in any pose; see `hwp_bench.methods.contract.Avatar`.
+
+    Args:
+        model: what to draw. While the fit goes on it may be the live one.
+        steps: optimiser steps behind it.
+    """
+
+    def __init__(self, model: PlainModel, steps: int) -> None:
+        self.model = model
+        self.steps = steps
+
+    @property
+    def device(self) -> str:
+        """Where it is drawn."""
+        return str(self.model.light.device)
+
+    @torch.no_grad()
+    def render(self, hands: Mapping[str, HandPose], camera: Camera) -> np.ndarray:
+        """Draw the hands that are given.
+
+        Returns:
+            (H, W, 4) float32 in [0, 1]: sRGB colour over black (premultiplied) and coverage.
+
+        Raises:
+            UsageError: no hand, or one that was not fitted.
+        """
+        unknown = set(hands) - set(self.model.rigs)
+        if unknown or not hands:
+            raise UsageError(
+                f"asked for {sorted(hands)} of an avatar of {sorted(self.model.rigs)}",
+                field="hands",
+            )
+        model = self.model
+        device = model.light.device
+
+        def tensor(array: np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(np.asarray(array), dtype=torch.float32, device=device)
+
+        parts = []
+        for side, rig in model.rigs.items():
+            if side in hands:
+                hand = hands[side]
+                parts.append(
+                    rig.pose(tensor(hand.pose)[None], tensor(hand.betas), tensor(hand.transl)[None])
+                )
+        poses = join_hands(parts)
+        if len(hands) < len(model.rigs):
+            sections = list(model.sections(list(hands)))
+            chosen = {
+                name: torch.cat([value[section] for section in sections])
+                for name, value in model.gaussians.parameters().items()
+            }
+            model = replace(model, gaussians=AnchoredGaussians(**chosen))
+        image, coverage = model.render(
+            poses,
+            tensor(camera.viewmat)[None],
+            tensor(camera.K)[None],
+            camera.width,
+            camera.height,
+        )
+        rgba = torch.cat((image, coverage), dim=-1)[0]
+        return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()

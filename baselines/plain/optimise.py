@@ -1,0 +1,135 @@
+"""The optimisation of the plain avatar: Adam over random batches of frames."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+
+import numpy as np
+import torch
+
+from baselines.plain.clip import TrainingClip
+from baselines.plain.frames import TrainingFrames
+from baselines.plain.guard import Guard
+from baselines.plain.model import PlainAvatar, PlainModel
+from baselines.plain.settings import PlainSettings
+from hwp_bench.methods.contract import Budget, Report
+from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.progress import notice
+from wildghand.losses import photometric_loss
+
+#: Steps between two offers of a checkpoint.
+REPORT_EVERY = 10
+
+# Standard deviations stay within these, m: thinner than paper or wider than a finger explains
+# nothing of a hand.
+_SCALES = (2e-5, 1e-2)
+# Adam's epsilon: gradients of a mean over all pixels are small.
+_EPSILON = 1e-15
+_BETAS = (0.9, 0.99)
+
+
+def fit_model(
+    model: PlainModel,
+    training: TrainingCapture,
+    frames: TrainingFrames,
+    settings: PlainSettings,
+    budget: Budget,
+    report: Report,
+    seed: int,
+) -> PlainAvatar:
+    """Fit a model, within the budget.
+
+    Args:
+        model: where to start; its tensors are changed.
+        training: hand parameters and cameras.
+        frames: the frames to fit.
+        settings: how.
+        budget: when to stop.
+        report: where checkpoints are offered.
+        seed: of the order of the frames.
+
+    Returns:
+        The last state; the best one if the fit diverged later.
+
+    Raises:
+        DidNotConverge: the fit diverged without ever having been better than its start.
+    """
+    steps = settings.steps if budget.steps is None else budget.steps
+    device = model.light.device
+    clip = TrainingClip(training, frames.indices, model.rigs, device)
+    parameters = model.parameters()
+    rates = learning_rates(settings)
+    optimizer = torch.optim.Adam(
+        [{"params": [tensor.requires_grad_()], "lr": 0.0} for tensor in parameters.values()],
+        eps=_EPSILON,
+        betas=_BETAS,
+        fused=True,
+    )
+    spacing = torch.cat([torch.full((len(rig), 1), rig.spacing) for rig in model.rigs.values()])
+    spacing = spacing.to(device)
+    order = _batches(len(frames), settings.batch, seed)
+    guard = Guard()
+    step = 0
+    while step < steps and (fraction := _spent(step, steps, budget, report)) < 1.0:
+        for group, name in zip(optimizer.param_groups, parameters, strict=True):
+            group["lr"] = rates[name] * settings.final_rate**fraction
+        rows = next(order)
+        image, _ = model.render(
+            clip.poses(rows), clip.viewmats[rows], clip.Ks[rows], training.width, training.height
+        )
+        target, weights = frames.targets(rows, settings.outside_weight, device)
+        loss = photometric_loss(image, target, weights, settings.dssim_weight)
+        if settings.offset_weight:
+            stretch = (model.gaussians.offsets / spacing).square().sum(dim=-1).mean()
+            loss = loss + settings.offset_weight * stretch
+        if not guard.watch(step, float(loss.detach()), model):
+            model = guard.best()
+            notice(f"The fit diverged at step {step}; the state of step {guard.step} is kept.")
+            return PlainAvatar(model, guard.step)
+        optimizer.zero_grad()
+        loss.backward()
+        optimizer.step()
+        _clamp(model)
+        step += 1
+        report.progress(step, steps)
+        if step % REPORT_EVERY == 0:
+            report(step, PlainAvatar(model, step))
+    return PlainAvatar(model.snapshot(), step)
+
+
+def learning_rates(settings: PlainSettings) -> dict[str, float]:
+    """Adam's step at the start by parameter name."""
+    return {
+        "offsets": settings.offset_rate,
+        "log_scales": settings.scale_rate,
+        "quats": settings.quat_rate,
+        "logit_opacities": settings.opacity_rate,
+        "logit_colors": settings.color_rate,
+        "light": settings.light_rate,
+    }
+
+
+def _spent(step: int, steps: int, budget: Budget, report: Report) -> float:
+    """Share of the budget that is used up: of the steps or of the seconds, whichever is more."""
+    spent = step / steps
+    if budget.seconds is not None:
+        spent = max(spent, report.elapsed / budget.seconds)
+    return spent
+
+
+def _batches(count: int, batch: int, seed: int) -> Iterator[torch.Tensor]:
+    """Batches of row numbers without end: every row once before any comes again."""
+    random = np.random.default_rng(seed)
+    queue = np.empty(0, dtype=np.int64)
+    while True:
+        while len(queue) < batch:
+            queue = np.concatenate((queue, random.permutation(count)))
+        yield torch.from_numpy(queue[:batch])
+        queue = queue[batch:]
+
+
+@torch.no_grad()
+def _clamp(model: PlainModel) -> None:
+    low, high = _SCALES
+    model.gaussians.log_scales.clamp_(math.log(low), math.log(high))
