@@ -42,22 +42,29 @@ def viewmat(scene: Scene, seconds: float) -> np.ndarray:
 
 
 def pixel_rays(
-    K: np.ndarray, view: np.ndarray, size: int, samples: int
+    K: np.ndarray,
+    view: np.ndarray,
+    box: tuple[int, int, int, int],
+    grid: int,
+    shift: tuple[float, float] = (0.0, 0.0),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rays through a regular grid inside every pixel.
 
     Args:
         K: (3, 3) px.
         view: (4, 4) world to camera.
-        size: edge of the picture in pixels.
-        samples: edge of the grid inside a pixel.
+        box: top, bottom, left, right: the rows and columns wanted.
+        grid: edge of the grid inside a pixel.
+        shift: moves the grid right and down, in steps of the grid.
 
     Returns:
-        origin (3,) m and directions (size * samples, size * samples, 3), world, with length 1
+        origin (3,) m and directions (rows * grid, columns * grid, 3), world, with length 1
         along the camera's axis.
     """
-    ticks = (np.arange(size * samples) + 0.5) / samples
-    x, y = np.meshgrid((ticks - K[0, 2]) / K[0, 0], (ticks - K[1, 2]) / K[1, 1])
+    top, bottom, left, right = box
+    across = left + (np.arange((right - left) * grid) + 0.5 + shift[0]) / grid
+    down = top + (np.arange((bottom - top) * grid) + 0.5 + shift[1]) / grid
+    x, y = np.meshgrid((across - K[0, 2]) / K[0, 0], (down - K[1, 2]) / K[1, 1])
     in_camera = np.stack([x, y, np.ones_like(x)], axis=-1)
     turn = view[:3, :3]
     return -turn.T @ view[:3, 3], in_camera @ turn

@@ -2,63 +2,27 @@
 
 from __future__ import annotations
 
-import time
-from collections import Counter
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hwp_bench.sim.backdrop import look
-from hwp_bench.sim.camera import focus_point, intrinsics, pixel_rays, viewmat
+from hwp_bench.sim.camera import FOCUS_DISTANCE, intrinsics, viewmat
 from hwp_bench.sim.colors import linear_to_srgb
-from hwp_bench.sim.effects.base import Placement
-from hwp_bench.sim.motion import HandMoment, hand_parameters, heading_matrix
+from hwp_bench.sim.effects.base import Shutter
+from hwp_bench.sim.ledger import Ledger
+from hwp_bench.sim.motion import HandMoment
+from hwp_bench.sim.picture import Lens, Picture, take_picture
 from hwp_bench.sim.plan import FramePlan, hands_at, lights_at, objects_at, plan
-from hwp_bench.sim.raycast import LIFT, Tracer
 from hwp_bench.sim.scene import Scene
 from hwp_bench.sim.seeds import generator
-from hwp_bench.sim.shade import Lights, Samples, gather, shade, steady_light
-from hwp_bench.sim.sleeve import sleeve, sleeve_material, wrist_rim
-from hwp_bench.sim.subject import SubjectHand, scene_hands, skin_atlas
-from hwp_bench.sim.surface import Material, Surface, join, transformed
+from hwp_bench.sim.shade import steady_light
+from hwp_bench.sim.stage import Stage, between
+from hwp_bench.sim.subject import MOVING
 
 #: Edge of the grid of rays inside a pixel.
 SUPERSAMPLING = 2
-#: Rays per vertex that look for the sky.
-SKY_RAYS = 24
-#: How far the sky's rays reach, m: beyond it nothing darkens.
-SKY_REACH = 0.08
-# Half angle of the key light's disc as a slope; makes the rim of shadows soft.
-_LIGHT_RADIUS = 0.06
-
-
-@dataclass
-class Ledger:
-    """Measured cost of a frame: seconds by pass, rays by purpose."""
-
-    #: Seconds by pass.
-    seconds: Counter[str] = field(default_factory=Counter)
-    #: Rays by purpose.
-    rays: Counter[str] = field(default_factory=Counter)
-
-    @contextmanager
-    def time(self, name: str) -> Iterator[None]:
-        """Charge what happens inside to one pass."""
-        start = time.perf_counter()
-        yield
-        self.seconds[name] += time.perf_counter() - start
-
-
-@dataclass(frozen=True, eq=False)
-class Picture:
-    """Linear light and coverage of one instant, per pixel."""
-
-    #: (S, S, 3) linear.
-    color: np.ndarray
-    #: (S, S) share of the pixel that shows hand, 0-1.
-    coverage: np.ndarray
+# The golden ratio's powers spread the sub-frames' rays evenly inside the pixel.
+_SPREAD = (0.7548776662466927, 0.5698402909980532)
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,10 +37,6 @@ class FrameResult:
     coverage: np.ndarray
     #: (S, S) share of hand in the clean version, 0-1.
     clean_coverage: np.ndarray
-    #: Per side: pose (16, 3) rad and transl (3,) m, the true ones.
-    hands: dict[str, tuple[np.ndarray, np.ndarray]]
-    #: (4, 4) world to camera.
-    viewmat: np.ndarray
     #: The recipe.
     plan: FramePlan
     #: What it cost.
@@ -93,18 +53,29 @@ def render_frame(scene: Scene, frame: int, frame_count: int, size: int) -> Frame
         size: edge of the picture in pixels.
     """
     recipe = plan(scene, frame, frame_count, size)
+    return carry_out(scene, recipe, size)
+
+
+def carry_out(scene: Scene, recipe: FramePlan, size: int) -> FrameResult:
+    """Render a frame by its recipe."""
     ledger = Ledger()
-    stage = _Stage(scene, size, ledger)
+    stage = Stage(scene, ledger)
     hands = hands_at(scene, recipe.seconds)
-    view = viewmat(scene, recipe.seconds)
-    body = stage.body(hands)
-    lights = steady_light(scene.light)
-    clean = stage.picture(body, None, view, lights)
+    lens = Lens(intrinsics(scene, size), viewmat(scene, recipe.seconds), size, SUPERSAMPLING)
+    with ledger.time("hands"):
+        body = stage.traced(stage.surface(hands))
+    with ledger.time("sky"):
+        sky = stage.seen_sky(body)
+        body = replace(body, surface=stage.under_sky(body.surface, sky))
+    clean = take_picture(scene, lens, body, None, steady_light(scene.light), ledger)
     disturbed = clean
-    if recipe.perturbed:
-        disturbed = _disturbed(stage, recipe, body, view)
-    noise = _sensor_noise(scene, frame, size) if "sensor" in recipe.passes else None
+    if recipe.shutter is not None:
+        disturbed = _exposed(stage, recipe, recipe.shutter, sky, lens)
+    elif recipe.perturbed:
+        things = stage.things(objects_at(scene, recipe, recipe.seconds), hands)
+        disturbed = take_picture(scene, lens, body, things, lights_at(scene, recipe), ledger)
     with ledger.time("sensor"):
+        noise = _sensor_noise(scene, recipe.frame, size) if "sensor" in recipe.passes else None
         clean_rgb = _develop(clean.color, noise)
         rgb = clean_rgb if disturbed is clean else _develop(disturbed.color, noise)
     return FrameResult(
@@ -112,28 +83,25 @@ def render_frame(scene: Scene, frame: int, frame_count: int, size: int) -> Frame
         clean=clean_rgb,
         coverage=disturbed.coverage,
         clean_coverage=clean.coverage,
-        hands=stage.parameters(hands),
-        viewmat=view,
         plan=recipe,
         ledger=ledger,
     )
 
 
-def _disturbed(stage: _Stage, recipe: FramePlan, body: Surface, view: np.ndarray) -> Picture:
-    scene = stage.scene
-    lights = lights_at(scene, recipe)
-    if recipe.shutter is None:
-        things = stage.things(
-            objects_at(scene, recipe, recipe.seconds), hands_at(scene, recipe.seconds)
-        )
-        return stage.picture(body, things, view, lights)
-    shutter = recipe.shutter
-    width = 2.0 * 0.5 * np.tan(np.radians(scene.camera.field_of_view) / 2.0)
-    color, coverage = 0.0, 0.0
-    for step in range(recipe.subframes):
-        s = (step + 0.5) / recipe.subframes - 0.5
+def _exposed(
+    stage: Stage, recipe: FramePlan, shutter: Shutter, sky: dict[str, np.ndarray], lens: Lens
+) -> Picture:
+    """The mean of the sub-frames: the shutter's integral in linear light.
+
+    Hands are posed at the opening, the middle and the closing of the shutter and move on
+    parabolas between; each sub-frame casts one ray a pixel, at another place inside it.
+    """
+    scene, lights = stage.scene, lights_at(stage.scene, recipe)
+    width = 2.0 * FOCUS_DISTANCE * np.tan(np.radians(scene.camera.field_of_view) / 2.0)
+
+    def hands(s: float) -> dict[str, HandMoment]:
         seconds = recipe.seconds + s * shutter.seconds
-        hands = {
+        return {
             side: replace(
                 hand,
                 place=hand.place + s * width * np.array([*shutter.hand, 0.0]),
@@ -141,207 +109,28 @@ def _disturbed(stage: _Stage, recipe: FramePlan, body: Surface, view: np.ndarray
             )
             for side, hand in hands_at(scene, seconds).items()
         }
-        shaken = viewmat(scene, seconds).copy()
-        shaken[:2, 3] += s * width * np.array(shutter.camera)
-        things = stage.things(objects_at(scene, recipe, seconds), hands)
-        picture = stage.picture(stage.body(hands), things, shaken, lights)
-        color = color + picture.color / recipe.subframes
-        coverage = coverage + picture.coverage / recipe.subframes
-    return Picture(color=np.asarray(color), coverage=np.asarray(coverage))
 
-
-class _Stage:
-    """What the passes of one frame share."""
-
-    def __init__(self, scene: Scene, size: int, ledger: Ledger) -> None:
-        self.scene = scene
-        self.size = size
-        self.ledger = ledger
-        self.subjects = scene_hands(scene)
-        self.K = intrinsics(scene, size)
-
-    def parameters(self, hands: dict[str, HandMoment]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-        focus = focus_point()
-        return {
-            side: hand_parameters(moment, side, self.subjects[side].joints, focus)
-            for side, moment in hands.items()
-        }
-
-    def body(self, hands: dict[str, HandMoment]) -> Surface:
-        """Hands and sleeves, posed, with the share of the sky that they see."""
-        with self.ledger.time("hands"):
-            parts, counts = [], []
-            skin = _skin_material(self.scene)
-            cloth = sleeve_material(self.scene.subject.sleeve, self.scene.subject.seed)
-            for side, (pose, transl) in self.parameters(hands).items():
-                subject = self.subjects[side]
-                vertices, normals = subject.pose(pose, transl)
-                parts.append(_hand_surface(subject, vertices, normals, skin))
-                counts.append(len(vertices))
-                rim = vertices[wrist_rim(subject.template.faces)]
-                turn = heading_matrix(hands[side].heading, side)
-                forward = turn @ np.array([-1.0 if side == "right" else 1.0, 0.0, 0.0])
-                elbow = focus_point() + _elbow(side)
-                parts.append(sleeve(rim, forward, elbow, cloth))
-            whole = join(parts)
-        with self.ledger.time("sky"):
-            tracer = Tracer(whole.vertices, whole.faces, self.ledger.rays)
-            openness = np.ones(len(whole.vertices))
-            start = 0
-            for side, part in zip(hands, parts[::2], strict=True):
-                coarse = len(self.subjects[side].template.vertices)
-                here = _openness(tracer, part.vertices[:coarse], part.normals[:coarse])
-                openness[start : start + len(part.vertices)] = self.subjects[side].lift @ here
-                start += len(part.vertices)
-                start += len(parts[parts.index(part) + 1].vertices)
-        return replace(whole, openness=openness)
-
-    def things(
-        self, placements: tuple[Placement, ...], hands: dict[str, HandMoment]
-    ) -> Surface | None:
-        """The objects of an instant, or None."""
-        if not placements:
-            return None
-        from hwp_bench.sim.objects import build_object
-
-        with self.ledger.time("objects"):
-            parts = []
-            for placement in placements:
-                frame = np.eye(4)
-                frame[:3, 3] = focus_point()
-                if placement.anchor != "world":
-                    moment = hands[placement.anchor]
-                    still = heading_matrix(np.zeros(3), placement.anchor)
-                    turn = heading_matrix(moment.heading, placement.anchor) @ still.T
-                    frame[:3, :3] = turn
-                    frame[:3, 3] += moment.place
-                parts.append(
-                    transformed(build_object(placement.request), frame @ placement.transform)
-                )
-            return join(parts)
-
-    def picture(
-        self, body: Surface, things: Surface | None, view: np.ndarray, lights: Lights
-    ) -> Picture:
-        """Render one instant."""
-        size, grid = self.size, SUPERSAMPLING
-        edge = size * grid
-        origin, directions = pixel_rays(self.K, view, size, grid)
-        rays = directions.reshape(-1, 3)
-        origins = np.broadcast_to(origin, rays.shape)
-        with self.ledger.time("backdrop"):
-            color = self._backdrop(view, lights)
-            color = np.repeat(np.repeat(color, grid, axis=0), grid, axis=1).reshape(-1, 3)
-        depth = np.full(len(rays), np.inf)
-        hand = np.zeros(len(rays))
-        surfaces = [("hands", body)] + ([("objects", things)] if things is not None else [])
-        tracers = []
-        for name, surface in surfaces:
-            with self.ledger.time(name):
-                tracers.append(Tracer(surface.vertices, surface.faces, self.ledger.rays))
-        for (name, surface), tracer in zip(surfaces, tracers, strict=True):
-            with self.ledger.time(name):
-                hits = tracer.first_hits(origins, rays, name)
-                nearer = hits.distance < depth[hits.ray]
-                hits = replace(
-                    hits,
-                    ray=hits.ray[nearer],
-                    face=hits.face[nearer],
-                    weights=hits.weights[nearer],
-                    distance=hits.distance[nearer],
-                )
-                samples = gather(surface, hits, rays)
-            with self.ledger.time("shadow"):
-                lit = _lit(samples, lights, tracers, edge)
-            with self.ledger.time(name):
-                color[samples.ray] = shade(samples, lights, lit)
-                depth[samples.ray] = samples.distance
-                hand[samples.ray] = samples.hand
-        return Picture(
-            color=_pool(color.reshape(edge, edge, 3), grid),
-            coverage=_pool(hand.reshape(edge, edge), grid),
+    with stage.ledger.time("shutter"):
+        first, middle, last = (stage.surface(hands(s), MOVING) for s in (-0.5, 0.0, 0.5))
+        middle = stage.under_sky(middle, sky, MOVING)
+    color = np.zeros((lens.size, lens.size, 3))
+    coverage = np.zeros((lens.size, lens.size))
+    for step in range(recipe.subframes):
+        s = (step + 0.5) / recipe.subframes - 0.5
+        seconds = recipe.seconds + s * shutter.seconds
+        view = viewmat(scene, seconds)
+        view[:2, 3] += s * width * np.array(shutter.camera)
+        place = ((step + 1) * np.array(_SPREAD)) % 1.0 - 0.5
+        moved = replace(
+            lens, view=view, grid=1, shift=(float(place[0]), float(place[1])), turn=step
         )
-
-    def _backdrop(self, view: np.ndarray, lights: Lights) -> np.ndarray:
-        _, directions = pixel_rays(self.K, view, self.size, 1)
-        seen = look(self.scene.background, self.scene.seed, directions)
-        return seen * (0.45 * lights.key + 0.5 * lights.sky) * lights.exposure
-
-
-def _hand_surface(
-    subject: SubjectHand, vertices: np.ndarray, normals: np.ndarray, skin: Material
-) -> Surface:
-    return Surface(
-        vertices=vertices,
-        normals=normals,
-        faces=subject.faces,
-        corner_uv=subject.corner_uv,
-        material=np.zeros(len(subject.faces), dtype=np.int64),
-        materials=(skin,),
-        hand=np.ones(len(subject.faces), dtype=bool),
-    )
-
-
-def _skin_material(scene: Scene) -> Material:
-    atlas = skin_atlas(scene.subject)
-    return Material(
-        albedo=atlas.albedo,
-        roughness=atlas.roughness,
-        specular=0.028,
-        height=atlas.height,
-        wrap=(0.28, 0.12, 0.07),
-    )
-
-
-def _elbow(side: str) -> np.ndarray:
-    mirror = 1.0 if side == "right" else -1.0
-    return np.array([0.10 * mirror, 0.42, 0.02])
-
-
-def _openness(tracer: Tracer, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Share of the upper half space, weighted by the cosine, that nothing near blocks: (V,)."""
-    index = np.arange(SKY_RAYS) + 0.5
-    height = np.sqrt(1.0 - index / SKY_RAYS)
-    spin = np.pi * (3.0 - np.sqrt(5.0)) * index
-    flat = np.sqrt(1.0 - height**2)
-    local = np.stack([flat * np.cos(spin), flat * np.sin(spin), height], axis=1)
-    helper = np.where(np.abs(normals[:, :1]) < 0.8, [[1.0, 0.0, 0.0]], [[0.0, 1.0, 0.0]])
-    tangent = np.cross(helper, normals)
-    tangent /= np.linalg.norm(tangent, axis=1, keepdims=True)
-    frames = np.stack([tangent, np.cross(normals, tangent), normals], axis=1)
-    directions = np.einsum("rk,vkc->vrc", local, frames).reshape(-1, 3)
-    origins = np.repeat(vertices + 2.0 * LIFT * normals, SKY_RAYS, axis=0)
-    hits = tracer.first_hits(origins, directions, "sky")
-    blocked = np.zeros(len(directions))
-    blocked[hits.ray] = np.clip(1.0 - hits.distance / SKY_REACH, 0.0, 1.0) ** 0.5
-    return 1.0 - blocked.reshape(-1, SKY_RAYS).mean(axis=1)
-
-
-def _lit(samples: Samples, lights: Lights, tracers: list[Tracer], edge: int) -> np.ndarray:
-    """Share of the key light that arrives at each sample: 0 or 1."""
-    lit = np.ones(len(samples.ray))
-    facing = np.flatnonzero(samples.flat @ lights.direction > 0.0)
-    # The rays of one pixel aim at different points of the lamp, which softens the shadow.
-    row, column = samples.ray[facing] // edge, samples.ray[facing] % edge
-    helper = np.array([0.0, 0.0, 1.0]) if abs(lights.direction[2]) < 0.9 else np.array([1.0, 0, 0])
-    first = np.cross(lights.direction, helper)
-    first /= np.linalg.norm(first)
-    second = np.cross(lights.direction, first)
-    shift = np.array([[-0.4, -0.8], [0.8, -0.4], [-0.8, 0.4], [0.4, 0.8]])
-    pick = shift[(row % 2) * 2 + column % 2] * _LIGHT_RADIUS
-    directions = lights.direction + pick[:, :1] * first + pick[:, 1:] * second
-    origins = samples.points[facing] + LIFT * samples.flat[facing]
-    dark = np.zeros(len(facing), dtype=bool)
-    for tracer in tracers:
-        dark |= tracer.blocked(origins, directions, "shadow")
-    lit[facing[dark]] = 0.0
-    return lit
-
-
-def _pool(values: np.ndarray, grid: int) -> np.ndarray:
-    """Mean over the grid of rays inside each pixel."""
-    edge = values.shape[0] // grid
-    return values.reshape(edge, grid, edge, grid, *values.shape[2:]).mean(axis=(1, 3))
+        with stage.ledger.time("hands"):
+            body = stage.traced(between((first, middle, last), s))
+        things = stage.things(objects_at(scene, recipe, seconds), hands(s))
+        picture = take_picture(scene, moved, body, things, lights, stage.ledger)
+        color += picture.color / recipe.subframes
+        coverage += picture.coverage / recipe.subframes
+    return Picture(color, coverage)
 
 
 def _sensor_noise(scene: Scene, frame: int, size: int) -> np.ndarray:

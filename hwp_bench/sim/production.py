@@ -39,7 +39,7 @@ from hwp_bench.sim.subject import scene_hands, skin_atlas
 from hwp_bench.sim.worker import frame_file, read_frame, render_frames
 
 #: Version of the renderer's look; part of every render key.
-RENDERER = 1
+RENDERER = 2
 #: Smallest and largest edge of a picture.
 SIZES = (32, 1024)
 #: Edge of a picture where nobody says otherwise.

