@@ -97,6 +97,15 @@ class Fields:
             triples.append((a, b, c))
         return triples
 
+    def rising(self, key: str, count: int) -> tuple[float, ...] | None:
+        """Take `count` numbers from 0 up, none below the one before; None where absent."""
+        if key not in self._content:
+            return None
+        values = self._numbers(key, self._take(key), count)
+        if values[0] < 0.0 or sorted(values) != values:
+            raise self.wrong(key, f"is {values}, expected rising numbers from 0 up")
+        return tuple(values)
+
     def _numbers(self, key: str, value: Any, count: int) -> list[float]:
         good = isinstance(value, list | tuple) and len(value) == count
         if not good or not all(

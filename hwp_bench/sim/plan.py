@@ -59,7 +59,7 @@ def plan(scene: Scene, frame: int, frame_count: int, size: int) -> FramePlan:
     moment = float(moments(frame_count)[frame])
     seconds = moment * scene.duration
     acting = {
-        call.kind: strength_at(scene, call, level(call, moment))
+        call.kind: strength_at(call, level(call, moment))
         for call in scene.effects
         if level(call, moment)
     }

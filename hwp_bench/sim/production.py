@@ -31,10 +31,10 @@ from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.progress import progress
 from hwp_bench.sim.camera import focus_point, intrinsics, viewmat
 from hwp_bench.sim.estimates import estimate_hands, estimate_mask
+from hwp_bench.sim.locks import alone
 from hwp_bench.sim.motion import hand_parameters
 from hwp_bench.sim.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.scene import Scene, load_scene
-from hwp_bench.sim.strength import strengths
 from hwp_bench.sim.subject import scene_hands, skin_atlas
 from hwp_bench.sim.worker import frame_file, read_frame, render_frames
 
@@ -52,8 +52,7 @@ _FRAMES_PER_WORKER = 10
 
 def render_key(scene: Scene, frame_count: int, size: int) -> str:
     """Digest of everything that decides the pixels of a capture."""
-    calibration = {call.kind: strengths(scene, call) for call in scene.effects}
-    return sha256_json([RENDERER, scene.digest, calibration, frame_count, size])
+    return sha256_json([RENDERER, scene.digest, frame_count, size])
 
 
 def render_capture(
@@ -95,14 +94,16 @@ def render_capture(
     if out.exists() and not overwrite and (out.is_file() or any(out.iterdir())):
         raise UsageError("exists already", where=out, remedy="Choose another place or overwrite.")
     waiting = out.absolute().parent / f".{out.name}.{render_key(scene, count, edge)[:16]}"
-    try:
-        waiting.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise HwpError(f"cannot be made ({error.strerror})", where=waiting) from error
-    start = time.perf_counter()
-    _render_missing(scene, count, edge, waiting, workers)
-    _assemble(scene, count, edge, waiting, out, overwrite, time.perf_counter() - start)
-    shutil.rmtree(waiting, ignore_errors=True)
+    with alone(waiting.with_name(f"{waiting.name}.lock")):
+        try:
+            waiting.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise HwpError(f"cannot be made ({error.strerror})", where=waiting) from error
+        start = time.perf_counter()
+        _render_missing(scene, count, edge, waiting, workers)
+        _assemble(scene, count, edge, waiting, out, overwrite, time.perf_counter() - start)
+        shutil.rmtree(waiting, ignore_errors=True)
+    waiting.with_name(f"{waiting.name}.lock").unlink(missing_ok=True)
     return open_capture(out)
 
 

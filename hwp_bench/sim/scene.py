@@ -116,6 +116,8 @@ class EffectCall:
     kind: str
     #: When it acts.
     episodes: tuple[Episode, ...]
+    #: Calibrated strengths at severity 1 to 5, or None for the effect's own.
+    strengths: tuple[float, ...] | None = None
     #: Settings of this effect; each effect checks its own.
     settings: Mapping[str, Any] = field(default_factory=dict)
 
@@ -328,7 +330,8 @@ def _effect(fields: Fields) -> EffectCall:
         if not 1.0 <= severity <= MAX_SEVERITY:
             raise fields.wrong("episodes", f"severity {severity} is not in 1..{MAX_SEVERITY}")
         episodes.append(Episode(start, end, severity))
-    call = EffectCall(kind=kind, episodes=tuple(episodes), settings=fields.rest())
+    strengths = fields.rising("strengths", MAX_SEVERITY)
+    call = EffectCall(kind, tuple(episodes), strengths, fields.rest())
     fields.finish()
     return call
 

@@ -81,6 +81,7 @@ def ensure_suite(
         HwpError: a render failed; captures that were finished stay.
     """
     from hwp_bench.capture import open_capture
+    from hwp_bench.sim.locks import alone
     from hwp_bench.sim.production import render_capture, render_key
 
     root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
@@ -88,17 +89,18 @@ def ensure_suite(
     for item in suite(name):
         key = render_key(item.scene, item.frame_count, item.size)
         folder = root / f"{item.scene.id}-{item.frame_count}x{item.size}-{key[:12]}"
-        try:
-            open_capture(folder)
-        except HwpError:
-            render_capture(
-                item.scene,
-                folder,
-                frame_count=item.frame_count,
-                size=item.size,
-                seed=item.seed,
-                workers=workers,
-                overwrite=True,
-            )
+        with alone(folder.with_name(f"{folder.name}.lock")):
+            try:
+                open_capture(folder)
+            except HwpError:
+                render_capture(
+                    item.scene,
+                    folder,
+                    frame_count=item.frame_count,
+                    size=item.size,
+                    seed=item.seed,
+                    workers=workers,
+                    overwrite=True,
+                )
         folders.append(folder)
     return folders
