@@ -191,7 +191,7 @@ class _Array(np.ndarray):
 
 
 def _bytes_of(raw: Any) -> bytes:
-    """Bytes as they are; nothing else (an integer would make that many zeros)."""
+    # Nothing but bytes: an integer would make that many zeros.
     if not isinstance(raw, (bytes, bytearray)):
         raise TypeError(f"{type(raw).__name__} where bytes are expected")
     return bytes(raw)
@@ -230,8 +230,12 @@ def _encode(text: Any, codec: Any = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-def _bytearray(raw: Any = b"") -> bytearray:
-    return bytearray(_bytes_of(raw))
+def _bytes(raw: Any = b"") -> bytes:
+    return _bytes_of(raw)
+
+
+def _bytearray(raw: Any = b"", codec: Any = "latin1") -> bytearray:
+    return bytearray(_encode(raw, codec) if isinstance(raw, str) else _bytes_of(raw))
 
 
 def _object_reconstructor(made: Any, base: Any, state: Any) -> Any:
@@ -257,6 +261,7 @@ def _admitted() -> dict[str, Any]:
         names[f"{core}.numeric._frombuffer"] = _Function(_from_buffer)
     for builtins in ("builtins", "__builtin__"):  # Python 3 and 2
         names |= {f"{builtins}.{made.__name__}": made for made in (set, frozenset, complex)}
+        names[f"{builtins}.bytes"] = _Function(_bytes)
         names[f"{builtins}.bytearray"] = _Function(_bytearray)
         names[f"{builtins}.object"] = _OBJECT
     for copyreg in ("copyreg", "copy_reg"):

@@ -65,14 +65,14 @@ def load_mano(path: str | os.PathLike[str], side: str) -> HandTemplate:
     content = _read(file)
     vertices = _dense(content, "v_template", (VERTEX_COUNT, 3), file)
     faces = _dense(content, "f", (FACE_COUNT, 3), file).astype(np.int64)
+    if faces.min() < 0 or faces.max() >= VERTEX_COUNT:
+        raise BadHandModel("a face has a corner that is no vertex", where=file, field="f")
     shape_basis = _shape_basis(content, file)
     if side == "left" and _needs_mending(shape_basis, file):
         shape_basis = shape_basis * np.array([-1.0, 1.0, 1.0])[:, None]
     regressor = _dense(content, "J_regressor", (JOINT_COUNT, VERTEX_COUNT), file)
     _check_tree(content, file)
     joints = regressor @ vertices
-    if not np.isfinite(joints).all():
-        raise BadHandModel("holds NaN or infinity", where=file, field="J_regressor")
     uv, face_uv = two_chart_uv(vertices, faces, joints, side)
     return make_template(
         name="mano",
@@ -144,7 +144,7 @@ def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Pa
     try:
         array = np.asarray(_unwrap(content[field]), dtype=np.float64)
         # chumpy selections are stored flat.
-        return array.reshape(shape) if array.ndim == 1 else _of_shape(array, shape)
+        array = array.reshape(shape) if array.ndim == 1 else _of_shape(array, shape)
     except (TypeError, ValueError, KeyError, IndexError, RecursionError) as error:
         raise BadHandModel(
             f"cannot be read as an array of shape {shape} ({error})",
@@ -152,6 +152,9 @@ def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Pa
             field=field,
             remedy=_REMEDY,
         ) from error
+    if not np.isfinite(array).all():
+        raise BadHandModel("holds NaN or infinity", where=file, field=field, remedy=_REMEDY)
+    return array
 
 
 def _of_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hwp_bench.errors import BadHandModel
 from hwp_bench.hands.landmarks import JOINT_NAMES
 
 
@@ -27,17 +28,32 @@ def palm_directions(joints: np.ndarray, side: str) -> PalmDirections:
     Args:
         joints: (16, 3) rest joints, MANO order.
         side: "right" or "left"; the palm of one is the back of the other.
+
+    Raises:
+        BadHandModel: wrist and knuckles lie on one line.
     """
     index, middle, little = (
         JOINT_NAMES.index(f"{name}1") for name in ("index", "middle", "little")
     )
-    forward = unit(joints[middle] - joints[0])
-    across = joints[index] - joints[little]
+    ahead, across = joints[middle] - joints[0], joints[index] - joints[little]
+    # Less than 0.1 mm x 0.1 mm of palm has no direction worth the name.
+    if np.linalg.norm(np.cross(ahead, across)) < 1e-8:
+        raise BadHandModel("the wrist and the knuckles lie on one line", field="joints")
+    forward = unit(ahead)
     thumbward = unit(across - (across @ forward) * forward)
     palmar = np.cross(forward, thumbward)
     return PalmDirections(forward, -palmar if side == "right" else palmar, thumbward)
 
 
-def unit(vector: np.ndarray) -> np.ndarray:
-    """(..., 3) vectors scaled to length one."""
-    return vector / np.linalg.norm(vector, axis=-1, keepdims=True)
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """(..., 3) vectors scaled to length one.
+
+    Raises:
+        BadHandModel: a vector has no direction, because joints or segments coincide.
+    """
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    if length.min() < 1e-9:
+        raise BadHandModel(
+            "two joints, or a finger and the palm's normal, coincide", field="joints"
+        )
+    return vectors / length
