@@ -68,12 +68,15 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from hwp_bench.evaluate.evaluation import evaluate
+    from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.progress import JobProgress
     from hwp_bench.report.summary import all_tables, write_tables
     from hwp_bench.report.table import print_table
     from hwp_bench.splits import read_splits
 
     settings = _settings(args)
+    # A wrong method directory must be said before a suite is rendered for it.
+    read_manifest(find_method(args.method))
     captures = [Path(path) for path in args.capture] if args.capture else _suite(args.suite)
     method = Path(args.method.rstrip("/")).name
     out = Path(args.out or f"runs/{method}-{settings.suite}")

@@ -1,29 +1,11 @@
-"""`hwp-bench`: finds the command, builds its parser, runs it, turns errors into one line."""
+"""`hwp-bench`: its commands."""
 
 from __future__ import annotations
 
-import argparse
-import difflib
-import importlib
-import os
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, field
 
-from hwp_bench import __version__
-from hwp_bench.errors import HwpError
-
-
-@dataclass(frozen=True)
-class Command:
-    """A command, or a group of commands."""
-
-    #: One line for `--help`.
-    summary: str
-    #: Module with `add_arguments(parser)` and `run(args)`; empty for a group.
-    module: str = ""
-    #: Commands of a group, by name.
-    commands: dict[str, Command] = field(default_factory=dict)
+from hwp_bench.cli.program import Command, run_program
 
 
 def command_tree() -> Command:
@@ -50,68 +32,8 @@ def command_tree() -> Command:
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
-    """Run the command line; returns the exit status: 0 done, 1 failed, 2 asked for wrongly."""
-    words = list(sys.argv[1:] if arguments is None else arguments)
-    try:
-        status = _dispatch("hwp-bench", command_tree(), words)
-        sys.stdout.flush()
-        return status
-    except HwpError as error:
-        print(f"hwp-bench: error: {_one_line(str(error))}", file=sys.stderr)
-        return error.exit_status
-    except KeyboardInterrupt:
-        print("hwp-bench: stopped", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # The reader of our output (such as `head`) has gone; the flush at exit must not complain.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
-
-
-def _one_line(text: str) -> str:
-    """Return a message without line breaks and control characters, which may come from files."""
-    return "".join(char if char.isprintable() else " " for char in text)
-
-
-def _dispatch(program: str, group: Command, words: list[str]) -> int:
-    parser = _group_parser(program, group)
-    if not words or words[0].startswith("-"):
-        if not words:
-            parser.print_help(sys.stderr)
-            return 2
-        parser.parse_args(words)
-        parser.error("a command is needed")
-    name, rest = words[0], words[1:]
-    if name not in group.commands:
-        near = difflib.get_close_matches(name, group.commands, n=1)
-        hint = f"; did you mean {near[0]!r}?" if near else ""
-        parser.error(f"there is no command {name!r}{hint}")
-    command = group.commands[name]
-    if command.commands:
-        return _dispatch(f"{program} {name}", command, rest)
-    module = importlib.import_module(command.module)
-    leaf = argparse.ArgumentParser(
-        prog=f"{program} {name}",
-        description=command.summary[0].upper() + command.summary[1:] + ".",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    module.add_arguments(leaf)
-    return module.run(leaf.parse_args(rest))
-
-
-def _group_parser(program: str, group: Command) -> argparse.ArgumentParser:
-    width = max(len(name) for name in group.commands)
-    lines = [f"  {name:<{width}}  {item.summary}" for name, item in group.commands.items()]
-    parser = argparse.ArgumentParser(
-        prog=program,
-        usage=f"{program} [-h] COMMAND ...",
-        description=f"{group.summary[0].upper()}{group.summary[1:]}.\n\ncommands:\n"
-        + "\n".join(lines),
-        epilog=f"`{program} COMMAND --help` explains a command, with examples.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
-    return parser
+    """Run `hwp-bench`; returns the exit status."""
+    return run_program("hwp-bench", command_tree(), arguments)
 
 
 if __name__ == "__main__":

@@ -1,0 +1,138 @@
+"""The command line: help without torch, exit statuses, one line for every error."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from conftest import CaptureMaker
+
+from hwp_bench.cli.main import command_tree, main
+from hwp_bench.cli.program import Command
+
+HEAVY = ("torch", "numpy", "cv2", "scipy", "rich", "OpenImageIO", "numba", "trimesh")
+
+
+def leaves(tree: Command, path: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    found = []
+    for name, command in tree.commands.items():
+        here = (*path, name)
+        found += leaves(command, here) if command.commands else [here]
+    return found
+
+
+@pytest.mark.parametrize("words", [(), *leaves(command_tree())], ids=" ".join)
+def test_help_has_examples_and_imports_nothing_heavy(words: tuple[str, ...]) -> None:
+    script = (
+        "import sys\n"
+        "from hwp_bench.cli.main import main\n"
+        "try:\n    main(sys.argv[1:])\nexcept SystemExit as stop:\n    assert stop.code == 0\n"
+        f"loaded = [name for name in {HEAVY} if name in sys.modules]\n"
+        "print('LOADED', loaded)\n"
+    )
+    command = [sys.executable, "-c", script, *words, "--help"]
+    shown = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    assert "LOADED []" in shown
+    assert "usage: hwp-bench" in shown
+    if words:
+        assert "example" in shown
+
+
+def test_no_command_and_unknown_commands_are_usage_errors(capsys) -> None:
+    assert main([]) == 2
+    for words in (["evalute"], ["data", "chek"], ["evaluate"], ["--nothing"]):
+        with pytest.raises(SystemExit) as stop:
+            main(words)
+        assert stop.value.code == 2
+    errors = capsys.readouterr()
+    assert "did you mean 'evaluate'?" in errors.err
+    assert "did you mean 'check'?" in errors.err
+    assert errors.out == ""
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "problem"),
+    [
+        (["evaluate", "nowhere"], 1, "nowhere: is no method directory"),
+        (["evaluate", "baselines/plain", "--capture", "nowhere"], 1, "nowhere: is no capture"),
+        (["evaluate", "plain", "--capture", "x", "--budget", "-3"], 2, "--budget: -3.0"),
+        (["evaluate", "plain", "--capture", "x", "--set", "a b=1"], 2, "is not NAME=VALUE"),
+        (["table", "nowhere"], 1, "does not exist"),
+        (["data", "show", "nowhere"], 1, "is no capture"),
+        (["data", "audit", "x", "--guard", "-1"], 2, "--guard"),
+    ],
+)
+def test_errors_are_one_line_on_standard_error(
+    words, status: int, problem: str, capsys, tmp_path, monkeypatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(words) == status
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert problem in captured.err
+    assert captured.err.count("\n") == 1
+    assert captured.err.startswith("hwp-bench: error: ")
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_check_and_audit_speak_json(make_capture: CaptureMaker, capsys) -> None:
+    capture = make_capture(frames=20)
+    assert main(["data", "check", "--json", str(capture.root)]) == 0
+    report = json.loads(capsys.readouterr().out)[0]
+    assert report["ok"]
+    assert report["facts"]["frame_count"] == 20
+    assert main(["data", "audit", "--json", str(capture.root)]) == 0
+    assert json.loads(capsys.readouterr().out)[0]["counts"] == {
+        "train": 16,
+        "validation": 2,
+        "test": 2,
+    }
+    (capture.root / "frames" / "000004.png").write_bytes(b"")
+    assert main(["data", "check", str(capture.root)]) == 1
+    assert "000004.png: is empty" in capsys.readouterr().out
+
+
+def test_lists_speak_json(capsys) -> None:
+    assert main(["list", "--json"]) == 0
+    value = json.loads(capsys.readouterr().out)
+    assert [row["capture"] for row in value["captures"]] == [f"capture{i}" for i in range(11)]
+    assert [row["suite"] for row in value["suites"]] == ["smoke", "mini", "full"]
+    assert "plain" in [row["method"] for row in value["methods"]]
+
+
+def test_evaluate_prints_the_table_and_says_where_things_are(
+    make_capture: CaptureMaker, tmp_path: Path, capsys
+) -> None:
+    from hwp_bench.images import write_image
+
+    capture = make_capture(frames=20, size=48)
+    entry = tmp_path / "entry"
+    for frame in (18, 19):
+        write_image(entry / "predictions" / "tiny" / f"{frame:06d}.png", capture.frame(frame))
+    (entry / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "truth"\ntitle = "Truth [bold]"\n'
+        '[entry]\npredictions = "predictions"\n'
+    )
+    out = tmp_path / "out"
+    words = ["evaluate", str(entry), "--capture", str(capture.root), "--out", str(out)]
+    assert main(words) == 0
+    captured = capsys.readouterr()
+    assert "Truth [bold]" in captured.out
+    assert "100.00" in captured.out
+    assert str(out / "results.json") in captured.err
+    assert "comparison.png" in captured.err
+    assert main(["table", str(out), "--format", "md"]) == 0
+    assert "100.00" in capsys.readouterr().out
+    (entry / "predictions" / "tiny" / "000019.png").unlink()
+    assert main(words) == 1
+    assert "1 of 2 frames: 000019.png: does not exist" in capsys.readouterr().err
+
+
+def test_a_reader_that_stops_reading_is_no_traceback() -> None:
+    command = f"{sys.executable} -m hwp_bench.cli.main list captures | head -n 1"
+    done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
+    assert "Captures" in done.stdout
+    assert "Traceback" not in done.stderr

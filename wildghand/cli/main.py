@@ -1,0 +1,25 @@
+"""`wildghand`: its commands."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from hwp_bench.cli.program import Command, run_program
+
+
+def command_tree() -> Command:
+    """Return every command of `wildghand`."""
+    return Command(
+        "anti-perturbation Gaussian hand avatars",
+        commands={"info": Command("show what renders here, and check it", "wildghand.cli.info")},
+    )
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run `wildghand`; returns the exit status."""
+    return run_program("wildghand", command_tree(), arguments)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
