@@ -1,0 +1,169 @@
+"""LPIPS with random weights. Oracles: layers written out with torch.nn and the formula in
+float64 numpy (1e-5 relative), and torchmetrics where it is installed (1e-5 relative).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from hwp_bench.errors import BadInput, ShapeMismatch
+from hwp_bench.metrics.lpips import Lpips
+
+torch = pytest.importorskip("torch")
+nn = torch.nn
+
+#: Index in `features` after which LPIPS compares, and the channels there.
+TAPS = {"alex": (1, 4, 7, 9, 11), "vgg": (3, 8, 15, 22, 29)}
+CHANNELS = {"alex": (64, 192, 384, 256, 256), "vgg": (64, 128, 256, 512, 512)}
+
+
+def alexnet_features() -> nn.Sequential:
+    """The convolutional part of AlexNet as Krizhevsky's one-column form publishes it."""
+    return nn.Sequential(
+        *(nn.Conv2d(3, 64, 11, 4, 2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(64, 192, 5, padding=2), nn.ReLU(), nn.MaxPool2d(3, 2)),
+        *(nn.Conv2d(192, 384, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(384, 256, 3, padding=1), nn.ReLU()),
+        *(nn.Conv2d(256, 256, 3, padding=1), nn.ReLU(), nn.MaxPool2d(3, 2)),
+    )
+
+
+def vgg16_features() -> nn.Sequential:
+    """The convolutional part of VGG-16 (configuration D of the paper)."""
+    layers: list[nn.Module] = []
+    previous = 3
+    for width in (64, 64, "pool", 128, 128, "pool", *(256,) * 3, "pool", *(512,) * 3, "pool",
+                  *(512,) * 3, "pool"):  # fmt: skip
+        if width == "pool":
+            layers.append(nn.MaxPool2d(2, 2))
+        else:
+            layers += [nn.Conv2d(previous, width, 3, padding=1), nn.ReLU()]
+            previous = width
+    return nn.Sequential(*layers)
+
+
+FEATURES: dict[str, Callable[[], nn.Sequential]] = {
+    "alex": alexnet_features,
+    "vgg": vgg16_features,
+}
+
+
+def random_network(net: str) -> tuple[nn.Sequential, dict, dict]:
+    """Random layers, and their states under the names of the published checkpoints."""
+    torch.manual_seed(0)
+    features = FEATURES[net]().eval()
+    backbone = {f"features.{name}": value for name, value in features.state_dict().items()}
+    backbone["classifier.6.bias"] = torch.zeros(1000)
+    linear = {
+        f"lin{k}.model.1.weight": torch.rand(1, channels, 1, 1)
+        for k, channels in enumerate(CHANNELS[net])
+    }
+    return features, backbone, linear
+
+
+def written_out(net: str, features: nn.Sequential, linear: dict, x, y) -> float:
+    """The formula of the paper, layer after layer."""
+    shift, scale = np.array([-0.030, -0.088, -0.188]), np.array([0.458, 0.448, 0.450])
+    total = 0.0
+    a, b = (
+        torch.from_numpy(((2 * image - 1 - shift) / scale).transpose(2, 0, 1)[None]).float()
+        for image in (x, y)
+    )
+    with torch.no_grad():
+        for index, layer in enumerate(features):
+            a, b = layer(a), layer(b)
+            if index in TAPS[net]:
+                f, g = a[0].double().numpy(), b[0].double().numpy()
+                f, g = (v / (np.sqrt((v**2).sum(0)) + 1e-10) for v in (f, g))
+                weight = linear[f"lin{TAPS[net].index(index)}.model.1.weight"].double().numpy()
+                total += float(((f - g) ** 2 * weight[0]).sum(0).mean())
+    return total
+
+
+@pytest.fixture
+def images():
+    rng = np.random.default_rng(0)
+    return rng.random((70, 64, 3)), rng.random((70, 64, 3))
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg"])
+def test_matches_the_formula_written_out(net, images):
+    features, backbone, linear = random_network(net)
+    lpips = Lpips(net, backbone, linear)
+    assert lpips(*images) == pytest.approx(written_out(net, features, linear, *images), rel=1e-5)
+
+
+@pytest.mark.parametrize("net", ["alex", "vgg"])
+def test_matches_torchmetrics(net, images, monkeypatch):
+    oracle = pytest.importorskip("torchmetrics.functional.image.lpips")
+    features, backbone, linear = random_network(net)
+    monkeypatch.setattr(oracle, "_get_tv_model_features", lambda *_: features)
+    network = oracle._LPIPS(pretrained=False, net=net, pnet_rand=True)
+    missing = network.load_state_dict(linear, strict=False).unexpected_keys
+    assert not missing
+    x, y = (torch.from_numpy(i.transpose(2, 0, 1)[None]).float() * 2 - 1 for i in images)
+    with torch.no_grad():
+        expected = float(network(x, y))
+    assert Lpips(net, backbone, linear)(*images) == pytest.approx(expected, rel=1e-5)
+
+
+def test_identical_images_score_zero_and_batches_equal_single_images(images):
+    _, backbone, linear = random_network("alex")
+    lpips = Lpips("alex", backbone, linear)
+    x, y = images
+    assert lpips(x, x) == 0.0
+    batch = torch.from_numpy(np.stack([x, y])).permute(0, 3, 1, 2).float() * 2 - 1
+    together = lpips.distance(batch, batch.flip(0))
+    assert together.tolist() == pytest.approx([lpips(x, y), lpips(y, x)], rel=1e-5)
+
+
+def test_gradients_reach_the_image(images):
+    _, backbone, linear = random_network("alex")
+    x, y = (torch.from_numpy(i.transpose(2, 0, 1)[None]).float() * 2 - 1 for i in images)
+    x.requires_grad_()
+    Lpips("alex", backbone, linear).distance(x, y).sum().backward()
+    assert torch.isfinite(x.grad).all()
+    assert x.grad.abs().max() > 0
+
+
+def broken(state: dict, name: str, value) -> dict:
+    changed = dict(state)
+    if value is None:
+        del changed[name]
+    else:
+        changed[name] = value
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("part", "name", "value", "message"),
+    [
+        ("backbone", "features.3.weight", None, "features.3.weight: the checkpoint lacks"),
+        ("backbone", "features.3.weight", "text", "features.3.weight: the checkpoint lacks"),
+        ("backbone", "features.0.bias", (63,), r"features.0.bias: has shape \(63,\), not \(64,\)"),
+        ("linear", "lin2.model.1.weight", (1, 1, 1, 1), r"lin2.*not \(1, 384, 1, 1\)"),
+        ("linear", "lin0.model.1.weight", "nan", "NaN"),
+    ],
+)
+def test_a_wrong_checkpoint_is_refused_by_the_name_of_the_weight(part, name, value, message):
+    _, backbone, linear = random_network("alex")
+    if isinstance(value, tuple):
+        value = torch.zeros(value)
+    elif value == "nan":
+        value = torch.full((1, 64, 1, 1), float("nan"))
+    states = {"backbone": backbone, "linear": linear}
+    states[part] = broken(states[part], name, value)
+    with pytest.raises(BadInput, match=message):
+        Lpips("alex", states["backbone"], states["linear"])
+
+
+def test_images_that_do_not_fit_are_refused(images):
+    _, backbone, linear = random_network("alex")
+    lpips = Lpips("alex", backbone, linear)
+    with pytest.raises(ShapeMismatch):
+        lpips(images[0], images[1][1:])
+    with pytest.raises(ShapeMismatch, match="too small"):
+        lpips(images[0][:31], images[1][:31])
