@@ -19,6 +19,8 @@ class FitSettings:
     contour_steps: int = 120
     #: Rounds of: find the mesh's outline, pull it to the mask's outline.
     contour_rounds: int = 3
+    #: Factor on the learning rates in those rounds: only corrections are left.
+    contour_rate: float = 0.3
     #: Landmark error in the picture, as a share of the hand's size in the picture.
     image_scale: float = 0.012
     #: Error of centred world landmarks, m; the tracker's bones change by 5 mm between frames.
@@ -46,5 +48,7 @@ class FitSettings:
     focal_scale: float = 0.15
     #: Outline error in the picture, as a share of the hand's size in the picture.
     contour_scale: float = 0.007
+    #: How far an outline vertex looks for the mask's outline, as a share of the hand's size.
+    contour_reach: float = 0.06
     #: Weight of one outline vertex; neighbours say the same, so each counts little.
-    contour_weight: float = 0.25
+    contour_weight: float = 0.15

@@ -1,0 +1,97 @@
+"""What colours the hand and its surroundings have, learnt once over the whole clip."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Pixels of each kind that the model is learnt from; more change nothing.
+SAMPLES = 40_000
+#: Width of the picture that the samples are laid out in.
+_STRIP = 400
+
+
+@dataclass(frozen=True, eq=False)
+class ColourModel:
+    """Two Gaussian mixtures of five colours each, in OpenCV's GrabCut layout.
+
+    Attributes:
+        background: (1, 65) float64.
+        foreground: (1, 65) float64.
+    """
+
+    background: np.ndarray
+    foreground: np.ndarray
+
+
+def learn_colours(
+    samples: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]], seed: int = 0
+) -> ColourModel | None:
+    """Learn the mixtures from labelled pixels of all frames.
+
+    Args:
+        samples: for each frame its picture (S, S, 3) uint8 and two (S, S) bool arrays: pixels
+            that are hand, and pixels that are not.
+        seed: of the choice of pixels and of the clustering.
+
+    Returns:
+        The model, or None where one of the two kinds has fewer than 100 pixels.
+    """
+    import cv2
+
+    random = np.random.default_rng(seed)
+    kinds: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
+    for picture, hand, other in samples:
+        for pixels, where in zip(kinds, (hand, other), strict=True):
+            found = picture[where]
+            # A thousand of each frame: every frame has its say, none fills the memory.
+            pixels.append(found[random.integers(0, len(found), 1000)] if len(found) else found)
+    hand, other = (np.concatenate(pixels) for pixels in kinds)
+    if min(len(hand), len(other)) < 100:
+        return None
+    chosen = [colours[random.integers(0, len(colours), SAMPLES)] for colours in (hand, other)]
+    strip = np.concatenate(chosen).reshape(-1, _STRIP, 3)
+    labels = np.repeat([cv2.GC_FGD, cv2.GC_BGD], SAMPLES).reshape(-1, _STRIP).astype(np.uint8)
+    background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
+    cv2.setRNGSeed(seed)
+    cv2.grabCut(strip, labels, None, background, foreground, 3, cv2.GC_INIT_WITH_MASK)
+    return ColourModel(background, foreground)
+
+
+def evidence(picture: np.ndarray, model: ColourModel) -> np.ndarray:
+    """Log of (likelihood as hand / likelihood as surroundings) for every pixel.
+
+    Args:
+        picture: (S, S, 3) uint8, in the colour space that the model was learnt in.
+        model: the mixtures.
+
+    Returns:
+        (S, S) float32.
+    """
+    colours, place = np.unique(_packed(picture), return_inverse=True)
+    table = np.stack([colours >> 16, (colours >> 8) & 255, colours & 255], axis=1).astype(float)
+    value = _log_density(table, model.foreground) - _log_density(table, model.background)
+    return value.astype(np.float32)[place].reshape(picture.shape[:2])
+
+
+def _packed(picture: np.ndarray) -> np.ndarray:
+    """Colours as one number each, at half the resolution of each channel."""
+    coarse = picture.astype(np.uint32) | 1
+    return (coarse[..., 0] << 16) | (coarse[..., 1] << 8) | coarse[..., 2]
+
+
+def _log_density(colours: np.ndarray, mixture: np.ndarray) -> np.ndarray:
+    weights = mixture[0, :5]
+    means = mixture[0, 5:20].reshape(5, 3)
+    covariances = mixture[0, 20:].reshape(5, 3, 3)
+    total = np.full(len(colours), 1e-30)
+    for weight, mean, covariance in zip(weights, means, covariances, strict=True):
+        if weight <= 0:
+            continue
+        spread = covariance + 0.01 * np.eye(3)
+        offset = colours - mean
+        distance = np.einsum("ni,ij,nj->n", offset, np.linalg.inv(spread), offset)
+        total += weight * np.exp(-0.5 * distance) / np.sqrt(np.linalg.det(spread))
+    return np.log(total)

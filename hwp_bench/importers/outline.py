@@ -1,0 +1,130 @@
+"""Which vertices of a mesh make its outline in the picture, and where a mask wants them."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hwp_bench.importers.silhouette import draw_silhouette
+
+#: Edge of the pictures in which outlines are compared, px; distances interpolate well, so less
+#: than the crop's resolution is enough.
+FIELD_SIZE = 192
+#: Outline vertices of each frame.
+OUTLINE_COUNT = 200
+#: Vertices of the outline lie at most this far inside the silhouette, px of the field.
+OUTLINE_WITHIN = 1.6
+# Step of the search along a normal, px of the field.
+_STEP = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """Outline vertices of one frame and the line each is drawn to: normal . pixel = target.
+
+    Attributes:
+        index: (OUTLINE_COUNT,) int64 vertices.
+        normal: (OUTLINE_COUNT, 2) float32, outward unit normals; zero where nothing matched.
+        target: (OUTLINE_COUNT,) float32, px of the field; zero where nothing matched.
+    """
+
+    index: np.ndarray
+    normal: np.ndarray
+    target: np.ndarray
+
+    @classmethod
+    def nothing(cls) -> Outline:
+        """An outline that draws nothing anywhere."""
+        return cls(
+            np.zeros(OUTLINE_COUNT, dtype=np.int64),
+            np.zeros((OUTLINE_COUNT, 2), dtype=np.float32),
+            np.zeros(OUTLINE_COUNT, dtype=np.float32),
+        )
+
+
+def signed_distance(mask: np.ndarray) -> np.ndarray:
+    """Distance to the outline of a mask, positive outside.
+
+    Args:
+        mask: (S, S) uint8, 255 inside.
+
+    Returns:
+        (FIELD_SIZE, FIELD_SIZE) float16 in px of the field; zeros where the mask has no outline.
+    """
+    import cv2
+
+    small = cv2.resize(mask, (FIELD_SIZE, FIELD_SIZE), interpolation=cv2.INTER_AREA)
+    inside = (small >= 128).astype(np.uint8)
+    if inside.all() or not inside.any():
+        return np.zeros((FIELD_SIZE, FIELD_SIZE), dtype=np.float16)
+    outer = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    inner = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # Pixel centres next to the outline are half a pixel from it, on either side.
+    return (outer - inner - np.where(inside, -0.5, 0.5)).astype(np.float16)
+
+
+def match_outline(
+    pixels: np.ndarray, faces: np.ndarray, candidates: np.ndarray, field: np.ndarray, reach: float
+) -> Outline:
+    """Match the outline of a mesh with the outline of a mask.
+
+    Each vertex looks along its normal for the nearest place where the mask ends in the same
+    direction: a finger's left side never snaps to the right side of its neighbour, as it may
+    with the plainly nearest point.
+
+    Args:
+        pixels: (V, 2) vertices, px of the field.
+        faces: (F, 3) int.
+        candidates: (C,) vertices that may be chosen.
+        field: (FIELD_SIZE, FIELD_SIZE) signed distance of the mask.
+        reach: how far to look, px of the field.
+    """
+    import cv2
+
+    own = signed_distance(draw_silhouette(pixels, faces, FIELD_SIZE)).astype(np.float32)
+    if not own.any():
+        return Outline.nothing()
+    chosen = _on_outline(pixels, own, candidates)
+    places = pixels[chosen].astype(np.float32)
+    smooth = cv2.GaussianBlur(own, (0, 0), 1.0)
+    gradient = np.stack(
+        [_sample(cv2.Sobel(smooth, cv2.CV_32F, *axis), places) for axis in ((1, 0), (0, 1))], axis=1
+    )
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    normals = gradient / np.maximum(length, 1e-6)
+    steps = np.arange(-reach, reach + _STEP, _STEP, dtype=np.float32)
+    along = places[:, None] + normals[:, None] * steps[:, None]
+    values = _sample(field.astype(np.float32), along.reshape(-1, 2)).reshape(len(chosen), -1)
+    leaves = (values[:, :-1] <= 0) & (values[:, 1:] > 0)
+    middle = np.abs(steps[:-1] + 0.5 * _STEP)
+    best = np.where(leaves, middle, np.inf).argmin(axis=1)
+    rows = np.arange(len(chosen))
+    matched = leaves[rows, best] & (length[:, 0] > 1e-6)
+    before, after = values[rows, best], values[rows, best + 1]
+    offset = steps[best] + _STEP * before / np.minimum(before - after, -1e-6)
+    outline = Outline.nothing()
+    count = len(chosen)
+    outline.index[:count] = chosen
+    outline.normal[:count] = np.where(matched[:, None], normals, 0.0)
+    outline.target[:count] = np.where(matched, (normals * places).sum(axis=1) + offset, 0.0)
+    return outline
+
+
+def _on_outline(pixels: np.ndarray, own: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """Candidates near the outline, at most OUTLINE_COUNT, evenly thinned."""
+    cell = np.floor(pixels[candidates])
+    inside = ((cell >= 0) & (cell < FIELD_SIZE)).all(axis=1)
+    column, row = np.clip(cell, 0, FIELD_SIZE - 1).astype(np.int64).T
+    chosen = candidates[inside & (own[row, column] >= -OUTLINE_WITHIN)]
+    if len(chosen) > OUTLINE_COUNT:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, OUTLINE_COUNT).astype(np.int64)]
+    return chosen
+
+
+def _sample(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Bilinear samples (P,) at (P, 2) px, pixel centres at +0.5, the border repeated."""
+    import cv2
+
+    x, y = (places[:, axis, None].astype(np.float32) - 0.5 for axis in (0, 1))
+    return cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
