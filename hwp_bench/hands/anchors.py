@@ -143,9 +143,10 @@ def anchor_frames(
     Returns:
         (B, N, 3, 3) or (N, 3, 3) rotation matrices, also on degenerate faces.
     """
-    corners, _ = _gather(faces, anchors, vertices)
     normal = anchor_normals(vertices, faces, anchors)
-    edge = vertices[..., corners[:, 1], :] - vertices[..., corners[:, 0], :]
+    # Many anchors share a face: subtract once for each face.
+    edges = vertices[..., faces[:, 1], :] - vertices[..., faces[:, 0], :]
+    edge = edges[..., torch.as_tensor(anchors.face_index, device=faces.device), :]
     along = edge - (edge * normal).sum(dim=-1, keepdim=True) * normal
     tangent = unit_or(along, _any_perpendicular(normal.detach()))
     bitangent = torch.linalg.cross(normal, tangent)

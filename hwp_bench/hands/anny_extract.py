@@ -169,6 +169,7 @@ def main(arguments: list[str]) -> int:
     # system's folder for temporary files is often too small for them.
     with tempfile.TemporaryDirectory(prefix=".anny-", dir=output.parent) as scratch:
         os.environ["ANNY_CACHE_DIR"] = scratch
+        os.environ["WARP_CACHE_PATH"] = scratch
         write_npz(output, extract())
     return 0
 

@@ -203,7 +203,10 @@ def _index_part(
 
 def _digest(name: str, side: str, parts: dict[str, np.ndarray]) -> str:
     digest = hashlib.sha256(f"{name}/{side}".encode())
-    for field in ("vertices", "shape_basis", "joints", "joint_basis", "mean_pose", "weights"):
+    fields = ["vertices", "shape_basis", "joints", "joint_basis", "mean_pose", "weights"]
+    if parts["pose_basis"] is not None:
+        fields.append("pose_basis")
+    for field in fields:
         rounded = np.round(parts[field], _DIGEST_DECIMALS) + 0.0  # -0.0 becomes 0.0
         digest.update(f"/{field}{rounded.shape}".encode())
         digest.update(np.ascontiguousarray(rounded, dtype="<f8").tobytes())
