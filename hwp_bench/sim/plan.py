@@ -47,7 +47,13 @@ class FramePlan:
         return any(name in self.passes for name in ("objects", "light", "shutter"))
 
 
-def plan(scene: Scene, frame: int, frame_count: int, size: int) -> FramePlan:
+def plan(
+    scene: Scene,
+    frame: int,
+    frame_count: int,
+    size: int,
+    strengths: Mapping[str, float] | None = None,
+) -> FramePlan:
     """Plan one frame.
 
     Args:
@@ -55,11 +61,12 @@ def plan(scene: Scene, frame: int, frame_count: int, size: int) -> FramePlan:
         frame: 0 to frame_count - 1.
         frame_count: frames over which the capture is spread.
         size: edge of the picture in pixels; decides the number of sub-frames.
+        strengths: instead of those that follow from the severity of the effects that act.
     """
     moment = float(moments(frame_count)[frame])
     seconds = moment * scene.duration
     acting = {
-        call.kind: strength_at(call, level(call, moment))
+        call.kind: (strengths or {}).get(call.kind, strength_at(call, level(call, moment)))
         for call in scene.effects
         if level(call, moment)
     }

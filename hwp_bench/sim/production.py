@@ -36,10 +36,10 @@ from hwp_bench.sim.motion import hand_parameters
 from hwp_bench.sim.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.scene import Scene, load_scene
 from hwp_bench.sim.subject import scene_hands, skin_atlas
-from hwp_bench.sim.worker import frame_file, read_frame, render_frames
+from hwp_bench.sim.worker import exr_file, frame_file, read_frame, render_frames
 
 #: Version of the renderer's look; part of every render key.
-RENDERER = 2
+RENDERER = 3
 #: Smallest and largest edge of a picture.
 SIZES = (32, 1024)
 #: Edge of a picture where nobody says otherwise.
@@ -64,6 +64,7 @@ def render_capture(
     seed: int | None = None,
     workers: int | None = None,
     overwrite: bool = False,
+    exr: bool = False,
 ) -> Capture:
     """Render a capture.
 
@@ -78,6 +79,8 @@ def render_capture(
         seed: replaces the scene's seed.
         workers: processes; as many as pay if None.
         overwrite: replace an existing folder.
+        exr: also store linear light, depth, normals, object ids and motion of every frame as
+            OpenEXR, under `extra/`.
 
     Raises:
         UsageError: `out` exists, or a number is out of range.
@@ -93,14 +96,15 @@ def render_capture(
     out = Path(out)
     if out.exists() and not overwrite and (out.is_file() or any(out.iterdir())):
         raise UsageError("exists already", where=out, remedy="Choose another place or overwrite.")
-    waiting = out.absolute().parent / f".{out.name}.{render_key(scene, count, edge)[:16]}"
+    kind = "-exr" if exr else ""
+    waiting = out.absolute().parent / f".{out.name}.{render_key(scene, count, edge)[:16]}{kind}"
     with alone(waiting.with_name(f"{waiting.name}.lock")):
         try:
             waiting.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise HwpError(f"cannot be made ({error.strerror})", where=waiting) from error
         start = time.perf_counter()
-        _render_missing(scene, count, edge, waiting, workers)
+        _render_missing(scene, count, edge, waiting, workers, exr)
         _assemble(scene, count, edge, waiting, out, overwrite, time.perf_counter() - start)
         shutil.rmtree(waiting, ignore_errors=True)
     waiting.with_name(f"{waiting.name}.lock").unlink(missing_ok=True)
@@ -118,7 +122,7 @@ def _check(frame_count: int, size: int, workers: int | None) -> None:
 
 
 def _render_missing(
-    scene: Scene, count: int, size: int, waiting: Path, workers: int | None
+    scene: Scene, count: int, size: int, waiting: Path, workers: int | None, exr: bool
 ) -> None:
     missing = [frame for frame in range(count) if not frame_file(waiting, frame).exists()]
     if not missing:
@@ -131,14 +135,14 @@ def _render_missing(
     with progress(f"Rendering {scene.id}", len(missing)) as update:
         if workers == 1:
             for done, frame in enumerate(missing, start=1):
-                render_frames(scene, [frame], count, size, waiting)
+                render_frames(scene, [frame], count, size, waiting, exr)
                 update(done)
             return
         jobs = [missing[first::workers] for first in range(workers)]
         with contextlib.ExitStack() as stack:
             logs = [stack.enter_context(tempfile.TemporaryFile()) for _ in jobs]
             processes = [
-                _start((scene, job, count, size, os.fspath(waiting)), log)
+                _start((scene, job, count, size, os.fspath(waiting), exr), log)
                 for job, log in zip(jobs, logs, strict=True)
             ]
             stack.callback(_stop, processes)
@@ -223,6 +227,9 @@ def _assemble(
             writer.true_mask(item.frame, np.floor(255.0 * coverage + 1e-3).astype(np.uint8))
             clean_coverage = arrays["clean_coverage"].astype(np.float64)
             writer.mask(item.frame, estimate_mask(scene, item, coverage, clean_coverage))
+            layers = exr_file(waiting, item.frame)
+            if layers.exists():
+                writer.extra(f"exr/{layers.name}", layers.read_bytes())
             costs.append(json.loads(arrays["cost"].tobytes()))
         writer.true_hands(truth)
         writer.extra("scene.json", canonical_json(scene.to_json()))

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from hwp_bench.hands import HandTemplate
 
 # Rings along the arm, m behind the wrist's rim; the first two make the cuff's fold.
-_RINGS = (0.004, -0.012, -0.013, -0.006, 0.01, 0.03, 0.06, 0.1, 0.15, 0.22, 0.3)
+_RINGS = (0.006, -0.003, -0.004, 0.002, 0.014, 0.032, 0.06, 0.1, 0.15, 0.22, 0.3)
 _WIDTHS = (1.02, 1.06, 1.17, 1.22, 1.2, 1.22, 1.25, 1.3, 1.36, 1.45, 1.55)
 _AROUND = 40
 _TEXTURE = 256

@@ -42,8 +42,30 @@ class Stage:
         self.scene = scene
         self.ledger = ledger
 
-    def surface(self, hands: dict[str, HandMoment], subdivisions: int = FINE) -> Surface:
-        """Hands and sleeves, posed."""
+    def parameters(self, hands: dict[str, HandMoment]) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+        """Pose (16, 3) rad and transl (3,) m of every hand."""
+        focus = focus_point()
+        return {
+            side: hand_parameters(moment, side, subject.joints, focus)
+            for (side, moment), subject in zip(
+                hands.items(), scene_hands(self.scene).values(), strict=True
+            )
+        }
+
+    def surface(
+        self,
+        hands: dict[str, HandMoment],
+        subdivisions: int = FINE,
+        parameters: dict[str, tuple[np.ndarray, np.ndarray]] | None = None,
+    ) -> Surface:
+        """Hands and sleeves, posed.
+
+        Args:
+            hands: what the hands do.
+            subdivisions: of the hands' mesh.
+            parameters: pose and translation instead of the ones that follow from `hands`.
+        """
+        parameters = parameters or self.parameters(hands)
         skin = _skin(self.scene.subject)
         cloth = sleeve_material(self.scene.subject.sleeve, self.scene.subject.seed)
         subjects = scene_hands(self.scene, subdivisions)
@@ -51,8 +73,7 @@ class Stage:
         skins, sleeves = [], []
         for side, moment in hands.items():
             subject = subjects[side]
-            pose, transl = hand_parameters(moment, side, subject.joints, focus)
-            vertices, normals = subject.pose(pose, transl)
+            vertices, normals = subject.pose(*parameters[side])
             skins.append(_hand_surface(subject, vertices, normals, skin))
             rim = vertices[wrist_rim(subject.template)]
             turn = heading_matrix(moment.heading, side)

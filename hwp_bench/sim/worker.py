@@ -26,6 +26,11 @@ def frame_file(folder: Path, frame: int) -> Path:
     return folder / f"{frame:06d}.npz"
 
 
+def exr_file(folder: Path, frame: int) -> Path:
+    """Where the linear layers of a rendered frame wait."""
+    return folder / f"{frame:06d}.exr"
+
+
 def read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
     """Read a rendered frame; None where there is none or it is damaged."""
     try:
@@ -35,7 +40,12 @@ def read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
 
 
 def render_frames(
-    scene: Scene, frames: Iterable[int], frame_count: int, size: int, folder: Path
+    scene: Scene,
+    frames: Iterable[int],
+    frame_count: int,
+    size: int,
+    folder: Path,
+    exr: bool = False,
 ) -> None:
     """Render frames into a folder.
 
@@ -45,8 +55,10 @@ def render_frames(
         frame_count: frames over which the capture is spread.
         size: edge of the picture in pixels.
         folder: where they go.
+        exr: also write linear layers as EXR.
     """
     from hwp_bench.sim.frame import render_frame
+    from hwp_bench.sim.layers import write_layers
 
     for frame in frames:
         result = render_frame(scene, frame, frame_count, size)
@@ -64,6 +76,9 @@ def render_frames(
             clean_coverage=result.clean_coverage.astype(np.float32),
             cost=np.frombuffer(json.dumps(cost).encode(), dtype=np.uint8),
         )
+        if exr:
+            write_layers(exr_file(folder, frame), scene, result, frame_count, size)
+        # Last: the frame counts as rendered only when all of it is there.
         atomic_write(frame_file(folder, frame), buffer.getvalue())
 
 
@@ -75,8 +90,12 @@ def main() -> int:
 
     torch.set_num_threads(1)
     # The job comes from our own parent process through a pipe.
-    scene, frames, frame_count, size, folder = pickle.load(sys.stdin.buffer)
-    render_frames(scene, frames, frame_count, size, Path(folder))
+    scene, frames, frame_count, size, folder, exr = pickle.load(sys.stdin.buffer)
+    parent = os.getppid()
+    for frame in frames:
+        if os.getppid() != parent:
+            return 1  # whoever asked for the frames is gone
+        render_frames(scene, [frame], frame_count, size, Path(folder), exr)
     return 0
 
 

@@ -50,6 +50,8 @@ class Effect:
     name: str
     #: Strengths for severity 1 to 5 where the scene has no calibration.
     default_strengths: tuple[float, float, float, float, float]
+    #: Largest strength that makes sense.
+    max_strength: float
 
     def check(self, scene: Scene, call: EffectCall, where: str) -> None:
         """Check the settings.

@@ -81,7 +81,9 @@ def _read(
 
 class _HandObjectInteraction(Effect):
     name = "hand_object_interaction"
+    #: 0 leaves the objects where they come from, 1 brings them to their place.
     default_strengths = (0.25, 0.45, 0.65, 0.85, 1.0)
+    max_strength = 1.0
 
     def check(self, scene: Scene, call: EffectCall, where: str) -> None:
         _read(call.settings, scene.sides, where)

@@ -32,6 +32,7 @@ class _Illumination(Effect):
     name = "illumination"
     #: 1 halves or doubles the exposure, or its equal in colour or direction.
     default_strengths = (0.15, 0.3, 0.5, 0.8, 1.2)
+    max_strength = 2.5
 
     def check(self, scene: Scene, call: EffectCall, where: str) -> None:
         _modes(call, where)

@@ -22,6 +22,7 @@ class _MotionBlur(Effect):
     name = "motion_blur"
     #: Length of the streak, fraction of the picture's width.
     default_strengths = (0.008, 0.018, 0.034, 0.06, 0.1)
+    max_strength = 0.25
 
     def check(self, scene: Scene, call: EffectCall, where: str) -> None:
         _read(call, where)

@@ -14,7 +14,7 @@ _TEXTURE = 128
 
 
 def build(name: str, variant: int) -> Surface:
-    """Build a tube of 14 cm along z (cap at -z), or a dollop of cream about 3 cm wide."""
+    """Build a tube of 14 cm along z (cap at -z), or a dollop of cream about 4 cm wide."""
     return _tube(variant) if name == "lotion_tube" else _dollop(variant)
 
 
@@ -51,7 +51,7 @@ def _dollop(variant: int) -> Surface:
     waves = sum(
         rng.normal(0.0, 0.18 / k) * np.cos(k * angles + rng.uniform(0, 6.3)) for k in (2, 3, 5)
     )
-    radius = 0.017 * (1.0 + waves)
+    radius = 0.02 * (1.0 + waves)
     profile = np.sin(profile_at * np.pi / 2)
     height = 0.006 * np.cos(profile_at * np.pi / 2) ** 0.7
     swirl = (

@@ -9,12 +9,13 @@ from hwp_bench.sim.objects.shapes import grid
 from hwp_bench.sim.surface import Material, Surface, join, transformed
 
 _STICKERS = ((0.98, 0.83, 0.12), (0.90, 0.25, 0.45), (0.20, 0.65, 0.85), (0.35, 0.75, 0.30))
+_RADIUS = 0.022
 _SUITS = ("heart", "spade", "diamond", "club")
 _RED, _BLACK = (0.78, 0.08, 0.10), (0.06, 0.06, 0.08)
 
 
 def build(name: str, variant: int) -> Surface:
-    """Build a sticker (36 mm, round) or a playing card (58 x 89 mm), facing +z."""
+    """Build a sticker (44 mm, round) or a playing card (58 x 89 mm), facing +z."""
     if name == "sticker":
         front, back = _sticker(variant), canvas(4, 4, (0.93, 0.93, 0.93))
         return _disc(front, back)
@@ -34,7 +35,7 @@ def _sheet(front: np.ndarray, back: np.ndarray, size: tuple[float, float], bend:
 
 def _disc(front: np.ndarray, back: np.ndarray) -> Surface:
     radius, angle = np.meshgrid(np.linspace(1e-3, 1.0, 4), np.linspace(0, 2 * np.pi, 33))
-    place = 0.018 * radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    place = _RADIUS * radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
     vertices = np.concatenate([place, 0.002 * radius[..., None] ** 2], axis=-1).reshape(-1, 3)
     return _two_sided(vertices, front, back, columns=4)
 
@@ -45,7 +46,7 @@ def _two_sided(
     rows = len(vertices) // columns
     top = grid(vertices, rows, columns, _material(front))
     if columns == 4:
-        flat = vertices[top.faces][..., :2] / 0.036 + 0.5
+        flat = vertices[top.faces][..., :2] / (2.0 * _RADIUS) + 0.5
         from dataclasses import replace
 
         top = replace(top, corner_uv=flat)

@@ -1,4 +1,4 @@
-"""A ball pen: barrel, clip, grip and tip."""
+"""A felt-tip pen: barrel, clip, grip and tip."""
 
 from __future__ import annotations
 
@@ -12,20 +12,20 @@ _BARRELS = ((0.08, 0.14, 0.55), (0.75, 0.08, 0.10), (0.05, 0.05, 0.06))
 
 
 def build(name: str, variant: int) -> Surface:
-    """Build a pen of 15 cm along z, its tip at -z."""
+    """Build a pen of 15 cm along z and 17 mm across, its tip at -z."""
     barrel = plain(srgb_to_linear(np.array(_BARRELS[variant % len(_BARRELS)])), gloss=0.25)
     rubber = plain((0.02, 0.02, 0.02), gloss=0.8)
     metal = plain((0.55, 0.55, 0.57), gloss=0.2, specular=0.6)
-    shaft = np.array([[0.0, 0.076], [0.0042, 0.076], [0.0052, 0.07], [0.0055, -0.03]])
-    grip = np.array([[0.0055, -0.03], [0.0061, -0.035], [0.0058, -0.055], [0.005, -0.062]])
-    tip = np.array([[0.005, -0.062], [0.0018, -0.073], [0.0006, -0.076], [0.0, -0.0765]])
+    shaft = np.array([[0.0, 0.076], [0.007, 0.076], [0.0082, 0.072], [0.0084, -0.03]])
+    grip = np.array([[0.0084, -0.03], [0.009, -0.035], [0.0086, -0.052], [0.0072, -0.06]])
+    tip = np.array([[0.0072, -0.06], [0.0032, -0.07], [0.002, -0.076], [0.0, -0.0765]])
     move = np.eye(4)
-    move[:3, 3] = [0.0, 0.0066, 0.05]
+    move[:3, 3] = [0.0, 0.0096, 0.05]
     return join(
         [
             turned(shaft, barrel),
             turned(grip, rubber),
             turned(tip, metal),
-            transformed(box((0.0035, 0.0016, 0.04), metal), move),
+            transformed(box((0.004, 0.0022, 0.045), metal), move),
         ]
     )

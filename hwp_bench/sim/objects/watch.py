@@ -10,7 +10,7 @@ from hwp_bench.sim.objects.shapes import grid, turned
 from hwp_bench.sim.surface import Material, Surface, join, plain, transformed
 
 # Half axes of the wrist, m, and half the width of the strap.
-_WRIST = (0.034, 0.025)
+_WRIST = (0.036, 0.026)
 _STRAP = 0.011
 
 

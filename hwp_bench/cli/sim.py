@@ -1,0 +1,92 @@
+"""`hwp-bench sim`: list, plan, render, preview and calibrate simulated captures."""
+
+from __future__ import annotations
+
+import argparse
+
+_EXAMPLES = """examples:
+  hwp-bench sim list
+  hwp-bench sim plan capture4 --frames 60 --size 176
+  hwp-bench sim render --suite mini
+  hwp-bench sim render capture0 -o my_capture --frames 60 --size 160 --severity 3
+  hwp-bench sim render all -o captures --subject 7
+  hwp-bench sim preview capture5 -o preview
+  hwp-bench sim calibrate my_scene.toml --write
+
+A scene is the name of one of the eleven captures or the path of a scene file.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    parser.formatter_class = argparse.RawDescriptionHelpFormatter
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    _add_list(actions.add_parser("list", help="list scenes, suites, objects and effects"))
+    _add_plan(actions.add_parser("plan", help="print what a scene's frames need and will cost"))
+    _add_render(actions.add_parser("render", help="render captures"))
+    _add_preview(actions.add_parser("preview", help="contact sheet and animation of a scene"))
+    _add_calibrate(actions.add_parser("calibrate", help="solve strengths for stated losses"))
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.sim import commands
+
+    action = {
+        "list": commands.list_scenes,
+        "plan": commands.print_plan,
+        "render": commands.render,
+        "preview": commands.preview,
+        "calibrate": commands.calibrate_scenes,
+    }[args.action]
+    return action(args)
+
+
+def _add_list(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _add_plan(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", metavar="SCENE", nargs="+", help="scene names, files, or all")
+    _add_extent(parser)
+    parser.add_argument(
+        "--no-probe", action="store_true", help="count passes only, render no probe for the cost"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _add_render(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", metavar="SCENE", nargs="?", help="scene name or file, or all")
+    parser.add_argument("-o", "--out", help="folder to make; for all and suites their parent")
+    parser.add_argument("--suite", choices=("smoke", "mini", "full"), help="render a suite")
+    _add_extent(parser)
+    parser.add_argument("--severity", type=float, help="one severity, 1-5, for every episode")
+    parser.add_argument("--subject", type=int, metavar="SEED", help="another person")
+    parser.add_argument("--seed", type=int, help="another seed of everything random")
+    parser.add_argument("--workers", type=int, help="processes (default: as many as pay)")
+    parser.add_argument("--exr", action="store_true", help="also linear EXR with extra layers")
+    parser.add_argument("--overwrite", action="store_true", help="replace what exists")
+
+
+def _add_preview(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", metavar="SCENE", help="scene name or file")
+    parser.add_argument("-o", "--out", default=".", help="folder (default: here)")
+    parser.add_argument("--frames", type=int, default=48, help="frames (default 48)")
+    parser.add_argument("--size", type=int, default=160, help="edge in pixels (default 160)")
+    parser.add_argument("--severity", type=float, help="one severity, 1-5, for every episode")
+    parser.add_argument("--subject", type=int, metavar="SEED", help="another person")
+    parser.add_argument(
+        "--stage", action="store_true", help="draw hand, objects, light and camera in 3D instead"
+    )
+
+
+def _add_calibrate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("scene", metavar="SCENE", nargs="+", help="scene names, files, or all")
+    parser.add_argument("--write", action="store_true", help="write strengths into the files")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def _add_extent(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--frames", type=int, help="frames (default: the scene's own)")
+    parser.add_argument("--size", type=int, help="edge of the picture in pixels (default 256)")

@@ -1,0 +1,172 @@
+"""What `hwp-bench sim` does, action by action."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from hwp_bench.errors import UsageError
+from hwp_bench.sim.scene import Scene, load_scene, scene_names
+
+
+def list_scenes(args: argparse.Namespace) -> int:
+    """Print the scenes, and what scenes can be made of."""
+    from hwp_bench.sim.backdrop import backdrop_names
+    from hwp_bench.sim.effects import ORDER
+    from hwp_bench.sim.gestures import gestures
+    from hwp_bench.sim.objects import object_names
+    from hwp_bench.sim.suites import suite, suite_names
+
+    scenes = [load_scene(name) for name in scene_names()]
+    suites = {name: [item.scene.id for item in suite(name)] for name in suite_names()}
+    parts = {
+        "suites": suites,
+        "effects": list(ORDER),
+        "objects": list(object_names()),
+        "gestures": list(gestures()),
+        "backgrounds": list(backdrop_names()),
+    }
+    if args.json:
+        rows = [
+            {
+                "id": scene.id,
+                "title": scene.title,
+                "hands": scene.hands,
+                "action": scene.action,
+                "device": scene.device,
+                "frame_count": scene.frame_count,
+                "effects": [call.kind for call in scene.effects],
+                "digest": scene.digest,
+            }
+            for scene in scenes
+        ]
+        print(json.dumps({"scenes": rows, **parts}, indent=1))
+        return 0
+    for scene in scenes:
+        effects = ", ".join(call.kind for call in scene.effects)
+        print(f"{scene.id:<10} {scene.frame_count:>5} frames  {scene.title} ({effects})")
+    for name, ids in suites.items():
+        print(f"suite {name}: {', '.join(ids)}")
+    for name in ("objects", "gestures", "backgrounds"):
+        print(f"{name}: {', '.join(parts[name])}")
+    return 0
+
+
+def print_plan(args: argparse.Namespace) -> int:
+    """Print passes and predicted cost."""
+    from hwp_bench.sim.forecast import forecast, plan_table
+
+    reports = [
+        forecast(scene, args.frames, args.size, probe=not args.no_probe)
+        for scene in _scenes(args.scene)
+    ]
+    if args.json:
+        print(json.dumps([report.to_json() for report in reports], indent=1))
+    else:
+        print(plan_table(reports))
+    return 0
+
+
+def render(args: argparse.Namespace) -> int:
+    """Render captures and print their folders."""
+    from hwp_bench.sim.production import render_capture
+    from hwp_bench.sim.suites import ensure_suite
+
+    if (args.suite is None) == (args.scene is None):
+        raise UsageError("name a scene, all, or a suite with --suite")
+    changes = (args.frames, args.size, args.severity, args.subject, args.seed)
+    if args.suite is not None:
+        if any(change is not None for change in changes) or args.exr:
+            raise UsageError("a suite is rendered as it is", field="--suite")
+        for folder in ensure_suite(args.suite, args.out, args.workers):
+            print(folder)
+        return 0
+    if args.out is None:
+        raise UsageError("says not where to", field="-o", remedy="Give a folder with -o.")
+    for scene in _scenes([args.scene]):
+        out = Path(args.out) / scene.id if args.scene == "all" else Path(args.out)
+        capture = render_capture(
+            _changed(scene, args.severity, args.subject),
+            out,
+            frame_count=args.frames,
+            size=args.size,
+            seed=args.seed,
+            workers=args.workers,
+            overwrite=args.overwrite,
+            exr=args.exr,
+        )
+        print(capture.path)
+    return 0
+
+
+def preview(args: argparse.Namespace) -> int:
+    """Write a contact sheet and an animation, or the stage in 3D."""
+    scene = _changed(load_scene(args.scene), args.severity, args.subject)
+    if args.stage:
+        from hwp_bench.sim.stageview import draw_stage
+
+        print(draw_stage(scene, Path(args.out)))
+        return 0
+    from hwp_bench.sim.preview import write_preview
+
+    for path in write_preview(scene, Path(args.out), frame_count=args.frames, size=args.size):
+        print(path)
+    return 0
+
+
+def calibrate_scenes(args: argparse.Namespace) -> int:
+    """Solve strengths, print them with what was measured, and write them if asked."""
+    from hwp_bench.sim.calibration import calibrate, write_strengths
+
+    rows: list[dict[str, Any]] = []
+    for name in _names(args.scene):
+        scene = load_scene(name)
+        results = [calibrate(scene, call) for call in scene.effects]
+        if args.write:
+            write_strengths(_scene_path(name), results)
+        for item in results:
+            rows.append(
+                {
+                    "scene": scene.id,
+                    "digest": load_scene(name).digest if args.write else scene.digest,
+                    "effect": item.kind,
+                    "measure": item.measure,
+                    "strengths": item.strengths,
+                    "measured": item.measured,
+                    "targets": item.targets,
+                }
+            )
+            if not args.json:
+                measured = " ".join(f"{value:7.3f}" for value in item.measured)
+                wanted = " ".join(f"{value:7.3f}" for value in item.targets)
+                print(f"{scene.id} {item.kind} ({item.measure}): {measured}  wanted {wanted}")
+    if args.json:
+        print(json.dumps(rows, indent=1))
+    return 0
+
+
+def _names(names: list[str]) -> list[str]:
+    return list(scene_names()) if names == ["all"] else names
+
+
+def _scenes(names: list[str]) -> list[Scene]:
+    return [load_scene(name) for name in _names(names)]
+
+
+def _scene_path(name: str) -> Path:
+    if name in scene_names():
+        return Path(str(resources.files("hwp_bench.sim").joinpath(f"scenes/{name}.toml")))
+    return Path(name)
+
+
+def _changed(scene: Scene, severity: float | None, subject: int | None) -> Scene:
+    from hwp_bench.sim.variants import with_severity, with_subject
+
+    if severity is not None:
+        scene = with_severity(scene, severity)
+    if subject is not None:
+        scene = with_subject(scene, subject)
+    return scene
