@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -80,3 +81,14 @@ def test_the_package_imports_no_numpy_opencv_or_torch():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("facts", METRICS, ids=lambda m: m.name)
+def test_the_documentation_states_every_metric_with_its_penalty(facts):
+    text = (Path(__file__).parents[3] / "docs" / "protocol.md").read_text(encoding="utf-8")
+    rows = [line for line in text.splitlines() if line.startswith("| `") and facts.name in line]
+    cells = [cell.strip() for cell in rows[0].strip("|").split("|")]
+    assert f"`{facts.name}`" in cells[0]
+    assert cells[1] == facts.unit
+    assert cells[2] == ("higher" if facts.higher_is_better else "lower")
+    assert float(cells[4]) == facts.penalty
