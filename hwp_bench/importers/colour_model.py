@@ -56,7 +56,7 @@ def learn_colours(
     labels = np.repeat([cv2.GC_FGD, cv2.GC_BGD], SAMPLES).reshape(-1, _STRIP).astype(np.uint8)
     background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
     cv2.setRNGSeed(seed)
-    cv2.grabCut(strip, labels, None, background, foreground, 3, cv2.GC_INIT_WITH_MASK)
+    cv2.grabCut(strip, labels, (0, 0, 1, 1), background, foreground, 3, cv2.GC_INIT_WITH_MASK)
     return ColourModel(background, foreground)
 
 

@@ -13,7 +13,7 @@ from hwp_bench.importers.clip_model import ClipModel, PosedClip
 from hwp_bench.importers.crop import CropWindows
 from hwp_bench.importers.fit_settings import FitSettings
 from hwp_bench.importers.fit_terms import geman_mcclure
-from hwp_bench.importers.outline import FIELD_SIZE, OUTLINE_COUNT, Outline, match_outline
+from hwp_bench.importers.outline import FIELD_SIZE, Outline, match_outline
 from hwp_bench.importers.silhouette import boundary_vertices
 
 #: Frames posed at once, to bound memory with fine templates.

@@ -57,11 +57,6 @@ class FrameRange:
                 remedy="Use A:B with 0 <= A < B, and a stride of at least 1.",
             )
 
-    @property
-    def whole(self) -> bool:
-        """Whether the last frame of the video is reached."""
-        return self.stop is None
-
     def indices(self, frame_count: int) -> np.ndarray:
         """Return the selected indices of a video of `frame_count` frames, (F,) int64."""
         stop = frame_count if self.stop is None else min(self.stop, frame_count)
@@ -129,7 +124,7 @@ def read_frames(info: VideoInfo, selection: FrameRange) -> Iterator[tuple[int, n
         (index in the video, (H, W, 3) uint8 RGB).
 
     Raises:
-        BadInput: the size changes on the way, or the video ends before the selection does.
+        BadInput: the size changes on the way, or the video ends before `selection.stop`.
     """
     import cv2
 
@@ -148,13 +143,11 @@ def read_frames(info: VideoInfo, selection: FrameRange) -> Iterator[tuple[int, n
                     )
                 yield index, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
             index += 1
-    wanted = info.stated_frames if selection.stop is None else selection.stop
-    if index < wanted:
+    if selection.stop is not None and index < selection.stop:
         raise BadInput(
-            f"ends after {index} frames where {wanted} are "
-            + ("stated in its header" if selection.stop is None else "asked for"),
+            f"ends after {index} frames where {selection.stop} are asked for",
             where=info.path,
-            remedy="The file may be truncated; --frames takes the part that is there.",
+            remedy="Choose other frames with --frames; the file may be truncated.",
         )
 
 

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from hwp_bench.hands import HandTemplate, pose_hand
-from hwp_bench.importers.clip_model import ClipModel
+from hwp_bench.importers.clip_model import ClipModel, PosedClip
 from hwp_bench.importers.contour import ContourEnergy
 from hwp_bench.importers.descent import descend
 from hwp_bench.importers.fit_settings import FitSettings
@@ -123,17 +123,21 @@ def fit_outline(
 ) -> None:
     """Refine a fit, in place, so that the mesh's outline meets the masks' outline."""
     settings = fitted.settings
+
+    def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        return fitted.energy(model, posed) + contour(model, posed)
+
     for done in range(settings.contour_rounds):
         contour.rematch(fitted.model)
-        first = done * settings.contour_steps
         descend(
             fitted.model,
-            lambda model, posed: fitted.energy(model, posed) + contour(model, posed),
+            energy,
             settings.contour_steps,
             rate=settings.contour_rate,
             hold=_HELD_BY_LANDMARKS,
-            update=None if update is None else lambda step, first=first: update(first + step),
         )
+        if update is not None:
+            update((done + 1) * settings.contour_steps)
 
 
 def reprojection_error(fitted: FittedClip, landmarks: Landmarks) -> ReprojectionError:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
 from hwp_bench.importers.colour_model import ColourModel, evidence, learn_colours
-from hwp_bench.importers.silhouette import draw_silhouette
-from hwp_bench.importers.wrist import beyond_wrist
 
 #: Frames that the colour model is learnt from.
 _COLOUR_FRAMES = 200
@@ -73,55 +71,42 @@ class Segmentation:
     hand: np.ndarray
 
 
-def make_prompt(
-    vertices: np.ndarray,
-    pixels: np.ndarray,
-    faces: np.ndarray,
-    ring: np.ndarray,
-    size: int,
-    detected: bool,
-) -> Prompt:
-    """Draw the mesh of one frame; shapes as in `draw_silhouette` and `beyond_wrist`."""
-    return Prompt(
-        draw_silhouette(pixels, faces, size),
-        beyond_wrist(vertices, pixels, ring, size),
-        detected,
-    )
-
-
 def segment_clip(
-    pictures: Sequence[np.ndarray],
+    picture: Callable[[int], np.ndarray],
     prompt: Callable[[int], Prompt],
+    count: int,
     hand_size: float,
     settings: MaskSettings,
-    update: Callable[[int], None] | None = None,
-) -> list[Segmentation]:
-    """Segment every picture with one colour model for the whole clip.
+) -> Iterator[tuple[Prompt, Segmentation]]:
+    """Segment every frame with one colour model for the whole clip.
 
     Args:
-        pictures: (S, S, 3) uint8 RGB each.
-        prompt: gives the prompt of a frame.
+        picture: gives the (S, S, 3) uint8 RGB picture of a frame; called from several threads.
+        prompt: gives the prompt of a frame; called from several threads.
+        count: number of frames.
         hand_size: px of these pictures.
         settings: how far to trust the prompts.
-        update: told the number of frames done.
+
+    Yields:
+        The prompt and the masks of each frame, in order.
     """
-    count = len(pictures)
-    prompts = [prompt(frame) for frame in range(count)]
-    chosen = [frame for frame in _spread(count, _COLOUR_FRAMES) if prompts[frame].detected]
-    model = learn_colours(
-        (to_lab(pictures[frame]), *_sure(prompts[frame], hand_size, settings)) for frame in chosen
-    )
-    done = []
-    with ThreadPoolExecutor(min(4, os.cpu_count() or 1)) as pool:
-        results = pool.map(
-            lambda frame: segment(pictures[frame], prompts[frame], model, hand_size, settings),
-            range(count),
-        )
-        for result in results:
-            done.append(result)
-            if update is not None:
-                update(len(done))
-    return done
+
+    def samples() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+        for frame in np.unique(np.linspace(0, count - 1, min(count, _COLOUR_FRAMES)).astype(int)):
+            said = prompt(int(frame))
+            if said.detected:
+                yield to_lab(picture(int(frame))), *_sure(said, hand_size, settings)
+
+    model = learn_colours(samples())
+
+    def work(frame: int) -> tuple[Prompt, Segmentation]:
+        said = prompt(frame)
+        return said, segment(picture(frame), said, model, hand_size, settings)
+
+    workers = min(4, os.cpu_count() or 1)
+    with ThreadPoolExecutor(workers) as pool:
+        for first in range(0, count, 8 * workers):
+            yield from pool.map(work, range(first, min(first + 8 * workers, count)))
 
 
 def segment(
@@ -157,9 +142,9 @@ def segment(
             edge = max(1, round(settings.window * hand_size))
             colour = cv2.blur(np.clip(evidence(lab, model), -5.0, 5.0), (edge, edge))
             labels[inside & (colour > settings.forbidding)] = cv2.GC_FGD
-        # OpenCV writes to the mixtures that it is given.
-        mixtures = model.background.copy(), model.foreground.copy()
-        cv2.grabCut(lab, labels, None, *mixtures, 1, cv2.GC_EVAL_FREEZE_MODEL)
+        # The rectangle is not read in this mode; the mixtures are written to, so copies.
+        background, foreground = model.background.copy(), model.foreground.copy()
+        cv2.grabCut(lab, labels, (0, 0, 1, 1), background, foreground, 1, cv2.GC_EVAL_FREEZE_MODEL)
         skin = _tidy((labels & 1) * np.uint8(255), prompt.silhouette, hand_size, settings)
     return Segmentation(skin, np.where(prompt.hand_side, skin, 0).astype(np.uint8))
 
@@ -200,7 +185,3 @@ def _tidy(
     small = sizes[:, cv2.CC_STAT_AREA] < (settings.hole * hand_size) ** 2
     small[0] = False
     return np.where(small[holes], 255, smooth).astype(np.uint8)
-
-
-def _spread(count: int, limit: int) -> np.ndarray:
-    return np.unique(np.linspace(0, count - 1, min(count, limit)).astype(np.int64))

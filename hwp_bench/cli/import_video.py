@@ -1,0 +1,131 @@
+"""`hwp-bench data import-video`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hwp_bench.importers.video import ImportedClip
+
+_EXAMPLES = """examples:
+  hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture
+  hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture --focal 1020 --hand left
+  hwp-bench data import-video hand.mp4 --landmarks hand.npz part --frames 100:400 --stride 2
+
+LANDMARKS.npz comes from a hand tracker such as MediaPipe and holds, for every frame of the
+video, image (F, 21, 2 or 3) in pixels, world (F, 21, 3) in metres and score (F,) in [0, 1];
+score 0 means that no hand was seen. docs/video.md says how to make it and how to read the result.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "Make a capture of a video of one hand and the landmarks tracked in it."
+    parser.epilog = _EXAMPLES
+    parser.add_argument("video", type=Path, metavar="VIDEO", help="video file")
+    parser.add_argument("out", type=Path, metavar="OUT", help="capture folder to make")
+    parser.add_argument(
+        "--landmarks", type=Path, required=True, metavar="LANDMARKS.npz", help="tracked landmarks"
+    )
+    parser.add_argument(
+        "--hand", choices=("right", "left"), default="right", help="which hand (default: right)"
+    )
+    parser.add_argument(
+        "--focal", type=float, metavar="PX", help="focal length of the whole frame; else estimated"
+    )
+    parser.add_argument(
+        "--masks", type=Path, metavar="DIR", help="masks of your own, named by frame number"
+    )
+    parser.add_argument(
+        "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
+    )
+    parser.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
+    parser.add_argument(
+        "--stride", type=int, default=1, metavar="K", help="every K-th frame (default: 1)"
+    )
+    parser.add_argument(
+        "--min-score",
+        type=float,
+        default=0.5,
+        metavar="S",
+        help="below this score a hand was not seen (default: 0.5)",
+    )
+    parser.add_argument(
+        "--hand-model", default="anny", metavar="MODEL", help="anny (default) or mano:PATH"
+    )
+    parser.add_argument("--sheet", type=Path, metavar="PNG", help="overlay sheet, here as well")
+    parser.add_argument("--id", metavar="ID", help="capture id (default: the folder's name)")
+    parser.add_argument("--action", default="unknown", metavar="TEXT", help="what the hand does")
+    parser.add_argument("--device", default="unknown", metavar="TEXT", help="what recorded it")
+    parser.add_argument("--licence", default="unknown", metavar="TEXT", help="terms of use")
+    parser.add_argument(
+        "--perturbations",
+        default="",
+        metavar="NAMES",
+        help="what disturbs the clip, comma separated; severities stay unknown",
+    )
+    parser.add_argument("--force", action="store_true", help="replace an existing capture")
+    parser.add_argument("--json", action="store_true", help="print the numbers as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.importers.decode import parse_frame_range
+    from hwp_bench.importers.options import VideoImport
+    from hwp_bench.importers.video import import_video
+
+    options = VideoImport(
+        hand=args.hand,
+        focal=args.focal,
+        masks=args.masks,
+        size=args.size,
+        frames=parse_frame_range(args.frames, args.stride),
+        id=args.id,
+        action=args.action,
+        device=args.device,
+        licence=args.licence,
+        perturbations=tuple(name for name in args.perturbations.split(",") if name),
+        hand_model=args.hand_model,
+        min_score=args.min_score,
+        sheet=args.sheet,
+        overwrite=args.force,
+    )
+    clip = import_video(args.video, args.landmarks, args.out, options)
+    if args.json:
+        print(json.dumps(clip.facts(), indent=1))
+    else:
+        _print(clip, args)
+    return 0
+
+
+def _print(clip: ImportedClip, args: argparse.Namespace) -> None:
+    import numpy as np
+
+    from hwp_bench.importers.store import SHEET_NAME
+
+    facts = clip.facts()
+    error, before = clip.error, clip.error_landmarks_only
+    count, detected, valid = (facts[key] for key in ("frames", "frames_detected", "frames_valid"))
+    video = clip.source.video
+    print(f"capture: {args.out}, {count} frames, hand detected in {detected}, fitted in {valid}")
+    print(
+        f"mean reprojection error of the 21 joints: {error.mean:.2f} px at "
+        f"{video.width}x{video.height} (median {error.median:.2f}, 95th percentile "
+        f"{error.percentile_95:.2f}, worst joint {error.worst_landmark} "
+        f"{error.worst_landmark_mean:.2f}; without the tracker's constant offsets "
+        f"{error.without_offsets:.2f}; before the outline fit {before.mean:.2f})"
+    )
+    print(
+        f"overlap of mesh and mask: {facts['overlap']:.3f} "
+        f"(5th percentile {facts['overlap_percentile_5']:.3f}; "
+        f"before the outline fit {facts['overlap_landmarks_only']:.3f})"
+    )
+    origin = "given" if args.focal is not None else "estimated"
+    near, far = np.percentile(clip.hand.transl[:, 2], (0, 100))
+    print(f"focal length: {clip.focal:.0f} px ({origin}); hand at {near:.2f} to {far:.2f} m")
+    print(f"crop: {clip.source.windows.side} px squares, stored at {args.size} px")
+    sheet = args.sheet or args.out / "extra" / SHEET_NAME
+    print(f"look at: {sheet}")

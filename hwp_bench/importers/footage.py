@@ -1,0 +1,113 @@
+"""Everything taken from the video in one pass: cropped frames, and the user's own masks."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.errors import BadInput
+from hwp_bench.images import read_gray
+from hwp_bench.importers.crop import CropWindows, cut, resample
+from hwp_bench.importers.decode import FrameRange, VideoInfo, read_frames
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """The frames of a clip at two resolutions.
+
+    Attributes:
+        frames: (F, size, size, 3) uint8 RGB, what the capture stores.
+        working: (F, S, S, 3) uint8 RGB, what masks are cut in: the video's own resolution, at
+            most twice the stored one.
+    """
+
+    frames: np.ndarray
+    working: np.ndarray
+
+
+def working_size(windows: CropWindows) -> int:
+    """Edge of the working pictures, px."""
+    return min(windows.side, 2 * windows.size)
+
+
+def read_pictures(
+    info: VideoInfo,
+    selection: FrameRange,
+    windows: CropWindows,
+    update: Callable[[int], None] | None = None,
+) -> Pictures:
+    """Decode the video once and keep the window of every selected frame.
+
+    Raises:
+        BadInput: the video ends early, goes on longer than the landmarks, or is damaged.
+    """
+    count, edge = len(windows.corners), working_size(windows)
+    frames = np.zeros((count, windows.size, windows.size, 3), dtype=np.uint8)
+    working = np.zeros((count, edge, edge, 3), dtype=np.uint8)
+    done = 0
+    for _, picture in read_frames(info, selection):
+        if done < count:
+            square = cut(picture, windows.corners[done], windows.side)
+            frames[done] = resample(square, windows.size)
+            working[done] = resample(square, edge)
+        done += 1
+        if update is not None:
+            update(min(done, count))
+    if done != count:
+        raise BadInput(
+            f"yields {done} frames where the landmarks have {count}",
+            where=info.path,
+            remedy="The video may be truncated, or the landmarks belong to another one.",
+        )
+    return Pictures(frames, working)
+
+
+def read_masks(
+    folder: str | os.PathLike[str],
+    info: VideoInfo,
+    indices: np.ndarray,
+    windows: CropWindows,
+) -> np.ndarray:
+    """Read the user's masks and cut the windows out of them.
+
+    Args:
+        folder: images of the video's size whose names end in the frame number (`000012.png`,
+            `frame_12.png`); above 127 is hand.
+        info: the video.
+        indices: (F,) frame numbers to read.
+        windows: of those frames.
+
+    Returns:
+        (F, S, S) uint8 at the working resolution, 255 = hand.
+
+    Raises:
+        BadInput: no such folder, or a frame has no mask.
+        BadImage: a mask is damaged or not of the video's size.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise BadInput("is no folder", where=folder, field="--masks")
+    numbered: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        number = re.search(r"(\d+)$", path.stem)
+        if number and path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp"):
+            numbered[int(number[1])] = path
+    missing = [int(frame) for frame in indices if int(frame) not in numbered]
+    if missing:
+        raise BadInput(
+            f"{len(missing)} of {len(indices)} frames have no mask, first frame {missing[0]}",
+            where=folder,
+            field="--masks",
+            remedy="Name the masks by the frame's number in the video, from 0: 000000.png, ...",
+        )
+    edge = working_size(windows)
+    masks = np.zeros((len(indices), edge, edge), dtype=np.uint8)
+    for row, frame in enumerate(indices):
+        mask = read_gray(numbered[int(frame)], (info.height, info.width))
+        masks[row] = resample(cut(mask, windows.corners[row], windows.side), edge)
+    return masks

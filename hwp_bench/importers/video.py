@@ -1,0 +1,220 @@
+"""From a video and its tracked landmarks to a capture."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.capture.schema import check_id
+from hwp_bench.errors import UsageError
+from hwp_bench.hands import HandParameters, load_template
+from hwp_bench.importers.contour import ContourEnergy
+from hwp_bench.importers.crop import CropWindows, follow_hand
+from hwp_bench.importers.decode import VideoInfo, probe
+from hwp_bench.importers.fit_clip import (
+    FittedClip,
+    Footage,
+    ReprojectionError,
+    fit_landmarks,
+    fit_outline,
+    reprojection_error,
+)
+from hwp_bench.importers.fit_terms import hand_size
+from hwp_bench.importers.footage import Pictures, read_masks, read_pictures
+from hwp_bench.importers.landmarks import Landmarks, check_against_video, read_landmarks
+from hwp_bench.importers.masking import ClipMasks, Masking
+from hwp_bench.importers.options import VideoImport
+from hwp_bench.importers.projected import ProjectedClip, project_clip
+from hwp_bench.importers.segment import NARROW, WIDE
+from hwp_bench.progress import progress
+from hwp_bench.taxonomy import perturbation
+
+#: A frame whose landmarks are missed by more than this share of the hand's size is not valid.
+FAILED_FIT = 0.10
+
+
+@dataclass(frozen=True, eq=False)
+class Source:
+    """What the import reads.
+
+    Attributes:
+        video: the probed video.
+        landmarks_path: the tracker's file.
+        indices: (F,) frame numbers in the video.
+        landmarks: of those frames.
+        windows: where the hand is.
+        pictures: the frames.
+        own_masks: (F, S, S) uint8 or None.
+    """
+
+    video: VideoInfo
+    landmarks_path: Path
+    indices: np.ndarray
+    landmarks: Landmarks
+    windows: CropWindows
+    pictures: Pictures
+    own_masks: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedClip:
+    """What the import makes of it.
+
+    Attributes:
+        source: what was read.
+        hand: parameters of the hand.
+        fitted: the fit.
+        projected: the fit in the pictures.
+        masks: final masks.
+        error: reprojection error of the final fit.
+        error_landmarks_only: the same before the outline was fitted.
+        overlap_landmarks_only: mean overlap of mesh and mask before the outline was fitted.
+    """
+
+    source: Source
+    hand: HandParameters
+    fitted: FittedClip
+    projected: ProjectedClip
+    masks: ClipMasks
+    error: ReprojectionError
+    error_landmarks_only: ReprojectionError
+    overlap_landmarks_only: float
+
+    @property
+    def focal(self) -> float:
+        """Focal length, px of the whole frame."""
+        return float(self.fitted.model.focal.detach())
+
+    def facts(self) -> dict[str, object]:
+        """Return the numbers by which the import is judged, as JSON."""
+        seen = self.source.landmarks.detected
+        overlaps = self.masks.overlap[seen]
+
+        def pixels(error: ReprojectionError) -> dict[str, object]:
+            values = {key: value for key, value in asdict(error).items() if key != "by_frame"}
+            return {k: round(v, 3) if isinstance(v, float) else v for k, v in values.items()}
+
+        return {
+            "frames": len(seen),
+            "frames_detected": int(seen.sum()),
+            "frames_valid": int(self.hand.valid.sum()),
+            "reprojection_px": pixels(self.error),
+            "reprojection_px_landmarks_only": pixels(self.error_landmarks_only),
+            "overlap": round(float(overlaps.mean()), 4),
+            "overlap_percentile_5": round(float(np.percentile(overlaps, 5)), 4),
+            "overlap_landmarks_only": round(self.overlap_landmarks_only, 4),
+            "focal_px": round(self.focal, 2),
+            "depth_m": [
+                round(float(z), 3) for z in np.percentile(self.hand.transl[:, 2], (0, 100))
+            ],
+            "world_scale": round(float(self.fitted.model.variables.log_size.detach().exp()), 4),
+        }
+
+
+def import_video(
+    video: str | os.PathLike[str],
+    landmarks: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    options: VideoImport | None = None,
+) -> ImportedClip:
+    """Make a capture of a video of one hand.
+
+    Args:
+        video: any file that OpenCV decodes.
+        landmarks: the tracker's npz, `read_landmarks` says of what.
+        out: the capture folder to make.
+        options: choices; the defaults where None.
+
+    Returns:
+        The clip as it was written, with the numbers by which to judge it.
+
+    Raises:
+        BadInput: one of the files is unusable; file and field are named.
+        UsageError: `out` exists, or an option makes no sense.
+    """
+    from hwp_bench.importers.store import store_clip
+
+    options = options or VideoImport()
+    _check_output(Path(out), options)
+    clip = fit_video(read_source(video, landmarks, options), options)
+    store_clip(clip, out, options)
+    return clip
+
+
+def read_source(
+    video: str | os.PathLike[str], landmarks: str | os.PathLike[str], options: VideoImport
+) -> Source:
+    """Read and check everything that the import needs from outside."""
+    info = probe(video)
+    every = read_landmarks(landmarks, min_score=options.min_score)
+    # Containers may state a wrong number of frames. A whole video is counted as it is decoded;
+    # of a part the end is never seen, so the header has to do.
+    part = options.frames.stop is not None
+    total = info.stated_frames if part and info.stated_frames else len(every.score)
+    tracked = check_against_video(every, total, info.width, info.height, landmarks)
+    indices = options.frames.indices(total)
+    if len(indices) < 3:
+        raise UsageError(
+            f"{len(indices)} of {total} frames are selected, at least 3 are needed",
+            field="--frames",
+        )
+    tracked = tracked.select(indices)
+    if not tracked.detected.any():
+        raise UsageError("no hand is detected in the selected frames", field="--frames")
+    windows = follow_hand(tracked, info.fps / options.frames.stride, options.size)
+    own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
+    with progress("reading frames", len(indices)) as update:
+        pictures = read_pictures(info, options.frames, windows, update)
+    return Source(info, Path(landmarks), indices, tracked, windows, pictures, own)
+
+
+def fit_video(source: Source, options: VideoImport) -> ImportedClip:
+    """Fit the hand and cut the masks: landmarks, masks, outline, masks, outline, masks."""
+    landmarks, windows, settings = source.landmarks, source.windows, options.fit
+    video = source.video
+    footage = Footage(video.width, video.height, video.fps / options.frames.stride, options.focal)
+    with progress("fitting landmarks", settings.landmark_steps) as update:
+        template = load_template(options.hand_model, options.hand)
+        fitted = fit_landmarks(landmarks, template, footage, settings, update)
+    first_error = reprojection_error(fitted, landmarks)
+    size = hand_size(landmarks)
+    scale = source.pictures.working.shape[1] / windows.side
+    masking = Masking(source.pictures, landmarks.detected, size * scale, source.own_masks)
+    overlaps = []
+    frames = len(source.indices)
+    steps = settings.contour_rounds * settings.contour_steps
+    for turn, trust in ((1, WIDE), (2, NARROW)):
+        with progress(f"cutting masks ({turn} of 3)", frames) as update:
+            projected = project_clip(fitted.model, windows)
+            masks = masking.masks(projected, trust, reduction=2, update=update)
+        overlaps.append(float(masks.overlap[landmarks.detected].mean()))
+        with progress(f"fitting outlines ({turn} of 2)", steps) as update:
+            contour = ContourEnergy(masks.fields, landmarks.detected, windows, settings, size)
+            fit_outline(fitted, contour, update)
+    projected = project_clip(fitted.model, windows)
+    with progress("cutting masks (3 of 3)", frames) as update:
+        masks = masking.masks(projected, NARROW, update=update)
+    error = reprojection_error(fitted, landmarks)
+    missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * size
+    return ImportedClip(
+        source=source,
+        hand=fitted.model.parameters(landmarks.detected & ~missed),
+        fitted=fitted,
+        projected=projected,
+        masks=masks,
+        error=error,
+        error_landmarks_only=first_error,
+        overlap_landmarks_only=overlaps[0],
+    )
+
+
+def _check_output(out: Path, options: VideoImport) -> None:
+    """Refuse before minutes of work what would be refused after them."""
+    if out.is_file() or (out.is_dir() and any(out.iterdir()) and not options.overwrite):
+        raise UsageError("exists already", where=out, remedy="Choose another place, or --force.")
+    check_id(options.capture_id(out), os.fspath(out))
+    for name in options.perturbations:
+        perturbation(name)
