@@ -113,23 +113,27 @@ class _SsimMap(torch.autograd.Function):
 
 def _blur(images: torch.Tensor) -> torch.Tensor:
     """Blur (B, H, W, C) with the SSIM window over a zero border."""
-    if images.device.type == "cpu":
-        import cv2
+    if images.device.type != "cpu":
+        return _convolve(images)
+    import cv2
 
-        # An order of magnitude faster than torch's convolution of a single channel.
-        source = np.ascontiguousarray(images.numpy())
-        blurred = np.empty_like(source)
-        window = _window()
-        for image, out in zip(source, blurred, strict=True):
-            cv2.sepFilter2D(image, -1, window, window, dst=out, borderType=cv2.BORDER_CONSTANT)
-        return torch.from_numpy(blurred)
-    kernel = torch.as_tensor(_window(), dtype=images.dtype, device=images.device)
+    # An order of magnitude faster on a CPU than torch's convolution of single channels.
+    source = np.ascontiguousarray(images.numpy())
+    blurred = np.empty_like(source)
+    window = _window()
+    for image, out in zip(source, blurred, strict=True):
+        cv2.sepFilter2D(image, -1, window, window, dst=out, borderType=cv2.BORDER_CONSTANT)
+    return torch.from_numpy(blurred)
+
+
+def _convolve(images: torch.Tensor) -> torch.Tensor:
+    window = torch.as_tensor(_window(), dtype=images.dtype, device=images.device)
     channels = images.shape[-1]
-    planes = images.permute(0, 3, 1, 2)
     half = WINDOW // 2
+    planes = images.permute(0, 3, 1, 2)
     for size, padding in (((WINDOW, 1), (half, 0)), ((1, WINDOW), (0, half))):
-        weight = kernel.reshape(1, 1, *size).expand(channels, 1, *size)
-        planes = torch.nn.functional.conv2d(planes, weight, padding=padding, groups=channels)
+        kernel = window.reshape(1, 1, *size).expand(channels, 1, *size)
+        planes = torch.nn.functional.conv2d(planes, kernel, padding=padding, groups=channels)
     return planes.permute(0, 2, 3, 1)
 
 

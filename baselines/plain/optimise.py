@@ -112,10 +112,11 @@ def learning_rates(settings: PlainSettings) -> dict[str, float]:
 
 def _spent(step: int, steps: int, budget: Budget, report: Report) -> float:
     """Share of the budget that is used up: of the steps or of the seconds, whichever is more."""
-    spent = step / steps
-    if budget.seconds is not None:
-        spent = max(spent, report.elapsed / budget.seconds)
-    return spent
+    if budget.seconds is None:
+        return step / steps
+    if budget.seconds <= 0.0:
+        return 1.0
+    return max(step / steps, report.elapsed / budget.seconds)
 
 
 def _batches(count: int, batch: int, seed: int) -> Iterator[torch.Tensor]:

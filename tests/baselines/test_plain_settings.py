@@ -1,0 +1,70 @@
+"""Settings from outside: each mistake is named with its remedy."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from baselines.plain.method import PlainMethod
+from baselines.plain.settings import PlainSettings, read_settings
+from hwp_bench.errors import BadMethod
+from hwp_bench.methods import find_method, read_manifest
+
+
+def test_defaults_hold_where_nothing_is_said() -> None:
+    assert read_settings({}) == PlainSettings()
+    assert read_settings({"steps": 7}) == dataclasses.replace(PlainSettings(), steps=7)
+
+
+def test_whole_numbers_do_for_real_ones() -> None:
+    assert read_settings({"dssim_weight": 0}).dssim_weight == 0.0
+
+
+def test_unknown_setting_is_named_with_a_suggestion() -> None:
+    with pytest.raises(BadMethod, match=r"gausians: is no setting.*Did you mean 'gaussians'"):
+        PlainMethod({"gausians": 100}, 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "value"),
+    [
+        ("gaussians", 0),
+        ("gaussians", 1.5),
+        ("gaussians", True),
+        ("steps", "many"),
+        ("batch", 1000),
+        ("shading_degree", 4),
+        ("dssim_weight", 1.5),
+        ("outside_weight", -0.1),
+        ("initial_opacity", 1.0),
+        ("offset_rate", -1.0),
+        ("color_rate", float("nan")),
+        ("light_rate", float("inf")),
+        ("final_rate", 0.0),
+        ("device", "tpu"),
+        ("device", ["cpu"]),
+    ],
+)
+def test_values_out_of_range_are_named(name: str, value: Any) -> None:
+    with pytest.raises(BadMethod, match=name):
+        read_settings({name: value})
+
+
+def test_the_manifest_and_all_its_presets_can_be_read() -> None:
+    manifest = read_manifest(find_method("plain"))
+    assert manifest.kind == "python"
+    assert {"default", "mini", "smoke"} <= set(manifest.presets)
+    for settings in manifest.presets.values():
+        read_settings(settings)
+
+
+def test_every_setting_has_a_line_of_documentation() -> None:
+    import baselines.plain.settings as module
+
+    lines = Path(module.__file__).read_text().splitlines()
+    for field in dataclasses.fields(PlainSettings):
+        row = next(i for i, line in enumerate(lines) if line.startswith(f"    {field.name}:"))
+        assert lines[row - 1].strip().startswith("#:"), field.name
