@@ -7,6 +7,7 @@ hand +y, thumb's side +z).
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 
@@ -191,7 +192,7 @@ def _rounded(bends: np.ndarray, samples: int = 24) -> np.ndarray:
 def _distance_to_line(places: np.ndarray, line: np.ndarray) -> np.ndarray:
     """Distance of (N, 2) places to a row of (K, 2) points joined by segments."""
     nearest = np.full(len(places), np.inf)
-    for start, end in zip(line[:-1], line[1:], strict=True):
+    for start, end in pairwise(line):
         nearest = np.minimum(nearest, _to_segment(places, start, end)[0])
     return nearest
 

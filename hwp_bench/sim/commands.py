@@ -88,7 +88,7 @@ def render(args: argparse.Namespace) -> int:
         raise UsageError("says not where to", field="-o", remedy="Give a folder with -o.")
     for scene in _scenes([args.scene]):
         out = Path(args.out) / scene.id if args.scene == "all" else Path(args.out)
-        capture = render_capture(
+        render_capture(
             _changed(scene, args.severity, args.subject),
             out,
             frame_count=args.frames,
@@ -98,7 +98,7 @@ def render(args: argparse.Namespace) -> int:
             overwrite=args.overwrite,
             exr=args.exr,
         )
-        print(capture.path)
+        print(out)
     return 0
 
 

@@ -11,6 +11,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import IO, Any
@@ -124,7 +125,7 @@ def _check(frame_count: int, size: int, workers: int | None) -> None:
 def _render_missing(
     scene: Scene, count: int, size: int, waiting: Path, workers: int | None, exr: bool
 ) -> None:
-    missing = [frame for frame in range(count) if not frame_file(waiting, frame).exists()]
+    missing = [frame for frame in range(count) if read_frame(waiting, frame) is None]
     if not missing:
         return
     # Built once here, so that no two processes paint the same skin.
@@ -184,7 +185,7 @@ def _stop(processes: list[subprocess.Popen[bytes]]) -> None:
 
 
 def _raise_if_failed(
-    scene: Scene, processes: list[subprocess.Popen[bytes]], logs: list[IO[bytes]]
+    scene: Scene, processes: list[subprocess.Popen[bytes]], logs: Sequence[IO[bytes]]
 ) -> None:
     for process, log in zip(processes, logs, strict=True):
         if process.poll():

@@ -247,7 +247,7 @@ def parse_scene(text: str, *, where: str) -> Scene:
         effects=tuple(_effect(row) for row in top.rows("effects")),
     )
     top.finish()
-    _check_effects(scene, where)
+    _check_parts(scene, where)
     return scene
 
 
@@ -336,10 +336,12 @@ def _effect(fields: Fields) -> EffectCall:
     return call
 
 
-def _check_effects(scene: Scene, where: str) -> None:
+def _check_parts(scene: Scene, where: str) -> None:
+    from hwp_bench.sim.backdrop import check_backdrop
     from hwp_bench.sim.effects import registered
     from hwp_bench.sim.episodes import clean_share
 
+    check_backdrop(scene.background, where)
     kinds = [call.kind for call in scene.effects]
     if len(set(kinds)) != len(kinds):
         raise BadInput("an effect is called twice", where=where, field="effects")

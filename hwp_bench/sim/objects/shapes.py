@@ -53,7 +53,8 @@ def box(size: tuple[float, float, float], material: Material) -> Surface:
     )
     vertices = np.array(sides, dtype=np.float64).reshape(-1, 3)
     start = np.arange(6)[:, None] * 4
-    faces = np.concatenate([start + [0, 1, 2], start + [0, 2, 3]])
+    halves = np.array([[0, 1, 2], [0, 2, 3]])
+    faces = (start + halves[:, None]).reshape(-1, 3)
     corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
     uv = np.concatenate(
         [np.tile(corners[[0, 1, 2]], (6, 1, 1)), np.tile(corners[[0, 2, 3]], (6, 1, 1))]
