@@ -8,7 +8,7 @@ import torch
 
 from hwp_bench.errors import MissingDependency, UsageError
 from wildghand.splat.layout import check_options, flatten
-from wildghand.splat.scene import Options
+from wildghand.splat.scene import Options, unflattened
 
 #: What `backend` may be.
 BACKENDS = ("auto", "numba", "gsplat", "reference")
@@ -61,14 +61,13 @@ def rasterize(
     if backend == "reference":
         from wildghand.splat.reference import rasterize_reference
 
-        scene, layout = flatten(tensors, backgrounds, options)
+        scene = flatten(tensors, backgrounds, options)
         channels, alphas, info = rasterize_reference(scene)
     else:
         from wildghand.splat.numba_backend import rasterize_numba
 
         tensors = {name: value.float() for name, value in tensors.items()}
         backgrounds = None if backgrounds is None else backgrounds.float()
-        scene, layout = flatten(tensors, backgrounds, options)
+        scene = flatten(tensors, backgrounds, options)
         channels, alphas, info = rasterize_numba(scene)
-    info = {name: layout.unflatten(value) for name, value in info.items()}
-    return layout.unflatten(channels), layout.unflatten(alphas), info
+    return unflattened(channels, scene), unflattened(alphas, scene), info

@@ -28,3 +28,7 @@ LOG_255 = math.log(255.0)
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 #: Values of `rasterize_mode`, as in gsplat.
 RASTERIZE_MODES = ("classic", "antialiased")
+#: A splat is culled where its visible part reaches farther than this many pixels from its
+#: centre, or is so thin that the inverse of its variance (px^-2) exceeds MAX_PRECISION.
+MAX_REACH = 1e30
+MAX_PRECISION = 1e30

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 
 import torch
 
@@ -12,23 +11,11 @@ from wildghand.splat.conventions import RASTERIZE_MODES, RENDER_MODES
 from wildghand.splat.scene import Options, Scene
 
 
-@dataclass(frozen=True)
-class Layout:
-    """How flat results go back into the shapes that the caller expects."""
-
-    #: The leading shape of `means` that `viewmats` shares, then the number of cameras.
-    image_dims: tuple[int, ...]
-
-    def unflatten(self, tensor: torch.Tensor) -> torch.Tensor:
-        """(I, ...) to (*image_dims, ...)."""
-        return tensor.reshape(self.image_dims + tuple(tensor.shape[1:]))
-
-
 def flatten(
     tensors: dict[str, torch.Tensor],
     backgrounds: torch.Tensor | None,
     options: Options,
-) -> tuple[Scene, Layout]:
+) -> Scene:
     """One `Scene` from the arguments as the caller gave them.
 
     Args:
@@ -59,9 +46,7 @@ def flatten(
         image_dims = (*batch, cameras)
     _require(tuple(viewmats.shape) == expected, "viewmats", viewmats, _show(expected))
     Ks = tensors["Ks"]
-    _require(
-        tuple(Ks.shape) == (*expected[:-2], 3, 3), "Ks", Ks, _show((*expected[:-2], 3, 3))
-    )
+    _require(tuple(Ks.shape) == (*expected[:-2], 3, 3), "Ks", Ks, _show((*expected[:-2], 3, 3)))
     groups = math.prod(batch)
     images = groups * cameras
 
@@ -70,8 +55,10 @@ def flatten(
         tensor = tensors[name]
         shape = tuple(tensor.shape)
         _require(shape in (tail, (*batch, *tail)), name, tensor, _show((*batch, *tail)))
-        flat[name] = tensor.reshape(-1 if shape == tail else groups, *tail) if count else (
-            tensor.reshape(groups, *tail)
+        flat[name] = (
+            tensor.reshape(-1 if shape == tail else groups, *tail)
+            if count
+            else (tensor.reshape(groups, *tail))
         )
     flat["colors"] = _flat_colors(tensors["colors"], batch, cameras, count)
     channels = flat["colors"].shape[-1]
@@ -80,18 +67,20 @@ def flatten(
         shape = tuple(backgrounds.shape)
         wanted = (*image_dims, channels)
         _require(
-            shape in (wanted, (channels,)), "backgrounds", backgrounds,
+            shape in (wanted, (channels,)),
+            "backgrounds",
+            backgrounds,
             f"{_show(wanted)} or ({channels},)",
         )
         flat_backgrounds = backgrounds.expand(wanted).reshape(images, channels)
-    scene = Scene(
+    return Scene(
         **flat,
         viewmats=viewmats.reshape(images, 4, 4),
         Ks=Ks.reshape(images, 3, 3),
         backgrounds=flat_backgrounds,
         options=options,
+        image_dims=image_dims,
     )
-    return scene, Layout(image_dims)
 
 
 def check_options(options: Options, rasterize_mode: str) -> None:
@@ -105,9 +94,7 @@ def check_options(options: Options, rasterize_mode: str) -> None:
         ("rasterize_mode", RASTERIZE_MODES, rasterize_mode),
     ):
         if value not in choices:
-            raise UsageError(
-                f"is {value!r}", field=name, remedy=f"Use one of {', '.join(choices)}"
-            )
+            raise UsageError(f"is {value!r}", field=name, remedy=f"Use one of {', '.join(choices)}")
     for name, value in (("width", options.width), ("height", options.height)):
         if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= 32768:
             raise UsageError(
@@ -145,9 +132,7 @@ def _check_kind(tensors: dict[str, torch.Tensor]) -> None:
     for name, tensor in tensors.items():
         if not isinstance(tensor, torch.Tensor) or not tensor.is_floating_point():
             kind = tensor.dtype if isinstance(tensor, torch.Tensor) else type(tensor).__name__
-            raise UsageError(
-                f"is {kind}", field=name, remedy="Pass a floating-point torch.Tensor"
-            )
+            raise UsageError(f"is {kind}", field=name, remedy="Pass a floating-point torch.Tensor")
         if tensor.device != tensors["means"].device:
             raise UsageError(
                 f"is on {tensor.device}, means on {tensors['means'].device}",

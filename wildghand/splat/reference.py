@@ -11,7 +11,14 @@ from typing import Any
 import torch
 
 from wildghand.splat import conventions as rules
-from wildghand.splat.scene import Options, Scene, channels_with_depth, expected_depth, per_image
+from wildghand.splat.scene import (
+    Options,
+    Scene,
+    channels_with_depth,
+    expected_depth,
+    per_image,
+    unflattened,
+)
 
 #: Elements of a (pixels, Gaussians) matrix that are worked on at a time.
 CHUNK = 1 << 22
@@ -21,65 +28,62 @@ def rasterize_reference(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[
     """Draws the scene; see `wildghand.splat.rasterize` for shapes and units.
 
     Returns:
-        channels (I, H, W, X), alphas (I, H, W, 1) and the flat part of `info`.
+        channels (I, H, W, X), alphas (I, H, W, 1) and the backend's part of `info`.
 
     Source: Kerbl et al. 2023, equations 3-6; Zwicker et al. 2001 for the projection; order and
     limits as in gsplat (see `conventions`).
     """
-    dtype = scene.means.dtype
-    images = scene.images
+    options, images = scene.options, scene.images
     means, quats, scales, opacities, colors = (
         per_image(tensor, images)
         for tensor in (scene.means, scene.quats, scene.scales, scene.opacities, scene.colors)
     )
-    options = scene.options
-    results: list[dict[str, torch.Tensor]] = []
-    drawn: list[torch.Tensor] = []
-    alphas: list[torch.Tensor] = []
+    whole: dict[str, list[torch.Tensor]] = {}
+    indices = []
     for i in range(images):
         keep = usable(means[i], quats[i], scales[i], opacities[i], colors[i])
         keep &= camera_usable(scene.viewmats[i], scene.Ks[i])
         index = keep.nonzero().squeeze(-1)
         projected = project(
-            means[i][index], quats[i][index], scales[i][index], scene.viewmats[i], scene.Ks[i],
+            means[i][index],
+            quats[i][index],
+            scales[i][index],
+            opacities[i][index],
+            scene.viewmats[i],
+            scene.Ks[i],
             options,
         )
-        opacity = opacities[i][index]
-        if options.antialiased:
-            opacity = opacity * projected["compensations"]
-        seen = projected["seen"] & (opacity.detach() >= rules.MIN_ALPHA)
-        index = index[seen]
-        projected = {name: value[seen] for name, value in projected.items()}
-        depths = means.new_zeros(means.shape[1]).index_copy(0, index, projected["depths"])
-        one = Scene(
-            *(tensor[i : i + 1] for tensor in (means, quats, scales, opacities, colors)),
-            viewmats=scene.viewmats[i : i + 1],
-            Ks=scene.Ks[i : i + 1],
-            backgrounds=None if scene.backgrounds is None else scene.backgrounds[i : i + 1],
-            options=options,
+        seen = projected.pop("seen")
+        indices.append(index[seen])
+        for name, value in projected.items():
+            empty = value.new_zeros(means.shape[1], *value.shape[1:])
+            filled = empty.index_copy(0, index[seen], value[seen])
+            whole.setdefault(name, []).append(filled)
+    flat = {name: torch.stack(values) for name, values in whole.items()}
+    info: dict[str, Any] = {
+        "means2d": unflattened(flat["means2d"], scene),
+        "depths": unflattened(flat["depths"], scene),
+        "radii": unflattened(flat["radii"], scene),
+        "visible": unflattened(torch.tensor([len(index) for index in indices]), scene),
+    }
+    flat["means2d"] = info["means2d"].reshape(flat["means2d"].shape)
+    channels, backgrounds = channels_with_depth(scene.colors, flat["depths"], scene)
+    channels = per_image(channels, images)
+    if backgrounds is None:
+        backgrounds = channels.new_zeros(images, channels.shape[-1])
+    drawn = [
+        blend(
+            *(flat[name][i][index] for name in ("means2d", "conics", "depths", "opacities")),
+            channels[i][index],
+            backgrounds[i],
+            options,
         )
-        channels, backgrounds = channels_with_depth(colors[i : i + 1], depths[None], one)
-        background = means.new_zeros(channels.shape[-1]) if backgrounds is None else backgrounds[0]
-        background = torch.where(background.isfinite(), background, torch.zeros((), dtype=dtype))
-        image, alpha, pairs = blend(
-            projected["means2d"], projected["conics"], projected["depths"], opacity[seen],
-            channels[0][index], background, options,
-        )
-        drawn.append(image)
-        alphas.append(alpha)
-        results.append(
-            _info(means.shape[1], index, projected, opacity[seen], depths, pairs)
-        )
-    if not images:
-        channels = 1 if options.render_mode in ("D", "ED") else colors.shape[-1] + len(
-            options.render_mode[4:5] or ""
-        )
-        empty = means.new_zeros(0, options.height, options.width, channels)
-        return empty, empty[..., :1], {}
-    stacked_alphas = torch.stack(alphas)
-    stacked = expected_depth(torch.stack(drawn), stacked_alphas, options.render_mode)
-    info = {name: torch.stack([result[name] for result in results]) for name in results[0]}
-    return stacked, stacked_alphas, info
+        for i, index in enumerate(indices)
+    ]
+    image, alpha, pairs = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+    if options.count_pairs:
+        info["pairs"] = unflattened(pairs, scene)
+    return expected_depth(image, alpha, options.render_mode), alpha, info
 
 
 def usable(
@@ -116,6 +120,7 @@ def project(
     means: torch.Tensor,
     quats: torch.Tensor,
     scales: torch.Tensor,
+    opacities: torch.Tensor,
     viewmat: torch.Tensor,
     K: torch.Tensor,
     options: Options,
@@ -125,8 +130,8 @@ def project(
     Returns:
         `means2d` (N, 2) px, `depths` (N,), `conics` (N, 3): the inverse covariance as
         (1 / variance along a pixel row, shear of the rows, 1 / variance across the rows), so
-        that its exponent is -1/2 (a (dx + s dy)^2 + c dy^2); `covars2d` (N, 3) px^2: xx, xy, yy
-        with the low-pass filter; `compensations` (N,); `seen` (N,) bool.
+        that the exponent is -1/2 (a (dx + s dy)^2 + c dy^2); `opacities` (N,) as blended;
+        `radii` (N, 2) px, half the size of the visible part; `seen` (N,) bool.
 
     The determinant is that of a Gram matrix, written as a sum of squares: the plain A C - B^2
     loses every digit for a needle.
@@ -151,15 +156,25 @@ def project(
     det = area + eps * (trace_x + trace_y) + eps * eps
     conics = torch.stack((C / det, -B / C, 1 / C), -1)
     means2d = torch.stack((fx * x / z + cx, fy * y / z + cy), -1)
-    finite = means2d.isfinite().all(-1) & conics.isfinite().all(-1) & det.isfinite()
-    compensations = (area / det).clamp_min(0).sqrt() if options.antialiased else zero
+    if options.antialiased:
+        # The square root of zero has no derivative; a splat without area is not seen.
+        flat = area <= 0
+        opacities = opacities * torch.where(flat, area, (torch.where(flat, det, area) / det).sqrt())
+    with torch.no_grad():
+        reach = 2 * (opacities / rules.MIN_ALPHA).log()
+        extent = (reach[:, None] * torch.stack((A, C), -1)).sqrt()
+        size = means2d.new_tensor([options.width, options.height])
+        seen = seen & (det > 0) & (opacities >= rules.MIN_ALPHA) & conics.isfinite().all(-1)
+        seen &= (extent < rules.MAX_REACH).all(-1) & (conics[:, 0] < rules.MAX_PRECISION)
+        seen &= ((means2d + extent >= 0.5) & (means2d - extent <= size - 0.5)).all(-1)
+        radii = extent.nan_to_num(0).ceil().clamp_max(2.0**30).to(torch.int32)
     return {
         "means2d": means2d,
         "depths": z,
         "conics": conics,
-        "covars2d": torch.stack((A, B, C), -1),
-        "compensations": compensations,
-        "seen": seen & finite & (det > 0),
+        "opacities": opacities,
+        "radii": radii,
+        "seen": seen,
     }
 
 
@@ -200,23 +215,3 @@ def blend(
         remaining.append(before[:, -1])
     shape = (options.height, options.width, -1)
     return torch.cat(image).reshape(shape), 1 - torch.cat(remaining).reshape(shape), pairs
-
-
-def _info(
-    count: int,
-    index: torch.Tensor,
-    projected: dict[str, torch.Tensor],
-    opacities: torch.Tensor,
-    depths: torch.Tensor,
-    pairs: torch.Tensor,
-) -> dict[str, torch.Tensor]:
-    means2d = projected["means2d"]
-    reach = 2 * (opacities.detach() / rules.MIN_ALPHA).log().clamp_min(0)
-    extent = (reach[:, None] * projected["covars2d"].detach()[:, ::2]).sqrt()
-    radii = extent.ceil().clamp_max(2.0**30).to(torch.int32)
-    return {
-        "means2d": means2d.new_zeros(count, 2).index_copy(0, index, means2d),
-        "depths": depths,
-        "radii": radii.new_zeros(count, 2).index_copy(0, index, radii),
-        "pairs": pairs,
-    }

@@ -48,6 +48,7 @@ class Scene:
     Ks: torch.Tensor  # (I, 3, 3)
     backgrounds: torch.Tensor | None  # (I, D)
     options: Options
+    image_dims: tuple[int, ...]  # the caller's leading shape of an image; its product is I
 
     @property
     def images(self) -> int:
@@ -58,6 +59,11 @@ class Scene:
     def gaussians(self) -> int:
         """How many Gaussians each image has, culled ones included."""
         return self.means.shape[1]
+
+
+def unflattened(tensor: torch.Tensor, scene: Scene) -> torch.Tensor:
+    """(I, ...) to (*image_dims, ...)."""
+    return tensor.reshape(scene.image_dims + tuple(tensor.shape[1:]))
 
 
 def per_image(tensor: torch.Tensor, images: int) -> torch.Tensor:

@@ -1,0 +1,1 @@
+"""The CPU kernels, one module for each stage; nothing here knows of torch."""

@@ -1,0 +1,220 @@
+"""Eight Gaussians at a time: from (N, k) float32 arrays to float64 vectors and back.
+
+The arrays of a call hold one Gaussian after another, (x, y, z), (x, y, z)...; the projection
+works on vectors (x, x, ...), (y, y, ...). Shuffles in registers do the exchange.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+from wildghand.splat.kernels.lanes import call, make_constant, make_fill
+from wildghand.splat.kernels.simd import Vector, shuffle
+
+#: Gaussians that are projected together.
+GROUP = 8
+#: One float64 for each of them.
+EXACT = Vector(types.float64, GROUP)
+
+_SINGLE = ir.VectorType(ir.FloatType(), GROUP)
+_LARGEST = 3.4028234663852886e38
+
+fill_exact = make_fill(EXACT)
+#: 0, 1, ... 7.
+lane_index = make_constant(EXACT, range(GROUP))
+
+
+def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any, floats: int) -> Any:
+    data = context.make_array(kind)(context, builder, array).data
+    vector = ir.VectorType(ir.FloatType(), floats)
+    return builder.bitcast(builder.gep(data, [index]), ir.PointerType(vector))
+
+
+def make_load_columns(columns: int) -> Callable[[Any, Any], Any]:
+    """An intrinsic `load(array, flat_index)` for 8 rows of `columns` float32.
+
+    It gives a tuple with one float64 vector for each column.
+    """
+
+    @intrinsic
+    def load_columns(typingctx: Any, array: Any, index: Any) -> Any:
+        result = types.UniTuple(EXACT, columns)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+            pointer = _address(context, builder, sig.args[0], *args, GROUP * columns)
+            whole = builder.load(pointer, align=4)
+            parts = []
+            for column in range(columns):
+                lanes = [row * columns + column for row in range(GROUP)]
+                part = shuffle(builder, whole, whole, lanes)
+                parts.append(builder.fpext(part, EXACT.llvm))
+            return context.make_tuple(builder, result, parts)
+
+        return result(array, types.intp), codegen
+
+    return load_columns
+
+
+load1, load2, load3, load4 = (make_load_columns(columns) for columns in range(1, 5))
+
+
+def _saturated(builder: Any, value: ir.Value) -> ir.Value:
+    """float32 of float64 lanes; what is too large becomes the largest float32."""
+    for sign, bound in (("<", _LARGEST), (">", -_LARGEST)):
+        limit = ir.Constant(value.type, [bound] * value.type.count)
+        beyond = builder.fcmp_ordered(sign, limit, value)
+        value = builder.select(beyond, limit, value)
+    return builder.fptrunc(value, ir.VectorType(ir.FloatType(), value.type.count))
+
+
+def _joined(builder: Any, parts: list[ir.Value]) -> ir.Value:
+    """One vector with the lanes of all parts, in order."""
+    while len(parts) > 1:
+        if len(parts) % 2:
+            parts = [*parts, parts[-1]]
+        wide = parts[0].type.count
+        parts = [
+            shuffle(builder, parts[k], parts[k + 1], list(range(2 * wide)))
+            for k in range(0, len(parts), 2)
+        ]
+    return parts[0]
+
+
+@intrinsic
+def add_columns(typingctx: Any, array: Any, index: Any, values: Any) -> Any:
+    """Adds a tuple of float64 vectors to 8 rows of a float32 array; saturates, never inf."""
+    columns = values.count
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        pointer = _address(context, builder, sig.args[0], args[0], args[1], GROUP * columns)
+        together = _joined(builder, cgutils.unpack_tuple(builder, args[2]))
+        lanes = [column * GROUP + row for row in range(GROUP) for column in range(columns)]
+        rows = shuffle(builder, together, together, lanes)
+        held = builder.fpext(builder.load(pointer, align=4), rows.type)
+        builder.store(_saturated(builder, builder.fadd(held, rows)), pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, values), codegen
+
+
+@intrinsic
+def store_rows(typingctx: Any, array: Any, index: Any, values: Any) -> Any:
+    """Writes 16 float64 vectors as 8 rows of 16 float32."""
+    if not isinstance(values, types.UniTuple) or values.count != 2 * GROUP:
+        return None
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        parts = [builder.fptrunc(part, _SINGLE) for part in cgutils.unpack_tuple(builder, args[2])]
+        # Vector k holds values k and k + 8 of all rows; three rounds of exchanging the blocks
+        # off the diagonal transpose both halves.
+        rows = [
+            shuffle(builder, parts[k], parts[k + GROUP], list(range(2 * GROUP)))
+            for k in range(GROUP)
+        ]
+        for step in (4, 2, 1):
+            done: list[ir.Value] = [None] * GROUP
+            for k in range(GROUP):
+                if k & step:
+                    continue
+                keep, give = [], []
+                for lane in range(2 * GROUP):
+                    other = 2 * GROUP
+                    keep.append(other + lane - step if lane & step else lane)
+                    give.append(other + lane if lane & step else lane + step)
+                done[k] = shuffle(builder, rows[k], rows[k + step], keep)
+                done[k + step] = shuffle(builder, rows[k], rows[k + step], give)
+            rows = done
+        pointer = _address(context, builder, sig.args[0], args[0], args[1], 2 * GROUP)
+        for k, row in enumerate(rows):
+            offset = ir.Constant(ir.IntType(32), k)
+            builder.store(row, builder.gep(pointer, [offset]), align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, values), codegen
+
+
+@intrinsic
+def store_column(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
+    """Writes a float64 vector as 8 numbers of the array's own kind, float32 or int32."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        if array.dtype == types.float32:
+            number = builder.fptrunc(args[2], _SINGLE)
+        else:
+            number = builder.fptosi(args[2], ir.VectorType(ir.IntType(32), GROUP))
+        pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.PointerType(number.type))
+        builder.store(number, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, value), codegen
+
+
+@intrinsic
+def floor(typingctx: Any, value: Any) -> Any:
+    """The largest whole number not above, in every lane."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        return call(builder, "floor", value, args)
+
+    return value(value), codegen
+
+
+@intrinsic
+def ceil(typingctx: Any, value: Any) -> Any:
+    """The smallest whole number not below, in every lane."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        return call(builder, "ceil", value, args)
+
+    return value(value), codegen
+
+
+@intrinsic
+def round32(typingctx: Any, value: Any) -> Any:
+    """float64 lanes rounded to the precision of float32."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        return builder.fpext(builder.fptrunc(args[0], _SINGLE), value.llvm)
+
+    return value(value), codegen
+
+
+@intrinsic
+def store_pairs(typingctx: Any, array: Any, index: Any, first: Any, second: Any) -> Any:
+    """Writes two float64 vectors as 8 pairs of int32."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        whole = ir.VectorType(ir.IntType(32), GROUP)
+        lanes = [part * GROUP + row for row in range(GROUP) for part in range(2)]
+        pairs = shuffle(
+            builder, builder.fptosi(args[2], whole), builder.fptosi(args[3], whole), lanes
+        )
+        pointer = builder.bitcast(builder.gep(data, [args[1]]), ir.PointerType(pairs.type))
+        builder.store(pairs, pointer, align=4)
+        return context.get_dummy_value()
+
+    return types.void(array, types.intp, first, second), codegen
+
+
+@intrinsic
+def total(typingctx: Any, value: Any) -> Any:
+    """Sum of the lanes of a float64 vector, in a fixed order."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        rest, width = args[0], GROUP
+        while width > 1:
+            width //= 2
+            low = shuffle(builder, rest, rest, list(range(width)))
+            high = shuffle(builder, rest, rest, list(range(width, 2 * width)))
+            rest = builder.fadd(low, high)
+        return builder.extract_element(rest, ir.Constant(ir.IntType(32), 0))
+
+    return types.float64(value), codegen
