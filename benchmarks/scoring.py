@@ -1,9 +1,9 @@
 """How long scoring takes: every weight-free metric in both protocols, beside scikit-image.
 
 Run from the repository: `python -m benchmarks.scoring [--frames 1000] [--size 256]`.
-The plain loop computes one PSNR and one full-frame SSIM per frame with scikit-image, which is
-what most evaluation scripts do. Both run in turns, so that other work on the machine slows them
-alike; the processor time says what they cost whatever else runs.
+The plain loop computes the PSNR and SSIM of both protocols with scikit-image (not the oriented
+distance), and its numbers must equal ours. Both run in turns, so that other work on the machine
+slows them alike; the processor time says what they cost whatever else runs.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 
 import numpy as np
+from scipy import ndimage
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from hwp_bench.metrics.batch import Frame, score_frames
@@ -54,18 +55,46 @@ def run_ours(frames: list[Frame], count: int, workers: int) -> None:
 
 def run_scikit_image(frames: list[Frame], count: int) -> None:
     for frame in cycle(frames, count):
-        assert isinstance(frame.prediction, np.ndarray)
-        x, y = frame.prediction / 255.0, frame.target / 255.0
-        peak_signal_noise_ratio(y, x, data_range=1.0)
-        structural_similarity(
-            y,
-            x,
-            channel_axis=2,
-            gaussian_weights=True,
-            sigma=1.5,
-            use_sample_covariance=False,
-            data_range=1.0,
-        )
+        plain_scores(frame)
+
+
+def plain_scores(frame: Frame) -> dict[str, float]:
+    """PSNR and SSIM of both protocols as one writes them down with scikit-image."""
+    assert isinstance(frame.prediction, np.ndarray)
+    prediction, target = frame.prediction / 255.0, frame.target / 255.0
+    hand = frame.mask > 127
+    region = ndimage.binary_erosion(hand, np.ones((3, 3)), border_value=1)
+    x, y = (np.pad(i * region[..., None], ((5, 5), (5, 5), (0, 0))) for i in (prediction, target))
+    _, similarity = structural_similarity(
+        x,
+        y,
+        full=True,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+    )
+    similarity = similarity[5:-5, 5:-5].mean(axis=2)
+    rows, columns = np.nonzero(hand)
+    box = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+    x, y = (image * hand[..., None] for image in (prediction, target))
+    return {
+        "psnr": peak_signal_noise_ratio(target[region], prediction[region], data_range=1.0),
+        "psnr_edge": peak_signal_noise_ratio(target[hand], prediction[hand], data_range=1.0),
+        "ssim": similarity[region].mean(),
+        "ssim_full": similarity[5:-5, 5:-5].mean(),
+        "paper_psnr": peak_signal_noise_ratio(y, x, data_range=1.0),
+        "paper_ssim": structural_similarity(x[box], y[box], channel_axis=2, data_range=2.0),
+    }
+
+
+def check_agreement(frames: list[Frame]) -> None:
+    """Stop where the two loops do not compute the same numbers."""
+    for frame, score in zip(frames, score_frames(frames), strict=True):
+        for name, value in plain_scores(frame).items():
+            if abs(value - score.values[name]) > 1e-9:
+                raise SystemExit(f"{name}: {score.values[name]} here, {value} by scikit-image")
 
 
 def timed(work: Callable[[], None]) -> np.ndarray:
@@ -88,7 +117,7 @@ def main() -> None:
     turn = max(PLAIN_SHARE, args.frames // ROUNDS)
     for share in (0.25, 1.0):
         frames = make_frames(args.size, share)
-        run_ours(frames, DISTINCT, args.workers)
+        check_agreement(frames)
         ours, plain = np.zeros(2), np.zeros(2)
         for _ in range(ROUNDS):
             ours += timed(partial(run_ours, frames, turn, args.workers))
