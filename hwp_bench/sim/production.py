@@ -30,13 +30,14 @@ from hwp_bench.errors import HwpError, UsageError
 from hwp_bench.files import canonical_json, sha256_json
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.progress import progress
+from hwp_bench.sim.atlas import skin_atlas
 from hwp_bench.sim.camera import focus_point, intrinsics, viewmat
 from hwp_bench.sim.estimates import estimate_hands, estimate_mask
 from hwp_bench.sim.locks import alone
 from hwp_bench.sim.motion import hand_parameters
 from hwp_bench.sim.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.scene import Scene, load_scene
-from hwp_bench.sim.subject import scene_hands, skin_atlas
+from hwp_bench.sim.subject import scene_hands
 from hwp_bench.sim.worker import exr_file, frame_file, read_frame, render_frames
 
 #: Version of the renderer's look; part of every render key.
@@ -245,7 +246,8 @@ def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters
     staged = [hands_at(scene, item.seconds) for item in plans]
     for side in scene.sides:
         rows = [
-            hand_parameters(hands[side], side, subjects[side].joints, focus) for hands in staged
+            hand_parameters(hands[side], side, subjects[side].model_joints, focus)
+            for hands in staged
         ]
         truth[side] = HandParameters(
             pose=np.stack([pose for pose, _ in rows]),
@@ -257,9 +259,8 @@ def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters
 
 
 def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
-    template = scene_hands(scene)[scene.sides[0]].template
-    right = scene_hands(scene).get("right")
-    model = right.template if right is not None else template
+    model = scene_hands(scene)[scene.sides[0]].model
+    known = "anny" if scene.subject.model.startswith("gltf:") else scene.subject.model
     return CaptureInfo(
         id=scene.id,
         hands=scene.hands,
@@ -269,7 +270,7 @@ def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
         width=size,
         height=size,
         frame_count=len(plans),
-        hand_model=HandModelId(name=model.name, digest=model.digest, source="anny"),
+        hand_model=HandModelId(name=model.name, digest=model.digest, source=known),
         perturbations={
             call.kind: tuple(item.severity[call.kind] for item in plans) for call in scene.effects
         },

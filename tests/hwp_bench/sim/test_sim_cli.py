@@ -12,7 +12,7 @@ import pytest
 from tiny_scene import SINGLE
 
 from hwp_bench.cli.main import main
-from hwp_bench.sim.calibration import TARGET_PSNR, Calibration, calibrate, write_strengths
+from hwp_bench.sim.calibration import TARGETS, Calibration, calibrate, write_strengths
 from hwp_bench.sim.scene import Scene, load_scene
 
 SceneMaker = Callable[..., Scene]
@@ -89,7 +89,7 @@ def test_calibration_finds_the_stated_loss(make_scene: SceneMaker) -> None:
     assert call is not None
     result = calibrate(scene, call, size=40)
     assert list(result.strengths) == sorted(result.strengths)
-    np.testing.assert_allclose(result.measured, TARGET_PSNR, atol=0.7)
+    np.testing.assert_allclose(result.measured, TARGETS["illumination"], atol=0.7)
 
 
 def test_strengths_are_written_into_the_file(scene_file: Path) -> None:

