@@ -26,6 +26,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_plan(actions.add_parser("plan", help="print what a scene's frames need and will cost"))
     _add_render(actions.add_parser("render", help="render captures"))
     _add_preview(actions.add_parser("preview", help="contact sheet and animation of a scene"))
+    _add_gallery(actions.add_parser("gallery", help="pictures for the documentation"))
     _add_calibrate(actions.add_parser("calibrate", help="solve strengths for stated losses"))
 
 
@@ -38,6 +39,7 @@ def run(args: argparse.Namespace) -> int:
         "plan": commands.print_plan,
         "render": commands.render,
         "preview": commands.preview,
+        "gallery": commands.gallery,
         "calibrate": commands.calibrate_scenes,
     }[args.action]
     return action(args)
@@ -79,6 +81,10 @@ def _add_preview(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stage", action="store_true", help="draw hand, objects, light and camera in 3D instead"
     )
+
+
+def _add_gallery(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("-o", "--out", default="docs/pictures/sim", help="folder")
 
 
 def _add_calibrate(parser: argparse.ArgumentParser) -> None:

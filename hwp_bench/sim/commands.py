@@ -117,6 +117,15 @@ def preview(args: argparse.Namespace) -> int:
     return 0
 
 
+def gallery(args: argparse.Namespace) -> int:
+    """Write the documentation's strips."""
+    from hwp_bench.sim.gallery import write_gallery
+
+    for path in write_gallery(Path(args.out)):
+        print(path)
+    return 0
+
+
 def calibrate_scenes(args: argparse.Namespace) -> int:
     """Solve strengths, print them with what was measured, and write them if asked."""
     from hwp_bench.sim.calibration import calibrate, write_strengths
