@@ -102,7 +102,9 @@ def match_outline(
     rows = np.arange(len(chosen))
     matched = leaves[rows, best] & (length[:, 0] > 1e-6)
     before, after = values[rows, best], values[rows, best + 1]
-    offset = steps[best] + _STEP * before / np.minimum(before - after, -1e-6)
+    crossing = steps[best] + _STEP * before / np.minimum(before - after, -1e-6)
+    # A vertex that lies inside the mesh's own outline shall stay as far inside the mask's.
+    offset = crossing + _sample(own, places)
     outline = Outline.nothing()
     count = len(chosen)
     outline.index[:count] = chosen

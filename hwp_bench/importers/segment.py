@@ -30,6 +30,9 @@ class MaskSettings:
     window: float = 0.03
     #: Holes narrower than this are filled.
     hole: float = 0.02
+    #: How much colour counts against smoothness, over GrabCut's own balance, which closes the
+    #: narrow gaps between fingers.
+    colour_weight: float = 4.0
 
 
 #: For the first masks, made from landmarks alone.
@@ -143,7 +146,8 @@ def segment(
             colour = cv2.blur(np.clip(evidence(lab, model), -5.0, 5.0), (edge, edge))
             labels[inside & (colour > settings.forbidding)] = cv2.GC_FGD
         # The rectangle is not read in this mode; the mixtures are written to, so copies.
-        background, foreground = model.background.copy(), model.foreground.copy()
+        sharp = model.sharpened(settings.colour_weight)
+        background, foreground = sharp.background, sharp.foreground
         cv2.grabCut(lab, labels, (0, 0, 1, 1), background, foreground, 1, cv2.GC_EVAL_FREEZE_MODEL)
         skin = _tidy((labels & 1) * np.uint8(255), prompt.silhouette, hand_size, settings)
     return Segmentation(skin, np.where(prompt.hand_side, skin, 0).astype(np.uint8))
