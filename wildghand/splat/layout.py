@@ -49,17 +49,15 @@ def flatten(
     _require(tuple(Ks.shape) == (*expected[:-2], 3, 3), "Ks", Ks, _show((*expected[:-2], 3, 3)))
     groups = math.prod(batch)
     images = groups * cameras
+    _require(images >= 1, "viewmats", viewmats, "at least one camera")
 
     flat: dict[str, torch.Tensor] = {"means": means.reshape(groups, count, 3)}
     for name, tail in (("quats", (count, 4)), ("scales", (count, 3)), ("opacities", (count,))):
         tensor = tensors[name]
         shape = tuple(tensor.shape)
-        _require(shape in (tail, (*batch, *tail)), name, tensor, _show((*batch, *tail)))
-        flat[name] = (
-            tensor.reshape(-1 if shape == tail else groups, *tail)
-            if count
-            else (tensor.reshape(groups, *tail))
-        )
+        shared = shape == tail
+        _require(shared or shape == (*batch, *tail), name, tensor, _show((*batch, *tail)))
+        flat[name] = tensor.reshape(1 if shared else groups, *tail)
     flat["colors"] = _flat_colors(tensors["colors"], batch, cameras, count)
     channels = flat["colors"].shape[-1]
     flat_backgrounds = None
@@ -95,10 +93,10 @@ def check_options(options: Options, rasterize_mode: str) -> None:
     ):
         if value not in choices:
             raise UsageError(f"is {value!r}", field=name, remedy=f"Use one of {', '.join(choices)}")
-    for name, value in (("width", options.width), ("height", options.height)):
-        if not isinstance(value, int) or isinstance(value, bool) or not 1 <= value <= 32768:
+    for name, size in (("width", options.width), ("height", options.height)):
+        if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= 32768:
             raise UsageError(
-                f"is {value!r}", field=name, remedy="Use a whole number of pixels, 1 to 32768"
+                f"is {size!r}", field=name, remedy="Use a whole number of pixels, 1 to 32768"
             )
     if not 0.0 <= options.near_plane < options.far_plane:
         raise UsageError(

@@ -6,18 +6,32 @@ from typing import Any
 
 import torch
 
-from wildghand.splat.autograd import Blend, Project, call_for
-from wildghand.splat.scene import Scene, channels_with_depth, expected_depth, per_image, unflattened
+from wildghand.splat.autograd import Blend, Call, Project
+from wildghand.splat.scene import (
+    Scene,
+    channels_with_depth,
+    expected_depth,
+    per_image,
+    unflattened,
+)
+from wildghand.splat.stages import camera_rows
+from wildghand.splat.warmup import warm_up
 
 
 def rasterize_numba(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """Draws the scene; see `wildghand.splat.rasterize` for shapes and units.
+    """Draws the scene, float32 on the CPU; see `wildghand.splat.rasterize`.
 
     Returns:
         channels (I, H, W, X), alphas (I, H, W, 1) and the backend's part of `info`.
     """
-    call = call_for(scene)
     options = scene.options
+    warm_up()
+    call = Call(
+        options,
+        camera_rows(
+            scene.viewmats.detach().double().numpy(), scene.Ks.detach().double().numpy(), options
+        ),
+    )
     means2d, shapes, depths, compensations = Project.apply(
         scene.means.contiguous(),
         scene.quats.contiguous(),
@@ -29,15 +43,14 @@ def rasterize_numba(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str,
     )
     # The caller's tensor lies on the way, so that its gradient can be kept.
     info_means2d = unflattened(means2d, scene)
-    means2d = info_means2d.reshape(means2d.shape)
     opacities = scene.opacities
     if options.antialiased:
         opacities = per_image(opacities, scene.images) * compensations
     channels, backgrounds = channels_with_depth(scene.colors, depths, scene)
     if backgrounds is None:
-        backgrounds = means2d.new_zeros(scene.images, channels.shape[-1])
+        backgrounds = torch.zeros(scene.images, channels.shape[-1])
     images, alphas = Blend.apply(
-        means2d,
+        info_means2d.reshape(means2d.shape),
         shapes,
         opacities.contiguous(),
         channels.contiguous(),

@@ -73,7 +73,10 @@ def rasterize_reference(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[
         backgrounds = channels.new_zeros(images, channels.shape[-1])
     drawn = [
         blend(
-            *(flat[name][i][index] for name in ("means2d", "conics", "depths", "opacities")),
+            flat["means2d"][i][index],
+            flat["conics"][i][index],
+            flat["depths"][i][index],
+            flat["opacities"][i][index],
             channels[i][index],
             backgrounds[i],
             options,

@@ -1,5 +1,8 @@
 """Alpha of a splat over the pixels of a block: shared by the forward and the backward pass."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np

@@ -5,6 +5,9 @@ splats touch and counts them; a prefix sum over (tile, chunk) says where each ch
 chunk then writes. Any number of chunks gives the same lists.
 """
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math

@@ -1,5 +1,8 @@
 """Forward pass: every tile blends its splats from front to back."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np
@@ -17,8 +20,16 @@ from wildghand.splat.kernels.alpha import (
 )
 from wildghand.splat.kernels.channels import count, fetch, paint
 from wildghand.splat.kernels.jit import inline, kernel
-from wildghand.splat.kernels.lanes import absolute, atomic_next, bits, lowest_bit, negate
-from wildghand.splat.kernels.lanes import count_bits, select, store
+from wildghand.splat.kernels.lanes import (
+    absolute,
+    atomic_next,
+    bits,
+    count_bits,
+    lowest_bit,
+    negate,
+    select,
+    store,
+)
 from wildghand.splat.kernels.tiles import (
     BLOCKS,
     LANES,

@@ -9,6 +9,9 @@ loses a T (c . v) at every splat. So nothing but the image and its transmittance
 from the forward pass.
 """
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np
@@ -33,8 +36,15 @@ from wildghand.splat.kernels.channels import (
     start_sums,
 )
 from wildghand.splat.kernels.jit import inline, kernel
-from wildghand.splat.kernels.lanes import absolute, atomic_next, fma, lowest_bit, negate
-from wildghand.splat.kernels.lanes import select, store
+from wildghand.splat.kernels.lanes import (
+    absolute,
+    atomic_next,
+    fma,
+    lowest_bit,
+    negate,
+    select,
+    store,
+)
 from wildghand.splat.kernels.tiles import (
     BLOCKS,
     LANES,

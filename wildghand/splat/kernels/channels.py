@@ -5,17 +5,21 @@ their gradients live in registers: the path of RGB. A plain number is a loop ove
 compiled kernel for every D. The kernels are written once against the functions here.
 """
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
-from numba import njit, types
+from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic, overload
+from numba.extending import overload
 
 from wildghand.splat.kernels.lanes import fma, store, store_sums
+from wildghand.splat.kernels.simd import intrinsic
 from wildghand.splat.kernels.tiles import LANES, PIXELS, fill_pixels, load_pixels
 
 _ZERO = np.float32(0.0)

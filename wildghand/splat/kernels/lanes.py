@@ -8,11 +8,11 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
 from wildghand.splat.kernels.simd import (
     Mask,
     Vector,
+    intrinsic,
     shuffle,
     splat,
     vector_of,
@@ -296,7 +296,8 @@ def _sum_rows(builder: ir.IRBuilder, rows: list[Any], lanes: int) -> ir.Value:
     width = lanes  # lanes over which one row's sum is still spread
     while width > 1:
         half = width // 2
-        low, high = [], []
+        low: list[int] = []
+        high: list[int] = []
         for first in range(0, 2 * lanes, width):
             low += range(first, first + half)
             high += range(first + half, first + width)

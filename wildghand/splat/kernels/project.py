@@ -4,6 +4,9 @@ float64 because a needle's projected covariance is nearly singular, and because 
 coordinate in float32 is off by up to 3e-5 px, which an image error of 1e-5 does not allow.
 """
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
@@ -27,7 +30,7 @@ from wildghand.splat.kernels.rows import (
     store_pairs,
     store_rows,
 )
-from wildghand.splat.kernels.tiles import TILE_HEIGHT, TILE_WIDTH
+from wildghand.splat.kernels.tiles import TILE_HEIGHT
 
 #: Gaussians in a piece of work; sums over Gaussians are made piece by piece, in order.
 PIECE = 512

@@ -1,5 +1,8 @@
 """Gradients through the projection: from the image plane to the Gaussians and the cameras."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np
@@ -7,7 +10,6 @@ import numpy as np
 from wildghand.splat.kernels.jit import inline, kernel
 from wildghand.splat.kernels.lanes import atomic_next, select, square_root
 from wildghand.splat.kernels.project import (
-    CAMERA,
     PIECE,
     clamp,
     cross,

@@ -4,6 +4,9 @@ Every pair owns its slot, so threads share nothing, and each Gaussian adds its s
 order of its tiles: the sums are the same bits on every run.
 """
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math

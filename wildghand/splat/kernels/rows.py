@@ -12,10 +12,9 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core import cgutils
-from numba.extending import intrinsic
 
 from wildghand.splat.kernels.lanes import call, make_constant, make_fill
-from wildghand.splat.kernels.simd import Vector, shuffle
+from wildghand.splat.kernels.simd import Vector, intrinsic, shuffle
 
 #: Gaussians that are projected together.
 GROUP = 8
@@ -30,7 +29,7 @@ fill_exact = make_fill(EXACT)
 lane_index = make_constant(EXACT, range(GROUP))
 
 
-def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any, floats: int) -> Any:
+def _address(context: Any, builder: Any, kind: Any, array: Any, index: Any, *, floats: int) -> Any:
     data = context.make_array(kind)(context, builder, array).data
     vector = ir.VectorType(ir.FloatType(), floats)
     return builder.bitcast(builder.gep(data, [index]), ir.PointerType(vector))
@@ -47,7 +46,7 @@ def make_load_columns(columns: int) -> Callable[[Any, Any], Any]:
         result = types.UniTuple(EXACT, columns)
 
         def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-            pointer = _address(context, builder, sig.args[0], *args, GROUP * columns)
+            pointer = _address(context, builder, sig.args[0], *args, floats=GROUP * columns)
             whole = builder.load(pointer, align=4)
             parts = []
             for column in range(columns):
@@ -92,7 +91,7 @@ def add_columns(typingctx: Any, array: Any, index: Any, values: Any) -> Any:
     columns = values.count
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        pointer = _address(context, builder, sig.args[0], args[0], args[1], GROUP * columns)
+        pointer = _address(context, builder, sig.args[0], args[0], args[1], floats=GROUP * columns)
         together = _joined(builder, cgutils.unpack_tuple(builder, args[2]))
         lanes = [column * GROUP + row for row in range(GROUP) for column in range(columns)]
         rows = shuffle(builder, together, together, lanes)
@@ -130,7 +129,7 @@ def store_rows(typingctx: Any, array: Any, index: Any, values: Any) -> Any:
                 done[k] = shuffle(builder, rows[k], rows[k + step], keep)
                 done[k + step] = shuffle(builder, rows[k], rows[k + step], give)
             rows = done
-        pointer = _address(context, builder, sig.args[0], args[0], args[1], 2 * GROUP)
+        pointer = _address(context, builder, sig.args[0], args[0], args[1], floats=2 * GROUP)
         for k, row in enumerate(rows):
             offset = ir.Constant(ir.IntType(32), k)
             builder.store(row, builder.gep(pointer, [offset]), align=4)

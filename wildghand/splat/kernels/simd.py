@@ -20,7 +20,11 @@ from typing import Any
 from llvmlite import ir
 from numba import types
 from numba.core.typing.templates import AbstractTemplate, infer_global, signature
+from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import lower_builtin, models, register_model
+
+#: Untyped: what numba says of its own types differs between its versions.
+intrinsic: Any = numba_intrinsic
 
 _LLVM = {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}
 

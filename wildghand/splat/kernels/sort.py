@@ -1,5 +1,8 @@
 """The visible Gaussians of each image from front to back: a radix sort on float32 depth."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import numpy as np

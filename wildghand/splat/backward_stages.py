@@ -1,0 +1,178 @@
+"""The stages of the CPU backend's backward pass, from arrays to arrays."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from wildghand.splat.kernels.blend_backward import background_backward, blend_backward
+from wildghand.splat.kernels.channels import slot_size
+from wildghand.splat.kernels.project import PIECE
+from wildghand.splat.kernels.project_backward import project_backward
+from wildghand.splat.kernels.reduce import reduce_slots
+from wildghand.splat.memory import lease
+from wildghand.splat.scene import Options
+from wildghand.splat.stages import (
+    UNROLLED,
+    Drawn,
+    Inputs,
+    Lists,
+    Projected,
+    kernel_channels,
+    share_of,
+)
+from wildghand.splat.threads import run, thread_count
+
+
+@dataclass(frozen=True)
+class BlendGradients:
+    """Gradients of what was blended; the last two are zeros to begin with."""
+
+    means2d: np.ndarray  # (I, N, 2)
+    shapes: np.ndarray  # (I, N, 3), see kernels.reduce
+    opacities: np.ndarray  # (S, N)
+    colors: np.ndarray  # (S, N, D)
+
+
+@dataclass(frozen=True)
+class ProjectGradients:
+    """Gradients of what was projected; zeros to begin with."""
+
+    means: np.ndarray  # (S, N, 3)
+    quats: np.ndarray  # (S, N, 4)
+    scales: np.ndarray  # (S, N, 3)
+
+
+def blend_backward_stage(
+    projected: Projected,
+    lists: Lists,
+    opacities: np.ndarray,
+    colors: np.ndarray,
+    drawn: Drawn,
+    images: np.ndarray,
+    v_images: np.ndarray,
+    v_alphas: np.ndarray,
+    options: Options,
+    gradients: BlendGradients,
+) -> None:
+    """Fills `gradients`.
+
+    Args:
+        projected, lists, drawn, images: as the forward pass left them.
+        opacities: (S, N) float32, as blended.
+        colors: (S, N, D) float32.
+        v_images, v_alphas: gradients of the loss, (I, H, W, D) and (I, H, W, 1).
+        options: of the call.
+        gradients: overwritten.
+    """
+    count, gaussians = projected.depths.shape
+    size = colors.shape[-1]
+    looked_at = drawn.stops - lists.start[:-1]
+    first_slot = np.cumsum(looked_at) - looked_at
+    floats = slot_size(size, size in UNROLLED)
+    slots = lease((int(looked_at.sum()), floats), np.float32)
+    slot_of = lease((len(lists.entries),), np.int32)
+    run(
+        blend_backward,
+        thread_count(len(drawn.stops)),
+        lists.start,
+        drawn.stops,
+        first_slot,
+        lists.entries,
+        projected.geom.reshape(-1),
+        colors.reshape(-1),
+        share_of(len(colors), count),
+        options.width,
+        options.height,
+        gaussians,
+        images.reshape(-1),
+        drawn.remaining.reshape(-1),
+        v_images.reshape(-1),
+        v_alphas.reshape(-1),
+        slots.reshape(-1),
+        floats,
+        slot_of,
+        kernel_channels(size),
+    )
+    run(
+        reduce_slots,
+        thread_count(gaussians // PIECE),
+        gaussians,
+        size,
+        projected.geom.reshape(-1),
+        opacities.reshape(-1),
+        share_of(len(opacities), count),
+        share_of(len(colors), count),
+        lists.first_entry,
+        projected.depths,
+        slot_of,
+        slots.reshape(-1),
+        floats,
+        gradients.means2d.reshape(-1),
+        gradients.shapes.reshape(-1),
+        gradients.opacities.reshape(-1),
+        gradients.colors.reshape(-1),
+    )
+
+
+def background_backward_stage(v_images: np.ndarray, remaining: np.ndarray) -> np.ndarray:
+    """Gradient of the backgrounds, (I, D) float64."""
+    count, height, _, size = v_images.shape
+    lines = np.empty((count, height, size))
+    run(background_backward, thread_count(count * height), v_images, remaining, lines)
+    return lines.sum(1)
+
+
+def project_backward_stage(
+    inputs: Inputs,
+    projected: Projected,
+    v_means2d: np.ndarray,
+    v_shapes: np.ndarray,
+    v_depths: np.ndarray,
+    v_compensations: np.ndarray,
+    options: Options,
+    want_cameras: bool,
+    gradients: ProjectGradients,
+) -> np.ndarray:
+    """Fills `gradients`.
+
+    Args:
+        inputs: of the call; opacities and colours are not read.
+        projected: from the forward pass.
+        v_means2d, v_shapes: (I, N, 2) and (I, N, 3) float32, see `BlendGradients`.
+        v_depths: (I, N) float32, or (0,) for none.
+        v_compensations: (I, N) float32.
+        options: of the call.
+        want_cameras: whether the result is wanted.
+        gradients: overwritten.
+
+    Returns:
+        Gradients of the cameras, (I, 12) float64: rotation row by row, then translation.
+    """
+    count, gaussians = projected.depths.shape
+    pieces = max(1, gaussians // PIECE)
+    v_cameras = np.zeros((count, pieces if want_cameras else 0, 12))
+    run(
+        project_backward,
+        thread_count(pieces),
+        inputs.means.reshape(-1),
+        inputs.quats.reshape(-1),
+        inputs.scales.reshape(-1),
+        inputs.shares,
+        inputs.cameras,
+        gaussians,
+        projected.depths.reshape(-1),
+        options.eps2d,
+        v_means2d.reshape(-1),
+        v_shapes.reshape(-1),
+        v_depths.reshape(-1),
+        v_compensations.reshape(-1),
+        options.antialiased,
+        want_cameras,
+        gradients.means.reshape(-1),
+        gradients.quats.reshape(-1),
+        gradients.scales.reshape(-1),
+        v_cameras,
+    )
+    return v_cameras.sum(1)

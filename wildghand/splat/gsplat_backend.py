@@ -1,0 +1,216 @@
+"""CUDA backend: gsplat's kernels, behind the same signature and with the same manners.
+
+gsplat computes in float32 throughout and does not look for values that are not finite: one NaN
+quaternion makes every gradient NaN. So one number is read back from the device before the call; if
+it tells of anything unusual, the offenders are replaced by Gaussians that draw nothing and get
+no gradient. Otherwise the tensors go to gsplat as they are.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from hwp_bench.errors import MissingDependency
+from wildghand.splat import conventions as rules
+from wildghand.splat.scene import Scene, channels_with_depth
+
+#: Beyond this, squares of lengths leave float32 inside gsplat.
+_MAX_LENGTH = 1e15
+#: gsplat divides by the depth of all that is not nearer than the near plane.
+_LEAST_NEAR_PLANE = 1e-6
+#: gsplat takes leading batch dimensions from this version on; before, sets of Gaussians that
+#: differ between images are drawn one after the other.
+_BATCHES_SINCE = (1, 5, 2)
+
+
+def rasterize_gsplat(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Draws the scene, float32 on a CUDA device; see `wildghand.splat.rasterize`.
+
+    Returns:
+        channels (I, H, W, X), alphas (I, H, W, 1) and the backend's part of `info`.
+
+    Raises:
+        MissingDependency: gsplat is not installed, or cannot load its kernels.
+
+    Source: gsplat, `gsplat.rasterization` (Ye et al. 2024), version 1.4 or later.
+    """
+    rasterization, batches = _gsplat()
+    if not scene.gaussians:
+        return _nothing(scene)
+    tensors = _harmless(scene)
+    groups = max(tensors[name].shape[0] for name in ("means", "quats", "scales", "opacities"))
+    if groups <= 1:
+        channels, alphas, meta = _draw(rasterization, scene, _single(tensors))
+    elif batches:
+        channels, alphas, meta = _draw(rasterization, scene, _batch(tensors, groups))
+    else:
+        channels, alphas, meta = _one_by_one(rasterization, scene, tensors, groups)
+    return channels.flatten(0, -4), alphas.flatten(0, -4), _info(scene, meta)
+
+
+def _nothing(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Images of no Gaussian at all, for which gsplat's kernels cannot be started."""
+    options = scene.options
+    depths = scene.means.new_zeros(scene.images, 0)
+    channels, backgrounds = channels_with_depth(scene.colors, depths, scene)
+    size = channels.shape[-1]
+    if backgrounds is None:
+        backgrounds = scene.means.new_zeros(scene.images, size)
+    shape = (scene.images, options.height, options.width)
+    images = backgrounds[:, None, None].expand(*shape, size).contiguous()
+    meta = {
+        "means2d": scene.means.new_zeros(scene.images, 0, 2),
+        "depths": depths,
+        "radii": scene.means.new_zeros(scene.images, 0, 2, dtype=torch.int32),
+    }
+    return images, scene.means.new_zeros(*shape, 1), _info(scene, meta)
+
+
+def _info(scene: Scene, meta: dict[str, Any]) -> dict[str, Any]:
+    count = scene.gaussians
+    info = {}
+    for name, tail in (("means2d", (count, 2)), ("depths", (count,)), ("radii", (count, 2))):
+        value = meta[name]
+        if name == "radii" and value.ndim == meta["depths"].ndim:  # one radius, in older ones
+            value = value.unsqueeze(-1).expand(*value.shape, 2)
+        # Where the shape is right already, this must be the very tensor whose gradient gsplat
+        # makes, not a view of it.
+        shape = (*scene.image_dims, *tail)
+        info[name] = value if tuple(value.shape) == shape else value.reshape(shape)
+    info["visible"] = (info["radii"] > 0).all(-1).sum(-1)
+    return info
+
+
+def _gsplat() -> tuple[Callable[..., Any], bool]:
+    """gsplat's function, and whether it takes batches."""
+    try:
+        import gsplat
+    except (ImportError, OSError) as error:
+        raise MissingDependency(
+            f"the CUDA backend needs gsplat, which cannot be imported ({error})",
+            field="backend",
+            remedy="Install it with `pip install gsplat`, or pass CPU tensors",
+        ) from error
+    version = tuple(int(part) for part in gsplat.__version__.split("+")[0].split(".")[:3])
+    return gsplat.rasterization, version >= _BATCHES_SINCE
+
+
+def _harmless(scene: Scene) -> dict[str, torch.Tensor]:
+    """The scene's tensors, with everything that gsplat cannot take made invisible."""
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
+    tensors = {name: getattr(scene, name) for name in names}
+    tensors = {name: tensor for name, tensor in tensors.items() if tensor is not None}
+    with torch.no_grad():
+        largest = torch.cat([tensor.reshape(-1) for tensor in tensors.values()]).abs().amax()
+        focals = scene.Ks.diagonal(dim1=-2, dim2=-1)[:, :2]
+        smallest = torch.minimum(scene.quats.norm(dim=-1).amin(), focals.amin())
+        usual = (smallest > 0) & (largest < _MAX_LENGTH)  # false for NaN
+    return tensors if bool(usual) else _sanitised(scene, tensors)
+
+
+def _sanitised(scene: Scene, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    def within(tensor: torch.Tensor, bound: float) -> torch.Tensor:
+        return (tensor.detach().abs() <= bound).all(-1)
+
+    def replaced(tensor: torch.Tensor, good: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+        return torch.where(good.reshape(good.shape + (1,) * value.ndim), tensor, value)
+
+    result = dict(tensors)
+    zero = scene.means.new_zeros(())
+    quats = scene.quats
+    good = {
+        "means": within(scene.means, _MAX_LENGTH),
+        "scales": within(scene.scales, _MAX_LENGTH),
+        "quats": within(quats, _MAX_LENGTH) & (quats.detach().norm(dim=-1) > 0),
+        "colors": within(scene.colors, rules.MAX_COLOR),
+        "opacities": scene.opacities.detach().isfinite(),
+    }
+    values = {
+        "means": zero.expand(3),
+        "scales": zero.expand(3),
+        "quats": scene.means.new_tensor([1.0, 0.0, 0.0, 0.0]),
+        "colors": zero.expand(scene.colors.shape[-1]),
+        "opacities": zero,
+    }
+    for name, value in values.items():
+        result[name] = replaced(tensors[name], good[name], value)
+    # An offender in any argument makes the Gaussian vanish: its opacity is zero.
+    opacities = result["opacities"]
+    finest = max(mask.shape[0] for mask in good.values())
+    visible = torch.ones(finest, scene.gaussians, dtype=torch.bool, device=opacities.device)
+    for mask in good.values():
+        visible = visible & _repeat(mask, finest)
+    result["opacities"] = torch.where(visible, _repeat(opacities, finest), zero)
+    cameras = tensors["viewmats"].detach().flatten(1).isfinite().all(1)
+    cameras &= tensors["Ks"].detach().flatten(1).isfinite().all(1)
+    cameras &= (tensors["Ks"].detach().diagonal(dim1=-2, dim2=-1)[:, :2] > 0).all(1)
+    away = torch.eye(4, device=zero.device, dtype=zero.dtype)
+    away[:3, :3] = 0.0
+    away[2, 3] = -1.0  # all that there is lies behind this camera
+    result["viewmats"] = replaced(tensors["viewmats"], cameras, away)
+    result["Ks"] = replaced(tensors["Ks"], cameras, torch.eye(3, device=zero.device))
+    return result
+
+
+def _repeat(tensor: torch.Tensor, count: int) -> torch.Tensor:
+    return tensor.repeat_interleave(count // tensor.shape[0], dim=0)
+
+
+def _single(tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+    """Arguments for cameras that all see the same Gaussians; colours may differ."""
+    flat = {name: tensors[name][0] for name in ("means", "quats", "scales", "opacities")}
+    colors = tensors["colors"]
+    flat["colors"] = colors[0] if colors.shape[0] == 1 else colors
+    return {**tensors, **flat}
+
+
+def _batch(tensors: dict[str, torch.Tensor], groups: int) -> dict[str, torch.Tensor]:
+    """Arguments with a leading dimension of sets of Gaussians."""
+    cameras = tensors["viewmats"].shape[0] // groups
+    result = {}
+    for name, tensor in tensors.items():
+        if name in ("viewmats", "Ks", "backgrounds") or (
+            name == "colors" and tensor.shape[0] > groups
+        ):
+            result[name] = tensor.reshape(groups, cameras, *tensor.shape[1:])
+        else:
+            result[name] = tensor.expand(groups, *tensor.shape[1:])
+    return result
+
+
+def _draw(
+    rasterization: Callable[..., Any], scene: Scene, tensors: dict[str, torch.Tensor]
+) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    options = scene.options
+    return rasterization(
+        **tensors,
+        width=options.width,
+        height=options.height,
+        near_plane=max(options.near_plane, _LEAST_NEAR_PLANE),
+        far_plane=options.far_plane,
+        eps2d=options.eps2d,
+        packed=False,
+        render_mode=options.render_mode,
+        rasterize_mode="antialiased" if options.antialiased else "classic",
+    )
+
+
+def _one_by_one(
+    rasterization: Callable[..., Any],
+    scene: Scene,
+    tensors: dict[str, torch.Tensor],
+    groups: int,
+) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    batched = _batch(tensors, groups)
+    parts = [
+        _draw(rasterization, scene, {name: tensor[g] for name, tensor in batched.items()})
+        for g in range(groups)
+    ]
+    channels = torch.stack([part[0] for part in parts])
+    alphas = torch.stack([part[1] for part in parts])
+    names = ("means2d", "radii", "depths")
+    meta = {name: torch.stack([part[2][name] for part in parts]) for name in names}
+    return channels, alphas, meta

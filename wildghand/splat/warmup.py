@@ -1,0 +1,103 @@
+"""The first call: compiles the kernels, or loads them, and says so when it takes long."""
+
+from __future__ import annotations
+
+import functools
+import logging
+import pickle
+import threading
+import time
+
+import numpy as np
+
+from wildghand.splat import backward_stages, stages
+from wildghand.splat.kernels.jit import Kernel
+from wildghand.splat.kernels.rows import GROUP
+from wildghand.splat.scene import Options
+
+_log = logging.getLogger("wildghand.splat")
+_lock = threading.Lock()
+
+#: What a damaged or full cache may raise.
+_CACHE_ERRORS = (OSError, EOFError, pickle.PickleError, ImportError, AttributeError, IndexError)
+
+
+def warm_up() -> None:
+    """Makes the kernels ready; costs nothing from the second call on.
+
+    Compiling takes some ten seconds, once on a machine. A person who waits is told on the log
+    (level WARNING, which goes to standard error unless logging is set up otherwise).
+    """
+    with _lock:
+        _warm_up()
+
+
+@functools.cache
+def _warm_up() -> None:
+    kernels = all_kernels()
+    if not all(kernel.on_disk() for kernel in kernels):
+        _log.warning(
+            "compiling the CPU rasterizer, once on this machine; it takes some ten seconds"
+        )
+    start = time.perf_counter()
+    try:
+        _run_all()
+    except _CACHE_ERRORS as error:
+        _log.warning("the compile cache cannot be used (%s); compiling without it", error)
+        for kernel in kernels:
+            kernel.forget_cache()
+        _run_all()
+    if any(kernel.compiled_anew() for kernel in kernels):
+        _log.warning("compiled the CPU rasterizer in %.1f s", time.perf_counter() - start)
+
+
+def all_kernels() -> list[Kernel]:
+    """Every kernel that the stages call."""
+    modules = (stages, backward_stages)
+    return [
+        value for module in modules for value in vars(module).values() if isinstance(value, Kernel)
+    ]
+
+
+def _run_all() -> None:
+    """Every kernel in every version: unrolled and for any number of channels."""
+    for channels in (*stages.UNROLLED, max(stages.UNROLLED) + 1):
+        _draw_nothing(channels)
+
+
+def _draw_nothing(channels: int) -> None:
+    """Runs every stage, forward and backward, on Gaussians that are all culled."""
+    options = Options(1, 1, 0.01, 1e10, 0.3, "RGB", antialiased=False, count_pairs=False)
+
+    def zeros(*shape: int) -> np.ndarray:
+        return np.zeros(shape, np.float32)
+
+    cameras = stages.camera_rows(np.eye(4)[None], np.eye(3)[None], options)
+    opacities, colors = zeros(1, GROUP), zeros(1, GROUP, channels)
+    inputs = stages.Inputs(
+        zeros(1, GROUP, 3), zeros(1, GROUP, 4), zeros(1, GROUP, 3), opacities, colors, cameras
+    )
+    projected = stages.project_stage(inputs, options)
+    lists = stages.list_stage(projected, options)
+    image, alpha = zeros(1, 1, 1, channels), zeros(1, 1, 1, 1)
+    drawn = stages.blend_stage(projected, lists, colors, zeros(1, channels), options, image, alpha)
+    backward_stages.background_backward_stage(image, drawn.remaining)
+    blended = backward_stages.BlendGradients(
+        zeros(1, GROUP, 2), zeros(1, GROUP, 3), opacities, zeros(1, GROUP, channels)
+    )
+    backward_stages.blend_backward_stage(
+        projected, lists, opacities, colors, drawn, image, image, alpha, options, blended
+    )
+    backward_stages.project_backward_stage(
+        inputs,
+        projected,
+        blended.means2d,
+        blended.shapes,
+        zeros(0),
+        zeros(1, GROUP),
+        options,
+        True,
+        backward_stages.ProjectGradients(
+            zeros(1, GROUP, 3), zeros(1, GROUP, 4), zeros(1, GROUP, 3)
+        ),
+    )
