@@ -28,7 +28,7 @@ class Forecast:
     subframes: int
     #: Frames of each group: frames with the same set of effects acting.
     groups: Mapping[str, int]
-    #: Seconds of one process by group, or None without probing.
+    #: Processor seconds by group, or None without probing.
     seconds: Mapping[str, float] | None
     #: Rays by group, or None without probing.
     rays: Mapping[str, int] | None

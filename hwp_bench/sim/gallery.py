@@ -97,7 +97,7 @@ def _with_estimate(scene: Scene, call: EffectCall, result: FrameResult) -> Frame
     seconds = result.plan.seconds
     angle, length = registered(call.kind).estimate_error(result.plan.strength[call.kind])
     rng = generator(scene.seed, "gallery")
-    image = np.ascontiguousarray(result.rgb)
+    image = result.rgb.copy()
     for side, moment in hands_at(scene, seconds).items():
         hand = scene_hands(scene)[side]
         pose, transl = hand_parameters(moment, side, hand.joints, focus_point())

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 class Ledger:
     """Measured cost of a frame."""
 
-    #: Seconds by pass.
+    #: Processor seconds by pass; other work on the machine does not count.
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))
     #: Rays by purpose.
     rays: Counter[str] = field(default_factory=Counter)
@@ -21,6 +21,6 @@ class Ledger:
     @contextmanager
     def time(self, name: str) -> Iterator[None]:
         """Charge what happens inside to one pass."""
-        start = time.perf_counter()
+        start = time.process_time()
         yield
-        self.seconds[name] += time.perf_counter() - start
+        self.seconds[name] += time.process_time() - start

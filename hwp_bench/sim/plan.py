@@ -77,7 +77,9 @@ def plan(
     subframes = 1
     if shutter is not None:
         way = _screen_way(scene, seconds, shutter, size)
-        subframes = int(np.clip(np.ceil(way / SUBFRAME_STEP) + 1, 2, MAX_SUBFRAMES))
+        # In fours: each pixel then aims at every part of the lamp equally often.
+        fours = np.ceil(way / SUBFRAME_STEP / 4.0)
+        subframes = int(np.clip(4 * fours, 4, MAX_SUBFRAMES))
     passes = ["hands", "shadow", "sky", "backdrop"]
     if "hand_object_interaction" in acting:
         passes.append("objects")

@@ -65,7 +65,7 @@ def strip(results: list[FrameResult], columns: int) -> np.ndarray:
 def _captioned(result: FrameResult) -> np.ndarray:
     import cv2
 
-    image = np.ascontiguousarray(result.rgb)
+    image = result.rgb.copy()
     severity = [
         f"{_SHORT.get(name, name)}{value}" for name, value in result.plan.severity.items() if value
     ]

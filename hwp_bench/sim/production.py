@@ -41,7 +41,7 @@ from hwp_bench.sim.subject import scene_hands
 from hwp_bench.sim.worker import exr_file, frame_file, read_frame, render_frames
 
 #: Version of the renderer's look; part of every render key.
-RENDERER = 3
+RENDERER = 4
 #: Smallest and largest edge of a picture.
 SIZES = (32, 1024)
 #: Edge of a picture where nobody says otherwise.
@@ -235,7 +235,7 @@ def _assemble(
             costs.append(json.loads(arrays["cost"].tobytes()))
         writer.true_hands(truth)
         writer.extra("scene.json", canonical_json(scene.to_json()))
-        writer.extra("cost.json", json.dumps({"wall_seconds": seconds, "frames": costs}))
+        writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
 
 
 def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters]:
