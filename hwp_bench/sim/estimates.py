@@ -16,6 +16,8 @@ EASY_ERROR = (0.005, 0.0004)
 CORRELATION = 0.7
 #: Chance of a gross failure in a frame of severity 4 or 5 of an effect that moves the hand.
 FAILURE_CHANCE = 0.06
+#: Least and largest share of an occluder over the hand that a segmenter takes for hand.
+OCCLUDER_TAKEN = (0.2, 0.9)
 _MOVING = ("complex_poses", "motion_blur")
 
 
@@ -60,7 +62,8 @@ def estimate_mask(
 ) -> np.ndarray:
     """Visible-hand mask as a segmenter gives it.
 
-    Soft and slightly displaced borders, bites around occluders, and now and then a missed part.
+    Soft and slightly displaced borders, bites around occluders, parts of occluders taken for
+    hand, and now and then a missed part.
 
     Args:
         scene: the scene.
@@ -81,11 +84,12 @@ def estimate_mask(
     wobble = gaussian_filter(rng.normal(size=(size, size)), 6.0 * unit)
     wobble *= 0.10 / max(float(wobble.std()), 1e-9)
     covered = np.clip(clean_coverage - coverage, 0.0, 1.0)
-    if covered.max() > 0.5:
+    if "objects" in plan.passes and covered.max() > 0.5:
         bite = gaussian_filter(covered, 2.5 * unit)
         bites = gaussian_filter(rng.normal(size=(size, size)), 4.0 * unit)
         bites /= max(float(bites.std()), 1e-9)
         soft = soft - 0.9 * bite * np.clip(bites + 0.3, 0.0, 1.0)
+        soft = np.maximum(soft, gaussian_filter(covered * _taken(covered, rng), unit))
     if rng.uniform() < (0.10 if plan.strength else 0.02) and coverage.sum() > 10:
         soft = soft * _missed_part(coverage, rng)
     mask = np.clip((soft - 0.5 + wobble) / 0.35 + 0.5, 0.0, 1.0)
@@ -108,6 +112,15 @@ def _correlated(noise: np.ndarray) -> np.ndarray:
     for frame in range(1, len(walk)):
         walk[frame] = keep * walk[frame - 1] + add * noise[frame]
     return walk
+
+
+def _taken(covered: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Where a segmenter takes the occluder for hand: blobs over a part of it, (S, S) 0 or 1."""
+    from scipy.ndimage import gaussian_filter
+
+    field = gaussian_filter(rng.normal(size=covered.shape), len(covered) / 20.0)
+    share = rng.uniform(*OCCLUDER_TAKEN)
+    return field > np.quantile(field[covered > 0.5], 1.0 - share)
 
 
 def _missed_part(coverage: np.ndarray, rng: np.random.Generator) -> np.ndarray:

@@ -59,8 +59,8 @@ def _capture_strip(scene: Scene) -> list[FrameResult]:
         for part in call.episodes[step : step + 1]
     ][: PICTURES - 3]
     moments = sorted([0.0, *busy, 0.87, 0.96])
-    moments = (moments + [0.8, 0.83, 0.99, 0.9])[:PICTURES]
-    frames = [int(moment * scene.frame_count) for moment in sorted(moments)]
+    moments += [0.8, 0.83, 0.99, 0.9]
+    frames = [int(moment * scene.frame_count) for moment in sorted(moments[:PICTURES])]
     return [render_frame(scene, frame, scene.frame_count, SIZE) for frame in frames]
 
 

@@ -188,3 +188,22 @@ def test_a_suite_in_the_cache_is_not_rendered_again(
     (first,) = ensure_suite("smoke", tmp_path, workers=1)
     monkeypatch.setattr(production, "render_frames", None)
     assert ensure_suite("smoke", tmp_path) == [first]
+
+
+def test_masks_err_at_borders_and_occluders(make_scene: SceneMaker) -> None:
+    from tiny_scene import CLEAN, OBJECT
+
+    from hwp_bench.sim.estimates import OCCLUDER_TAKEN, estimate_mask
+    from hwp_bench.sim.frame import render_frame
+
+    scene = make_scene()
+    for frame in (CLEAN, OBJECT):
+        result = render_frame(scene, frame, 40, 96)
+        mask = estimate_mask(scene, result.plan, result.coverage, result.clean_coverage) / 255.0
+        hand, covered = result.coverage > 0.99, result.clean_coverage - result.coverage > 0.9
+        backdrop = result.clean_coverage < 0.01
+        assert mask[hand].mean() > 0.85
+        assert mask[backdrop].mean() < 0.05
+        assert ((mask > 0.02) & (mask < 0.98)).any()
+    taken = float(mask[covered].mean())
+    assert OCCLUDER_TAKEN[0] - 0.15 < taken < OCCLUDER_TAKEN[1] + 0.1
