@@ -86,6 +86,8 @@ def rasterize(
             `radii` (..., C, N, 2): int32, half the size of the visible part in pixels, 0 if
                 culled;
             `visible` (..., C): how many Gaussians were not culled;
+            `margin` (..., C, H, W), reference only: how near a pixel comes to one of the limits in
+                `conventions`, as the least |log ratio|; float32 may decide otherwise below 1e-5;
             `pairs` (..., C): blended (Gaussian, pixel) pairs, if counted;
             `width`, `height`, `n_cameras`, `n_batches`, `backend`, and, as gsplat's strategies
             look for them, `camera_ids` and `gaussian_ids`: None.

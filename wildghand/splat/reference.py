@@ -44,21 +44,14 @@ def rasterize_reference(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[
         keep = usable(means[i], quats[i], scales[i], opacities[i], colors[i])
         keep &= camera_usable(scene.viewmats[i], scene.Ks[i])
         index = keep.nonzero().squeeze(-1)
-        projected = project(
-            means[i][index],
-            quats[i][index],
-            scales[i][index],
-            opacities[i][index],
-            scene.viewmats[i],
-            scene.Ks[i],
-            options,
-        )
-        seen = projected.pop("seen")
-        indices.append(index[seen])
-        for name, value in projected.items():
+        with torch.no_grad():
+            seen = _project_some(scene, i, index)["seen"]
+        # Once more without those that are not seen: zero times an infinite slope is NaN.
+        index = index[seen]
+        indices.append(index)
+        for name, value in _project_some(scene, i, index).items():
             empty = value.new_zeros(means.shape[1], *value.shape[1:])
-            filled = empty.index_copy(0, index[seen], value[seen])
-            whole.setdefault(name, []).append(filled)
+            whole.setdefault(name, []).append(empty.index_copy(0, index, value))
     flat = {name: torch.stack(values) for name, values in whole.items()}
     info: dict[str, Any] = {
         "means2d": unflattened(flat["means2d"], scene),
@@ -83,10 +76,21 @@ def rasterize_reference(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[
         )
         for i, index in enumerate(indices)
     ]
-    image, alpha, pairs = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+    image, alpha, pairs, margin = (torch.stack(parts) for parts in zip(*drawn, strict=True))
+    info["margin"] = unflattened(margin, scene)
     if options.count_pairs:
         info["pairs"] = unflattened(pairs, scene)
     return expected_depth(image, alpha, options.render_mode), alpha, info
+
+
+def _project_some(scene: Scene, image: int, index: torch.Tensor) -> dict[str, torch.Tensor]:
+    means, quats, scales, opacities = (
+        per_image(tensor, scene.images)[image][index]
+        for tensor in (scene.means, scene.quats, scene.scales, scene.opacities)
+    )
+    return project(
+        means, quats, scales, opacities, scene.viewmats[image], scene.Ks[image], scene.options
+    )
 
 
 def usable(
@@ -189,8 +193,13 @@ def blend(
     channels: torch.Tensor,
     background: torch.Tensor,
     options: Options,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Front-to-back blending of one image: (H, W, X), alpha (H, W, 1), blended pairs ().
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Front-to-back blending of one image.
+
+    Returns:
+        (H, W, X); alpha (H, W, 1); blended pairs (); and, (H, W), how near a pixel comes to one of
+        the limits in `conventions`, as the least |log ratio|: below 1e-5, float32 may decide
+        otherwise.
 
     The order is that of float32 depth, ties by index, as every backend sorts.
     """
@@ -201,20 +210,37 @@ def blend(
     rows = torch.arange(options.height, dtype=kind, device=means2d.device) + 0.5
     columns = torch.arange(options.width, dtype=kind, device=means2d.device) + 0.5
     pixels = torch.cartesian_prod(rows, columns).flip(-1)
-    image, remaining = [], []
+    image, remaining, margin = [], [], []
     pairs = torch.zeros((), dtype=torch.int64)
     for some in pixels.split(max(1, CHUNK // max(1, len(means2d)))):
         dx, dy = (some[:, None] - means2d).unbind(-1)
         a, shear, c = conics.unbind(-1)
         power = -0.5 * (a * (dx + shear * dy) ** 2 + c * dy * dy)
-        alpha = (opacities * power.exp()).clamp_max(rules.MAX_ALPHA)
+        raw = opacities * power.exp()
+        alpha = raw.clamp_max(rules.MAX_ALPHA)
         alpha = torch.where(alpha >= rules.MIN_ALPHA, alpha, torch.zeros_like(alpha))
         after = torch.cumprod(1 - alpha.detach(), 1)
         alpha = torch.where(after > rules.MIN_TRANSMITTANCE, alpha, torch.zeros_like(alpha))
-        pairs += (alpha > 0).sum()
+        pairs += (alpha > 0).sum().cpu()
+        margin.append(_margin(raw.detach(), after))
         after = torch.cumprod(1 - alpha, 1)
-        before = torch.cat((torch.ones_like(after[:, :1]), after), 1)
+        before = torch.cat((after.new_ones(len(after), 1), after), 1)
         image.append((alpha * before[:, :-1]) @ channels + before[:, -1:] * background)
         remaining.append(before[:, -1])
-    shape = (options.height, options.width, -1)
-    return torch.cat(image).reshape(shape), 1 - torch.cat(remaining).reshape(shape), pairs
+    shape = (options.height, options.width)
+    return (
+        torch.cat(image).reshape(*shape, -1),
+        1 - torch.cat(remaining).reshape(*shape, 1),
+        pairs,
+        torch.cat(margin).reshape(shape),
+    )
+
+
+def _margin(alpha: torch.Tensor, after: torch.Tensor) -> torch.Tensor:
+    """How near each pixel comes to a decision, as the least |log ratio| to a limit. (P,)."""
+    limits = ((alpha, rules.MIN_ALPHA), (alpha, rules.MAX_ALPHA), (after, rules.MIN_TRANSMITTANCE))
+    least = alpha.new_full(alpha.shape[:1], torch.inf)
+    if alpha.shape[1]:
+        for value, limit in limits:
+            least = torch.minimum(least, (value / limit).log().abs().amin(1))
+    return least

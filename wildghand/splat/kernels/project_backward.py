@@ -57,13 +57,17 @@ def keep(mask, values):
 
 
 @inline
-def shape_gradient(u, v, A, C, det, shear, v_log_a, v_log_c, v_shear):
-    """Gradient of the two rows of J R M from that of the Cholesky form of their Gram matrix."""
+def shape_gradient(u, v, normal, C, det, shear, eps2d, v_log_a, v_log_c, v_shear):
+    """Gradient of the two rows of J R M from that of the Cholesky form of their Gram matrix.
+
+    `normal` is u x v. What is left of u after its part along v, u + shear v, is tiny beside u for
+    a needle; as a vector product it keeps its digits.
+    """
     a = C / det
     c = 1.0 / C
     g = a * v_log_a * (0.0 - 2.0)  # twice the gradient of 1 / a
     h = v_shear * square_root(a * c)
-    rest = plus(u, by(v, shear))
+    rest = by(plus(cross(v, normal), by(u, fill_exact(eps2d))), c)
     v_u = plus(by(rest, g), by(v, 0.0 - h))
     tilted = plus(rest, by(v, shear))
     v_v = plus(by(rest, shear * g), plus(by(tilted, 0.0 - h), by(v, c * v_log_c * (0.0 - 2.0))))
@@ -165,12 +169,14 @@ def project_backward(
                 normal = cross(u, v)
                 area = dot(normal, normal)
                 trace_x, trace_y = dot(u, u), dot(v, v)
-                A, B, C = trace_x + eps2d, dot(u, v), trace_y + eps2d
+                B, C = dot(u, v), trace_y + eps2d
                 det = area + (trace_x + trace_y) * eps2d + eps2d * eps2d
 
                 v_px, v_py = load2(v_means2d, 2 * at)
                 v_log_a, v_log_c, v_shear = load3(v_shapes, 3 * at)
-                v_u, v_v = shape_gradient(u, v, A, C, det, 0.0 - B / C, v_log_a, v_log_c, v_shear)
+                v_u, v_v = shape_gradient(
+                    u, v, normal, C, det, 0.0 - B / C, eps2d, v_log_a, v_log_c, v_shear
+                )
                 if antialiased:
                     (v_ratio,) = load1(v_compensations, at)
                     more_u, more_v = compensation_gradient(u, v, normal, area, det, eps2d, v_ratio)

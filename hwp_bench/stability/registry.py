@@ -1,0 +1,136 @@
+"""Hard cases as data, and where they come from.
+
+A part of the product, or a stranger's package, offers its cases by an entry point in the group
+`hwp_bench.stability` that names a function without arguments:
+
+    [project.entry-points."hwp_bench.stability"]
+    splat = "wildghand.splat.hard_cases:cases"
+
+So the benchmark runs cases of packages that it knows nothing of, and imports none of them
+before their cases are asked for.
+"""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import time
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from importlib import metadata
+
+from hwp_bench.errors import HwpError, MissingDependency, UsageError
+
+#: Entry-point group of functions that return cases.
+ENTRY_POINTS = "hwp_bench.stability"
+
+
+@dataclass(frozen=True)
+class Context:
+    """What a case is told when it runs."""
+
+    #: The implementation to run it on; empty where a case has no choice of them.
+    backend: str = ""
+
+
+@dataclass(frozen=True)
+class Measured:
+    """What came out."""
+
+    #: Whether what must hold did hold.
+    passed: bool
+    #: The numbers behind it, in a few words.
+    text: str
+
+
+@dataclass(frozen=True)
+class Case:
+    """One hard case."""
+
+    #: Unique within its group.
+    name: str
+    #: The part of the product that it tries, such as "splat".
+    group: str
+    #: What must hold, as a person reads it.
+    must_hold: str
+    #: Tries it. An exception counts as a failure.
+    run: Callable[[Context], Measured]
+    #: Implementations that this machine has; one empty name where there is no choice.
+    backends: tuple[str, ...] = ("",)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """One case, run on one backend."""
+
+    case: Case
+    backend: str
+    measured: Measured
+    seconds: float
+
+
+def find_cases(groups: Sequence[str] = (), providers: Sequence[str] = ()) -> list[Case]:
+    """The cases that are on offer.
+
+    Args:
+        groups: only these; all if empty.
+        providers: more sources, each "module:function", beside the installed entry points.
+
+    Raises:
+        UsageError: a group that nobody offers.
+        MissingDependency: nothing is installed that offers cases.
+        HwpError: a source cannot be loaded.
+    """
+    sources = {point.name: point.value for point in metadata.entry_points(group=ENTRY_POINTS)}
+    every = dict.fromkeys([*sources.values(), *providers])
+    cases = [case for source in every for case in _load(source)]
+    if not cases:
+        raise MissingDependency(
+            "no installed package offers hard cases",
+            remedy="Install the project with `pip install -e .`, or name one with --provider",
+        )
+    known = list(dict.fromkeys(case.group for case in cases))
+    for group in groups:
+        if group not in known:
+            near = difflib.get_close_matches(group, known, n=1)
+            hint = f"Did you mean {near[0]!r}? " if near else ""
+            raise UsageError(
+                f"there is no group {group!r}",
+                field="--group",
+                remedy=f"{hint}There are {', '.join(known)}",
+            )
+    return [case for case in cases if not groups or case.group in groups]
+
+
+def run_cases(
+    cases: Iterable[Case], backends: Sequence[str] = (), clock: Callable[[], float] = time.monotonic
+) -> Iterator[Outcome]:
+    """Runs cases one by one, each on every backend that it has, and yields as it goes.
+
+    Args:
+        cases: in the order to run them.
+        backends: only on these; on all if empty.
+        clock: seconds.
+    """
+    for case in cases:
+        for backend in case.backends:
+            if backends and backend not in backends:
+                continue
+            start = clock()
+            try:
+                measured = case.run(Context(backend))
+            except Exception as error:  # what a case throws is its result
+                measured = Measured(False, f"raised {type(error).__name__}: {error}")
+            yield Outcome(case, backend, measured, clock() - start)
+
+
+def _load(source: str) -> list[Case]:
+    module, _, function = source.partition(":")
+    try:
+        return list(getattr(importlib.import_module(module), function)())
+    except (ImportError, AttributeError, TypeError) as error:
+        raise HwpError(
+            f"cannot be loaded ({type(error).__name__}: {error})",
+            where=source,
+            remedy='A provider is "module:function" and returns cases',
+        ) from error
