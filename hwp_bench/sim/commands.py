@@ -57,7 +57,7 @@ def list_scenes(args: argparse.Namespace) -> int:
 
 def print_plan(args: argparse.Namespace) -> int:
     """Print passes and predicted cost."""
-    from hwp_bench.sim.forecast import forecast, plan_table
+    from hwp_bench.sim.forecast import forecast, plan_table, share_table
 
     reports = [
         forecast(scene, args.frames, args.size, probe=not args.no_probe)
@@ -67,6 +67,9 @@ def print_plan(args: argparse.Namespace) -> int:
         print(json.dumps([report.to_json() for report in reports], indent=1))
     else:
         print(plan_table(reports))
+        if not args.no_probe:
+            print()
+            print(share_table(reports))
     return 0
 
 

@@ -7,9 +7,13 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from hwp_bench.sim.effects import ORDER
 from hwp_bench.sim.frame import carry_out
 from hwp_bench.sim.plan import FramePlan, plan
 from hwp_bench.sim.scene import Scene
+
+# Joins the names of effects that act in the same frame.
+_PLUS = " + "
 
 
 @dataclass(frozen=True)
@@ -32,6 +36,28 @@ class Forecast:
     seconds: Mapping[str, float] | None
     #: Rays by group, or None without probing.
     rays: Mapping[str, int] | None
+
+    def shares(self) -> dict[str, float] | None:
+        """Seconds by what calls for them: `clean`, then each effect on top; they add up to all.
+
+        Where effects meet in a frame the extra cost is split by what each costs alone.
+        """
+        if self.seconds is None:
+            return None
+        base = self.seconds.get("clean", 0.0) / max(self.groups.get("clean", 0), 1)
+        shares = {"clean": base * self.frame_count}
+        alone = {
+            name: max(self.seconds[name] / count - base, 1e-6)
+            for name, count in self.groups.items()
+            if name != "clean" and _PLUS not in name
+        }
+        for name, count in self.groups.items():
+            kinds = [] if name == "clean" else name.split(_PLUS)
+            weights = [alone.get(kind, 1e-6) for kind in kinds]
+            extra = self.seconds[name] - base * count
+            for kind, weight in zip(kinds, weights, strict=True):
+                shares[kind] = shares.get(kind, 0.0) + extra * weight / sum(weights)
+        return shares
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values."""
@@ -73,7 +99,7 @@ def forecast(
 
 def group_name(item: FramePlan) -> str:
     """Name of the group of a frame: the effects that act in it, or `clean`."""
-    return " + ".join(item.strength) or "clean"
+    return _PLUS.join(item.strength) or "clean"
 
 
 def _probed(
@@ -89,6 +115,21 @@ def _probed(
         seconds[name] = round(scale * sum(ledger.seconds.values()), 3)
         rays[name] = round(scale * sum(ledger.rays.values()))
     return seconds, rays
+
+
+def share_table(forecasts: list[Forecast]) -> str:
+    """A Markdown table: what each effect of each scene costs, in processor seconds."""
+    lines = [
+        f"| scene | frames | clean | {' | '.join(ORDER)} | all | s a frame |",
+        "| --- | ---: | ---: | " + "---: | " * len(ORDER) + "---: | ---: |",
+    ]
+    for item in forecasts:
+        shares = item.shares() or {}
+        total = sum(shares.values())
+        cells = [f"{shares[name]:.0f}" if name in shares else "" for name in ("clean", *ORDER)]
+        row = [item.scene, str(item.frame_count), *cells, f"{total:.0f}"]
+        lines.append("| " + " | ".join([*row, f"{total / item.frame_count:.2f}"]) + " |")
+    return "\n".join(lines)
 
 
 def plan_table(forecasts: list[Forecast]) -> str:

@@ -7,14 +7,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hwp_bench.sim.camera import FOCUS_DISTANCE, intrinsics, viewmat
-from hwp_bench.sim.colors import linear_to_srgb
 from hwp_bench.sim.effects.base import Shutter
 from hwp_bench.sim.ledger import Ledger
 from hwp_bench.sim.motion import HandMoment
 from hwp_bench.sim.picture import Lens, Picture, take_picture
 from hwp_bench.sim.plan import FramePlan, hands_at, lights_at, objects_at, plan
 from hwp_bench.sim.scene import Scene
-from hwp_bench.sim.seeds import generator
+from hwp_bench.sim.sensor import develop, sensor_noise
 from hwp_bench.sim.shade import steady_light
 from hwp_bench.sim.stage import Stage, between
 from hwp_bench.sim.subject import MOVING
@@ -75,9 +74,9 @@ def carry_out(scene: Scene, recipe: FramePlan, size: int) -> FrameResult:
         things = stage.things(objects_at(scene, recipe, recipe.seconds), hands)
         disturbed = take_picture(scene, lens, body, things, lights_at(scene, recipe), ledger)
     with ledger.time("sensor"):
-        noise = _sensor_noise(scene, recipe.frame, size) if "sensor" in recipe.passes else None
-        clean_rgb = _develop(clean.color, noise)
-        rgb = clean_rgb if disturbed is clean else _develop(disturbed.color, noise)
+        noise = sensor_noise(scene, recipe.frame, size) if "sensor" in recipe.passes else None
+        clean_rgb = develop(clean.color, noise)
+        rgb = clean_rgb if disturbed is clean else develop(disturbed.color, noise)
     return FrameResult(
         rgb=rgb,
         clean=clean_rgb,
@@ -131,15 +130,3 @@ def _exposed(
         color += picture.color / recipe.subframes
         coverage += picture.coverage / recipe.subframes
     return Picture(color, coverage)
-
-
-def _sensor_noise(scene: Scene, frame: int, size: int) -> np.ndarray:
-    rng = generator(scene.seed, "sensor", frame)
-    return scene.noise * rng.normal(size=(size, size, 3))
-
-
-def _develop(color: np.ndarray, noise: np.ndarray | None) -> np.ndarray:
-    """Linear light to 8-bit sRGB; noise grows with the square root of the light."""
-    if noise is not None:
-        color = color + noise * np.sqrt(np.clip(color, 0.02, 1.0))
-    return np.round(linear_to_srgb(color) * 255.0).astype(np.uint8)

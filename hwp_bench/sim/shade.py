@@ -14,6 +14,25 @@ from hwp_bench.sim.surface import Material, Surface
 
 
 @dataclass(frozen=True, eq=False)
+class CastShadow:
+    """A soft-edged shadow over one side of the scene."""
+
+    #: (3,) unit vector across the edge, into the shadow.
+    across: np.ndarray
+    #: Where the edge is along it, m.
+    edge: float
+    #: Width of the edge, m.
+    width: float
+    #: Share of the key light that is lost inside, 0-1.
+    depth: float
+
+    def passed(self, points: np.ndarray) -> np.ndarray:
+        """Share of the key light that passes at (N, 3) points: (N,)."""
+        x = np.clip((points @ self.across - self.edge) / self.width + 0.5, 0.0, 1.0)
+        return 1.0 - self.depth * x * x * (3.0 - 2.0 * x)
+
+
+@dataclass(frozen=True, eq=False)
 class Lights:
     """The light in one frame, in linear sRGB relative to white."""
 
@@ -27,6 +46,8 @@ class Lights:
     ground: np.ndarray
     #: Factor on everything at the end: what the exposure does.
     exposure: float = 1.0
+    #: Shadow that something outside the picture casts, or None.
+    cast: CastShadow | None = None
 
 
 def steady_light(light: Light) -> Lights:
@@ -148,6 +169,8 @@ def shade(samples: Samples, lights: Lights, lit: np.ndarray) -> np.ndarray:
     Source: Lambert with wrapped terminator for skin, hemisphere sky, and the GGX lobe with
     Schlick's Fresnel term and Smith-Schlick visibility for the gloss.
     """
+    if lights.cast is not None:
+        lit = lit * lights.cast.passed(samples.points)
     cosine = samples.normals @ lights.direction
     wrap = samples.wrap
     diffuse = np.clip((cosine[:, None] + wrap) / (1.0 + wrap) ** 2, 0.0, None)

@@ -10,16 +10,16 @@ from hwp_bench.sim.colors import lamp_color
 from hwp_bench.sim.effects.base import Effect
 from hwp_bench.sim.fields import Fields
 from hwp_bench.sim.mesh import unit
-from hwp_bench.sim.scene import EffectCall, Scene
-from hwp_bench.sim.shade import Lights
+from hwp_bench.sim.scene import EffectCall, Episode, Scene
+from hwp_bench.sim.shade import CastShadow, Lights
 
 #: What an episode can do to the light.
-MODES = ("dim", "bright", "warm", "cool", "move", "flicker")
+MODES = ("dim", "bright", "warm", "cool", "move", "flicker", "shadow")
 
 
 def _modes(call: EffectCall, where: str) -> tuple[str, ...]:
     fields = Fields(call.settings, where, "effects(illumination).")
-    modes = fields.rest().get("modes", ["dim", "warm", "move", "bright", "cool"])
+    modes = fields.rest().get("modes", ["dim", "warm", "move", "bright", "cool", "shadow"])
     unknown = set(call.settings) - {"modes"}
     if unknown:
         raise fields.wrong(sorted(unknown)[0], "is unknown")
@@ -56,10 +56,23 @@ class _Illumination(Effect):
             return replace(
                 lights, key=lights.key * tint, sky=lights.sky * tint, ground=lights.ground * tint
             )
+        if mode == "shadow":
+            return replace(lights, cast=_passing_shadow(call.episodes[number], moment, strength))
         return _moved(lights, strength)
 
     def estimate_error(self, strength: float) -> tuple[float, float]:
         return 0.004 * strength, 0.0005 * strength
+
+
+def _passing_shadow(episode: Episode, moment: float, strength: float) -> CastShadow:
+    """A shadow that sweeps over the hands during an episode; black at strength 1.3."""
+    through = (moment - episode.start) / (episode.end - episode.start)
+    return CastShadow(
+        across=unit(np.array([1.0, 0.35, 0.0])),
+        edge=0.12 * (1.0 - 4.0 * min(through, 1.0 - through)),
+        width=0.03,
+        depth=min(1.0, strength / 1.3),
+    )
 
 
 def _moved(lights: Lights, strength: float) -> Lights:

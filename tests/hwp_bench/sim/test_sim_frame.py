@@ -167,3 +167,8 @@ def test_the_forecast_is_the_sum_of_what_is_called_for(make_scene: SceneMaker) -
     # Clean frames differ in pose only; their rays differ by how much of the picture they fill.
     assert 0.5 < report.rays["clean"] / (report.groups["clean"] * clean) < 2.0
     assert "| tiny | clean |" in plan_table([report])
+    shares, seconds = report.shares(), report.seconds
+    assert shares is not None
+    assert seconds is not None
+    assert set(shares) == {"clean", *(call.kind for call in scene.effects)}
+    assert sum(shares.values()) == pytest.approx(sum(seconds.values()))
