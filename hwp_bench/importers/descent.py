@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import fields
 
 import torch
@@ -64,6 +65,33 @@ def descend(
         return min(1.0, (step + 1) / _WARM_UP) * (_LAST_RATE + (1.0 - _LAST_RATE) * fall)
 
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, schedule)
+    with _one_thread():
+        return _run(model, energy, steps, optimizer, scheduler, update)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Hold torch to one thread: its operations here are too small to share out.
+
+    On a busy machine the threads of a small operation wait for each other, and a fit takes
+    several times as long.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _run(
+    model: ClipModel,
+    energy: Callable[[ClipModel, PosedClip], torch.Tensor],
+    steps: int,
+    optimizer: torch.optim.Optimizer,
+    scheduler: torch.optim.lr_scheduler.LRScheduler,
+    update: Callable[[int], None] | None,
+) -> float:
     value = math.nan
     for step in range(steps):
         optimizer.zero_grad(set_to_none=True)

@@ -35,6 +35,10 @@ class FitSettings:
     motion_weight: float = 0.3
     #: Weight of the joint-limit penalty (rad^2 beyond the anatomical range).
     limit_weight: float = 300.0
+    #: Overlap of fingers with each other or the palm, m.
+    contact_scale: float = 0.003
+    #: Weight of that overlap.
+    contact_weight: float = 0.5
     #: Weight of the finger angles squared: what nothing else decides stays near the rest pose.
     pose_weight: float = 0.02
     #: Constant distance between the tracker's landmark and the model's joint, m.
@@ -51,4 +55,4 @@ class FitSettings:
     #: How far an outline vertex looks for the mask's outline, as a share of the hand's size.
     contour_reach: float = 0.06
     #: Weight of one outline vertex; neighbours say the same, so each counts little.
-    contour_weight: float = 0.15
+    contour_weight: float = 0.2

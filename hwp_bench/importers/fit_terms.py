@@ -9,6 +9,7 @@ from hwp_bench.hands.joint_limits import anatomical_limits, joint_limit_penalty
 from hwp_bench.importers.clip_model import ClipModel, PosedClip
 from hwp_bench.importers.fit_settings import FitSettings
 from hwp_bench.importers.landmarks import Landmarks
+from hwp_bench.importers.self_contact import ContactEnergy
 
 
 class LandmarkEnergy:
@@ -39,6 +40,7 @@ class LandmarkEnergy:
         self.world = model.world - model.world.mean(dim=1, keepdim=True)
         self.hand_size = hand_size(landmarks)
         self.limits = anatomical_limits(model.template)
+        self.contact = ContactEnergy(model.template, settings.contact_scale)
         self.pace = (30.0 / fps) ** 2
         self.prior = settings.prior_share * float(landmarks.detected.sum())
 
@@ -73,6 +75,7 @@ class LandmarkEnergy:
     def _priors(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         settings, free = self.settings, model.variables
         anatomy = settings.limit_weight * joint_limit_penalty(posed.pose, self.limits).sum()
+        anatomy = anatomy + settings.contact_weight * self.contact(model, posed)
         anatomy = anatomy + settings.pose_weight * (free.fingers**2).sum()
         constant = (free.betas**2).sum()
         constant = constant + ((free.offsets / settings.offset_scale) ** 2).sum()
