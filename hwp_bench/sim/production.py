@@ -226,8 +226,9 @@ def _assemble(
             coverage = arrays["coverage"].astype(np.float64)
             writer.frame(item.frame, arrays["rgb"])
             writer.clean(item.frame, arrays["clean"])
-            writer.true_mask(item.frame, np.floor(255.0 * coverage + 1e-3).astype(np.uint8))
+            writer.true_mask(item.frame, _eight_bits(coverage))
             clean_coverage = arrays["clean_coverage"].astype(np.float64)
+            writer.clean_mask(item.frame, _eight_bits(clean_coverage))
             writer.mask(item.frame, estimate_mask(scene, item, coverage, clean_coverage))
             layers = exr_file(waiting, item.frame)
             if layers.exists():
@@ -236,6 +237,11 @@ def _assemble(
         writer.true_hands(truth)
         writer.extra("scene.json", canonical_json(scene.to_json()))
         writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
+
+
+def _eight_bits(coverage: np.ndarray) -> np.ndarray:
+    """Coverage in 8 bits, rounded down: 255 means that the hand covers the pixel fully."""
+    return np.floor(255.0 * coverage + 1e-3).astype(np.uint8)
 
 
 def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters]:
