@@ -99,6 +99,7 @@ def make_capture(tmp_path: Path) -> CaptureMaker:
                 if truth:
                     writer.clean(frame, picture)
                     writer.true_mask(frame, mask)
+                    writer.clean_mask(frame, mask)
             if truth:
                 writer.true_hands(parameters)
         return open_capture(path)
@@ -134,6 +135,7 @@ def results_example(name: str = "plain", psnr: float = 20.0, digest: str = "d") 
         suite="smoke",
         seed=0,
         budget={"seconds": None, "steps": None},
+        frames="perturbed",
         protocols={},
         environment={},
         started="2026-01-01T00:00:00+00:00",

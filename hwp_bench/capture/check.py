@@ -106,7 +106,7 @@ def _facts(capture: Capture) -> dict[str, Any]:
 def _images(capture: Capture) -> Iterator[Finding]:
     for kind in IMAGE_FOLDERS:
         folder = capture.root / IMAGE_FOLDERS[kind]
-        if kind in ("clean", "true_masks") and not folder.is_dir():
+        if kind not in ("frames", "masks") and not folder.is_dir():
             continue
         yield from _one_kind(capture, kind, folder)
 
@@ -117,6 +117,7 @@ def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
         "masks": capture.mask,
         "clean": capture.clean,
         "true_masks": capture.true_mask,
+        "clean_masks": capture.clean_mask,
     }[kind]
 
     def inspect(frame: int) -> tuple[str | None, Finding | None]:

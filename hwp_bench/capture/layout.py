@@ -15,12 +15,13 @@ TRUE_HANDS = "truth/hands.npz"
 #: Further files of the maker (scene, timings, overlays); withheld from methods.
 EXTRA = "extra"
 
-#: Folder of each kind of image. `clean` and `true_masks` are truth and withheld from methods.
+#: Folder of each kind of image. All but `frames` and `masks` are truth, withheld from methods.
 IMAGE_FOLDERS = {
     "frames": "frames",
     "masks": "masks",
     "clean": "truth/clean",
     "true_masks": "truth/masks",
+    "clean_masks": "truth/clean_masks",
 }
 
 

@@ -102,6 +102,10 @@ class Capture:
         """Read the exact coverage of visible hand: (H, W) uint8, 255 = covered fully."""
         return read_gray(self._path("true_masks", frame), self.size)
 
+    def clean_mask(self, frame: int) -> np.ndarray:
+        """Read the visible hand of the clean frame: (H, W) uint8, 255 = covered fully."""
+        return read_gray(self._path("clean_masks", frame), self.size)
+
     def scoring_mask(self, frame: int) -> tuple[np.ndarray, bool]:
         """Read the mask that scores are taken over.
 

@@ -104,6 +104,10 @@ class CaptureWriter:
         """Store the exact coverage of visible hand (truth): (H, W) uint8, 255 = covered fully."""
         self._image("true_masks", frame, coverage, 2)
 
+    def clean_mask(self, frame: int, coverage: np.ndarray) -> None:
+        """Store the visible hand of the clean frame (truth): (H, W) uint8, 255 = all hand."""
+        self._image("clean_masks", frame, coverage, 2)
+
     def true_hands(self, hands: Mapping[str, HandParameters]) -> None:
         """Store the true hand parameters by side."""
         self._check_hands(hands)

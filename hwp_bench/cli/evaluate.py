@@ -17,6 +17,7 @@ _EXAMPLES = """examples:
   hwp-bench evaluate baselines/plain --capture my_capture --out runs/plain-mine
   hwp-bench evaluate my_method --suite mini --budget 60 --seed 1
   hwp-bench evaluate my_method --suite mini --set gaussians=20000 --json
+  hwp-bench evaluate baselines/plain --suite mini --frames clean     # what no method can beat
 
 An evaluation that is started again with the same arguments takes finished captures as they are.
 Exit status 0: every frame was scored; 1: the method failed on a capture or left out frames
@@ -50,6 +51,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="override one setting of the preset; may be given again",
     )
+    parser.add_argument(
+        "--frames",
+        choices=("perturbed", "clean", "unperturbed-only"),
+        default="perturbed",
+        help="training frames to give; all but the first are oracles on simulated captures",
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
     parser.add_argument("--budget", type=float, metavar="SECONDS", help="limit of the fit's time")
     parser.add_argument("--steps", type=int, help="limit of the fit's optimiser steps")
@@ -79,7 +86,8 @@ def run(args: argparse.Namespace) -> int:
     read_manifest(find_method(args.method))
     captures = [Path(path) for path in args.capture] if args.capture else _suite(args.suite)
     method = Path(args.method.rstrip("/")).name
-    out = Path(args.out or f"runs/{method}-{settings.suite}")
+    oracle = "" if args.frames == "perturbed" else f"-{args.frames}"
+    out = Path(args.out or f"runs/{method}-{settings.suite}{oracle}")
     splits = read_splits(args.splits) if args.splits else None
     with JobProgress() as jobs:
         results = evaluate(
@@ -130,6 +138,7 @@ def _settings(args: argparse.Namespace) -> EvaluationSettings:
         overrides=dict(_override(text) for text in args.set),
         seed=args.seed,
         budget=Budget(args.budget, args.steps),
+        frames=args.frames,
         time_limit=args.time_limit,
     )
 

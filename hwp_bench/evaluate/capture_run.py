@@ -65,6 +65,7 @@ class Job:
                 "settings": dict(self.run.settings),
                 "seed": self.run.seed,
                 "budget": asdict(self.run.budget),
+                "frames": self.run.frames,
                 "protocols": [protocol.as_dict() for protocol in PROTOCOLS],
                 "networks": sorted(self.networks),
             }

@@ -42,6 +42,8 @@ class EvaluationSettings:
     seed: int = 0
     #: When to stop fitting.
     budget: Budget = field(default_factory=Budget)
+    #: Training frames that the method is given, one of `methods.material.FRAME_CHOICES`.
+    frames: str = "perturbed"
     #: Seconds after which a method is killed on one capture.
     time_limit: float = DEFAULT_TIME_LIMIT
 
@@ -79,7 +81,7 @@ def evaluate(
     manifest = read_manifest(find_method(method))
     preset = manifest.preset(settings.preset, settings.suite)
     chosen = {**manifest.presets.get(preset, {}), **settings.overrides}
-    run = RunSettings(chosen, settings.seed, settings.budget)
+    run = RunSettings(chosen, settings.seed, settings.budget, settings.frames)
     networks = load_available()
     jobs = _jobs(captures, splits, manifest, run, settings, networks)
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
@@ -93,6 +95,7 @@ def evaluate(
         suite=settings.suite,
         seed=settings.seed,
         budget={"seconds": settings.budget.seconds, "steps": settings.budget.steps},
+        frames=settings.frames,
         protocols={protocol.name: protocol.as_dict() for protocol in PROTOCOLS},
         environment=environment(),
         started=started,

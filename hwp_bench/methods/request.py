@@ -24,6 +24,7 @@ from hwp_bench.files import atomic_folder, read_json, write_json
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.images import read_gray, read_rgb
 from hwp_bench.methods.contract import Budget, Camera, HandPose
+from hwp_bench.methods.material import FRAME_CHOICES, training_material
 from hwp_bench.splits import Split
 
 if TYPE_CHECKING:
@@ -46,6 +47,8 @@ class RunSettings:
     seed: int = 0
     #: When to stop fitting.
     budget: Budget = field(default_factory=Budget)
+    #: Which training frames are given, one of `FRAME_CHOICES`; all but the first are oracles.
+    frames: str = FRAME_CHOICES[0]
 
 
 class TrainingCapture:
@@ -78,12 +81,15 @@ class TrainingCapture:
             root / HANDS, self.sides, self.split.frame_count
         )
         self.cameras: Cameras = read_cameras(root / CAMERAS, self.split.frame_count)
-        self.run = RunSettings(value["settings"], value["seed"], Budget(**value["budget"]))
+        self.run = RunSettings(
+            value["settings"], value["seed"], Budget(**value["budget"]), value["frames"]
+        )
+        self._train = np.array(value["train"], dtype=np.int64)
 
     @property
     def train(self) -> np.ndarray:
         """Indices of the training frames."""
-        return self.split.train
+        return self._train
 
     @property
     def validation(self) -> np.ndarray:
@@ -141,18 +147,23 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
 
     Raises:
         BadImage: a training or validation image is missing or damaged.
+        UsageError: the capture does not know what `run.frames` asks for.
     """
     info = capture.info
+    material = training_material(capture, split, run.frames)
     with atomic_folder(path, overwrite=True) as root:
-        for kind in ("frames", "masks"):
-            for frame in [*split.train.tolist(), *split.validation.tolist()]:
-                source = image_path(capture.root, kind, frame)
-                target = image_path(root, kind, frame)
+        for frame in [*material.train.tolist(), *split.validation.tolist()]:
+            for kind, source_kind, read in (
+                ("frames", material.frames, read_rgb),
+                ("masks", material.masks, read_gray),
+            ):
+                source = image_path(capture.root, source_kind, frame)
                 # Reading first names a damaged image here, before a method stumbles over it.
-                (capture.frame if kind == "frames" else capture.mask)(frame)
+                read(source, capture.size)
+                target = image_path(root, kind, frame)
                 target.parent.mkdir(parents=True, exist_ok=True)
                 shutil.copyfile(source, target)
-        write_hands(root / HANDS, capture.hands)
+        write_hands(root / HANDS, material.hands)
         write_cameras(root / CAMERAS, capture.cameras)
         description = {
             "schema": SCHEMA,
@@ -166,6 +177,8 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
             "settings": dict(run.settings),
             "seed": run.seed,
             "budget": {"seconds": run.budget.seconds, "steps": run.budget.steps},
+            "frames": run.frames,
+            "train": material.train.tolist(),
         }
         write_json(root / REQUEST, description)
     return path

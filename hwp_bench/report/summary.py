@@ -182,7 +182,7 @@ def _labels(results: Sequence[Results]) -> list[str]:
     for result in results:
         title = result.method.title
         if titles.count(title) > 1:
-            title += f" ({result.method.preset}, seed {result.seed})"
+            title += f" ({result.method.preset}, {result.frames} frames, seed {result.seed})"
         labels.append(title)
     return labels
 

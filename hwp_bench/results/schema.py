@@ -117,6 +117,8 @@ class Results:
     seed: int
     #: Limits of the fit: `seconds`, `steps`, either may be None.
     budget: dict[str, Any]
+    #: Training frames that the method was given: `perturbed`, or an oracle's choice.
+    frames: str
     #: Settings of every protocol that was scored, by name.
     protocols: dict[str, Any]
     #: Versions, processor, system.

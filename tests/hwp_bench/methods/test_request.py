@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 from conftest import CaptureMaker
 
-from hwp_bench.errors import BadImage, BadInput, HwpError
+from hwp_bench.errors import BadImage, BadInput, HwpError, UsageError
 from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.request import RunSettings, open_request, write_request
 from hwp_bench.splits import contiguous_split
@@ -67,3 +68,40 @@ def test_a_request_that_is_none_is_refused(make_capture: CaptureMaker, tmp_path:
     (tmp_path / "request.json").write_text('{"schema": "hwp-request/1"}')
     with pytest.raises(HwpError, match="lacks or has a wrong field"):
         open_request(tmp_path)
+
+
+def test_the_oracles_choose_what_they_say(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    capture = make_capture(frames=20, truth=True)
+    severities = capture.info.perturbations["motion_blur"]
+    perturbed = [frame for frame in range(16) if severities[frame]]
+    split = contiguous_split("tiny", 20)
+    assert perturbed
+    only = replace(RUN, frames="unperturbed-only")
+    training = open_request(write_request(tmp_path / "only", capture, split, only))
+    assert sorted([*training.train, *perturbed]) == list(range(16))
+    for frame in perturbed:
+        assert not (training.root / "frames" / f"{frame:06d}.png").exists()
+    from hwp_bench.images import write_image
+
+    marked = np.full((32, 32, 3), 7, np.uint8)
+    write_image(capture.root / "truth" / "clean" / f"{perturbed[0]:06d}.png", marked)
+    capture.true_hands["right"].transl[perturbed[0]] += 0.5
+    clean = replace(RUN, frames="clean")
+    training = open_request(write_request(tmp_path / "clean", capture, split, clean))
+    np.testing.assert_array_equal(training.frame(perturbed[0]), marked)
+    np.testing.assert_array_equal(training.train, split.train)
+    # The estimate was misled in the perturbed frame only; the oracle is given the truth there.
+    moved = training.hands["right"].transl - capture.hands["right"].transl
+    assert (moved[perturbed[0]] == 0.5).all()
+    assert (np.delete(moved, perturbed[0], axis=0) == 0).all()
+
+
+def test_oracles_need_to_know_the_truth(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    split = contiguous_split("tiny", 20)
+    plain = make_capture(frames=20)
+    with pytest.raises(UsageError, match="does not know its clean frames"):
+        write_request(tmp_path / "r", plain, split, replace(RUN, frames="clean"))
+    unknown = make_capture("unknown", frames=20, perturbations={"illumination": None})
+    with pytest.raises(UsageError, match="in which frames illumination acts"):
+        write_request(tmp_path / "r", unknown, split, replace(RUN, frames="unperturbed-only"))
+    assert not (tmp_path / "r").exists()

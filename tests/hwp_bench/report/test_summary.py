@@ -77,7 +77,10 @@ def test_results_on_different_data_are_not_compared(two) -> None:
 
 def test_titles_that_repeat_are_told_apart(two) -> None:
     rows = all_tables([two[0], replace(two[0], seed=3)])["overall"].rows
-    assert [row[0] for row in rows] == ["Plain (default, seed 0)", "Plain (default, seed 3)"]
+    assert [row[0] for row in rows] == [
+        "Plain (default, perturbed frames, seed 0)",
+        "Plain (default, perturbed frames, seed 3)",
+    ]
 
 
 def test_every_table_is_written_in_every_spelling(two, tmp_path) -> None:
