@@ -121,5 +121,5 @@ def _place(shape: np.ndarray, rays: np.ndarray) -> np.ndarray:
     place = np.einsum("fij,fj->fi", np.linalg.pinv(matrix), right)
     # A flat or noisy frame may land at or behind the camera; the fit needs it in front.
     extent = np.linalg.norm(shape, axis=-1).max(axis=1)
-    place[:, 2] = np.maximum(place[:, 2], 1.5 * extent)
+    place[:, 2] = np.maximum(place[:, 2], np.maximum(1.5 * extent, 0.01))
     return place

@@ -16,6 +16,8 @@ LANDMARK_NAMES = (
     "wrist",
     *(f"{finger}_{k}" for finger in ("thumb", "index", "middle", "ring", "little") for k in "1234"),
 )
+#: What a hand can span, m: from a small child's fist to an open large hand, with room.
+HAND_METRES = (0.02, 0.5)
 #: Pairs of landmarks that a drawing connects.
 LANDMARK_EDGES = (
     *((0, 4 * finger + 1) for finger in range(5)),
@@ -60,7 +62,8 @@ def read_landmarks(path: str | os.PathLike[str], *, min_score: float) -> Landmar
 
     Raises:
         BadInput: the file is missing, no npz, too large, holds objects or the wrong shapes, has
-            no detected frame, or has NaN where the score says that a hand was seen.
+            no detected frame, is not in metres, or has NaN where the score says that a hand was
+            seen.
     """
     path = Path(path)
     arrays = _load(path)
@@ -98,8 +101,21 @@ def read_landmarks(path: str | os.PathLike[str], *, min_score: float) -> Landmar
             field="score",
             remedy="Track a hand first, or lower --min-score.",
         )
+    _check_metres(path, world[detected])
     usable = detected[:, None, None]
     return Landmarks(np.where(usable, image, 0.0), np.where(usable, world, 0.0), score, detected)
+
+
+def _check_metres(path: Path, world: np.ndarray) -> None:
+    extent = np.median(np.ptp(world, axis=1).max(axis=1))
+    low, high = HAND_METRES
+    if not low <= extent <= high:
+        raise BadInput(
+            f"spans {extent:.3g} in a typical frame, no hand in metres",
+            where=path,
+            field="world",
+            remedy=f"World landmarks are metres; a hand spans {low:g} to {high:g}.",
+        )
 
 
 def check_against_video(
@@ -108,8 +124,8 @@ def check_against_video(
     """Check the landmarks against the video that they were tracked in.
 
     Returns:
-        The landmarks, with frames whose hand lies wholly outside the picture, or is smaller than
-        8 pixels, marked as not detected.
+        The landmarks; frames are marked as not detected whose hand lies wholly outside the
+        picture, strays from it by more than its size, or is smaller than 8 pixels.
 
     Raises:
         BadInput: another number of frames, or no frame is left.
@@ -122,7 +138,9 @@ def check_against_video(
             remedy="Track every frame of this very video.",
         )
     low, high = landmarks.image.min(axis=1), landmarks.image.max(axis=1)
-    inside = (high > 0).all(axis=1) & (low < (width, height)).all(axis=1)
+    picture = np.array([width, height])
+    inside = ((high > 0) & (low < picture)).all(axis=1)
+    inside &= ((low > -picture) & (high < 2 * picture)).all(axis=1)
     detected = landmarks.detected & inside & ((high - low).max(axis=1) >= 8)
     if not detected.any():
         raise BadInput(

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.importers.crop import resample
-from hwp_bench.importers.footage import Pictures
 from hwp_bench.importers.outline import signed_distance
+from hwp_bench.importers.pictures import Pictures
 from hwp_bench.importers.projected import ProjectedClip
 from hwp_bench.importers.segment import MaskSettings, Prompt, Segmentation, segment_clip
 from hwp_bench.importers.silhouette import overlap

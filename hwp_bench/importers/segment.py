@@ -22,7 +22,7 @@ class MaskSettings:
     #: Pixels deeper than this inside the silhouette are hand, if their colour allows it.
     inside: float = 0.04
     #: Pixels farther than this outside the silhouette are not hand.
-    outside: float = 0.10
+    outside: float = 0.12
     #: Mean log evidence around a pixel below which its colour forbids it to be sure hand: an
     #: object before the hand then stays out of the mask.
     forbidding: float = -1.0
@@ -38,7 +38,7 @@ class MaskSettings:
 #: For the first masks, made from landmarks alone.
 WIDE = MaskSettings()
 #: For the last masks, made after the outline has been fitted.
-NARROW = MaskSettings(inside=0.027, outside=0.05)
+NARROW = MaskSettings(inside=0.027, outside=0.08)
 
 
 @dataclass(frozen=True, eq=False)

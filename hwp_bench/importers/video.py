@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.capture.schema import check_id
+from hwp_bench.capture.schema import MAX_FRAMES, check_id
 from hwp_bench.errors import UsageError
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.importers.contour import ContourEnergy
@@ -23,10 +23,10 @@ from hwp_bench.importers.fit_clip import (
     reprojection_error,
 )
 from hwp_bench.importers.fit_terms import hand_size
-from hwp_bench.importers.footage import Pictures, read_masks, read_pictures
 from hwp_bench.importers.landmarks import Landmarks, check_against_video, read_landmarks
 from hwp_bench.importers.masking import ClipMasks, Masking
 from hwp_bench.importers.options import VideoImport
+from hwp_bench.importers.pictures import Pictures, check_memory, read_masks, read_pictures
 from hwp_bench.importers.projected import ProjectedClip, project_clip
 from hwp_bench.importers.segment import NARROW, WIDE
 from hwp_bench.progress import progress
@@ -156,15 +156,16 @@ def read_source(
     total = info.stated_frames if part and info.stated_frames else len(every.score)
     tracked = check_against_video(every, total, info.width, info.height, landmarks)
     indices = options.frames.indices(total)
-    if len(indices) < 3:
+    if not 3 <= len(indices) <= MAX_FRAMES:
         raise UsageError(
-            f"{len(indices)} of {total} frames are selected, at least 3 are needed",
+            f"{len(indices)} of {total} frames are selected, a capture has 3 to {MAX_FRAMES}",
             field="--frames",
         )
     tracked = tracked.select(indices)
     if not tracked.detected.any():
         raise UsageError("no hand is detected in the selected frames", field="--frames")
     windows = follow_hand(tracked, info.fps / options.frames.stride, options.size)
+    check_memory(windows)
     own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
     with progress("reading frames", len(indices)) as update:
         pictures = read_pictures(info, options.frames, windows, update)

@@ -10,10 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.errors import BadInput
+from hwp_bench.errors import BadInput, UsageError
 from hwp_bench.images import read_gray
 from hwp_bench.importers.crop import CropWindows, cut, resample
 from hwp_bench.importers.decode import FrameRange, VideoInfo, read_frames
+from hwp_bench.importers.outline import FIELD_SIZE
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +34,27 @@ class Pictures:
 def working_size(windows: CropWindows) -> int:
     """Edge of the working pictures, px."""
     return min(windows.side, 2 * windows.size)
+
+
+def check_memory(windows: CropWindows) -> None:
+    """Refuse a clip that would not fit into memory, before minutes of work.
+
+    Raises:
+        UsageError: the pictures would take more than the free memory.
+    """
+    import psutil
+
+    edge = working_size(windows)
+    # Colours at both resolutions, the mask, the distance field, and the posed vertices.
+    each = 3 * edge**2 + 4 * windows.size**2 + 2 * FIELD_SIZE**2 + 200_000
+    needed, free = len(windows.corners) * each, psutil.virtual_memory().available
+    if needed > free:
+        raise UsageError(
+            f"{len(windows.corners)} frames need about {needed / 1e9:.1f} GB of memory, "
+            f"{free / 1e9:.1f} GB are free",
+            field="--frames",
+            remedy="Take fewer frames with --frames or --stride, or a smaller --size.",
+        )
 
 
 def read_pictures(
