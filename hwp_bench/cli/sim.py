@@ -89,6 +89,7 @@ def _add_gallery(parser: argparse.ArgumentParser) -> None:
 
 def _add_calibrate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("scene", metavar="SCENE", nargs="+", help="scene names, files, or all")
+    parser.add_argument("--effect", metavar="KIND", help="only this effect")
     parser.add_argument("--write", action="store_true", help="write strengths into the files")
     parser.add_argument("--json", action="store_true", help="print JSON")
 

@@ -136,7 +136,8 @@ def calibrate_scenes(args: argparse.Namespace) -> int:
     rows: list[dict[str, Any]] = []
     for name in _names(args.scene):
         scene = load_scene(name)
-        results = [calibrate(scene, call) for call in scene.effects]
+        calls = [call for call in scene.effects if args.effect in (None, call.kind)]
+        results = [calibrate(scene, call) for call in calls]
         if args.write:
             write_strengths(_scene_path(name), results)
         for item in results:

@@ -13,7 +13,7 @@ from hwp_bench.sim.seeds import generator
 #: Error of a good estimator on an easy frame: rad and m.
 EASY_ERROR = (0.005, 0.0004)
 #: How much of a frame's error is the last frame's.
-CORRELATION = 0.7
+CORRELATION = 0.85
 #: Chance of a gross failure in a frame of severity 4 or 5 of an effect that moves the hand.
 FAILURE_CHANCE = 0.06
 #: Least and largest share of an occluder over the hand that a segmenter takes for hand.

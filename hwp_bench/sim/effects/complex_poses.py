@@ -25,7 +25,7 @@ class _ComplexPoses(Effect):
     name = "complex_poses"
     #: Error of the estimated joint angles, rad.
     default_strengths = (0.02, 0.035, 0.055, 0.085, 0.13)
-    max_strength = 0.35
+    max_strength = 0.2
 
     def check(self, scene: Scene, call: EffectCall, where: str) -> None:
         _read(call, scene.sides, where)

@@ -42,7 +42,7 @@ class _MotionBlur(Effect):
         )
 
     def estimate_error(self, strength: float) -> tuple[float, float]:
-        return 0.25 * strength, 0.03 * strength
+        return 0.5 * strength, 0.04 * strength
 
 
 def _slow_angle(scene: Scene, seconds: float) -> float:
