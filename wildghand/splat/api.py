@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 import warnings
 from collections.abc import Callable
 from dataclasses import replace
@@ -10,6 +11,7 @@ from typing import Any
 import torch
 
 from hwp_bench.errors import UsageError
+from wildghand.splat.conventions import MAX_COLOR
 from wildghand.splat.layout import check_options, flatten
 from wildghand.splat.scene import Options, Scene, unflattened
 
@@ -52,7 +54,7 @@ def rasterize(
     one of its values is not finite, its quaternion is zero, a colour exceeds
     `conventions.MAX_COLOR`, its centre is not between the planes, its opacity is below 1/255,
     or nothing of it is on screen. A camera that is not finite, or has no positive focal
-    length, sees nothing, and a background that is not finite is black; both with a warning.
+    length, sees nothing, and a background that no colour may have is black; both with a warning.
 
     Args:
         means: (..., N, 3) centres in world units.
@@ -112,8 +114,8 @@ def rasterize(
         ((1, 32, 32, 3), (1, 32, 32, 1))
     """
     options = Options(
-        width=width,
-        height=height,
+        width=_whole(width),
+        height=_whole(height),
         near_plane=float(near_plane),
         far_plane=float(far_plane),
         eps2d=float(eps2d),
@@ -139,8 +141,8 @@ def rasterize(
     scene = _usable_views(_one_dtype(scene, name))
     channels, alphas, info = draw(scene)
     info.update(
-        width=width,
-        height=height,
+        width=options.width,
+        height=options.height,
         n_cameras=scene.image_dims[-1],
         n_batches=scene.images // max(1, scene.image_dims[-1]),
         backend=name,
@@ -148,6 +150,14 @@ def rasterize(
         gaussian_ids=None,
     )
     return unflattened(channels, scene), unflattened(alphas, scene), info
+
+
+def _whole(number: Any) -> Any:
+    """An int of any other whole-number type, such as numpy's; what is none stays as it is."""
+    try:
+        return operator.index(number)
+    except TypeError:
+        return number
 
 
 def _backend(name: str, device: torch.device) -> tuple[str, Callable[[Scene], _Result]]:
@@ -199,8 +209,10 @@ def _usable_views(scene: Scene) -> Scene:
         warnings.warn("rasterize: a camera is not finite; its image shows the background alone")
     elif not (scene.Ks.diagonal(dim1=-2, dim2=-1)[:, :2] > 0).all():
         warnings.warn("rasterize: a camera has no positive focal length; it sees nothing")
-    if scene.backgrounds is None or scene.backgrounds.isfinite().all():
+    if scene.backgrounds is None:
         return scene
-    warnings.warn("rasterize: a background is not finite; drawn black")
-    black = torch.where(scene.backgrounds.isfinite(), scene.backgrounds, 0.0)
-    return replace(scene, backgrounds=black)
+    good = scene.backgrounds.detach().abs() <= MAX_COLOR
+    if good.all():
+        return scene
+    warnings.warn("rasterize: a background is not finite or beyond MAX_COLOR; drawn black")
+    return replace(scene, backgrounds=torch.where(good, scene.backgrounds, 0.0))

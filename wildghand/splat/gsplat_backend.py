@@ -144,6 +144,9 @@ def _sanitised(scene: Scene, tensors: dict[str, torch.Tensor]) -> dict[str, torc
     for mask in good.values():
         visible = visible & _repeat(mask, finest)
     result["opacities"] = torch.where(visible, _repeat(opacities, finest), zero)
+    if scene.backgrounds is not None:
+        fine = scene.backgrounds.detach().abs() <= rules.MAX_COLOR
+        result["backgrounds"] = torch.where(fine, scene.backgrounds, zero)
     cameras = tensors["viewmats"].detach().flatten(1).isfinite().all(1)
     cameras &= tensors["Ks"].detach().flatten(1).isfinite().all(1)
     cameras &= (tensors["Ks"].detach().diagonal(dim1=-2, dim2=-1)[:, :2] > 0).all(1)

@@ -45,11 +45,11 @@ def flatten(
         expected = (*batch, cameras, 4, 4)
         image_dims = (*batch, cameras)
     _require(tuple(viewmats.shape) == expected, "viewmats", viewmats, _show(expected))
+    _require(math.prod(image_dims) >= 1, "viewmats", viewmats, "at least one camera")
     Ks = tensors["Ks"]
     _require(tuple(Ks.shape) == (*expected[:-2], 3, 3), "Ks", Ks, _show((*expected[:-2], 3, 3)))
     groups = math.prod(batch)
     images = groups * cameras
-    _require(images >= 1, "viewmats", viewmats, "at least one camera")
 
     flat: dict[str, torch.Tensor] = {"means": means.reshape(groups, count, 3)}
     for name, tail in (("quats", (count, 4)), ("scales", (count, 3)), ("opacities", (count,))):
@@ -94,7 +94,7 @@ def check_options(options: Options, rasterize_mode: str) -> None:
         if value not in choices:
             raise UsageError(f"is {value!r}", field=name, remedy=f"Use one of {', '.join(choices)}")
     for name, size in (("width", options.width), ("height", options.height)):
-        if not isinstance(size, int) or isinstance(size, bool) or not 1 <= size <= 32768:
+        if not isinstance(size, int) or not 1 <= size <= 32768:
             raise UsageError(
                 f"is {size!r}", field=name, remedy="Use a whole number of pixels, 1 to 32768"
             )

@@ -12,6 +12,7 @@ import math
 import llvmlite.binding
 import numpy as np
 from numba import types
+from numba.core import config
 
 from wildghand.splat import conventions as rules
 from wildghand.splat.kernels.lanes import make_constant, make_fill, make_load
@@ -19,12 +20,14 @@ from wildghand.splat.kernels.simd import Vector
 
 
 def _lanes() -> int:
-    """float32 lanes of the widest registers worth using on this machine."""
-    try:
-        features = llvmlite.binding.get_host_cpu_features()
-    except RuntimeError:  # not every platform can tell
-        return 8
-    return 16 if features.get("avx512f") and features.get("avx512vl") else 8
+    """float32 lanes of the widest registers of the processor that numba compiles for."""
+    features = config.CPU_FEATURES  # set by NUMBA_CPU_FEATURES, else None
+    if features is None:
+        try:
+            features = llvmlite.binding.get_host_cpu_features().flatten()
+        except RuntimeError:  # not every platform can tell
+            features = ""
+    return 16 if "+avx512f" in features and "+avx512vl" in features else 8
 
 
 #: Pixels in a block: one vector.

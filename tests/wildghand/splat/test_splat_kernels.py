@@ -1,0 +1,236 @@
+"""The compiled kernels: that they are vectors in the machine code, their arithmetic, their cache.
+
+Oracles: the machine code itself, numpy in float64, the same call without a cache.
+"""
+
+from __future__ import annotations
+
+import logging
+import platform
+import re
+from pathlib import Path
+
+import numba
+import numpy as np
+import pytest
+
+from wildghand.splat import stages, warmup
+from wildghand.splat.kernels import alpha, jit, lanes, project, rows, tiles
+from wildghand.splat.kernels.blend import blend
+from wildghand.splat.kernels.blend_backward import blend_backward
+from wildghand.splat.kernels.project import project as project_kernel
+from wildghand.splat.kernels.project_backward import project_backward
+
+X86 = platform.machine().lower() in ("x86_64", "amd64")
+
+
+def machine_code(kernel: jit.Kernel) -> str:
+    """Assembly of the kernel's first version: unrolled, as RGB uses it."""
+    warmup.warm_up()
+    fresh = numba.njit(nogil=True, boundscheck=False, error_model="numpy")(kernel.__wrapped__)
+    signature = kernel.dispatcher.signatures[0]
+    fresh.compile(signature)
+    return fresh.inspect_asm(signature)
+
+
+def innermost_block(assembly: str, marker: str) -> str:
+    """The straight run of instructions, between labels and jumps back, that holds the marker."""
+    blocks = re.split(r"\n\.?\w+:\n", assembly)
+    held = [block for block in blocks if re.search(marker, block)]
+    assert held, f"no {marker} in the machine code"
+    return max(held, key=len)
+
+
+@pytest.mark.skipif(not X86, reason="reads x86 assembly")
+@pytest.mark.parametrize(("kernel", "products"), [(blend, 10), (blend_backward, 18)])
+def test_the_inner_loop_over_pixels_is_vectorised(kernel: jit.Kernel, products: int) -> None:
+    """2^n is made by shifting integers by 23 bits: that marks the loop."""
+    loop = innermost_block(machine_code(kernel), r"v?pslld\s+\$23")
+    packed = re.findall(r"\bv?f?n?m(?:add|sub|ul)\w*ps\b|\bvfn?m(?:add|sub)\w*ps\b", loop)
+    scalar = re.findall(r"\bv?(?:add|sub|mul|div|fn?m\w+)ss\b", loop)
+    assert len(packed) >= products
+    assert scalar == []
+    widest = "zmm" if tiles.LANES == 16 else "ymm"
+    assert widest in loop
+
+
+@pytest.mark.skipif(not X86, reason="reads x86 assembly")
+@pytest.mark.parametrize("kernel", [project_kernel, project_backward])
+def test_the_projection_is_vectorised(kernel: jit.Kernel) -> None:
+    assembly = machine_code(kernel)
+    packed = re.findall(r"\bv?(?:mul|fn?m(?:add|sub)\w+)pd\b", assembly)
+    scalar = re.findall(r"\bv?(?:mul|fn?m(?:add|sub)\w+)sd\b", assembly)
+    assert len(packed) > 100
+    assert len(packed) > 10 * len(scalar)
+
+
+def test_no_fast_math_in_the_intermediate_code() -> None:
+    """`nnan`, `ninf` and `fast` would let the compiler drop the tests that cull."""
+    warmup.warm_up()
+    fresh = numba.njit(nogil=True, boundscheck=False, error_model="numpy")(
+        project_kernel.__wrapped__
+    )
+    signature = project_kernel.dispatcher.signatures[0]
+    fresh.compile(signature)
+    assert not re.search(r"\b(fast|nnan|ninf)\b", fresh.inspect_llvm(signature))
+
+
+@numba.njit
+def _exp2(values, out):
+    for k in range(0, values.size, tiles.LANES):
+        lanes.store(out, k, alpha.exp2(tiles.load_pixels(values, k)))
+
+
+@numba.njit
+def _log2(values, out):
+    (x,) = rows.load1(values, 0)
+    rows.store_column(out, 0, project.log2(x))
+
+
+@numba.njit
+def _sums(values, out):
+    a = tiles.load_pixels(values, 0)
+    lanes.store_sums(out, 0, (a, a * a, a + a))
+
+
+@numba.njit
+def _columns(values, out, total):
+    x, y, z = rows.load3(values, 0)
+    rows.add_columns(out, 0, (x, y * 10.0, z * 1e300))
+    total[0] = rows.total(x)
+
+
+@numba.njit
+def _rows(values, out):
+    (v,) = rows.load1(values, 0)
+    rows.store_rows(
+        out, 0,
+        (v, v + 10.0, v + 20.0, v + 30.0, v + 40.0, v + 50.0, v + 60.0, v + 70.0,
+         v + 80.0, v + 90.0, v + 100.0, v + 110.0, v + 120.0, v + 130.0, v + 140.0, v + 150.0),
+    )  # fmt: skip
+
+
+def test_exp2_to_3e_7() -> None:
+    x = np.linspace(-12, 0.5, 64 * tiles.LANES).astype(np.float32)
+    out = np.empty_like(x)
+    _exp2(x, out)
+    np.testing.assert_allclose(out, np.exp2(x.astype(np.float64)), rtol=3e-7)
+
+
+def test_log2_to_float32() -> None:
+    x = np.array([1.0, 0.75, 1 / 255, 0.99, 1.5, 1e-3, 3e38, 1.0000001], np.float32)
+    out = np.empty_like(x)
+    _log2(x, out)
+    np.testing.assert_allclose(out, np.log2(x.astype(np.float64)), rtol=1e-7, atol=1e-12)
+
+
+def test_sums_over_lanes() -> None:
+    x = np.random.default_rng(0).normal(size=tiles.LANES).astype(np.float32)
+    out = np.zeros(tiles.LANES, np.float32)
+    _sums(x, out)
+    np.testing.assert_allclose(out[:3], [x.sum(), (x * x).sum(), 2 * x.sum()], rtol=1e-5)
+
+
+def test_columns_and_rows_change_places() -> None:
+    values = np.arange(24, dtype=np.float32)
+    out, total = np.ones(24, np.float32), np.zeros(1)
+    _columns(values, out, total)
+    largest = np.finfo(np.float32).max
+    by_row = values.reshape(8, 3)
+    expected = np.stack([by_row[:, 0] + 1, 10 * by_row[:, 1] + 1, np.full(8, largest)], 1)
+    assert np.array_equal(out.reshape(8, 3), expected)
+    assert total[0] == by_row[:, 0].sum()
+    big = np.zeros(128, np.float32)
+    _rows(values[:8], big)
+    assert np.array_equal(big.reshape(8, 16), values[:8, None] + 10 * np.arange(16))
+
+
+def test_tiles_are_made_of_blocks_that_fill_a_vector() -> None:
+    assert tiles.BLOCK_WIDTH * tiles.BLOCK_HEIGHT == tiles.LANES
+    assert tiles.TILE_WIDTH * tiles.TILE_HEIGHT == tiles.BLOCKS * tiles.LANES
+    places = {
+        alpha.place_of.py_func(x, y)
+        for y in range(tiles.TILE_HEIGHT)
+        for x in range(tiles.TILE_WIDTH)
+    }
+    assert places == {(b, lane) for b in range(tiles.BLOCKS) for lane in range(tiles.LANES)}
+
+
+def test_sort_is_by_depth_and_stable() -> None:
+    warmup.warm_up()
+    generator = np.random.default_rng(0)
+    depths = generator.choice([0.0, 0.5, 1.0, 1.5, 1e-38, 3e38], size=(3, 1000)).astype(np.float32)
+    visible = np.array([(row > 0).sum() for row in depths])
+    order = np.empty((3, 1000), np.int32)
+    found, chunk_rows = np.empty(3, np.int64), np.empty((3, 3), np.int64)
+    stages.sort_by_depth(
+        np.zeros(1, np.int64), depths, np.ones((3, 1000), np.int32), order,
+        np.empty((3, 1000), np.int32), found, chunk_rows,
+    )  # fmt: skip
+    assert found.tolist() == visible.tolist()
+    for row, places, count in zip(depths, order, visible, strict=True):
+        expected = np.argsort(np.where(row > 0, row, np.inf), kind="stable")[:count]
+        assert np.array_equal(places[:count], expected)
+    assert chunk_rows[:, -1].tolist() == visible.tolist()
+
+
+def test_the_first_call_says_that_it_compiles(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(jit.Kernel, "on_disk", lambda self: False)
+    monkeypatch.setattr(jit.Kernel, "compiled_anew", lambda self: 1)
+    monkeypatch.setattr(warmup, "_run_all", lambda: None)
+    warmup._warm_up.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        warmup.warm_up()
+        warmup.warm_up()
+    assert re.match(r"compiling the CPU rasterizer, once", caplog.messages[0])
+    assert re.match(r"compiled the CPU rasterizer in \d+\.\d s", caplog.messages[1])
+    assert len(caplog.messages) == 2
+
+
+def test_a_damaged_cache_is_done_without(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    forgotten, runs = [], []
+
+    def run() -> None:
+        runs.append(1)
+        if len(runs) == 1:
+            raise EOFError("Ran out of input")
+
+    monkeypatch.setattr(jit.Kernel, "forget_cache", lambda self: forgotten.append(self))
+    monkeypatch.setattr(warmup, "_run_all", run)
+    warmup._warm_up.cache_clear()
+    with caplog.at_level(logging.WARNING):
+        warmup.warm_up()
+    assert len(runs) == 2
+    assert len(forgotten) == len(warmup.all_kernels()) == 10
+    assert "cache cannot be used (Ran out of input)" in caplog.text
+
+
+def test_a_kernel_without_a_place_for_its_cache_still_works(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """A read-only install in a home without a cache folder: numba raises RuntimeError."""
+    real = numba.njit
+
+    def njit(*args: object, **options: object) -> object:
+        if options.get("cache"):
+            raise RuntimeError("cannot cache function: no locator available")
+        return real(*args, **options)
+
+    monkeypatch.setattr(jit, "_njit", njit)
+
+    @jit.kernel
+    def double(x):
+        return 2 * x
+
+    assert double(21) == 42
+    assert not double.on_disk()
+
+
+def test_the_cache_hangs_on_the_text_of_all_kernels() -> None:
+    digest = jit.sources_digest()
+    index = warmup.all_kernels()[0].dispatcher._cache._cache_file
+    assert index._source_stamp == digest

@@ -1,0 +1,89 @@
+"""Leased buffers never overlap while in use; threads share out every job once."""
+
+from __future__ import annotations
+
+import gc
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wildghand.splat import memory
+from wildghand.splat.memory import lease
+from wildghand.splat.threads import run, thread_count
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.tuples(st.integers(0, 200_000), st.booleans()), max_size=12))
+def test_buffers_in_use_do_not_overlap(steps: list[tuple[int, bool]]) -> None:
+    held: list[tuple[np.ndarray, int]] = []
+    for number, (size, keep) in enumerate(steps):
+        array = lease((size,), np.int32)
+        assert array.shape == (size,)
+        assert array.dtype == np.int32
+        array[:] = number
+        if keep:
+            held.append((array, number))
+    for array, number in held:
+        assert (array == number).all()
+
+
+def test_a_buffer_comes_back_when_the_last_view_is_gone() -> None:
+    first = lease((300_000,), np.float32)
+    address = first.ctypes.data
+    assert address % 64 == 0
+    tensor = torch.from_numpy(first)[10:]
+    del first
+    gc.collect()
+    other = lease((300_000,), np.float32)
+    assert other.ctypes.data != address
+    tensor.fill_(1.0)
+    del tensor
+    gc.collect()
+    again = lease((300_000,), np.float32)
+    assert again.ctypes.data == address
+
+
+def test_idle_memory_is_bounded(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "MAX_IDLE", memory.idle_bytes() + (1 << 20))
+    arrays = [lease((1 << 19,), np.uint8) for _ in range(10)]
+    assert all(array.nbytes == 1 << 19 for array in arrays)
+    arrays.clear()
+    gc.collect()
+    assert memory.idle_bytes() <= memory.MAX_IDLE
+
+
+@pytest.mark.parametrize("size", [1, 4096, 4097, 5000, 123_456, 10_000_019])
+def test_size_classes_waste_at_most_a_quarter(size: int) -> None:
+    room = memory._size_class(size)
+    assert size <= room <= max(4096, 1.25 * size + 1)
+    assert memory._size_class(room) == room
+
+
+def test_every_job_is_done_once_and_failures_are_raised() -> None:
+    done: list[int] = []
+
+    def work(counter: np.ndarray) -> None:
+        while counter[0] < 20:
+            done.append(int(counter[0]))
+            counter[0] += 1
+
+    run(work, 1)
+    assert done == list(range(20))
+
+    def fail(counter: np.ndarray) -> None:
+        raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        run(fail, 3)
+
+
+def test_thread_count_follows_torch() -> None:
+    before = torch.get_num_threads()
+    try:
+        torch.set_num_threads(5)
+        assert [thread_count(jobs) for jobs in (0, 1, 4, 9)] == [1, 1, 4, 5]
+    finally:
+        torch.set_num_threads(before)
