@@ -15,6 +15,10 @@ SAMPLES = 40_000
 SPREAD = 4.0
 #: Width of the picture that the samples are laid out in.
 _STRIP = 400
+# Colours within so many standard deviations are the same.
+_SAME_COLOUR = 2.0
+# Colours of a mixture that have less weight than this are noise.
+_LEAST_WEIGHT = 0.01
 # Where the nine covariance entries of each of the five colours lie in a mixture.
 _COVARIANCES = slice(20, 65)
 
@@ -61,14 +65,27 @@ def learn_colours(
             found = picture[where]
             # A thousand of each frame: every frame has its say, none fills the memory.
             pixels.append(found[random.integers(0, len(found), 1000)] if len(found) else found)
-    hand, other = (np.concatenate(pixels) for pixels in kinds)
+    hand, other = (np.concatenate([np.zeros((0, 3), np.uint8), *pixels]) for pixels in kinds)
     if min(len(hand), len(other)) < 100:
         return None
+    cv2.setRNGSeed(seed)
+    model = _mixtures(hand, other, random)
+    # What the hand holds is drawn over, and would be learnt as hand, if its colour were not
+    # seen beside the hand too. (A hand before skin-coloured things loses nothing by this.)
+    elsewhere = _least_distance(hand, model.background) < _SAME_COLOUR**2
+    if 0.0 < elsewhere.mean() < 0.5:
+        model = _mixtures(hand[~elsewhere], other, random)
+    return model
+
+
+def _mixtures(hand: np.ndarray, other: np.ndarray, random: np.random.Generator) -> ColourModel:
+    """Five Gaussians for each of two sets of colours (N, 3) uint8."""
+    import cv2
+
     chosen = [colours[random.integers(0, len(colours), SAMPLES)] for colours in (hand, other)]
     strip = np.concatenate(chosen).reshape(-1, _STRIP, 3)
     labels = np.repeat([cv2.GC_FGD, cv2.GC_BGD], SAMPLES).reshape(-1, _STRIP).astype(np.uint8)
     background, foreground = np.zeros((1, 65)), np.zeros((1, 65))
-    cv2.setRNGSeed(seed)
     cv2.grabCut(strip, labels, (0, 0, 1, 1), background, foreground, 3, cv2.GC_INIT_WITH_MASK)
     for mixture in (background, foreground):
         mixture[:, _COVARIANCES] += np.tile((SPREAD**2 * np.eye(3)).ravel(), 5)
@@ -97,10 +114,22 @@ def _packed(picture: np.ndarray) -> np.ndarray:
     return (coarse[..., 0] << 16) | (coarse[..., 1] << 8) | coarse[..., 2]
 
 
+def _least_distance(colours: np.ndarray, mixture: np.ndarray) -> np.ndarray:
+    """Squared Mahalanobis distance (N,) to the nearest Gaussian of a mixture."""
+    means = mixture[0, 5:20].reshape(5, 3)
+    covariances = mixture[0, _COVARIANCES].reshape(5, 3, 3)
+    least = np.full(len(colours), np.inf)
+    for k in np.flatnonzero(mixture[0, :5] >= _LEAST_WEIGHT):
+        offset = colours - means[k]
+        inverse = np.linalg.inv(covariances[k])
+        np.minimum(least, np.einsum("ni,ij,nj->n", offset, inverse, offset), out=least)
+    return least
+
+
 def _log_density(colours: np.ndarray, mixture: np.ndarray) -> np.ndarray:
     weights = mixture[0, :5]
     means = mixture[0, 5:20].reshape(5, 3)
-    covariances = mixture[0, 20:].reshape(5, 3, 3)
+    covariances = mixture[0, _COVARIANCES].reshape(5, 3, 3)
     total = np.full(len(colours), 1e-30)
     for weight, mean, covariance in zip(weights, means, covariances, strict=True):
         if weight <= 0:
