@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from tiny_scene import scene_maker
 
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.errors import UsageError
@@ -20,6 +21,9 @@ from hwp_bench.sim.worker import frame_file
 
 SceneMaker = Callable[..., Scene]
 FRAMES, SIZE = 20, 40
+
+#: The fixture `make_scene`, found in this module by pytest.
+__all__ = ["scene_maker"]
 
 
 def _pixels(capture: Capture) -> np.ndarray:

@@ -9,13 +9,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from tiny_scene import SINGLE
+from tiny_scene import SINGLE, scene_maker
 
 from hwp_bench.cli.main import main
 from hwp_bench.sim.calibration import TARGETS, Calibration, calibrate, write_strengths
 from hwp_bench.sim.scene import Scene, load_scene
 
 SceneMaker = Callable[..., Scene]
+
+#: The fixture `make_scene`, found in this module by pytest.
+__all__ = ["scene_maker"]
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SINGLE
+from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SINGLE, scene_maker
 
 from hwp_bench.sim.forecast import forecast, plan_table
 from hwp_bench.sim.frame import FrameResult, render_frame
@@ -22,6 +22,9 @@ from hwp_bench.sim.variants import with_effects
 
 SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48
+
+#: The fixture `make_scene`, found in this module by pytest.
+__all__ = ["scene_maker"]
 
 
 @pytest.fixture

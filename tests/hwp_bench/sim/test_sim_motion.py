@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from tiny_scene import SINGLE
+from tiny_scene import SINGLE, scene_maker
 
 from hwp_bench.errors import BadInput
 from hwp_bench.hands import load_template
@@ -19,6 +19,9 @@ from hwp_bench.sim.scene import Scene, parse_scene
 from hwp_bench.sim.subject import template_vertices
 
 SceneMaker = Callable[..., Scene]
+
+#: The fixture `make_scene`, found in this module by pytest.
+__all__ = ["scene_maker"]
 
 
 def test_named_gestures_are_within_the_limits() -> None:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from tiny_scene import scene_maker
 
 from hwp_bench.errors import BadHandModel
 from hwp_bench.hands import HandTemplate, load_template
@@ -21,6 +22,9 @@ pygltflib = pytest.importorskip("pygltflib")
 # Another frame and unit: turned, ten times larger, elsewhere.
 _TURN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
 _SCALE, _SHIFT = 10.0, np.array([1.0, 2.0, 3.0])
+
+#: The fixture `make_scene`, found in this module by pytest.
+__all__ = ["scene_maker"]
 
 
 def write_gltf(path: Path, template: HandTemplate, names: tuple[str, ...]) -> Path:

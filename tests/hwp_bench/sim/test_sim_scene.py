@@ -7,7 +7,7 @@ from collections.abc import Callable
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_scene import SINGLE
+from tiny_scene import SINGLE, scene_maker
 
 from hwp_bench.errors import BadInput, UsageError
 from hwp_bench.sim.episodes import clean_share, level, severity
@@ -23,6 +23,9 @@ from hwp_bench.sim.variants import with_effects, with_severity, with_subject
 from hwp_bench.taxonomy import catalogue
 
 SceneMaker = Callable[..., Scene]
+
+#: The fixture `make_scene`, found in this module by pytest.
+__all__ = ["scene_maker"]
 
 
 def test_every_catalogue_capture_has_its_scene() -> None:
