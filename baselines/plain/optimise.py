@@ -66,8 +66,6 @@ def fit_model(
         betas=_BETAS,
         fused=True,
     )
-    spacing = torch.cat([torch.full((len(rig), 1), rig.spacing) for rig in model.rigs.values()])
-    spacing = spacing.to(device)
     order = _batches(len(frames), settings.batch, seed)
     guard = Guard()
     step = 0
@@ -80,9 +78,6 @@ def fit_model(
         )
         target, weights = frames.targets(rows, settings.outside_weight, device)
         loss = photometric_loss(image, target, weights, settings.dssim_weight)
-        if settings.offset_weight:
-            stretch = (model.gaussians.offsets / spacing).square().sum(dim=-1).mean()
-            loss = loss + settings.offset_weight * stretch
         if not guard.watch(step, float(loss.detach()), model):
             model = guard.best()
             notice(f"The fit diverged at step {step}; the state of step {guard.step} is kept.")

@@ -23,7 +23,7 @@ class PlainSettings:
     #: Optimiser steps unless the budget says otherwise.
     steps: int = 2_000
     #: Frames in each step.
-    batch: int = 2
+    batch: int = 1
     #: Degree of the spherical harmonics of the light, 0 (no shading) to 3.
     shading_degree: int = 2
     #: Share of D-SSIM in the loss; the rest is L1.
@@ -31,11 +31,9 @@ class PlainSettings:
     #: Weight of a pixel outside the visible-hand mask, beside 1 inside.
     outside_weight: float = 0.03
     #: Opacity of every Gaussian at the start.
-    initial_opacity: float = 0.7
-    #: Weight of the mean squared offset in units of the anchor spacing.
-    offset_weight: float = 0.0
+    initial_opacity: float = 0.9
     #: Adam step of the offsets, m.
-    offset_rate: float = 5e-5
+    offset_rate: float = 2e-4
     #: Adam step of the log scales.
     scale_rate: float = 0.01
     #: Adam step of the quaternions.

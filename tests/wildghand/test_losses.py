@@ -57,6 +57,37 @@ def test_both_ways_to_blur_agree() -> None:
     np.testing.assert_allclose(losses._blur(x), losses._convolve(x), atol=1e-14)
 
 
+@pytest.mark.parametrize("dssim_weight", [0.2, 1.0])
+def test_the_compiled_loss_agrees_with_torch_in_float64(dssim_weight: float) -> None:
+    """Value to 1e-6; gradients to 1e-5 of the largest entry."""
+    x, y, w = images(9), images(10), images(11, (2, 24, 30))
+    y[:, 5:9] = x[:, 5:9]
+    values, gradients = [], []
+    for dtype in (torch.float32, torch.float64):
+        leaves = [x.to(dtype).requires_grad_(), w.to(dtype).requires_grad_()]
+        loss = photometric_loss(leaves[0], y.to(dtype), leaves[1], dssim_weight)
+        (3.0 * loss).backward()
+        values.append(float(loss.detach()))
+        gradients.append([leaf.grad.double() for leaf in leaves])
+    assert values[0] == pytest.approx(values[1], abs=1e-6)
+    for fast, exact in zip(*gradients, strict=True):
+        np.testing.assert_allclose(fast, exact, atol=1e-5 * float(exact.abs().max()))
+
+
+def test_the_number_of_threads_changes_nothing() -> None:
+    x, y, w = (images(seed, (5, 24, 30, 3)).float() for seed in (12, 13, 14))
+    before, gradients = torch.get_num_threads(), []
+    try:
+        for threads in (1, 3):
+            torch.set_num_threads(threads)
+            leaf = x.clone().requires_grad_()
+            photometric_loss(leaf, y, w[..., 0], 0.3).backward()
+            gradients.append(leaf.grad)
+    finally:
+        torch.set_num_threads(before)
+    assert torch.equal(gradients[0], gradients[1])
+
+
 def test_weighted_l1_by_hand() -> None:
     prediction = torch.tensor([[[[0.5], [1.0]]]])
     target = torch.tensor([[[[0.0], [0.0]]]])
