@@ -17,6 +17,8 @@ import numpy as np
 MAX_IDLE = 256 << 20
 #: Buffers start on a cache line, which is also the widest vector.
 _ALIGNMENT = 64
+#: The C library keeps buffers below this many bytes by itself.
+_SMALL = 1 << 15
 
 _idle: defaultdict[int, deque[np.ndarray]] = defaultdict(deque)
 
@@ -38,9 +40,9 @@ class _Lease:
 
 
 def lease(shape: tuple[int, ...], kind: type[np.generic]) -> np.ndarray:
-    """An array of that shape, with whatever was there before in it, on a cache line."""
+    """An array of that shape, with whatever was there before in it; a large one on a cache line."""
     size = math.prod(shape) * np.dtype(kind).itemsize
-    if size == 0:
+    if size < _SMALL:
         return np.empty(shape, kind)
     room = _size_class(size)
     try:
@@ -57,8 +59,6 @@ def idle_bytes() -> int:
 
 
 def _size_class(size: int) -> int:
-    """The next of 4096 times 1, 1.25, 1.5, 1.75, 2, 2.5, ...: few sizes, at most 25 % waste."""
-    if size <= 4096:
-        return 4096
+    """The next of a power of two times 1, 1.25, 1.5, 1.75: few sizes, at most 25 % waste."""
     step = 1 << (size - 1).bit_length() - 3
     return -(-size // step) * step

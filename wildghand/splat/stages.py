@@ -10,11 +10,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.errors import HwpError
-from wildghand.splat import conventions as rules
 from wildghand.splat.kernels import geometry
 from wildghand.splat.kernels.bins import count_tiles, fill_tiles, place_tiles
 from wildghand.splat.kernels.blend import blend
-from wildghand.splat.kernels.project import CAMERA, PIECE, project
+from wildghand.splat.kernels.cameras import CAMERA, prepare_cameras
+from wildghand.splat.kernels.project import PIECE, project
 from wildghand.splat.kernels.sort import sort_by_depth
 from wildghand.splat.kernels.tiles import TILE_HEIGHT, TILE_WIDTH
 from wildghand.splat.memory import lease
@@ -90,18 +90,8 @@ def camera_rows(viewmats: np.ndarray, Ks: np.ndarray, options: Options) -> np.nd
         Ks: (I, 3, 3) float64, px.
         options: for the image size.
     """
-    rows = np.zeros((len(viewmats), CAMERA))
-    rows[:, :9] = viewmats[:, :3, :3].reshape(-1, 9)
-    rows[:, 9:12] = viewmats[:, :3, 3]
-    rows[:, 12:16] = Ks[:, (0, 1, 0, 1), (0, 1, 2, 2)]
-    usable = np.isfinite(rows).all(1) & (rows[:, 12:14] > 0).all(1)
-    rows[~usable] = 0.0
-    rows[~usable, 11] = -1.0  # everything lies behind it
-    rows[~usable, 12:14] = 1.0
-    for axis, size in ((0, options.width), (1, options.height)):
-        margin, center, focal = rules.FRUSTUM_MARGIN * size, rows[:, 14 + axis], rows[:, 12 + axis]
-        rows[:, 16 + 2 * axis] = -(center + margin) / focal
-        rows[:, 17 + 2 * axis] = (size - center + margin) / focal
+    rows = np.empty((len(viewmats), CAMERA))
+    prepare_cameras(viewmats, Ks, options.width, options.height, rows)
     return rows
 
 

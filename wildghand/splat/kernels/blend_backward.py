@@ -209,6 +209,16 @@ def background_backward(counter, v_images, remaining, v_lines):
         i, y = job // height, job % height
         sums = v_lines[i, y]
         sums[:] = 0.0
-        for x in range(width):
-            for k in range(size):
-                sums[k] += np.float64(v_images[i, y, x, k]) * np.float64(remaining[i, y, x])
+        if size == 3:  # in registers, since this is the usual number
+            red = green = blue = 0.0
+            for x in range(width):
+                rest = np.float64(remaining[i, y, x])
+                red += v_images[i, y, x, 0] * rest
+                green += v_images[i, y, x, 1] * rest
+                blue += v_images[i, y, x, 2] * rest
+            sums[0], sums[1], sums[2] = red, green, blue
+        else:
+            for x in range(width):
+                rest = np.float64(remaining[i, y, x])
+                for k in range(size):
+                    sums[k] += v_images[i, y, x, k] * rest

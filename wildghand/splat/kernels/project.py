@@ -34,10 +34,6 @@ from wildghand.splat.kernels.tiles import TILE_HEIGHT
 
 #: Gaussians in a piece of work; sums over Gaussians are made piece by piece, in order.
 PIECE = 512
-#: Numbers that describe a camera to the kernels: rotation, translation, fx, fy, cx, cy, and the
-#: range of the tangents of view angles, x then y.
-CAMERA = 20
-
 #: exponent -1/2 d^2 in base 2.
 _HALF_LOG2E = 0.5 * math.log2(math.e)
 _LOG2_255 = math.log2(255.0)
@@ -250,7 +246,7 @@ def project(
         means, quats, scales, opacities, colors: flat float32, (S, N, k).
         channels: floats in a colour.
         shares: int64 (I, 5); which of the S entries of each of the five an image reads.
-        cameras: float64 (I, CAMERA).
+        cameras: float64 (I, CAMERA), see `cameras`.
         gaussians: N.
         geom: out, flat float32 (I, N, 16), see `geometry`.
         depths: out, flat float32 (I, N); 0 where culled.

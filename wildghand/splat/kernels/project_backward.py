@@ -118,7 +118,7 @@ def project_backward(
         counter: int64 (1,), 0; shared by the threads.
         means, quats, scales: flat float32 (S, N, k), as in `project`.
         shares: int64 (I, 3 or more); which of the S entries an image reads.
-        cameras: float64 (I, CAMERA).
+        cameras: float64 (I, CAMERA), see `cameras`.
         gaussians: N.
         depths: float32 (I, N); 0 where culled.
         v_means2d, v_shapes: flat, as `reduce_slots` leaves them.

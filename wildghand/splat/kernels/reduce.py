@@ -15,10 +15,12 @@ import numpy as np
 
 from wildghand.splat.kernels import geometry as at
 from wildghand.splat.kernels.channels import MOMENTS
-from wildghand.splat.kernels.jit import kernel
-from wildghand.splat.kernels.lanes import atomic_next, prefetch
+from wildghand.splat.kernels.jit import inline, kernel
+from wildghand.splat.kernels.lanes import atomic_next, prefetch, store
 from wildghand.splat.kernels.project import PIECE
+from wildghand.splat.kernels.rows import GROUP, fill_exact, load1
 
+#: Entries by which slots are asked for before they are read.
 _AHEAD = 24
 _TWO_LN2 = 2.0 * math.log(2.0)
 
@@ -48,7 +50,8 @@ def reduce_slots(
     """
     images = depths.shape[0]
     pieces = max(1, gaussians // PIECE)
-    color = np.empty(channels, np.float64)
+    groups = (MOMENTS + channels + GROUP - 1) // GROUP
+    sums = np.empty(groups * GROUP, np.float64)
     while True:
         piece = atomic_next(counter)
         if piece >= pieces:
@@ -56,41 +59,52 @@ def reduce_slots(
         for i in range(images):
             for n in range(piece * gaussians // pieces, (piece + 1) * gaussians // pieces):
                 to = i * gaussians + n
-                m = m_u = m_e = m_uu = m_ue = m_ee = 0.0
-                color[:] = 0.0
-                if depths[i, n] > 0:
-                    for entry in range(first_entry[to], first_entry[to + 1]):
-                        if entry + _AHEAD < slot_of.size:
-                            prefetch(slots, np.int64(slot_of[entry + _AHEAD]) * slot_size)
-                        slot = np.int64(slot_of[entry])
-                        if slot < 0:
-                            continue
-                        f = slot * slot_size
-                        m += slots[f]
-                        m_u += slots[f + 1]
-                        m_e += slots[f + 2]
-                        m_uu += slots[f + 3]
-                        m_ue += slots[f + 4]
-                        m_ee += slots[f + 5]
-                        for k in range(channels):
-                            color[k] += slots[f + MOMENTS + k]
-                    row = to * at.ROW
-                    along = np.float64(geom[row + at.ALONG])
-                    across = np.float64(geom[row + at.ACROSS])
-                    shear = np.float64(geom[row + at.SHEAR]) + np.float64(geom[row + at.SHEAR_LOW])
-                    v_x = _TWO_LN2 * along * m_u
-                    v_means2d[2 * to] = v_x
-                    v_means2d[2 * to + 1] = _TWO_LN2 * across * m_e + shear * v_x
-                    v_shapes[3 * to] = -0.5 * _TWO_LN2 * m_uu
-                    v_shapes[3 * to + 1] = -0.5 * _TWO_LN2 * m_ee
-                    v_shapes[3 * to + 2] = -_TWO_LN2 * m_ue
-                    share = opacity_share[i] * gaussians + n
-                    v_opacities[share] += m / opacities[share]
-                    share = (color_share[i] * gaussians + n) * channels
-                    for k in range(channels):
-                        v_colors[share + k] += color[k]
-                else:
-                    v_means2d[2 * to] = 0.0
-                    v_means2d[2 * to + 1] = 0.0
+                if not depths[i, n] > 0:
+                    v_means2d[2 * to] = v_means2d[2 * to + 1] = 0.0
                     for k in range(3):
                         v_shapes[3 * to + k] = 0.0
+                    continue
+                add_slots(first_entry[to], first_entry[to + 1], slot_of, slots, slot_size, sums)
+                row = to * at.ROW
+                along = np.float64(geom[row + at.ALONG])
+                across = np.float64(geom[row + at.ACROSS])
+                shear = np.float64(geom[row + at.SHEAR]) + np.float64(geom[row + at.SHEAR_LOW])
+                m, m_u, m_e, m_uu, m_ue, m_ee = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
+                v_x = _TWO_LN2 * along * m_u
+                v_means2d[2 * to] = v_x
+                v_means2d[2 * to + 1] = _TWO_LN2 * across * m_e + shear * v_x
+                v_shapes[3 * to] = -0.5 * _TWO_LN2 * m_uu
+                v_shapes[3 * to + 1] = -0.5 * _TWO_LN2 * m_ee
+                v_shapes[3 * to + 2] = -_TWO_LN2 * m_ue
+                share = opacity_share[i] * gaussians + n
+                v_opacities[share] += m / opacities[share]
+                share = (color_share[i] * gaussians + n) * channels
+                for k in range(channels):
+                    v_colors[share + k] += sums[MOMENTS + k]
+
+
+@inline
+def add_slots(first, last, slot_of, slots, slot_size, sums):
+    """Writes the sum of the slots of entries `first` to `last` to `sums`, in their order."""
+    low, high = fill_exact(0.0), fill_exact(0.0)
+    for entry in range(first, last):
+        if entry + _AHEAD < slot_of.size:
+            prefetch(slots, np.int64(slot_of[entry + _AHEAD]) * slot_size)
+        slot = np.int64(slot_of[entry])
+        if slot >= 0:
+            (part,) = load1(slots, slot * slot_size)
+            low = low + part
+            if sums.size > GROUP:
+                (part,) = load1(slots, slot * slot_size + GROUP)
+                high = high + part
+    store(sums, 0, low)
+    if sums.size > GROUP:
+        store(sums, GROUP, high)
+    for k in range(2 * GROUP, sums.size, GROUP):  # more channels than usual
+        low = fill_exact(0.0)
+        for entry in range(first, last):
+            slot = np.int64(slot_of[entry])
+            if slot >= 0:
+                (part,) = load1(slots, slot * slot_size + k)
+                low = low + part
+        store(sums, k, low)

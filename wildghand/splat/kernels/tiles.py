@@ -21,7 +21,7 @@ from wildghand.splat.kernels.simd import Vector
 
 def _lanes() -> int:
     """float32 lanes of the widest registers of the processor that numba compiles for."""
-    features = config.CPU_FEATURES  # set by NUMBA_CPU_FEATURES, else None
+    features = getattr(config, "CPU_FEATURES", None)  # of NUMBA_CPU_FEATURES
     if features is None:
         try:
             features = llvmlite.binding.get_host_cpu_features().flatten()
