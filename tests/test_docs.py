@@ -6,7 +6,7 @@ import re
 from pathlib import Path
 
 import pytest
-from conftest import CaptureMaker
+from small_captures import CaptureMaker
 
 from hwp_bench.cli.main import command_tree
 from wildghand.cli.main import command_tree as wildghand_tree

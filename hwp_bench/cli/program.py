@@ -6,7 +6,9 @@ import argparse
 import difflib
 import importlib
 import os
+import signal
 import sys
+import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -38,6 +40,9 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
         The exit status: 0 done, 1 failed, 2 asked for wrongly, 130 stopped by the user.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
+    if threading.current_thread() is threading.main_thread():
+        # Ended as by Ctrl-C, so that child processes are stopped and temporary files removed.
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         status = _dispatch(program, tree, words)
         sys.stdout.flush()

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import CaptureMaker, cameras, hand_parameters, hand_picture
+from small_captures import CaptureMaker, cameras, hand_parameters, hand_picture
 
 from hwp_bench.capture import Cameras, CaptureWriter, open_capture
 from hwp_bench.capture.check import check_capture

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+import time
 from pathlib import Path
 
 import pytest
-from conftest import CaptureMaker
+from small_captures import CaptureMaker
 
 from hwp_bench.cli.main import command_tree, main
 from hwp_bench.cli.program import Command
@@ -136,3 +138,31 @@ def test_a_reader_that_stops_reading_is_no_traceback() -> None:
     done = subprocess.run(["bash", "-c", command], capture_output=True, text=True, check=True)
     assert "Captures" in done.stdout
     assert "Traceback" not in done.stderr
+
+
+def test_a_stopped_evaluation_leaves_no_process_behind(
+    make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    capture = make_capture(frames=20)
+    method = tmp_path / "method"
+    method.mkdir()
+    pid_file = tmp_path / "pid"
+    (method / "run.py").write_text(
+        f"import os, time\nopen({str(pid_file)!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)\n"
+    )
+    (method / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "slow"\n[entry]\ncommand = ["{python}", "{method}/run.py"]\n'
+    )
+    words = ["evaluate", str(method), "--capture", str(capture.root), "--out", str(tmp_path / "o")]
+    command = [sys.executable, "-m", "hwp_bench.cli.main", *words]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
+        while not (pid_file.is_file() and pid_file.read_text()):
+            assert process.poll() is None
+            time.sleep(0.05)
+        process.terminate()
+        _, errors = process.communicate(timeout=60)
+    assert process.returncode == 130
+    assert "stopped" in errors
+    assert "Traceback" not in errors
+    with pytest.raises(ProcessLookupError):
+        os.kill(int(pid_file.read_text()), 0)

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import CaptureMaker
+from small_captures import CaptureMaker
 
 from hwp_bench.capture import Capture
 from hwp_bench.errors import BadCapture, BadImage, BadSplit

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import CaptureMaker
+from small_captures import CaptureMaker
 
 from hwp_bench.errors import BadImage, BadInput, HwpError, UsageError
 from hwp_bench.methods.contract import Budget

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
-from conftest import CaptureMaker
 from hypothesis import given
 from hypothesis import strategies as st
+from small_captures import CaptureMaker
 
 from hwp_bench.errors import BadSplit
 from hwp_bench.splits import (
