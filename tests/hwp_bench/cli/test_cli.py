@@ -151,7 +151,8 @@ def test_a_stopped_evaluation_leaves_no_process_behind(
         f"import os, time\nopen({str(pid_file)!r}, 'w').write(str(os.getpid()))\ntime.sleep(600)\n"
     )
     (method / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "slow"\n[entry]\ncommand = ["{python}", "{method}/run.py"]\n'
+        'schema = "hwp-method/1"\nname = "slow"\n'
+        '[entry]\ncommand = ["{python}", "{method}/run.py"]\n'
     )
     words = ["evaluate", str(method), "--capture", str(capture.root), "--out", str(tmp_path / "o")]
     command = [sys.executable, "-m", "hwp_bench.cli.main", *words]
