@@ -24,6 +24,9 @@ from wildghand.splat.stages import (
 )
 from wildghand.splat.threads import run, thread_count
 
+#: Pixels of the background's gradient that take as long as a (Gaussian, tile) pair.
+_PIXELS_LIKE_A_PAIR = 20
+
 
 @dataclass(frozen=True)
 class BlendGradients:
@@ -75,7 +78,7 @@ def blend_backward_stage(
     slot_of = lease((len(lists.entries),), np.int32)
     run(
         blend_backward,
-        thread_count(len(drawn.stops)),
+        thread_count(len(drawn.stops), len(slots)),
         lists.start,
         drawn.stops,
         first_slot,
@@ -97,7 +100,7 @@ def blend_backward_stage(
     )
     run(
         reduce_slots,
-        thread_count(gaussians // PIECE),
+        thread_count(gaussians // PIECE, count * gaussians),
         gaussians,
         size,
         projected.geom.reshape(-1),
@@ -118,9 +121,15 @@ def blend_backward_stage(
 
 def background_backward_stage(v_images: np.ndarray, remaining: np.ndarray) -> np.ndarray:
     """Gradient of the backgrounds, (I, D) float64."""
-    count, height, _, size = v_images.shape
+    count, height, width, size = v_images.shape
     lines = np.empty((count, height, size))
-    run(background_backward, thread_count(count * height), v_images, remaining, lines)
+    run(
+        background_backward,
+        thread_count(count * height, count * height * width // _PIXELS_LIKE_A_PAIR),
+        v_images,
+        remaining,
+        lines,
+    )
     return lines.sum(1)
 
 
@@ -155,7 +164,7 @@ def project_backward_stage(
     v_cameras = np.zeros((count, pieces if want_cameras else 0, 12))
     run(
         project_backward,
-        thread_count(pieces),
+        thread_count(pieces, count * gaussians),
         inputs.means.reshape(-1),
         inputs.quats.reshape(-1),
         inputs.scales.reshape(-1),

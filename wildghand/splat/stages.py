@@ -23,8 +23,6 @@ from wildghand.splat.threads import run, thread_count
 
 #: Numbers of channels for which the blending kernels are compiled unrolled.
 UNROLLED = (3,)
-#: Fewest Gaussians that are worth a thread of their own while tiles are listed.
-_CHUNK = 2048
 #: Most chunks: each has a counter for every tile.
 _MOST_CHUNKS = 32
 
@@ -107,7 +105,7 @@ def project_stage(inputs: Inputs, options: Options) -> Projected:
     )
     run(
         project,
-        thread_count(images * gaussians // PIECE),
+        thread_count(images * gaussians // PIECE, images * gaussians),
         inputs.means.reshape(-1),
         inputs.quats.reshape(-1),
         inputs.scales.reshape(-1),
@@ -139,14 +137,14 @@ def list_stage(projected: Projected, options: Options) -> Lists:
         HwpError: more (splat, tile) pairs than can be counted.
     """
     images, gaussians = projected.depths.shape
-    chunks = max(1, min(thread_count(gaussians // _CHUNK), _MOST_CHUNKS))
+    chunks = min(thread_count(_MOST_CHUNKS, gaussians), _MOST_CHUNKS)
     order = lease((images, gaussians), np.int32)
     spare = lease((images, gaussians), np.int32)
     visible = np.empty(images, np.int64)
     chunk_rows = np.empty((images, chunks + 1), np.int64)
     run(
         sort_by_depth,
-        thread_count(images),
+        thread_count(images, images * gaussians),
         projected.depths,
         projected.rows,
         order,
@@ -163,7 +161,7 @@ def list_stage(projected: Projected, options: Options) -> Lists:
     counts = lease((images, chunks, tiles), np.int32)
     entry_count = lease((images, gaussians), np.int32)
     entry_count[:] = 0
-    threads = thread_count(images * chunks)
+    threads = thread_count(images * chunks, images * gaussians)
     run(
         count_tiles,
         threads,
@@ -237,7 +235,7 @@ def blend_stage(
     )
     run(
         blend,
-        thread_count(tiles),
+        thread_count(tiles, len(lists.entries)),
         lists.start,
         lists.entries,
         projected.geom.reshape(-1),

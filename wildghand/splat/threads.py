@@ -17,10 +17,19 @@ from typing import Any
 import numpy as np
 import torch
 
+#: Work, in Gaussians or (Gaussian, tile) pairs, that outweighs waking a thread (some 0.1 ms).
+WORTH_A_THREAD = 4096
 
-def thread_count(jobs: int) -> int:
-    """Threads worth using for so many pieces of work."""
-    return max(1, min(torch.get_num_threads(), jobs))
+
+def thread_count(jobs: int, work: int | None = None) -> int:
+    """Threads worth using.
+
+    Args:
+        jobs: pieces into which the work is cut.
+        work: how many Gaussians or pairs it is; None if every job is worth a thread.
+    """
+    worth = jobs if work is None else min(jobs, work // WORTH_A_THREAD)
+    return max(1, min(torch.get_num_threads(), worth))
 
 
 def run(kernel: Callable[..., Any], threads: int, *args: Any) -> None:

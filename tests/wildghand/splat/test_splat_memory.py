@@ -85,5 +85,6 @@ def test_thread_count_follows_torch() -> None:
     try:
         torch.set_num_threads(5)
         assert [thread_count(jobs) for jobs in (0, 1, 4, 9)] == [1, 1, 4, 5]
+        assert [thread_count(9, work) for work in (10, 10_000, 10**6)] == [1, 2, 5]
     finally:
         torch.set_num_threads(before)

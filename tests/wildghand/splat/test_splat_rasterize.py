@@ -198,7 +198,7 @@ def test_alpha_alone_has_gradients() -> None:
 
 
 def test_same_bits_for_any_number_of_threads_and_on_every_run() -> None:
-    tensors = arguments(cameras=2, count=4000)
+    tensors = arguments(cameras=2, count=30_000)
     before = torch.get_num_threads()
     results = []
     try:
@@ -213,7 +213,7 @@ def test_same_bits_for_any_number_of_threads_and_on_every_run() -> None:
 
 
 def test_many_callers_at_once() -> None:
-    scenes = [arguments(count=50 + 10 * k) for k in range(8)]
+    scenes = [arguments(count=12_000 * (k % 2) + 50 + 10 * k) for k in range(8)]
     expected = [gradients(scene) for scene in scenes]
     with concurrent.futures.ThreadPoolExecutor(8) as pool:
         for _ in range(3):
@@ -230,7 +230,7 @@ def test_a_forked_child_can_draw() -> None:
         sys.path.insert(0, sys.argv[1])
         from test_splat_rasterize import SIZE, arguments, rasterize
         torch.set_num_threads(2)
-        tensors = arguments(cameras=2, count=3000)
+        tensors = arguments(cameras=2, count=30_000)
         expected = rasterize(**tensors, **SIZE)[0]
         def child():
             sys.exit(0 if torch.equal(rasterize(**tensors, **SIZE)[0], expected) else 3)
