@@ -20,6 +20,8 @@ from hwp_bench.importers.landmarks import LANDMARK_NAMES, Landmarks
 #: Focal length that is taken for likely where none is given, as a share of the picture's longer
 #: side: a horizontal field of view of 64 degrees, between a webcam and a phone's main camera.
 LIKELY_FOCAL = 0.8
+# Variables that are the same in all frames; they wait until every frame has found its pose.
+_CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
 # Variables that the outline says nothing reliable about.
 _HELD_BY_LANDMARKS = ("log_focal", "log_size")
 
@@ -114,7 +116,13 @@ def fit_landmarks(
         landmarks, model, settings, footage.fps, focal if footage.focal is None else None
     )
     hold = () if footage.focal is None else ("log_focal",)
-    descend(model, energy, settings.landmark_steps, hold=hold, update=update)
+    descend(model, energy.from_afar, settings.start_steps, hold=_CONSTANTS, update=update)
+
+    def later(step: int) -> None:
+        if update is not None:
+            update(settings.start_steps + step)
+
+    descend(model, energy, settings.landmark_steps, hold=hold, update=later)
     return FittedClip(model, energy, settings)
 
 

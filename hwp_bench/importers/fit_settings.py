@@ -13,8 +13,10 @@ class FitSettings:
     size of an error that is still ordinary.
     """
 
-    #: Steps of Adam on the landmarks.
-    landmark_steps: int = 600
+    #: Steps of Adam from the rigid start, led by the world landmarks.
+    start_steps: int = 150
+    #: Steps of Adam after that, on all landmarks, with outliers let go.
+    landmark_steps: int = 450
     #: Steps of Adam in each round against the masks.
     contour_steps: int = 120
     #: Rounds of: find the mesh's outline, pull it to the mask's outline.
@@ -27,6 +29,8 @@ class FitSettings:
     world_scale: float = 0.015
     #: Weight of the world landmarks; they guide depth, the picture decides the rest.
     world_weight: float = 0.5
+    #: Weight of the image landmarks in the first steps, beside 1 of the world landmarks.
+    start_image_weight: float = 0.05
     #: Acceleration of landmarks in space, m per (1/30 s)^2.
     motion_scale: float = 0.003
     #: Acceleration of joint angles, rad per (1/30 s)^2.

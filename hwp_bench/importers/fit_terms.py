@@ -46,19 +46,37 @@ class LandmarkEnergy:
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy, a scalar."""
-        return self._data(model, posed) + self._motion(model, posed) + self._priors(model, posed)
+        picture = geman_mcclure(self._image_error(model, posed))
+        data = (self.weight * picture).sum() + self.settings.world_weight * self._world(
+            model, posed
+        )
+        return data + self._rest(model, posed)
 
-    def _data(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+    def from_afar(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        """Return the energy for the first steps, when most fingers are bent wrongly.
+
+        The world landmarks lead, because only they say whether a finger bends to or fro; the
+        image landmarks, however far off, do no more than to place the hand.
+        """
         settings = self.settings
-        scale = settings.image_scale * self.hand_size
-        image = (model.pixels(posed.landmarks) - self.image) / scale
-        picture = self.weight * geman_mcclure((image**2).sum(dim=-1))
+        picture = (self.weight * charbonnier(self._image_error(model, posed))).sum()
+        data = settings.start_image_weight * picture + self._world(model, posed)
+        return data + self._rest(model, posed)
+
+    def _image_error(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        scale = self.settings.image_scale * self.hand_size
+        return (((model.pixels(posed.landmarks) - self.image) / scale) ** 2).sum(dim=-1)
+
+    def _world(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         # Compared at the tracker's own scale: measured at the hand's, a hand that shrinks to
         # nothing would fit best.
         centred = posed.landmarks - posed.landmarks.mean(dim=1, keepdim=True)
-        space = (centred * torch.exp(-model.variables.log_size) - self.world) / settings.world_scale
-        world = self.weight * charbonnier((space**2).sum(dim=-1))
-        return picture.sum() + settings.world_weight * world.sum()
+        error = centred * torch.exp(-model.variables.log_size) - self.world
+        squared = ((error / self.settings.world_scale) ** 2).sum(dim=-1)
+        return (self.weight * charbonnier(squared)).sum()
+
+    def _rest(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        return self._motion(model, posed) + self._priors(model, posed)
 
     def _motion(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         settings = self.settings

@@ -177,7 +177,8 @@ def fit_video(source: Source, options: VideoImport) -> ImportedClip:
     landmarks, windows, settings = source.landmarks, source.windows, options.fit
     video = source.video
     footage = Footage(video.width, video.height, video.fps / options.frames.stride, options.focal)
-    with progress("fitting landmarks", settings.landmark_steps) as update:
+    steps = settings.start_steps + settings.landmark_steps
+    with progress("fitting landmarks", steps) as update:
         template = load_template(options.hand_model, options.hand)
         fitted = fit_landmarks(landmarks, template, footage, settings, update)
     first_error = reprojection_error(fitted, landmarks)

@@ -19,7 +19,7 @@ from hwp_bench.importers.fit_start import interpolate, rigid_start
 from hwp_bench.importers.landmarks import Landmarks
 
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
-SETTINGS = FitSettings(landmark_steps=250)
+SETTINGS = FitSettings(start_steps=80, landmark_steps=200)
 
 
 def fit(clip: SyntheticClip, landmarks: Landmarks, focal: float | None = FOCAL) -> FittedClip:
@@ -135,13 +135,18 @@ def test_the_fit_repeats_exactly() -> None:
 def test_the_callers_torch_threads_come_back() -> None:
     before = torch.get_num_threads()
     clip = make_clip(4)
-    fit_landmarks(clip.landmarks, clip.template, Footage(WIDTH, HEIGHT, FPS, FOCAL), FitSettings(2))
+    fit_landmarks(
+        clip.landmarks,
+        clip.template,
+        Footage(WIDTH, HEIGHT, FPS, FOCAL),
+        FitSettings(start_steps=1, landmark_steps=1),
+    )
     assert torch.get_num_threads() == before
 
 
 def test_a_fit_that_leaves_the_numbers_says_so() -> None:
     clip = make_clip(4)
-    settings = FitSettings(landmark_steps=2, world_scale=1e-30)
+    settings = FitSettings(start_steps=2, world_scale=1e-30)
     with pytest.raises(DidNotConverge):
         fit_landmarks(clip.landmarks, clip.template, Footage(WIDTH, HEIGHT, FPS, FOCAL), settings)
 

@@ -25,7 +25,7 @@ from hwp_bench.importers.silhouette import overlap
 from hwp_bench.importers.video import import_video
 
 FRAMES = 16
-QUICK = FitSettings(landmark_steps=150, contour_steps=30, contour_rounds=1)
+QUICK = FitSettings(start_steps=60, landmark_steps=120, contour_steps=30, contour_rounds=1)
 REAL = Path(__file__).resolve().parents[4] / "shared" / "data" / "real_hand"
 
 
@@ -222,7 +222,7 @@ def test_a_part_of_the_real_video(tmp_path: Path) -> None:
     # Frames 590 to 621 open and make a fist, fast; the bound is 8 px at 1280x720.
     options = VideoImport(
         frames=FrameRange(590, 621),
-        fit=FitSettings(landmark_steps=300, contour_steps=60, contour_rounds=2),
+        fit=FitSettings(start_steps=80, landmark_steps=200, contour_steps=60),
     )
     result = import_video(
         REAL / "human_hand_video.mp4", REAL / "landmarks.npz", tmp_path / "real", options
