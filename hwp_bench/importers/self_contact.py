@@ -104,8 +104,9 @@ class ContactEnergy:
         self.centres = torch.as_tensor(spheres.centres, dtype=torch.float32)
         self.basis = torch.as_tensor(spheres.basis, dtype=torch.float32)
         self.joints = torch.as_tensor(spheres.joints)
-        self.first, self.second = torch.as_tensor(pairs.T)
-        self.distance = torch.as_tensor(distance, dtype=torch.float32)
+        least = np.zeros((len(spheres.radii),) * 2)
+        least[tuple(pairs.T)] = distance
+        self.least = torch.as_tensor(least, dtype=torch.float32)
         self.scale = scale
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
@@ -113,10 +114,15 @@ class ContactEnergy:
         rest = self.centres + self.basis @ model.variables.betas
         motion = posed.transforms[:, self.joints]
         places = (motion[..., :3, :3] @ rest[..., None])[..., 0] + motion[..., :3, 3]
-        apart = places[:, self.first] - places[:, self.second]
+        # Few pairs touch: find them without gradients, then treat only those.
+        with torch.no_grad():
+            frame, first, second = torch.nonzero(
+                torch.cdist(places, places) < self.least, as_tuple=True
+            )
+        apart = places[frame, first] - places[frame, second]
         # A tiny length keeps the root's gradient finite for centres that meet.
         length = torch.sqrt((apart**2).sum(dim=-1) + 1e-10)
-        overlap = (self.distance - length).clamp(min=0.0) / self.scale
+        overlap = (self.least[first, second] - length).clamp(min=0.0) / self.scale
         return (overlap**2).sum()
 
 

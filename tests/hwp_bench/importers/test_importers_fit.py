@@ -12,11 +12,21 @@ from synthetic_clip import FOCAL, FPS, HEIGHT, WIDTH, SyntheticClip, make_clip
 
 from hwp_bench.errors import DidNotConverge
 from hwp_bench.hands import pose_hand
+from hwp_bench.hands.template import rebuilt
 from hwp_bench.importers.clip_model import continuous_rotation_vectors
-from hwp_bench.importers.fit_clip import FittedClip, Footage, fit_landmarks, reprojection_error
+from hwp_bench.importers.contour import ContourEnergy, posed_vertices
+from hwp_bench.importers.crop import cut, follow_hand
+from hwp_bench.importers.fit_clip import (
+    FittedClip,
+    Footage,
+    fit_landmarks,
+    fit_outline,
+    reprojection_error,
+)
 from hwp_bench.importers.fit_settings import FitSettings
 from hwp_bench.importers.fit_start import interpolate, rigid_start
 from hwp_bench.importers.landmarks import Landmarks
+from hwp_bench.importers.outline import signed_distance
 
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
 SETTINGS = FitSettings(start_steps=80, landmark_steps=200)
@@ -163,3 +173,57 @@ def test_rotation_vectors_do_not_jump() -> None:
 def test_interpolation_holds_the_ends() -> None:
     values = interpolate(np.array([[1.0], [3.0]]), np.array([1, 3]), 6)
     np.testing.assert_allclose(values[:, 0], [1, 1, 2, 3, 3, 3])
+
+
+@pytest.mark.parametrize("correctives", [False, True])
+def test_outline_vertices_are_those_of_the_hand_model(correctives: bool) -> None:
+    # The contour term poses a few vertices by itself; `pose_hand` poses all. Float32: 10 um.
+    clip = make_clip(4)
+    hand = clip.template
+    if correctives:
+        basis = np.random.default_rng(0).normal(0, 1e-3, (len(hand.vertices), 3, 135))
+        hand = rebuilt(hand, pose_basis=basis)
+    footage = Footage(WIDTH, HEIGHT, FPS, FOCAL)
+    quick = FitSettings(start_steps=20, landmark_steps=1)
+    fitted = fit_landmarks(clip.landmarks, hand, footage, quick)
+    windows = follow_hand(clip.landmarks, FPS, 96)
+    masks = [
+        cut(clip.silhouette(frame), windows.corners[frame], windows.side) for frame in range(4)
+    ]
+    fields = np.stack([signed_distance(mask) for mask in masks])
+    contour = ContourEnergy(fields, clip.landmarks.detected, windows, quick, 150.0)
+    contour.rematch(fitted.model)
+    everything = posed_vertices(fitted.model)
+    some = fitted.model.vertices(fitted.model.posed(), contour.index, contour.rest)
+    expected = np.take_along_axis(everything, contour.index.numpy()[..., None], axis=1)
+    np.testing.assert_allclose(some.detach().numpy(), expected, atol=1e-5)
+
+
+def test_the_outline_pulls_a_displaced_hand_back() -> None:
+    # Landmarks 5 px to the right of the hand; the masks are where the hand is.
+    clip = make_clip(6)
+    shifted = Landmarks(
+        clip.landmarks.image + np.array([5.0, 0.0]),
+        clip.landmarks.world,
+        clip.landmarks.score,
+        clip.landmarks.detected,
+    )
+    fitted = fit(clip, shifted)
+    windows = follow_hand(clip.landmarks, FPS, 96)
+    fields = np.stack(
+        [
+            signed_distance(cut(clip.silhouette(f), windows.corners[f], windows.side))
+            for f in range(6)
+        ]
+    )
+    contour = ContourEnergy(fields, clip.landmarks.detected, windows, SETTINGS, 150.0)
+
+    def offset() -> float:
+        with torch.no_grad():
+            pixels = fitted.model.pixels(torch.as_tensor(posed_vertices(fitted.model))).numpy()
+        return float(np.abs((pixels - clip.vertex_pixels).mean(axis=(0, 1)))[0])
+
+    before = offset()
+    fit_outline(fitted, contour)
+    assert before > 3.5
+    assert offset() < before / 2
