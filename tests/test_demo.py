@@ -37,10 +37,8 @@ def test_the_demo_renders_fits_scores_and_draws(tmp_path: Path) -> None:
     assert "Plain fit" in first.stdout
     assert "Time of this demo" in first.stdout
     results = json.loads((out / "results.json").read_text())
-    captures = {
-        capture.info.id: capture
-        for capture in map(open_capture, (tmp_path / "cache").glob("sim/captures/*/"))
-    }
+    rendered = map(open_capture, (tmp_path / "cache").glob("sim/captures/*/"))
+    captures = {capture.info.id: capture for capture in rendered}
     assert [capture["id"] for capture in results["captures"]] == ["capture0", "capture4"]
     for capture in results["captures"]:
         assert capture["exact_masks"]
