@@ -14,12 +14,10 @@ import numba
 import numpy as np
 import torch
 
-from wildghand.splat.threads import run, thread_count
-
 
 def _compile(function: Callable[..., None]) -> Any:
-    """Compile a function that releases the interpreter lock; kept on disk where that works."""
-    options: dict[str, Any] = {"nogil": True, "boundscheck": False, "error_model": "numpy"}
+    """Compile a function; the machine code is kept on disk where that works."""
+    options: dict[str, Any] = {"boundscheck": False, "error_model": "numpy"}
     try:
         return numba.njit(cache=True, **options)(function)
     except RuntimeError:  # numba found no folder to write to
@@ -46,23 +44,17 @@ class PhotometricCpu(torch.autograd.Function):
         )
         errors = np.empty(w.shape, np.float32)
         gradient = np.empty_like(x) if ctx.needs_input_grad[0] else None
-        jobs = iter(range(len(x)))
-
-        def work(_counter: np.ndarray) -> None:
-            # Every image is taken by one thread, so the result does not depend on their number.
-            for image in jobs:
-                _one_image(
-                    x[image],
-                    y[image],
-                    w[image] / np.float32(x.size),
-                    np.float32(dssim_weight),
-                    window,
-                    np.array(stabilisers, np.float32),
-                    errors[image],
-                    None if gradient is None else gradient[image],
-                )
-
-        run(work, thread_count(len(x)))
+        for image in range(len(x)):
+            _one_image(
+                x[image],
+                y[image],
+                w[image] / np.float32(x.size),
+                np.float32(dssim_weight),
+                window,
+                np.array(stabilisers, np.float32),
+                errors[image],
+                None if gradient is None else gradient[image],
+            )
         ctx.gradient = gradient
         ctx.save_for_backward(torch.from_numpy(errors))
         ctx.count = x.size
