@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import operator
 import warnings
 from collections.abc import Callable
@@ -205,9 +206,10 @@ def _usable_views(scene: Scene) -> Scene:
     """Warns of cameras that see nothing; makes backgrounds that are not finite black."""
     if scene.means.is_cuda:  # the backend does so without a second look from the host
         return scene
-    if not (scene.viewmats.isfinite().all() and scene.Ks.isfinite().all()):
+    finite = math.isfinite(scene.viewmats.detach().sum() + scene.Ks.detach().sum())
+    if not finite and not (scene.viewmats.isfinite().all() and scene.Ks.isfinite().all()):
         warnings.warn("rasterize: a camera is not finite; its image shows the background alone")
-    elif not (scene.Ks.diagonal(dim1=-2, dim2=-1)[:, :2] > 0).all():
+    elif not scene.Ks.detach()[:, (0, 1), (0, 1)].amin() > 0:
         warnings.warn("rasterize: a camera has no positive focal length; it sees nothing")
     if scene.backgrounds is None:
         return scene

@@ -98,7 +98,7 @@ class Project(torch.autograd.Function):
         v_means2d, v_shapes, v_depths, v_compensations = (
             None if v is None else _gaussians(v.contiguous()) for v in upstream
         )
-        wanted = [_gaussian_zeros(tensor) for tensor in (means, quats, scales)]
+        wanted = [_like_gaussians(tensor) for tensor in (means, quats, scales)]
         rows = project_backward_stage(
             Inputs(
                 means=_gaussians(means),
@@ -169,11 +169,11 @@ class Blend(torch.autograd.Function):
         if v_images is None:
             v_images = torch.zeros_like(images)
         if v_alphas is None:
-            v_alphas = torch.zeros(*images.shape[:-1], 1)
+            v_alphas = torch.empty(0)
         upstream = _array(v_images.contiguous())
         shape = call.projected.depths.shape
         v_means2d, v_shapes = torch.empty(*shape, 2), torch.empty(*shape, 3)
-        v_opacities, v_colors = _gaussian_zeros(opacities), _gaussian_zeros(colors)
+        v_opacities, v_colors = _like_gaussians(opacities), _like_gaussians(colors)
         blend_backward_stage(
             call.projected,
             call.lists,
@@ -211,9 +211,9 @@ def _gaussians(tensor: torch.Tensor) -> np.ndarray:
     return np.pad(_array(tensor), [(0, 0), (0, missing)] + [(0, 0)] * (tensor.ndim - 2))
 
 
-def _gaussian_zeros(tensor: torch.Tensor) -> torch.Tensor:
-    """Zeros for a gradient, with at least a group of Gaussians."""
-    return torch.zeros(tensor.shape[0], max(tensor.shape[1], GROUP), *tensor.shape[2:])
+def _like_gaussians(tensor: torch.Tensor) -> torch.Tensor:
+    """Room for a gradient, with at least a group of Gaussians."""
+    return torch.empty(tensor.shape[0], max(tensor.shape[1], GROUP), *tensor.shape[2:])
 
 
 def _refuse_second_order() -> None:

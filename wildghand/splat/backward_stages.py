@@ -20,9 +20,10 @@ from wildghand.splat.stages import (
     Lists,
     Projected,
     kernel_channels,
-    share_of,
+    repeat_of,
+    tile_jobs,
 )
-from wildghand.splat.threads import run, thread_count
+from wildghand.splat.threads import even_jobs, run, thread_count
 
 #: Pixels of the background's gradient that take as long as a (Gaussian, tile) pair.
 _PIXELS_LIKE_A_PAIR = 20
@@ -30,7 +31,7 @@ _PIXELS_LIKE_A_PAIR = 20
 
 @dataclass(frozen=True)
 class BlendGradients:
-    """Gradients of what was blended; the last two are zeros to begin with."""
+    """Where the gradients of what was blended are written."""
 
     means2d: np.ndarray  # (I, N, 2)
     shapes: np.ndarray  # (I, N, 3), see kernels.reduce
@@ -40,7 +41,7 @@ class BlendGradients:
 
 @dataclass(frozen=True)
 class ProjectGradients:
-    """Gradients of what was projected; zeros to begin with."""
+    """Where the gradients of what was projected are written."""
 
     means: np.ndarray  # (S, N, 3)
     quats: np.ndarray  # (S, N, 4)
@@ -65,7 +66,7 @@ def blend_backward_stage(
         projected, lists, drawn, images: as the forward pass left them.
         opacities: (S, N) float32, as blended.
         colors: (S, N, D) float32.
-        v_images, v_alphas: gradients of the loss, (I, H, W, D) and (I, H, W, 1).
+        v_images, v_alphas: gradients of the loss, (I, H, W, D) and (I, H, W, 1) or (0,).
         options: of the call.
         gradients: overwritten.
     """
@@ -76,16 +77,17 @@ def blend_backward_stage(
     floats = slot_size(size, size in UNROLLED)
     slots = lease((int(looked_at.sum()), floats), np.float32)
     slot_of = lease((len(lists.entries),), np.int32)
+    pieces = max(1, gaussians // PIECE)
     run(
         blend_backward,
-        thread_count(len(drawn.stops), len(slots)),
+        tile_jobs(np.append(first_slot, len(slots))),
         lists.start,
         drawn.stops,
         first_slot,
         lists.entries,
         projected.geom.reshape(-1),
         colors.reshape(-1),
-        share_of(len(colors), count),
+        repeat_of(colors, count),
         options.width,
         options.height,
         gaussians,
@@ -100,13 +102,13 @@ def blend_backward_stage(
     )
     run(
         reduce_slots,
-        thread_count(gaussians // PIECE, count * gaussians),
+        even_jobs(pieces, thread_count(pieces, count * gaussians)),
         gaussians,
         size,
         projected.geom.reshape(-1),
         opacities.reshape(-1),
-        share_of(len(opacities), count),
-        share_of(len(colors), count),
+        repeat_of(opacities, count),
+        repeat_of(colors, count),
         lists.first_entry,
         projected.depths,
         slot_of,
@@ -123,9 +125,10 @@ def background_backward_stage(v_images: np.ndarray, remaining: np.ndarray) -> np
     """Gradient of the backgrounds, (I, D) float64."""
     count, height, width, size = v_images.shape
     lines = np.empty((count, height, size))
+    work = count * height * width // _PIXELS_LIKE_A_PAIR
     run(
         background_backward,
-        thread_count(count * height, count * height * width // _PIXELS_LIKE_A_PAIR),
+        even_jobs(count * height, thread_count(count * height, work)),
         v_images,
         remaining,
         lines,
@@ -164,11 +167,11 @@ def project_backward_stage(
     v_cameras = np.zeros((count, pieces if want_cameras else 0, 12))
     run(
         project_backward,
-        thread_count(pieces, count * gaussians),
+        even_jobs(pieces, thread_count(pieces, count * gaussians)),
         inputs.means.reshape(-1),
         inputs.quats.reshape(-1),
         inputs.scales.reshape(-1),
-        inputs.shares,
+        inputs.repeats,
         inputs.cameras,
         gaussians,
         projected.depths.reshape(-1),

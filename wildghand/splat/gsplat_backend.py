@@ -8,6 +8,7 @@ no gradient. Otherwise the tensors go to gsplat as they are.
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from typing import Any
 
@@ -94,7 +95,7 @@ def _gsplat() -> tuple[Callable[..., Any], bool]:
             field="backend",
             remedy="Install it with `pip install gsplat`, or pass CPU tensors",
         ) from error
-    version = tuple(int(part) for part in gsplat.__version__.split("+")[0].split(".")[:3])
+    version = tuple(int(part) for part in re.findall(r"\d+", gsplat.__version__)[:3])
     return gsplat.rasterization, version >= _BATCHES_SINCE
 
 

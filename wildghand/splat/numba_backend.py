@@ -29,7 +29,9 @@ def rasterize_numba(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str,
     call = Call(
         options,
         camera_rows(
-            scene.viewmats.detach().double().numpy(), scene.Ks.detach().double().numpy(), options
+            scene.viewmats.detach().double().contiguous().numpy(),
+            scene.Ks.detach().double().contiguous().numpy(),
+            options,
         ),
     )
     means2d, shapes, depths, compensations = Project.apply(

@@ -8,6 +8,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import psutil
 
 from hwp_bench.errors import HwpError
 from wildghand.splat.kernels import geometry
@@ -19,10 +20,14 @@ from wildghand.splat.kernels.sort import sort_by_depth
 from wildghand.splat.kernels.tiles import TILE_HEIGHT, TILE_WIDTH
 from wildghand.splat.memory import lease
 from wildghand.splat.scene import Options
-from wildghand.splat.threads import run, thread_count
+from wildghand.splat.threads import even_jobs, run, thread_count, weighted_jobs
 
 #: Numbers of channels for which the blending kernels are compiled unrolled.
 UNROLLED = (3,)
+#: Memory of a (Gaussian, tile) pair: its entry, and what the backward pass adds at least.
+_BYTES_PER_ENTRY = 12
+#: Bytes that are taken without a look at what the machine has.
+_LITTLE = 1 << 30
 #: Most chunks: each has a counter for every tile.
 _MOST_CHUNKS = 32
 
@@ -39,10 +44,10 @@ class Inputs:
     cameras: np.ndarray  # (I, CAMERA) float64
 
     @property
-    def shares(self) -> np.ndarray:
-        """(I, 5) int64: which entry of each of the five an image reads."""
+    def repeats(self) -> np.ndarray:
+        """(5,) int64: how many images in a row read the same entry of each of the five."""
         arrays = (self.means, self.quats, self.scales, self.opacities, self.colors)
-        return np.stack([share_of(len(part), len(self.cameras)) for part in arrays], 1)
+        return np.array([repeat_of(part, len(self.cameras)) for part in arrays])
 
 
 @dataclass(frozen=True)
@@ -75,9 +80,9 @@ class Drawn:
     pairs: np.ndarray  # (tiles,) int64, blended (Gaussian, pixel) pairs if counted
 
 
-def share_of(shared: int, images: int) -> np.ndarray:
-    """Which of `shared` entries each image reads."""
-    return np.arange(images, dtype=np.int64) // max(1, images // max(1, shared))
+def repeat_of(shared: np.ndarray, images: int) -> int:
+    """How many images in a row read the same entry of an array."""
+    return images // max(1, len(shared))
 
 
 def camera_rows(viewmats: np.ndarray, Ks: np.ndarray, options: Options) -> np.ndarray:
@@ -103,16 +108,17 @@ def project_stage(inputs: Inputs, options: Options) -> Projected:
         radii=lease((images, gaussians, 2), np.int32),
         compensations=lease((images, gaussians if options.antialiased else 0), np.float32),
     )
+    jobs = images * max(1, gaussians // PIECE)
     run(
         project,
-        thread_count(images * gaussians // PIECE, images * gaussians),
+        even_jobs(jobs, thread_count(jobs, images * gaussians)),
         inputs.means.reshape(-1),
         inputs.quats.reshape(-1),
         inputs.scales.reshape(-1),
         inputs.opacities.reshape(-1),
         inputs.colors.reshape(-1),
         inputs.colors.shape[-1],
-        inputs.shares,
+        inputs.repeats,
         inputs.cameras,
         gaussians,
         float(options.width),
@@ -134,7 +140,7 @@ def list_stage(projected: Projected, options: Options) -> Lists:
     """Sorts by depth and lists the splats of each tile.
 
     Raises:
-        HwpError: more (splat, tile) pairs than can be counted.
+        HwpError: more (splat, tile) pairs than can be counted or held.
     """
     images, gaussians = projected.depths.shape
     chunks = min(thread_count(_MOST_CHUNKS, gaussians), _MOST_CHUNKS)
@@ -144,7 +150,7 @@ def list_stage(projected: Projected, options: Options) -> Lists:
     chunk_rows = np.empty((images, chunks + 1), np.int64)
     run(
         sort_by_depth,
-        thread_count(images, images * gaussians),
+        even_jobs(images, thread_count(images, images * gaussians)),
         projected.depths,
         projected.rows,
         order,
@@ -161,10 +167,10 @@ def list_stage(projected: Projected, options: Options) -> Lists:
     counts = lease((images, chunks, tiles), np.int32)
     entry_count = lease((images, gaussians), np.int32)
     entry_count[:] = 0
-    threads = thread_count(images * chunks, images * gaussians)
+    shares = even_jobs(images * chunks, thread_count(images * chunks, images * gaussians))
     run(
         count_tiles,
-        threads,
+        shares,
         projected.geom.reshape(-1),
         order,
         visible,
@@ -180,16 +186,11 @@ def list_stage(projected: Projected, options: Options) -> Lists:
     start = np.empty(images * tiles + 1, np.int64)
     first_entry = lease((images * gaussians + 1,), np.int32)
     number = place_tiles(counts, entry_count, start, first_entry)
-    if number < 0:
-        raise HwpError(
-            "the splats cover more than 2^31 tiles together",
-            field="scales",
-            remedy="Draw fewer or smaller Gaussians, or a smaller image, at a time",
-        )
+    _check_room(number)
     entries = lease((number,), np.uint64)
     run(
         fill_tiles,
-        threads,
+        shares,
         order,
         visible,
         heads,
@@ -202,6 +203,30 @@ def list_stage(projected: Projected, options: Options) -> Lists:
         entries,
     )
     return Lists(start, entries, first_entry, visible)
+
+
+def tile_jobs(start: np.ndarray) -> np.ndarray:
+    """Shares of the tiles for `run`, by the lengths of their lists.
+
+    Args:
+        start: where the list of each tile starts, and the end of the last.
+    """
+    tiles, entries = len(start) - 1, int(start[-1])
+    # A tile without splats is work, too: its background.
+    return weighted_jobs(start + np.arange(tiles + 1), thread_count(tiles, entries))
+
+
+def _check_room(entries: int) -> None:
+    """Refuses lists that cannot be held, before the system ends the process for them."""
+    needed = entries * _BYTES_PER_ENTRY
+    if 0 <= needed < _LITTLE or 0 <= needed < psutil.virtual_memory().available:
+        return
+    size = f"{needed / 2**30:.0f} GiB of memory" if entries >= 0 else "lists of more than 2^31"
+    raise HwpError(
+        f"the Gaussians cover so many pixels that drawing them needs {size}",
+        field="scales",
+        remedy="Draw fewer or smaller Gaussians, or a smaller image, at a time",
+    )
 
 
 def kernel_channels(size: int) -> int | tuple[int, ...]:
@@ -235,12 +260,12 @@ def blend_stage(
     )
     run(
         blend,
-        thread_count(tiles, len(lists.entries)),
+        tile_jobs(lists.start),
         lists.start,
         lists.entries,
         projected.geom.reshape(-1),
         colors.reshape(-1),
-        share_of(len(colors), len(images)),
+        repeat_of(colors, len(images)),
         backgrounds,
         options.width,
         options.height,

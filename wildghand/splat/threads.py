@@ -1,24 +1,37 @@
 """Runs a kernel on several threads.
 
-Kernels release the interpreter lock and share out their work by an atomic counter, so plain
-threads do; numba's own layers either forbid two callers at once or end the process on a fork.
-How many: `torch.get_num_threads()`, which is how users of torch say it. Results do not depend
-on it.
+Kernels release the interpreter lock and share out their jobs themselves (see `kernels.jobs`), so
+any threads do. The best are those of torch's own OpenMP: after an operation of torch they spin
+for some milliseconds in wait for the next one, and threads of ours would have to compete with
+them for the cores. Where torch has no OpenMP, and in a forked child, whose OpenMP is dead, plain
+threads take their place. Numba's own layers are no choice: they forbid two callers at once or end
+the process on a fork.
+
+How many threads: `torch.get_num_threads()`. Results do not depend on it.
 """
 
 from __future__ import annotations
 
+import ctypes
 import functools
+import multiprocessing
 import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from wildghand.splat.kernels.jobs import SPACING
+
 #: Work, in Gaussians or (Gaussian, tile) pairs, that outweighs waking a thread (some 0.1 ms).
 WORTH_A_THREAD = 4096
+
+#: The process that imported this; a forked child is another.
+_PROCESS = os.getpid()
+_TEAM_MEMBER = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 
 def thread_count(jobs: int, work: int | None = None) -> int:
@@ -32,34 +45,108 @@ def thread_count(jobs: int, work: int | None = None) -> int:
     return max(1, min(torch.get_num_threads(), worth))
 
 
-def run(kernel: Callable[..., Any], threads: int, *args: Any) -> None:
-    """Calls `kernel(counter, *args)` on `threads` threads and waits for all of them.
+def even_jobs(jobs: int, threads: int) -> np.ndarray:
+    """Equal shares of equal jobs: thread w begins with those from [w] to [w + 1]."""
+    return np.arange(threads + 1) * jobs // threads
+
+
+def weighted_jobs(before: np.ndarray, threads: int) -> np.ndarray:
+    """Equal shares of jobs of which some are longer.
 
     Args:
-        kernel: takes jobs by adding to `counter`, an int64 array of one zero, until none is left.
-        threads: the calling thread included.
+        before: (jobs + 1,) work of all jobs before each, and of all.
+        threads: how many shares.
+    """
+    if threads == 1:
+        return np.array([0, len(before) - 1])
+    goals = np.arange(1, threads) * (before[-1] / threads)
+    inner = np.searchsorted(before, goals)
+    return np.concatenate(([0], inner, [len(before) - 1])).astype(np.int64)
+
+
+def run(kernel: Callable[..., Any], ends: np.ndarray, *args: Any) -> None:
+    """Calls `kernel(worker, counters, ends, *args)` on as many threads as there are shares.
+
+    Args:
+        kernel: takes jobs by `kernels.jobs.next_job` until none is left.
+        ends: int64 (threads + 1,), the shares; the calling thread has the first.
         args: the same for all.
     """
-    counter = np.zeros(1, np.int64)
+    threads = len(ends) - 1
+    counters = np.zeros(threads * SPACING, np.int64)
     if threads == 1:
-        kernel(counter, *args)
+        kernel(0, counters, ends, *args)
         return
-    try:
-        pool = _pool(os.getpid(), threads - 1)
-        helpers = [pool.submit(kernel, counter, *args) for _ in range(threads - 1)]
-    except RuntimeError:  # the interpreter is shutting down, or no thread can be started
-        helpers = []
-    try:
-        kernel(counter, *args)
-    finally:
-        # One that has not begun is not needed: the jobs are all taken.
-        failures = [helper.exception() for helper in helpers if not helper.cancel()]
-    for failure in failures:
-        if failure is not None:
-            raise failure
+    failures: list[BaseException] = []
+
+    def work(worker: int) -> None:
+        try:
+            kernel(worker, counters, ends, *args)
+        except BaseException as error:  # it must not unwind into the threads' own code
+            failures.append(error)
+
+    team = _openmp() if _may_use_openmp() else None
+    if team is not None:
+        team(work, threads)
+    else:
+        _plain_threads(work, threads)
+    if failures:
+        raise failures[0]
 
 
-@functools.lru_cache(maxsize=8)
+def _may_use_openmp() -> bool:
+    forked = multiprocessing.parent_process() is not None
+    forked = forked and multiprocessing.get_start_method(allow_none=True) in (None, "fork")
+    return os.getpid() == _PROCESS and not forked
+
+
+@functools.cache
+def _openmp() -> Callable[[Callable[[int], None], int], None] | None:
+    """Runs a function on a team of torch's OpenMP threads; None if there is none.
+
+    `GOMP_parallel` is what compilers make of `#pragma omp parallel`; GNU's, LLVM's and Intel's
+    runtimes have it. Only one that torch has loaded already is looked for.
+    """
+    if not torch.backends.openmp.is_available() or not hasattr(os, "RTLD_NOLOAD"):
+        return None
+    folder = Path(torch.__file__).parent / "lib"
+    found = [path for kind in ("libgomp", "libiomp5", "libomp") for path in folder.glob(kind + "*")]
+    for name in [*map(str, found), "libgomp.so.1", "libiomp5.so", "libomp.so"]:
+        try:
+            library = ctypes.CDLL(name, mode=os.RTLD_NOLOAD | os.RTLD_NOW)
+            parallel, thread_number = library.GOMP_parallel, library.omp_get_thread_num
+        except (OSError, AttributeError):
+            continue
+        parallel.argtypes = [_TEAM_MEMBER, ctypes.c_void_p, ctypes.c_uint, ctypes.c_uint]
+        parallel.restype = None
+
+        def team(
+            work: Callable[[int], None],
+            threads: int,
+            parallel: Any = parallel,
+            thread_number: Any = thread_number,
+        ) -> None:
+            member = _TEAM_MEMBER(lambda data: work(thread_number()))
+            parallel(member, None, threads, 0)
+
+        return team
+    return None
+
+
+def _plain_threads(work: Callable[[int], None], threads: int) -> None:
+    helpers = []
+    try:
+        pool = _pool(os.getpid(), max(torch.get_num_threads(), threads) - 1)
+        helpers = [pool.submit(work, worker) for worker in range(1, threads)]
+    except RuntimeError:
+        pass  # the interpreter is shutting down, or no more threads can be started
+    work(0)
+    for helper in helpers:
+        if not helper.cancel():  # one that has not begun is not needed: the jobs are all taken
+            helper.result()
+
+
+@functools.lru_cache(maxsize=2)
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     """The helpers of this process: threads do not survive a fork, so a child starts its own."""
     return ThreadPoolExecutor(threads, thread_name_prefix="splat")

@@ -164,7 +164,7 @@ def test_sort_is_by_depth_and_stable() -> None:
     order = np.empty((3, 1000), np.int32)
     found, chunk_rows = np.empty(3, np.int64), np.empty((3, 3), np.int64)
     stages.sort_by_depth(
-        np.zeros(1, np.int64), depths, np.ones((3, 1000), np.int32), order,
+        0, np.zeros(8, np.int64), np.array([0, 3]), depths, np.ones((3, 1000), np.int32), order,
         np.empty((3, 1000), np.int32), found, chunk_rows,
     )  # fmt: skip
     assert found.tolist() == visible.tolist()

@@ -11,8 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildghand.splat import memory
+from wildghand.splat.kernels import jit
+from wildghand.splat.kernels.jobs import SPACING, next_job
 from wildghand.splat.memory import lease
-from wildghand.splat.threads import run, thread_count
+from wildghand.splat.threads import even_jobs, run, thread_count, weighted_jobs
 
 
 @settings(max_examples=50, deadline=None)
@@ -62,22 +64,55 @@ def test_size_classes_waste_at_most_a_quarter(size: int) -> None:
     assert memory._size_class(room) == room
 
 
-def test_every_job_is_done_once_and_failures_are_raised() -> None:
-    done: list[int] = []
+@jit.inline
+def _take(worker, counters, ends):
+    return next_job(worker, counters, ends)
 
-    def work(counter: np.ndarray) -> None:
-        while counter[0] < 20:
-            done.append(int(counter[0]))
-            counter[0] += 1
 
-    run(work, 1)
-    assert done == list(range(20))
+@jit.kernel
+def _count_jobs(worker, counters, ends, done):
+    while True:
+        job = _take(worker, counters, ends)
+        if job < 0:
+            break
+        done[job] += 1
 
-    def fail(counter: np.ndarray) -> None:
-        raise ValueError("no")
 
-    with pytest.raises(ValueError, match="no"):
-        run(fail, 3)
+@pytest.mark.parametrize("threads", [1, 2, 5])
+@pytest.mark.parametrize("jobs", [0, 1, 3, 1000])
+def test_every_job_is_done_once(jobs: int, threads: int) -> None:
+    done = np.zeros(jobs, np.int64)
+    run(_count_jobs, even_jobs(jobs, threads), done)
+    assert (done == 1).all()
+
+
+def test_one_thread_does_the_jobs_of_those_that_never_come() -> None:
+    done, counters = np.zeros(10, np.int64), np.zeros(3 * SPACING, np.int64)
+    _count_jobs(1, counters, even_jobs(10, 3), done)
+    assert (done == 1).all()
+
+
+@given(st.lists(st.integers(0, 100), min_size=1, max_size=30), st.integers(1, 6))
+def test_weighted_shares_are_even_to_one_job(work: list[int], threads: int) -> None:
+    before = np.concatenate(([0], np.cumsum(work)))
+    ends = weighted_jobs(before, threads)
+    assert len(ends) == threads + 1
+    assert (ends[0], ends[-1]) == (0, len(work))
+    assert (np.diff(ends) >= 0).all()
+    assert np.diff(before[ends]).max() <= sum(work) / threads + max(work) + 1e-9
+
+
+def test_failures_of_any_thread_are_raised() -> None:
+    def fail(worker: int, counters: np.ndarray, ends: np.ndarray) -> None:
+        if worker == 1:
+            raise ValueError("no")
+
+    for _ in range(20):  # a thread that comes too late is not run at all
+        try:
+            run(fail, even_jobs(3, 3))
+        except ValueError:
+            return
+    pytest.fail("the failure was lost")
 
 
 def test_thread_count_follows_torch() -> None:

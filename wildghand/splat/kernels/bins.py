@@ -16,7 +16,8 @@ import numpy as np
 
 from wildghand.splat.kernels import geometry as at
 from wildghand.splat.kernels.jit import inline, kernel
-from wildghand.splat.kernels.lanes import atomic_next, prefetch
+from wildghand.splat.kernels.jobs import next_job
+from wildghand.splat.kernels.lanes import prefetch
 from wildghand.splat.kernels.tiles import LOG2_MIN_ALPHA, TILE_HEIGHT, TILE_WIDTH
 
 _LOG2_MIN_ALPHA = float(LOG2_MIN_ALPHA)
@@ -67,13 +68,14 @@ def find_spans(geom, row, last_column, first, number, spans, span):
 
 @kernel
 def count_tiles(
-    counter, geom, order, visible, chunk_rows, image_spans, tiles_x, width, spans, heads,
+    worker, counters, ends,
+    geom, order, visible, chunk_rows, image_spans, tiles_x, width, spans, heads,
     counts, entry_count,
 ):  # fmt: skip
     """Finds the tiles of every visible Gaussian and counts, chunk by chunk.
 
     Args:
-        counter: int64 (1,), 0; shared by the threads.
+        worker, counters, ends: see `next_job`; a job is a chunk of an image.
         geom: flat float32 (I, N, 16).
         order, visible, chunk_rows: as `sort_by_depth` leaves them.
         image_spans: int64 (I + 1,); where each image's spans start.
@@ -84,13 +86,13 @@ def count_tiles(
         counts: out, int32 (I, K, tiles of an image).
         entry_count: in zeros, out, int32 (I, N); tiles that each Gaussian touches.
     """
-    images, gaussians = order.shape
+    gaussians = order.shape[1]
     chunks = counts.shape[1]
     while True:
-        job = atomic_next(counter)
-        i = job // chunks
-        if i >= images:
+        job = next_job(worker, counters, ends)
+        if job < 0:
             break
+        i = job // chunks
         c = job - i * chunks
         number = counts[i, c]
         number[:] = 0
@@ -160,25 +162,26 @@ def place_tiles(counts, entry_count, start, first_entry):
 
 @kernel
 def fill_tiles(
-    counter, order, visible, heads, chunk_rows, image_spans, spans, places, first_entry, tiles_x,
+    worker, counters, ends,
+    order, visible, heads, chunk_rows, image_spans, spans, places, first_entry, tiles_x,
     entries,
 ):  # fmt: skip
     """Writes the lists.
 
     Args:
-        counter: int64 (1,), 0; shared by the threads.
+        worker, counters, ends: see `next_job`; a job is a chunk of an image.
         order, visible, heads, chunk_rows, image_spans, spans: as for `count_tiles`.
         places, first_entry: as `place_tiles` leaves them; places are used up.
         entries: out, uint64 (E,); tile by tile, front to back: the Gaussian in the low half, in
             the high half the number of the entry in order of Gaussians.
     """
-    images, gaussians = order.shape
+    gaussians = order.shape[1]
     chunks = places.shape[1]
     while True:
-        job = atomic_next(counter)
-        i = job // chunks
-        if i >= images:
+        job = next_job(worker, counters, ends)
+        if job < 0:
             break
+        i = job // chunks
         c = job - i * chunks
         place = places[i, c]
         span = image_spans[i] + chunk_rows[i, c]

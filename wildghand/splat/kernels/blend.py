@@ -20,9 +20,9 @@ from wildghand.splat.kernels.alpha import (
 )
 from wildghand.splat.kernels.channels import count, fetch, paint
 from wildghand.splat.kernels.jit import inline, kernel
+from wildghand.splat.kernels.jobs import next_job
 from wildghand.splat.kernels.lanes import (
     absolute,
-    atomic_next,
     bits,
     count_bits,
     lowest_bit,
@@ -95,17 +95,18 @@ def blend_tile(
 
 @kernel
 def blend(
-    counter, start, entries, geom, colors, color_share, backgrounds, width, height, gaussians,
+    worker, counters, ends,
+    start, entries, geom, colors, color_repeat, backgrounds, width, height, gaussians,
     images, alphas, remaining, stops, pairs, channels, counting,
 ):  # fmt: skip
     """Draws every image.
 
     Args:
-        counter: int64 (1,), 0; shared by the threads.
+        worker, counters, ends: see `next_job`; a job is a tile.
         start, entries: the lists of all tiles of all images, see `bins`.
         geom: flat float32 (I, N, 16).
         colors: flat float32 (S, N, D).
-        color_share: int64 (I,); which of the S entries an image reads.
+        color_repeat: image i reads entry i // color_repeat of the S.
         backgrounds: float32 (I, D).
         width, height, gaussians: pixels and N.
         images: out, flat float32 (I, H, W, D).
@@ -126,8 +127,8 @@ def blend(
     ids = np.empty(BATCH, np.int64)
     slopes = np.empty(BATCH, np.float32)
     while True:
-        tile = atomic_next(counter)
-        if tile >= stops.size:
+        tile = next_job(worker, counters, ends)
+        if tile < 0:
             break
         image = tile // (tiles_x * tiles_y)
         left = tile % tiles_x * TILE_WIDTH
@@ -146,7 +147,7 @@ def blend(
                         b, lane = place_of(x, y)
                         state[b * stride + lane] = -_ONE
             stops[tile], pairs[tile] = blend_tile(
-                geom, image * gaussians, colors, color_share[image] * gaussians, entries,
+                geom, image * gaussians, colors, image // color_repeat * gaussians, entries,
                 first, last, left + 0.5, top + 0.5,
                 state, offsets, blocks, ids, slopes, channels, counting,
             )  # fmt: skip

@@ -36,9 +36,9 @@ from wildghand.splat.kernels.channels import (
     start_sums,
 )
 from wildghand.splat.kernels.jit import inline, kernel
+from wildghand.splat.kernels.jobs import next_job
 from wildghand.splat.kernels.lanes import (
     absolute,
-    atomic_next,
     fma,
     lowest_bit,
     negate,
@@ -125,17 +125,18 @@ def tile_backward(
 
 @kernel
 def blend_backward(
-    counter, start, stops, first_slot, entries, geom, colors, color_share, width, height,
+    worker, counters, ends,
+    start, stops, first_slot, entries, geom, colors, color_repeat, width, height,
     gaussians, images, remaining, v_images, v_alphas, slots, slot_size, slot_of, channels,
 ):  # fmt: skip
     """Gradients of every (splat, tile) pair that was looked at.
 
     Args:
-        counter: int64 (1,), 0; shared by the threads.
-        start, entries, geom, colors, color_share, width, height, gaussians: as for `blend`.
+        worker, counters, ends: see `next_job`; a job is a tile.
+        start, entries, geom, colors, color_repeat, width, height, gaussians: as for `blend`.
         images, remaining, stops: as `blend` left them.
         first_slot: int64 (tiles,); slot of the first entry of each tile.
-        v_images, v_alphas: flat, upstream gradients of images and alphas.
+        v_images, v_alphas: flat, upstream gradients of images and alphas; the latter may be empty.
         slots: out, flat float32, `slot_size` for each pair; see `channels.finish_sums`.
         slot_of: out, int32 (E,); slot of each entry in order of Gaussians, or -1.
         channels: as for `blend`.
@@ -151,8 +152,8 @@ def blend_backward(
     ids = np.empty(BATCH, np.int64)
     slopes = np.empty(BATCH, np.float32)
     while True:
-        tile = atomic_next(counter)
-        if tile >= stops.size:
+        tile = next_job(worker, counters, ends)
+        if tile < 0:
             break
         first, last = start[tile], stops[tile]
         for k in range(first, last):
@@ -176,7 +177,7 @@ def blend_backward(
                 pixel = line + x
                 b, lane = place_of(x, y)
                 to = b * stride + lane
-                whole = -v_alphas[pixel] * remaining[pixel]
+                whole = -v_alphas[pixel] * remaining[pixel] if v_alphas.size > 0 else _ZERO
                 for k in range(size):
                     v = v_images[pixel * size + k]
                     state[to + (2 + k) * LANES] = v
@@ -184,7 +185,7 @@ def blend_backward(
                 state[to] = _ONE
                 state[to + LANES] = whole
         tile_backward(
-            geom, image * gaussians, colors, color_share[image] * gaussians, entries,
+            geom, image * gaussians, colors, image // color_repeat * gaussians, entries,
             first, last, left + 0.5, top + 0.5,
             state, offsets, blocks, ids, slopes, sum_scratch, slots, first_slot[tile], slot_size,
             channels,
@@ -192,19 +193,19 @@ def blend_backward(
 
 
 @kernel
-def background_backward(counter, v_images, remaining, v_lines):
+def background_backward(worker, counters, ends, v_images, remaining, v_lines):
     """Gradient of the background, one sum for each line of pixels.
 
     Args:
-        counter: int64 (1,), 0; shared by the threads.
+        worker, counters, ends: see `next_job`; a job is a line.
         v_images: float32 (I, H, W, D).
         remaining: float32 (I, H, W).
         v_lines: out, float64 (I, H, D).
     """
-    images, height, width, size = v_images.shape
+    _, height, width, size = v_images.shape
     while True:
-        job = atomic_next(counter)
-        if job >= images * height:
+        job = next_job(worker, counters, ends)
+        if job < 0:
             break
         i, y = job // height, job % height
         sums = v_lines[i, y]

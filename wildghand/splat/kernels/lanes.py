@@ -230,14 +230,14 @@ def split_exponent(typingctx: Any, value: Any) -> Any:
 
 
 @intrinsic
-def atomic_next(typingctx: Any, counter: Any) -> Any:
-    """Adds one to the first element of an int64 array, and returns what it was."""
+def atomic_add_one(typingctx: Any, array: Any, index: Any) -> Any:
+    """Adds one to an element of an int64 array that threads share, and returns what it was."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        data = context.make_array(sig.args[0])(context, builder, args[0]).data
-        return builder.atomic_rmw("add", data, ir.Constant(ir.IntType(64), 1), "monotonic")
+        pointer = _pointer(context, builder, sig.args[0], *args)
+        return builder.atomic_rmw("add", pointer, ir.Constant(ir.IntType(64), 1), "monotonic")
 
-    return types.int64(counter), codegen
+    return types.int64(array, types.intp), codegen
 
 
 @intrinsic

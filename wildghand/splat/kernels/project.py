@@ -16,7 +16,8 @@ import numpy as np
 from wildghand.splat import conventions as rules
 from wildghand.splat.kernels import geometry as at
 from wildghand.splat.kernels.jit import inline, kernel
-from wildghand.splat.kernels.lanes import atomic_next, select, split_exponent, square_root
+from wildghand.splat.kernels.jobs import next_job
+from wildghand.splat.kernels.lanes import select, split_exponent, square_root
 from wildghand.splat.kernels.rows import (
     GROUP,
     ceil,
@@ -235,17 +236,18 @@ def mark_usable(colors, first, channels, usable):
 
 @kernel
 def project(
-    counter, means, quats, scales, opacities, colors, channels, shares, cameras, gaussians,
+    worker, counters, ends,
+    means, quats, scales, opacities, colors, channels, repeats, cameras, gaussians,
     width, height, near, far, eps2d, antialiased, geom, depths, rows, radii,
     compensations,
 ):  # fmt: skip
     """Projects every Gaussian of every image; at least 8 Gaussians.
 
     Args:
-        counter: int64 (1,), 0; the threads that run this share it.
+        worker, counters, ends: see `next_job`; a job is a piece of an image.
         means, quats, scales, opacities, colors: flat float32, (S, N, k).
         channels: floats in a colour.
-        shares: int64 (I, 5); which of the S entries of each of the five an image reads.
+        repeats: int64 (5,); image i reads entry i // repeats[k] of the S of each of the five.
         cameras: float64 (I, CAMERA), see `cameras`.
         gaussians: N.
         geom: out, flat float32 (I, N, 16), see `geometry`.
@@ -257,21 +259,21 @@ def project(
     pieces = max(1, gaussians // PIECE)
     usable = np.empty(GROUP, np.float32)
     while True:
-        job = atomic_next(counter)
-        image = job // pieces
-        if image >= shares.shape[0]:
+        job = next_job(worker, counters, ends)
+        if job < 0:
             break
+        image = job // pieces
         piece = job - image * pieces
         stop = (piece + 1) * gaussians // pieces
         for start in range(piece * gaussians // pieces, stop, GROUP):
             n = min(start, stop - GROUP)
-            mark_usable(colors, (shares[image, 4] * gaussians + n) * channels, channels, usable)
+            mark_usable(colors, (image // repeats[4] * gaussians + n) * channels, channels, usable)
             to = image * gaussians + n
             project_group(
-                means, (shares[image, 0] * gaussians + n) * 3,
-                quats, (shares[image, 1] * gaussians + n) * 4,
-                scales, (shares[image, 2] * gaussians + n) * 3,
-                opacities, shares[image, 3] * gaussians + n,
+                means, (image // repeats[0] * gaussians + n) * 3,
+                quats, (image // repeats[1] * gaussians + n) * 4,
+                scales, (image // repeats[2] * gaussians + n) * 3,
+                opacities, image // repeats[3] * gaussians + n,
                 usable, cameras[image], width, height, near, far, eps2d, antialiased,
                 geom, to * at.ROW, depths, rows, radii, compensations, to,
             )  # fmt: skip

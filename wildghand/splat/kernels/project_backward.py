@@ -8,7 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from wildghand.splat.kernels.jit import inline, kernel
-from wildghand.splat.kernels.lanes import atomic_next, select, square_root
+from wildghand.splat.kernels.jobs import next_job
+from wildghand.splat.kernels.lanes import select, square_root
 from wildghand.splat.kernels.project import (
     PIECE,
     clamp,
@@ -54,6 +55,14 @@ def keep(mask, values):
         select(mask, values[1], zero),
         select(mask, values[2], zero),
     )
+
+
+@inline
+def clear_first(gradient, size, image, repeat, gaussians, begin, stop):
+    """Zeros for Gaussians `begin` to `stop`, by the first image of those that share them."""
+    if image % repeat == 0:
+        base = image // repeat * gaussians
+        gradient[(base + begin) * size : (base + stop) * size] = 0.0
 
 
 @inline
@@ -108,16 +117,17 @@ def quaternion_gradient(w, x, y, z, over, n):
 
 @kernel
 def project_backward(
-    counter, means, quats, scales, shares, cameras, gaussians, depths, eps2d,
+    worker, counters, ends,
+    means, quats, scales, repeats, cameras, gaussians, depths, eps2d,
     v_means2d, v_shapes, v_depths, v_compensations, antialiased, want_cameras,
     v_means, v_quats, v_scales, v_cameras,
 ):  # fmt: skip
     """Gradients of the Gaussians and the cameras; at least 8 Gaussians.
 
     Args:
-        counter: int64 (1,), 0; shared by the threads.
+        worker, counters, ends: see `next_job`; a job is a piece of Gaussians.
         means, quats, scales: flat float32 (S, N, k), as in `project`.
-        shares: int64 (I, 3 or more); which of the S entries an image reads.
+        repeats: int64 (3 or more,); image i reads entry i // repeats[k] of the S.
         cameras: float64 (I, CAMERA), see `cameras`.
         gaussians: N.
         depths: float32 (I, N); 0 where culled.
@@ -125,7 +135,7 @@ def project_backward(
         v_depths: flat float32 (I, N), or empty if depth has no gradient.
         v_compensations: flat float32 (I, N), read only if `antialiased`.
         want_cameras: whether `v_cameras` is wanted.
-        v_means, v_quats, v_scales: in zeros, out, flat float32 (S, N, k).
+        v_means, v_quats, v_scales: out, flat float32 (S, N, k).
         v_cameras: out, float64 (I, pieces, 12); rotation row by row, then translation, one sum
             for each piece of Gaussians.
     """
@@ -133,12 +143,15 @@ def project_backward(
     pieces = max(1, gaussians // PIECE)
     zero = fill_exact(0.0)
     while True:
-        piece = atomic_next(counter)
-        if piece >= pieces:
+        piece = next_job(worker, counters, ends)
+        if piece < 0:
             break
         begin, stop = piece * gaussians // pieces, (piece + 1) * gaussians // pieces
         for i in range(images):
             camera = cameras[i]
+            clear_first(v_means, 3, i, repeats[0], gaussians, begin, stop)
+            clear_first(v_quats, 4, i, repeats[1], gaussians, begin, stop)
+            clear_first(v_scales, 3, i, repeats[2], gaussians, begin, stop)
             back_x, back_y, back_z = camera[0:3], camera[3:6], camera[6:9]
             sum_x, sum_y, sum_z = (zero, zero, zero), (zero, zero, zero), (zero, zero, zero)
             moved = (zero, zero, zero)
@@ -148,15 +161,15 @@ def project_backward(
                 (depth,) = load1(depths, at)
                 # The last group of a piece reaches back; what it saw before counts once.
                 seen = (depth > 0.0) & (lane_index() >= np.float64(start - first))
-                m = load3(means, (shares[i, 0] * gaussians + first) * 3)
+                m = load3(means, (i // repeats[0] * gaussians + first) * 3)
                 x = to_camera(camera, 0, m[0], m[1], m[2])
                 y = to_camera(camera, 1, m[0], m[1], m[2])
                 z = select(seen, to_camera(camera, 2, m[0], m[1], m[2]), 1.0)
-                qw, qx, qy, qz = load4(quats, (shares[i, 1] * gaussians + first) * 4)
+                qw, qx, qy, qz = load4(quats, (i // repeats[1] * gaussians + first) * 4)
                 over = 1.0 / square_root(qw * qw + qx * qx + qy * qy + qz * qz)
                 qw, qx, qy, qz = qw * over, qx * over, qy * over, qz * over
                 turn = rotation(qw, qx, qy, qz)
-                size = load3(scales, (shares[i, 2] * gaussians + first) * 3)
+                size = load3(scales, (i // repeats[2] * gaussians + first) * 3)
                 inverse = 1.0 / z
                 fx, fy = camera[12], camera[13]
                 tan_x, tan_y = x * inverse, y * inverse
@@ -211,7 +224,7 @@ def project_backward(
                 v_x, v_y, v_z = in_camera
                 add_columns(
                     v_means,
-                    (shares[i, 0] * gaussians + first) * 3,
+                    (i // repeats[0] * gaussians + first) * 3,
                     (
                         v_x * back_x[0] + v_y * back_y[0] + v_z * back_z[0],
                         v_x * back_x[1] + v_y * back_y[1] + v_z * back_z[1],
@@ -221,7 +234,7 @@ def project_backward(
                 g_w, g_x, g_y, g_z = v_q
                 add_columns(
                     v_quats,
-                    (shares[i, 1] * gaussians + first) * 4,
+                    (i // repeats[1] * gaussians + first) * 4,
                     (
                         select(seen, g_w, zero),
                         select(seen, g_x, zero),
@@ -229,7 +242,7 @@ def project_backward(
                         select(seen, g_z, zero),
                     ),
                 )
-                add_columns(v_scales, (shares[i, 2] * gaussians + first) * 3, keep(seen, v_size))
+                add_columns(v_scales, (i // repeats[2] * gaussians + first) * 3, keep(seen, v_size))
                 if want_cameras:
                     # J R depends on R through its own row and, by the tangent, the third.
                     m = keep(seen, m)

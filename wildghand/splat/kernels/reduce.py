@@ -16,8 +16,10 @@ import numpy as np
 from wildghand.splat.kernels import geometry as at
 from wildghand.splat.kernels.channels import MOMENTS
 from wildghand.splat.kernels.jit import inline, kernel
-from wildghand.splat.kernels.lanes import atomic_next, prefetch, store
+from wildghand.splat.kernels.jobs import next_job
+from wildghand.splat.kernels.lanes import prefetch, store
 from wildghand.splat.kernels.project import PIECE
+from wildghand.splat.kernels.project_backward import clear_first
 from wildghand.splat.kernels.rows import GROUP, fill_exact, load1
 
 #: Entries by which slots are asked for before they are read.
@@ -27,17 +29,18 @@ _TWO_LN2 = 2.0 * math.log(2.0)
 
 @kernel
 def reduce_slots(
-    counter, gaussians, channels, geom, opacities, opacity_share, color_share, first_entry,
+    worker, counters, ends,
+    gaussians, channels, geom, opacities, opacity_repeat, color_repeat, first_entry,
     depths, slot_of, slots, slot_size, v_means2d, v_shapes, v_opacities, v_colors,
 ):  # fmt: skip
     """Gradients of the projected Gaussians, summed over images for what images share.
 
     Args:
-        counter: int64 (1,), 0; shared by the threads.
+        worker, counters, ends: see `next_job`; a job is a piece of Gaussians.
         gaussians, channels: N and D.
         geom: flat float32 (I, N, 16).
         opacities: flat float32 (S, N), as blended.
-        opacity_share, color_share: int64 (I,); which of the S entries an image reads.
+        opacity_repeat, color_repeat: image i reads entry i // repeat of the S.
         first_entry: int32 (I * N + 1,); see `bins`.
         depths: float32 (I, N); 0 where culled.
         slot_of: int32 (E,); slot of each entry, -1 if nothing of it was blended.
@@ -46,18 +49,21 @@ def reduce_slots(
         v_shapes: out, flat float32 (I, N, 3); with the exponent -1/2 (a u^2 + c e^2), u = dx +
             s dy, e = dy: gradient of log a, of log c, of s times sqrt(c / a). They have no unit,
             so they fit into float32 for every size of splat.
-        v_opacities, v_colors: in zeros, out, flat float32 (S, N) and (S, N, D).
+        v_opacities, v_colors: out, flat float32 (S, N) and (S, N, D).
     """
     images = depths.shape[0]
     pieces = max(1, gaussians // PIECE)
     groups = (MOMENTS + channels + GROUP - 1) // GROUP
     sums = np.empty(groups * GROUP, np.float64)
     while True:
-        piece = atomic_next(counter)
-        if piece >= pieces:
+        piece = next_job(worker, counters, ends)
+        if piece < 0:
             break
+        begin, stop = piece * gaussians // pieces, (piece + 1) * gaussians // pieces
         for i in range(images):
-            for n in range(piece * gaussians // pieces, (piece + 1) * gaussians // pieces):
+            clear_first(v_opacities, 1, i, opacity_repeat, gaussians, begin, stop)
+            clear_first(v_colors, channels, i, color_repeat, gaussians, begin, stop)
+            for n in range(begin, stop):
                 to = i * gaussians + n
                 if not depths[i, n] > 0:
                     v_means2d[2 * to] = v_means2d[2 * to + 1] = 0.0
@@ -76,9 +82,9 @@ def reduce_slots(
                 v_shapes[3 * to] = -0.5 * _TWO_LN2 * m_uu
                 v_shapes[3 * to + 1] = -0.5 * _TWO_LN2 * m_ee
                 v_shapes[3 * to + 2] = -_TWO_LN2 * m_ue
-                share = opacity_share[i] * gaussians + n
+                share = i // opacity_repeat * gaussians + n
                 v_opacities[share] += m / opacities[share]
-                share = (color_share[i] * gaussians + n) * channels
+                share = (i // color_repeat * gaussians + n) * channels
                 for k in range(channels):
                     v_colors[share + k] += sums[MOMENTS + k]
 

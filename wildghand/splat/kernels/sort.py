@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from wildghand.splat.kernels.jit import kernel
-from wildghand.splat.kernels.lanes import atomic_next
+from wildghand.splat.kernels.jobs import next_job
 
 #: Three digits cover the 32 bits of a depth; positive floats sort like their bits.
 _BITS = 11
@@ -19,11 +19,11 @@ _SECOND = np.uint32(2 * _BITS)
 
 
 @kernel
-def sort_by_depth(counter, depths, rows, order, spare, visible, chunk_rows):
+def sort_by_depth(worker, counters, ends, depths, rows, order, spare, visible, chunk_rows):
     """Sorts every image; equal depths keep the order of their indices.
 
     Args:
-        counter: int64 (1,), 0; shared by the threads.
+        worker, counters, ends: see `next_job`; a job is an image.
         depths: float32 (I, N); 0 where culled.
         rows: int32 (I, N); tile rows of each Gaussian.
         order: out, int32 (I, N); indices of the visible ones, front to back.
@@ -31,11 +31,11 @@ def sort_by_depth(counter, depths, rows, order, spare, visible, chunk_rows):
         visible: out, int64 (I,); how many there are.
         chunk_rows: out, int64 (I, K + 1); tile rows before each of K equal chunks of the order.
     """
-    images, gaussians = depths.shape
+    gaussians = depths.shape[1]
     digits = np.empty((3, _DIGITS), np.int32)
     while True:
-        i = atomic_next(counter)
-        if i >= images:
+        i = next_job(worker, counters, ends)
+        if i < 0:
             break
         first, second = order[i], spare[i]
         bits = depths[i].view(np.uint32)
