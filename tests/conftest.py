@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pytest
 from small_captures import CaptureMaker, cameras, hand_parameters, hand_picture, results_example
@@ -67,3 +68,36 @@ def make_capture(tmp_path: Path) -> CaptureMaker:
 def make_results() -> Callable[..., Results]:
     """Return a function that makes results without an evaluation."""
     return results_example
+
+
+@pytest.fixture(scope="session")
+def make_painted(tmp_path_factory: pytest.TempPathFactory) -> Callable[..., Capture]:
+    """Return a function that draws the painted capture of `right`, `left` or `both` hands."""
+    from painted import paint_capture
+
+    made: dict[str, Capture] = {}
+
+    def make(hands: str = "right") -> Capture:
+        if hands not in made:
+            made[hands] = paint_capture(tmp_path_factory.mktemp("painted") / hands, hands)
+        return made[hands]
+
+    return make
+
+
+@pytest.fixture
+def make_training(make_painted: Callable[..., Capture], tmp_path: Path) -> Callable[..., Any]:
+    """Return a function that opens what a method is given of a painted capture."""
+    from painted import FRAMES, QUICK
+
+    from hwp_bench.methods.contract import Budget
+    from hwp_bench.methods.request import RunSettings, open_request, write_request
+    from hwp_bench.splits import contiguous_split
+
+    def make(hands: str = "right", **settings: object) -> Any:
+        capture = make_painted(hands)
+        split = contiguous_split(capture.info.id, FRAMES)
+        run = RunSettings({**QUICK, **settings}, 0, Budget())
+        return open_request(write_request(tmp_path / f"request-{hands}", capture, split, run))
+
+    return make

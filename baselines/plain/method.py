@@ -10,15 +10,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import torch
-
-from baselines.plain.frames import load_frames
 from baselines.plain.model import PlainAvatar, make_model
 from baselines.plain.optimise import fit_model
 from baselines.plain.settings import read_settings
-from hwp_bench.errors import MissingDependency
 from hwp_bench.methods.contract import Budget, Report
 from hwp_bench.methods.request import TrainingCapture
+from wildghand.device import choose_device
+from wildghand.fit.frames import load_frames
 from wildghand.photometric_cpu import warm_up as warm_up_loss
 from wildghand.splat.warmup import warm_up
 
@@ -39,7 +37,7 @@ class PlainMethod:
     def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
         self.settings = read_settings(settings)
         self.seed = seed
-        self.device = _device(self.settings.device)
+        self.device = choose_device(self.settings.device)
         if self.device.type == "cpu":
             # Compiling takes some ten seconds once on a machine; it is no part of a fit.
             warm_up()
@@ -68,18 +66,3 @@ class PlainMethod:
             device=self.device,
         )
         return fit_model(model, training, frames, self.settings, budget, report, self.seed)
-
-
-def _device(name: str) -> torch.device:
-    if name == "cpu":
-        return torch.device("cpu")
-    import importlib.util
-
-    ready = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
-    if name == "cuda" and not ready:
-        raise MissingDependency(
-            "a CUDA GPU and the package gsplat are not both there",
-            field="device",
-            remedy="Use device = auto or cpu, or install the extra `cuda`.",
-        )
-    return torch.device("cuda" if ready else "cpu")

@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from baselines.plain.clip import join_hands
 from hwp_bench.errors import UsageError
 from hwp_bench.hands import HandTemplate
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.anchored import AnchoredGaussians, flat_gaussians
+from wildghand.fit.clip import join_hands
 from wildghand.quaternions import quat_third_axis
 from wildghand.rig import AnchorPoses, HandRig, make_rig
 from wildghand.shading import sh_basis, sh_count

@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
 
-import numpy as np
 import torch
 
-from baselines.plain.clip import TrainingClip
-from baselines.plain.frames import TrainingFrames
-from baselines.plain.guard import Guard
 from baselines.plain.model import PlainAvatar, PlainModel
 from baselines.plain.settings import PlainSettings
 from hwp_bench.methods.contract import Budget, Report
 from hwp_bench.methods.request import TrainingCapture
 from hwp_bench.progress import notice
+from wildghand.fit.clip import TrainingClip
+from wildghand.fit.frames import TrainingFrames
+from wildghand.fit.guard import Guard
+from wildghand.fit.schedule import batches, spent
 from wildghand.losses import photometric_loss
 
 #: Steps between two offers of a checkpoint.
@@ -66,10 +65,10 @@ def fit_model(
         betas=_BETAS,
         fused=True,
     )
-    order = _batches(len(frames), settings.batch, seed)
-    guard = Guard()
+    order = batches(len(frames), settings.batch, seed)
+    guard: Guard[PlainModel] = Guard()
     step = 0
-    while step < steps and (fraction := _spent(step, steps, budget, report)) < 1.0:
+    while step < steps and (fraction := spent(step, steps, budget, report)) < 1.0:
         for group, name in zip(optimizer.param_groups, parameters, strict=True):
             group["lr"] = rates[name] * settings.final_rate**fraction
         rows = next(order)
@@ -103,26 +102,6 @@ def learning_rates(settings: PlainSettings) -> dict[str, float]:
         "logit_colors": settings.color_rate,
         "light": settings.light_rate,
     }
-
-
-def _spent(step: int, steps: int, budget: Budget, report: Report) -> float:
-    """Share of the budget that is used up: of the steps or of the seconds, whichever is more."""
-    if budget.seconds is None:
-        return step / steps
-    if budget.seconds <= 0.0:
-        return 1.0
-    return max(step / steps, report.elapsed / budget.seconds)
-
-
-def _batches(count: int, batch: int, seed: int) -> Iterator[torch.Tensor]:
-    """Batches of row numbers without end: every row once before any comes again."""
-    random = np.random.default_rng(seed)
-    queue = np.empty(0, dtype=np.int64)
-    while True:
-        while len(queue) < batch:
-            queue = np.concatenate((queue, random.permutation(count)))
-        yield torch.from_numpy(queue[:batch])
-        queue = queue[batch:]
 
 
 @torch.no_grad()

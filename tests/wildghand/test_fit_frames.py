@@ -9,11 +9,11 @@ import pytest
 import torch
 from painted import FRAMES, SIZE, TrainingMaker
 
-from baselines.plain.clip import TrainingClip
-from baselines.plain.frames import TrainingFrames, load_frames
 from hwp_bench.errors import BadInput
 from hwp_bench.images import write_image
 from hwp_bench.methods.request import TrainingCapture
+from wildghand.fit.clip import TrainingClip
+from wildghand.fit.frames import TrainingFrames, load_frames
 from wildghand.rig import make_rig
 
 

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Generic, Protocol, TypeVar
 
-from baselines.plain.model import PlainModel
+import torch
+
 from hwp_bench.errors import DidNotConverge
 
 #: Steps over which the loss is averaged before it is judged.
@@ -13,7 +16,22 @@ WINDOW = 50
 MAX_RISE = 3.0
 
 
-class Guard:
+class Fitted(Protocol):
+    """A model that is being fitted."""
+
+    def parameters(self) -> Mapping[str, torch.Tensor]:
+        """The fitted tensors by name."""
+        ...
+
+    def snapshot(self: Model) -> Model:
+        """A copy that the fit no longer changes."""
+        ...
+
+
+Model = TypeVar("Model", bound=Fitted)
+
+
+class Guard(Generic[Model]):
     """Watches the loss of a fit.
 
     Attributes:
@@ -23,10 +41,10 @@ class Guard:
     def __init__(self) -> None:
         self.step = 0
         self._best_loss = math.inf
-        self._best: PlainModel | None = None
+        self._best: Model | None = None
         self._losses: list[float] = []
 
-    def watch(self, step: int, loss: float, model: PlainModel) -> bool:
+    def watch(self, step: int, loss: float, model: Model) -> bool:
         """Take note of the loss of `model` after `step` steps; False means divergence."""
         if not math.isfinite(loss):
             return False
@@ -41,7 +59,7 @@ class Guard:
             self._best_loss, self._best, self.step = mean, model.snapshot(), step
         return mean <= MAX_RISE * self._best_loss
 
-    def best(self) -> PlainModel:
+    def best(self) -> Model:
         """The state with the lowest loss.
 
         Raises:

@@ -8,9 +8,9 @@ import pytest
 import torch
 from painted import painted_avatar
 
-from baselines.plain.guard import MAX_RISE, WINDOW, Guard
 from baselines.plain.model import PlainModel
 from hwp_bench.errors import DidNotConverge
+from wildghand.fit.guard import MAX_RISE, WINDOW, Guard
 
 
 @pytest.fixture(scope="module")

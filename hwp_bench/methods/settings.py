@@ -1,0 +1,121 @@
+"""Settings of a method as a dataclass, checked when they are read.
+
+For authors of methods: `settings_from(MySettings, table)` turns a preset's table, with what the
+command line overrides, into a frozen dataclass, or says which name or value is wrong.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import math
+import types
+import typing
+from collections.abc import Mapping
+from typing import Any, TypeVar
+
+from hwp_bench.errors import BadMethod, HwpError
+
+Settings = TypeVar("Settings")
+
+#: Longest piece of a name or value that is repeated in a message.
+_SHOWN = 100
+
+
+def number(default: float, low: float = 0.0, high: float = math.inf) -> Any:
+    """A dataclass field for a number within [low, high]."""
+    return dataclasses.field(default=default, metadata={"range": (low, high)})
+
+
+def choice(default: str, *others: str) -> Any:
+    """A dataclass field for one of several words."""
+    return dataclasses.field(default=default, metadata={"choices": (default, *others)})
+
+
+def settings_from(cls: type[Settings], values: Mapping[str, Any], where: str) -> Settings:
+    """Check a table of settings.
+
+    A field that is itself a dataclass reads a table of its own; `name.field` reaches into it,
+    and so does `--set name.field=value`.
+
+    Args:
+        cls: a dataclass whose fields are bool, int, float, str, or such dataclasses, each with a
+            default; numbers may be bounded by `number`, words by `choice`. An unbounded number
+            must not be negative.
+        values: any of its fields; later entries win over earlier ones.
+        where: what messages call the place, such as the method's folder.
+
+    Raises:
+        BadMethod: an unknown name (the message says which one is close), a wrong type, or a
+            value outside its range.
+    """
+    return _read(cls, _unfold(values), where, "")
+
+
+def _unfold(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Turn `a.b` into tables, and merge tables that are named twice."""
+    tree: dict[str, Any] = {}
+    for name, value in values.items():
+        head, dot, rest = str(name).partition(".")
+        if dot:
+            value = {rest: value}
+        if isinstance(value, Mapping):
+            before = tree.get(head)
+            merged = {**before, **value} if isinstance(before, dict) else dict(value)
+            tree[head] = _unfold(merged)
+        else:
+            tree[head] = value
+    return tree
+
+
+def _read(cls: type[Settings], values: Mapping[str, Any], where: str, prefix: str) -> Settings:
+    items = {item.name: item for item in dataclasses.fields(cls)}  # type: ignore[arg-type]
+    kinds = typing.get_type_hints(cls)
+    checked: dict[str, Any] = {}
+    for name, value in values.items():
+        field = f"{prefix}{name}"[:_SHOWN]
+        if name not in items:
+            close = difflib.get_close_matches(name, items, n=1)
+            raise BadMethod(
+                "is no setting of this method",
+                where=where,
+                field=field,
+                remedy=f"Did you mean {prefix + close[0]!r}?" if close else f"Known: {[*items]}.",
+            )
+        kind = kinds[name]
+        if dataclasses.is_dataclass(kind):
+            if not isinstance(value, Mapping):
+                raise BadMethod("must be a table", where=where, field=field)
+            checked[name] = _read(typing.cast("type[Any]", kind), value, where, f"{field}.")
+        else:
+            checked[name] = _checked(value, kind, items[name].metadata, where, field)
+    try:
+        return cls(**checked)
+    except HwpError as error:
+        raise BadMethod(str(error), where=where, field=prefix.rstrip(".")) from error
+
+
+def _checked(value: Any, kind: Any, rules: Mapping[str, Any], where: str, field: str) -> Any:
+    def bad(remedy: str) -> BadMethod:
+        return BadMethod(f"is {str(value)[:_SHOWN]!r}", where=where, field=field, remedy=remedy)
+
+    if isinstance(kind, types.UnionType):  # X | None
+        if value is None:
+            return None
+        kind = next(part for part in kind.__args__ if part is not type(None))
+    if kind is bool:
+        if not isinstance(value, bool):
+            raise bad("Use true or false.")
+        return value
+    if kind is str:
+        choices = rules.get("choices")
+        if not isinstance(value, str) or (choices and value not in choices):
+            raise bad(f"Use one of {', '.join(choices)}." if choices else "Use a text.")
+        return value
+    numbers = (int,) if kind is int else (int, float)
+    if isinstance(value, bool) or not isinstance(value, numbers):
+        raise bad("Use a whole number." if kind is int else "Use a number.")
+    low, high = rules.get("range", (0.0, math.inf))
+    if not low <= value <= high or not math.isfinite(value):
+        raise bad(f"Use {low:g} to {high:g}.")
+    return value if kind is int else float(value)
