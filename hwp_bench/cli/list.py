@@ -110,10 +110,16 @@ def _methods() -> Table:
     from hwp_bench.report.table import Column, Table
 
     rows = tuple(
-        (method.name, method.title, ", ".join(method.presets), method.description)
+        (
+            method.name,
+            method.title,
+            ", ".join(method.presets),
+            ", ".join(method.switches) or "-",
+            method.description,
+        )
         for method in shipped_methods()
     )
-    columns = ("method", "title", "presets", "description")
+    columns = ("method", "title", "presets", "switches", "description")
     return Table("Methods that ship with the toolkit", tuple(map(Column, columns)), rows)
 
 

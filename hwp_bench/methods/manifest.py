@@ -8,12 +8,13 @@ import os
 import re
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hwp_bench.errors import BadMethod
 from hwp_bench.files import inside
+from hwp_bench.methods.switches import Switch, read_switches
 
 #: Version of the method contract.
 SCHEMA = "hwp-method/1"
@@ -26,7 +27,18 @@ DEFAULT_PRESET = "default"
 #: Ways to enter a method; a manifest has exactly one.
 ENTRY_KINDS = ("python", "command", "predictions")
 
-_KEYS = {"schema", "name", "title", "description", "authors", "licence", "url", "entry", "presets"}
+_KEYS = {
+    "schema",
+    "name",
+    "title",
+    "description",
+    "authors",
+    "licence",
+    "url",
+    "entry",
+    "presets",
+    "switches",
+}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _PYTHON = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 
@@ -49,6 +61,8 @@ class MethodManifest:
     entry: str | tuple[str, ...]
     #: Settings by preset.
     presets: Mapping[str, Mapping[str, Any]]
+    #: What can be taken out or put in place of something, by name, in the order of the file.
+    switches: Mapping[str, Switch] = field(default_factory=dict)
 
     def preset(self, name: str | None, suite: str = "") -> str:
         """Return the name of the preset to use.
@@ -140,6 +154,7 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         kind=kind,
         entry=entry,
         presets=_presets(value.get("presets", {}), where),
+        switches=read_switches(value.get("switches", {}), where),
     )
 
 

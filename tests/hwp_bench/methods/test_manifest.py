@@ -87,3 +87,42 @@ def test_the_digest_follows_the_code_and_nothing_else(tmp_path: Path) -> None:
     assert read_manifest(tmp_path).digest == first
     (tmp_path / "code.py").write_text("x = 1")
     assert read_manifest(tmp_path).digest != first
+
+
+SWITCHES = """
+[switches.weighting]
+title = "Weighting"
+settings_off = {weighting = false}
+[switches.binary-mask]
+settings_on = {weighting = "mask"}
+"""
+
+
+def test_switches_are_read_in_the_order_of_the_file(tmp_path: Path) -> None:
+    switches = read_manifest(_write(tmp_path, GOOD + SWITCHES)).switches
+    assert list(switches) == ["weighting", "binary-mask"]
+    component, alternative = switches.values()
+    assert (component.title, component.thrown) == ("Weighting", "no-weighting")
+    assert (component.alternative, dict(component.settings)) == (False, {"weighting": False})
+    assert (alternative.title, alternative.thrown) == ("binary-mask", "binary-mask")
+    assert (alternative.alternative, dict(alternative.settings)) == (True, {"weighting": "mask"})
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "problem"),
+    [
+        ("switches.binary-mask", "switches.Binary", "switches.Binary: is no name of a switch"),
+        ('title = "Weighting"', "title = 3", "switches.weighting.title: must be one line"),
+        ('title = "Weighting"', "titel = 3", "switches.weighting.titel: is no field of a switch"),
+        ("settings_off", "description = 'a'\nsettings_on = {a = 1}\nsettings_off", "exactly one"),
+        ("settings_off = {weighting = false}", "", "exactly one of settings_off and settings_on"),
+        ("{weighting = false}", "{}", "must be a table of at least one setting"),
+        ("{weighting = false}", "{'a b' = 1}", "'a b' is no name of a setting"),
+        ("switches.binary-mask", "switches.no-weighting", "two switches make a variant"),
+    ],
+)
+def test_faults_of_switches_are_named(tmp_path: Path, old: str, new: str, problem: str) -> None:
+    assert old in SWITCHES
+    with pytest.raises(BadMethod) as caught:
+        read_manifest(_write(tmp_path, GOOD + SWITCHES.replace(old, new)))
+    assert problem in str(caught.value)
