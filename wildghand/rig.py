@@ -52,14 +52,33 @@ class HandRig:
             betas: (10,).
             transl: (F, 3) m.
         """
+        parts = [
+            self.follow(pose[start : start + CHUNK], betas, transl[start : start + CHUNK])
+            for start in range(0, len(pose), CHUNK)
+        ]
+        return AnchorPoses(
+            torch.cat([part.positions for part in parts]),
+            torch.cat([part.orientations for part in parts]),
+        )
+
+    def follow(
+        self, pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor
+    ) -> AnchorPoses:
+        """Pose the anchors of a few frames; the positions are differentiable.
+
+        Their frames carry no gradient: it would cost as much again, and what a turned splat
+        changes in the image is little beside what a moved one does.
+
+        Args:
+            pose: (F, 16, 3) axis-angle, rad.
+            betas: (10,) or (F, 10).
+            transl: (F, 3) m.
+        """
         faces = self.template.faces
-        positions, orientations = [], []
-        for start in range(0, len(pose), CHUNK):
-            part = slice(start, start + CHUNK)
-            vertices = pose_hand(self.template, pose[part], betas, transl[part]).vertices
-            positions.append(anchor_positions(vertices, faces, self.anchors))
-            orientations.append(matrix_to_quat(anchor_frames(vertices, faces, self.anchors)))
-        return AnchorPoses(torch.cat(positions), torch.cat(orientations))
+        vertices = pose_hand(self.template, pose, betas, transl).vertices
+        with torch.no_grad():
+            orientations = matrix_to_quat(anchor_frames(vertices, faces, self.anchors))
+        return AnchorPoses(anchor_positions(vertices, faces, self.anchors), orientations)
 
 
 def make_rig(

@@ -26,6 +26,11 @@ class TrainingClip:
         rigs: by side.
         device: where the tensors live.
         cache_bytes: most memory for posed anchors.
+
+    Attributes:
+        parameters: by side, pose (R, 16, 3), betas (10,) and transl (R, 3).
+        viewmats: (R, 4, 4).
+        Ks: (R, 3, 3) px.
     """
 
     def __init__(
@@ -40,7 +45,7 @@ class TrainingClip:
             return torch.as_tensor(array, dtype=torch.float32, device=device)
 
         self._rigs = rigs
-        self._hands = {
+        self.parameters = {
             side: (
                 tensor(training.hands[side].pose[indices]),
                 tensor(training.hands[side].betas),
@@ -51,26 +56,30 @@ class TrainingClip:
         self.viewmats = tensor(training.cameras.viewmats[indices])
         self.Ks = tensor(training.cameras.Ks[indices])
         size = len(indices) * sum(len(rig) for rig in rigs.values()) * _ANCHOR_BYTES
-        self._cache: AnchorPoses | None = None
+        self._cache: dict[str, AnchorPoses] | None = None
         if size <= cache_bytes:
-            self._cache = self._pose(torch.arange(len(indices), device=device))
+            rows = torch.arange(len(indices), device=device)
+            self._cache = {side: self._pose(side, rows) for side in rigs}
 
-    def poses(self, rows: torch.Tensor) -> AnchorPoses:
-        """The anchors of all hands in a batch.
+    def hand(self, side: str, rows: torch.Tensor) -> AnchorPoses:
+        """The anchors of one hand in a batch, without gradient.
 
         Args:
+            side: which.
             rows: (B,) int64 positions in `indices`.
         """
         if self._cache is None:
-            return self._pose(rows)
-        return AnchorPoses(self._cache.positions[rows], self._cache.orientations[rows])
+            return self._pose(side, rows)
+        posed = self._cache[side]
+        return AnchorPoses(posed.positions[rows], posed.orientations[rows])
 
-    def _pose(self, rows: torch.Tensor) -> AnchorPoses:
-        posed = []
-        for side, rig in self._rigs.items():
-            pose, betas, transl = self._hands[side]
-            posed.append(rig.pose(pose[rows], betas, transl[rows]))
-        return join_hands(posed)
+    def poses(self, rows: torch.Tensor) -> AnchorPoses:
+        """The anchors of all hands in a batch, one hand after the other."""
+        return join_hands([self.hand(side, rows) for side in self._rigs])
+
+    def _pose(self, side: str, rows: torch.Tensor) -> AnchorPoses:
+        pose, betas, transl = self.parameters[side]
+        return self._rigs[side].pose(pose[rows], betas, transl[rows])
 
 
 def join_hands(hands: list[AnchorPoses]) -> AnchorPoses:

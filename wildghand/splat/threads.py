@@ -3,8 +3,8 @@
 Kernels release the interpreter lock and share out their jobs themselves (see `kernels.jobs`), so
 any threads do. The best are those of torch's own OpenMP: after an operation of torch they spin
 for some milliseconds in wait for the next one, and threads of ours would have to compete with
-them for the cores. Where torch has no OpenMP, and in a forked child, whose OpenMP is dead, plain
-threads take their place. Numba's own layers are no choice: they forbid two callers at once or end
+them for the cores. Where torch has no OpenMP, in a forked child, whose OpenMP is dead, and on a
+machine that is busy otherwise, plain threads take their place. Numba's own layers are no choice: they forbid two callers at once or end
 the process on a fork.
 
 How many threads: `torch.get_num_threads()`. Results do not depend on it.
@@ -16,6 +16,7 @@ import ctypes
 import functools
 import multiprocessing
 import os
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -85,7 +86,7 @@ def run(kernel: Callable[..., Any], ends: np.ndarray, *args: Any) -> None:
         except BaseException as error:  # it must not unwind into the threads' own code
             failures.append(error)
 
-    team = _openmp() if _may_use_openmp() else None
+    team = _openmp() if _may_use_openmp() and not _crowded(int(time.monotonic())) else None
     if team is not None:
         team(work, threads)
     else:
@@ -98,6 +99,19 @@ def _may_use_openmp() -> bool:
     forked = multiprocessing.parent_process() is not None
     forked = forked and multiprocessing.get_start_method(allow_none=True) in (None, "fork")
     return os.getpid() == _PROCESS and not forked
+
+
+@functools.lru_cache(maxsize=1)
+def _crowded(second: int) -> bool:
+    """Whether other processes want the cores, asked at most once a second.
+
+    Threads that spin then take time from those that they wait for: a step of 5 ms took 100 ms
+    beside one busy process of two threads.
+    """
+    try:
+        return os.getloadavg()[0] > (os.cpu_count() or 1) + 0.5
+    except (AttributeError, OSError):  # no such number here
+        return False
 
 
 @functools.cache
