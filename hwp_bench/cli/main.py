@@ -11,10 +11,15 @@ from hwp_bench.cli.program import Command, run_program
 def command_tree() -> Command:
     """Return every command of `hwp-bench`."""
     here = "hwp_bench.cli"
+    imports = {
+        "wildghand": Command("make captures of the official release", f"{here}.import_wildghand"),
+        "video": Command("make a capture of a video", f"{here}.import_video"),
+    }
     data = {
         "check": Command("check a capture and say what is wrong", f"{here}.data_check"),
         "show": Command("draw a contact sheet of a capture", f"{here}.data_show"),
         "audit": Command("prove that a capture's split is fair", f"{here}.data_audit"),
+        "import": Command("make captures of other data", commands=imports),
         "import-video": Command("make a capture of a video", f"{here}.import_video"),
     }
     return Command(
@@ -22,6 +27,7 @@ def command_tree() -> Command:
         commands={
             "demo": Command("simulate a capture, fit a baseline, score it", f"{here}.demo"),
             "evaluate": Command("run a method on captures and score it", f"{here}.evaluate"),
+            "compare": Command("say how sure the differences are", f"{here}.compare"),
             "table": Command("print tables of results", f"{here}.table"),
             "list": Command("list captures, suites, methods, metrics", f"{here}.list"),
             "data": Command("make, check and show captures", commands=data),

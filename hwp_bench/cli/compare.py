@@ -1,0 +1,91 @@
+"""`hwp-bench compare`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+_EXAMPLES = """examples:
+  hwp-bench compare runs/mine-mini runs/plain-mini
+  hwp-bench compare runs/mine-seed*/ runs/plain-seed*/      # seeds of one method go together
+  hwp-bench compare runs/mine runs/other runs/plain --metric psnr ssim --json
+  hwp-bench compare runs/mine runs/plain --format md > differences.md
+
+Prints every method with its tie group, and the paired difference of every pair (the first named
+less the second) over all captures, single and interacting hands, and each perturbation, with 95 %
+interval, P(better) and Holm-adjusted p. Results on different data, splits, protocols or choices
+of training frames are refused (exit status 2).
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    parser.add_argument(
+        "results", nargs="+", metavar="RESULTS", help="results folder or results.json, two or more"
+    )
+    parser.add_argument(
+        "--metric",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="metrics to compare (default: the headline metrics that all have)",
+    )
+    parser.add_argument("--resamples", type=int, default=10_000, help="default 10000")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the resampling")
+    parser.add_argument(
+        "--format",
+        choices=("terminal", "md", "tex", "csv"),
+        default="terminal",
+        help="spelling of the tables (default terminal)",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON with full precision")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from dataclasses import asdict
+
+    from hwp_bench.errors import UsageError
+    from hwp_bench.metrics import metric
+    from hwp_bench.report.summary import HEADLINE
+    from hwp_bench.report.table import print_table, spell
+    from hwp_bench.results import read_results
+    from hwp_bench.statistics.compare import compare, standings
+    from hwp_bench.statistics.pairing import common_metrics, group_runs, refuse_unlike
+    from hwp_bench.statistics.tables import differences_table, standings_table
+
+    if not 100 <= args.resamples <= 1_000_000:
+        raise UsageError(f"{args.resamples} is not between 100 and 1000000", field="--resamples")
+    runs = group_runs([read_results(path) for path in args.results])
+    refuse_unlike(runs)
+    if len(runs) < 2:
+        raise UsageError(
+            "there is only one method to compare",
+            field="RESULTS",
+            remedy="Results that differ in the seed alone count as one method.",
+        )
+    wanted = [metric(name).name for name in args.metric] or list(HEADLINE)
+    names = common_metrics(runs, wanted)
+    if not names or (args.metric and len(names) < len(wanted)):
+        raise UsageError("not every result has every metric asked for", field="--metric")
+    value = {}
+    for name in names:
+        differences = compare(runs, name, resamples=args.resamples, seed=args.seed)
+        methods = standings(runs, name, differences)
+        if args.json:
+            value[name] = {
+                "methods": [asdict(item) for item in methods],
+                "differences": [asdict(item) for item in differences],
+            }
+            continue
+        for table in (standings_table(name, methods), differences_table(name, differences)):
+            if args.format == "terminal":
+                print_table(table)
+            else:
+                print(spell(table, args.format))
+    if args.json:
+        json.dump(value, sys.stdout, indent=1)
+        print()
+    return 0

@@ -1,0 +1,1 @@
+"""How sure a difference is: hierarchical bootstrap, several comparisons at once, ties."""
