@@ -106,6 +106,29 @@ def write_mano_folder(folder: Path) -> None:
         (folder / f"MANO_{side.upper()}.pkl").write_bytes(as_published(mano_content(side)))
 
 
+def mirrored_content() -> dict[str, Any]:
+    """A left file that is the right one mirrored, but for the published sign of its shapes."""
+    content = mano_content("right")
+    flip = np.array([-1.0, 1.0, 1.0])
+    signs = np.tile(np.outer(flip, flip).reshape(-1), 15)
+    mean = content["hands_mean"].reshape(15, 3) * [1.0, -1.0, -1.0]
+    return {
+        **content,
+        "v_template": content["v_template"] * flip,
+        "f": np.ascontiguousarray(content["f"][:, ::-1]),
+        "posedirs": content["posedirs"] * flip[:, None] * signs,
+        "hands_mean": mean.reshape(-1),
+    }
+
+
+def write_mirrored_mano(folder: Path) -> Path:
+    """A MANO folder whose hands mirror each other, as the published ones do."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "MANO_RIGHT.pkl").write_bytes(as_published(mano_content("right")))
+    (folder / "MANO_LEFT.pkl").write_bytes(as_published(mirrored_content()))
+    return folder
+
+
 class _Modules:
     """Classes under foreign module names for as long as a pickle is written."""
 

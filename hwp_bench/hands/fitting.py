@@ -1,0 +1,238 @@
+"""Fit a hand template to known points: joints, lines of sight, and points on the skin."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+
+from hwp_bench.errors import BadInput, DidNotConverge
+from hwp_bench.hands.joint_limits import anatomical_limits, joint_limit_penalty
+from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skinning import PosedHand, TemplateTensors, pose_hand
+from hwp_bench.hands.surface import vertex_normals
+from hwp_bench.hands.template import HandTemplate
+
+#: Points farther from the fitted surface than this are not drawn to it, m.
+REACH = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class FitTargets:
+    """What is known of one hand in F frames, in the frame that `transl` is given in; metres.
+
+    At least one of the three must be known; NaN marks what is not.
+    """
+
+    #: (F, 21, 3) landmarks, OpenPose order.
+    landmarks: np.ndarray | None = None
+    #: (F, 21, 3) unit directions from the origin on which landmarks lie (a camera there).
+    rays: np.ndarray | None = None
+    #: (F, P, 3) points on the skin, without correspondence.
+    skin: np.ndarray | None = None
+
+
+@dataclass(frozen=True)
+class FittingSettings:
+    """How long and how hard is fitted."""
+
+    #: Steps to landmarks and lines of sight alone.
+    landmark_steps: int = 240
+    #: Steps with the skin.
+    skin_steps: int = 90
+    #: The nearest skin is looked up again after this many steps.
+    refresh: int = 15
+    #: Weight of the landmarks once the skin counts: models put joints in different places.
+    landmark_weight: float = 0.1
+    #: Weight of anatomical joint limits, mm^2 per rad^2.
+    limits: float = 30.0
+    #: Weight of the squared shape parameters, mm^2.
+    shape: float = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class FittedHand:
+    """A hand fitted to targets, and what it misses them by."""
+
+    #: The parameters.
+    parameters: HandParameters
+    #: (F,) mean distance of the known landmarks, mm; NaN where none is known.
+    landmark_mm: np.ndarray
+    #: (F,) mean distance of the skin points to the fitted surface, mm; NaN without skin.
+    skin_mm: np.ndarray
+
+
+def fit_hand(
+    template: HandTemplate,
+    targets: FitTargets,
+    start: HandParameters,
+    settings: FittingSettings | None = None,
+) -> FittedHand:
+    """Fit pose, one shape and translation, by Adam from a start; all frames at once.
+
+    Args:
+        template: the hand that is fitted.
+        targets: what is known; frames where `start.valid` is false are not fitted.
+        start: where the fit begins; its `valid` is kept.
+        settings: steps and weights.
+
+    Returns:
+        The fitted hand with its errors.
+
+    Raises:
+        BadInput: no frame is valid, or nothing is known.
+        DidNotConverge: the fit left the finite numbers.
+    """
+    settings = settings or FittingSettings()
+    if not start.valid.any() or (targets.landmarks is None and targets.skin is None):
+        raise BadInput("there is nothing to fit a hand to", field="targets")
+    chosen = np.flatnonzero(start.valid)
+    fit = _Fit(template, targets, start, chosen)
+    fit.run(settings, settings.landmark_steps, skin=False)
+    if targets.skin is not None:
+        fit.run(settings, settings.skin_steps, skin=True)
+    return fit.result(start)
+
+
+class _Fit:
+    """Variables and targets of the valid frames."""
+
+    def __init__(
+        self, template: HandTemplate, targets: FitTargets, start: HandParameters, chosen: np.ndarray
+    ) -> None:
+        self.whole = template.to_torch(torch.float64)
+        self.tips = _only_tips(self.whole)
+        self.limits = anatomical_limits(template)
+        self.faces = self.whole.faces
+        self.border = _border(template.faces)
+        self.chosen = chosen
+
+        def known(values: np.ndarray | None) -> torch.Tensor | None:
+            return None if values is None else torch.from_numpy(np.array(values[chosen], float))
+
+        self.landmarks, self.rays = known(targets.landmarks), known(targets.rays)
+        self.skin = known(targets.skin)
+        self.pose = torch.tensor(start.pose[chosen], requires_grad=True)
+        self.betas = torch.tensor(start.betas, requires_grad=True)
+        self.transl = torch.tensor(start.transl[chosen], requires_grad=True)
+
+    def run(self, settings: FittingSettings, steps: int, *, skin: bool) -> None:
+        """Take `steps` steps; the rate falls to a fiftieth along a cosine."""
+        rate = 0.3 if skin else 1.0
+        optimizer = torch.optim.Adam(
+            [
+                {"params": [self.pose], "lr": 0.03 * rate},
+                {"params": [self.betas], "lr": 0.05 * rate},
+                {"params": [self.transl], "lr": 0.004 * rate},
+            ],
+            betas=(0.9, 0.99),
+        )
+        scheduler = torch.optim.lr_scheduler.LambdaLR(
+            optimizer, lambda step: 0.02 + 0.49 * (1.0 + math.cos(math.pi * step / steps))
+        )
+        matches: tuple[torch.Tensor, ...] | None = None
+        for step in range(steps):
+            optimizer.zero_grad(set_to_none=True)
+            posed = self._posed(self.whole if skin else self.tips)
+            energy = self._landmark_energy(posed, settings)
+            if skin:
+                if step % settings.refresh == 0:
+                    matches = self._match(posed)
+                assert matches is not None
+                index, normals, near = matches
+                energy = settings.landmark_weight * energy
+                energy = energy + 1e6 * _squared(self._gaps(posed, index, normals), near)
+            energy = energy + settings.limits * joint_limit_penalty(self.pose, self.limits).mean()
+            energy = energy + settings.shape * (self.betas**2).sum()
+            if not math.isfinite(float(energy.detach())):
+                raise DidNotConverge("the fit of a hand left the finite numbers")
+            energy.backward()
+            optimizer.step()
+            scheduler.step()
+
+    def result(self, start: HandParameters) -> FittedHand:
+        """The parameters of all frames, with the errors of the fitted ones."""
+        with torch.no_grad():
+            posed = self._posed(self.whole)
+            frames = len(start.valid)
+            landmark_mm, skin_mm = np.full(frames, np.nan), np.full(frames, np.nan)
+            if self.landmarks is not None:
+                distance = (posed.landmarks - self.landmarks).norm(dim=-1)
+                known = torch.isfinite(distance)
+                total = torch.where(known, distance, 0.0).sum(dim=1) / known.sum(dim=1)
+                landmark_mm[self.chosen] = 1000.0 * total.numpy()
+            if self.skin is not None:
+                index, normals, near = self._match(posed)
+                gaps = self._gaps(posed, index, normals).abs()
+                total = torch.where(near, gaps, 0.0).sum(dim=1) / near.sum(dim=1).clamp_min(1)
+                skin_mm[self.chosen] = 1000.0 * total.numpy()
+        pose, transl = start.pose.copy(), start.transl.copy()
+        pose[self.chosen], transl[self.chosen] = self.pose.detach(), self.transl.detach()
+        fitted = HandParameters(pose, self.betas.detach().numpy(), transl, start.valid)
+        return FittedHand(fitted, landmark_mm, skin_mm)
+
+    def _posed(self, tensors: TemplateTensors) -> PosedHand:
+        return pose_hand(tensors, self.pose, self.betas, self.transl)
+
+    def _landmark_energy(self, posed: PosedHand, settings: FittingSettings) -> torch.Tensor:
+        energy = self.betas.sum() * 0.0
+        if self.landmarks is not None:
+            known = torch.isfinite(self.landmarks).all(dim=-1)
+            gap = posed.landmarks - torch.where(known[..., None], self.landmarks, 0.0)
+            energy = energy + 1e6 * _squared(gap.norm(dim=-1), known)
+        if self.rays is not None:
+            known = torch.isfinite(self.rays).all(dim=-1)
+            rays = torch.where(known[..., None], self.rays, 0.0)
+            along = (posed.landmarks * rays).sum(dim=-1, keepdim=True)
+            energy = energy + 1e6 * _squared((posed.landmarks - along * rays).norm(dim=-1), known)
+        return energy
+
+    def _match(self, posed: PosedHand) -> tuple[torch.Tensor, ...]:
+        """For every skin point the nearest vertex, its normal, and whether it may be used."""
+        from scipy.spatial import cKDTree
+
+        assert self.skin is not None
+        vertices = posed.vertices.detach()
+        normals = vertex_normals(vertices, self.faces)
+        index, usable = [], []
+        for points, own in zip(self.skin.numpy(), vertices.numpy(), strict=True):
+            distance, nearest = cKDTree(own).query(points)
+            index.append(nearest)
+            usable.append((distance < REACH) & ~self.border[nearest])
+        found = torch.from_numpy(np.stack(index))
+        picked = torch.gather(normals, 1, found[..., None].expand(-1, -1, 3))
+        return found, picked, torch.from_numpy(np.stack(usable))
+
+    def _gaps(self, posed: PosedHand, index: torch.Tensor, normals: torch.Tensor) -> torch.Tensor:
+        """(F, P) signed distance of the points to the tangent planes of their vertices, m."""
+        assert self.skin is not None
+        nearest = torch.gather(posed.vertices, 1, index[..., None].expand(-1, -1, 3))
+        return ((self.skin - nearest) * normals).sum(dim=-1)
+
+
+def _squared(values: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
+    return (torch.where(known, values, 0.0) ** 2).sum() / known.sum().clamp_min(1)
+
+
+def _only_tips(tensors: TemplateTensors) -> TemplateTensors:
+    """The template with no vertices but the finger tips: landmarks need no others."""
+    tips = tensors.fingertips
+    return replace(
+        tensors,
+        vertices=tensors.vertices[tips],
+        shape_basis=tensors.shape_basis[tips],
+        pose_basis=None if tensors.pose_basis is None else tensors.pose_basis[tips],
+        weights=tensors.weights[tips],
+        fingertips=torch.arange(len(tips)),
+    )
+
+
+def _border(faces: np.ndarray) -> np.ndarray:
+    """(V,) bool, true for vertices of the open wrist: what is nearest to them may be forearm."""
+    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
+    unique, count = np.unique(edges, axis=0, return_counts=True)
+    border = np.zeros(faces.max() + 1, dtype=bool)
+    border[unique[count == 1]] = True
+    return border

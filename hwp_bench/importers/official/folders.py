@@ -1,0 +1,112 @@
+"""Folders of the release: which capture they hold, how thinned out, and where its files are."""
+
+from __future__ import annotations
+
+import os
+import re
+from dataclasses import dataclass
+from pathlib import Path
+
+from hwp_bench.errors import BadInput
+from hwp_bench.taxonomy import catalogue
+
+_NAME = re.compile(r"(capture\d+)(?:_subsample(\d+))?(_single)?")
+_SEPARATORS = re.compile(r"[\\/]+")
+
+
+@dataclass(frozen=True)
+class OfficialFolder:
+    """One folder of the release."""
+
+    #: The folder.
+    path: Path
+    #: Its pickles (`output*.pkl`), in the order of their names; together they are one capture.
+    pickles: tuple[Path, ...]
+    #: Id of the capture, a key of the catalogue where the folder's name says so.
+    id: str
+    #: Every how many-th frame of the video was kept, or None where the name does not say.
+    subsample: int | None
+    #: Whether the name says that one hand was tracked.
+    single: bool
+
+
+def find_folders(
+    path: str | os.PathLike[str], identifier: str | None = None
+) -> list[OfficialFolder]:
+    """Find the captures of a folder: itself, or its subfolders.
+
+    Args:
+        path: a folder with `output.pkl`, or a folder of such folders.
+        identifier: id of the capture where the folder has no name of the release.
+
+    Raises:
+        BadInput: no such folder, no pickle, a name that is none of the release, or two folders
+            of one capture.
+    """
+    root = Path(path)
+    if not root.is_dir():
+        raise BadInput("is no folder", where=root)
+    candidates = [root] if _pickles(root) else sorted(p for p in root.iterdir() if _pickles(p))
+    if not candidates:
+        raise BadInput(
+            "holds no output.pkl, neither in itself nor in its folders",
+            where=root,
+            remedy="Give a folder of the release, such as capture0_subsample3_single.",
+        )
+    if identifier is not None and len(candidates) > 1:
+        raise BadInput("holds several captures, which cannot have one id", where=root, field="--id")
+    folders = [_folder(candidate, identifier) for candidate in candidates]
+    for index, folder in enumerate(folders):
+        for other in folders[:index]:
+            if other.id == folder.id:
+                raise BadInput(
+                    f"holds {folder.id} twice: {other.path.name} and {folder.path.name}",
+                    where=root,
+                    remedy="Import them one by one.",
+                )
+    return folders
+
+
+def _pickles(folder: Path) -> tuple[Path, ...]:
+    return tuple(sorted(folder.glob("output*.pkl"))) if folder.is_dir() else ()
+
+
+def _folder(path: Path, identifier: str | None) -> OfficialFolder:
+    name = path.absolute().name
+    match = _NAME.fullmatch(name)
+    if identifier is None and (match is None or match.group(1) not in catalogue()):
+        raise BadInput(
+            f"{name!r} is no name of the release (captureN_subsampleK, N from 0 to 10, for one hand "
+            "with _single)",
+            where=path,
+            remedy="Say which capture it is with --id.",
+        )
+    return OfficialFolder(
+        path=path,
+        pickles=_pickles(path),
+        id=identifier or (match.group(1) if match else name),
+        subsample=int(match.group(2)) if match and match.group(2) else None,
+        single=bool(match and match.group(3)),
+    )
+
+
+def find_file(folder: Path, named: str, *, where: Path, field: str) -> Path:
+    """Find a file that a pickle names, in the pickle's own folder and nowhere else.
+
+    The release's paths are of its authors' machine. The last parts of the name are looked for
+    below the folder, the bare file name first; nothing of the name can lead out of the folder.
+
+    Raises:
+        BadInput: there is no such file.
+    """
+    parts = [part for part in _SEPARATORS.split(named) if part not in ("", ".", "..")]
+    for count in range(1, len(parts) + 1):
+        candidate = folder.joinpath(*parts[-count:])
+        if candidate.is_file():
+            return candidate
+    raise BadInput(
+        f"names {named[-80:]!r}, which is not in {folder}",
+        where=where,
+        field=field,
+        remedy="Put the images and masks of the release beside its pickle.",
+    )

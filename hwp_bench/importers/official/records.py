@@ -1,0 +1,227 @@
+"""The frame records of the release's pickles, checked key by key."""
+
+from __future__ import annotations
+
+import itertools
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.capture.schema import MAX_FRAMES
+from hwp_bench.errors import BadInput
+from hwp_bench.importers.official.folders import OfficialFolder, find_file
+from hwp_bench.unpickle import load_pickle
+
+#: Keys of one hand, and their shapes without the batch axis of 1.
+SIDE_KEYS: Mapping[str, tuple[int, ...]] = {
+    "mano_pose": (48,),
+    "mano_shape": (10,),
+    "verts3d_world": (778, 3),
+    "cam_aligned": (3,),
+    "joints2d_world": (21, 2),
+}
+#: Keys that belong to the frame.
+FRAME_KEYS = (
+    "img_path",
+    "scaled_focal_length",
+    "root_rel",
+    "mask_sam1_path",
+    "bbox_inter",
+    "mask_bbox",
+)
+
+
+@dataclass(frozen=True, eq=False)
+class SideRecords:
+    """One hand in every frame, as the tracker wrote it.
+
+    Attributes:
+        pose: (F, 16, 3) axis-angle rad, relative to MANO's mean pose; of a left hand in the
+            mirrored right-hand convention.
+        shape: (F, 10).
+        vertices: (F, 778, 3) m, in camera axes: `verts3d_world` + `cam_aligned`.
+        camera: (F, 3) m, `cam_aligned`.
+        landmarks: (F, 21, 2) px of the whole frame.
+        valid: (F,) bool, false where a value is not finite.
+    """
+
+    pose: np.ndarray
+    shape: np.ndarray
+    vertices: np.ndarray
+    camera: np.ndarray
+    landmarks: np.ndarray
+    valid: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class OfficialRecords:
+    """Everything that one capture of the release says.
+
+    Attributes:
+        numbers: (F,) the first whole number in each image's name, ascending.
+        images: F image files.
+        masks: F mask files.
+        focal: (F,) px of the whole frame.
+        boxes: F boxes (4,) x1, y1, x2, y2 as stored, or None where there is none.
+        root_rel: (F, 3) m.
+        sides: the tracked hands.
+        unknown: keys that the format does not list.
+        reordered: whether the records were not in the order of their numbers.
+    """
+
+    numbers: np.ndarray
+    images: tuple[Path, ...]
+    masks: tuple[Path, ...]
+    focal: np.ndarray
+    boxes: tuple[np.ndarray | None, ...]
+    root_rel: np.ndarray
+    sides: Mapping[str, SideRecords]
+    unknown: tuple[str, ...]
+    reordered: bool
+
+
+def read_records(folder: OfficialFolder) -> OfficialRecords:
+    """Read and check the pickles of one capture.
+
+    Raises:
+        UnsafePickle: a pickle asks for something that is not plain data; it is named.
+        BadInput: a pickle is no list of records, a key is missing or has another shape, two
+            records have one number, or a file that is named does not exist.
+    """
+    rows: list[tuple[int, dict[str, Any], Path]] = []
+    for pickle in folder.pickles:
+        content = load_pickle(pickle)
+        if not isinstance(content, list) or not content:
+            raise BadInput("is no list of frame records", where=pickle)
+        rows += [(_number(row, i, pickle), row, pickle) for i, row in enumerate(content)]
+    if len(rows) > MAX_FRAMES:
+        raise BadInput(f"holds {len(rows)} frames, more than {MAX_FRAMES}", where=folder.path)
+    numbers = [number for number, _, _ in rows]
+    rows.sort(key=lambda row: row[0])
+    for before, after in itertools.pairwise(rows):
+        if before[0] == after[0]:
+            raise BadInput(
+                f"two records have the number {after[0]}", where=after[2], field="img_path"
+            )
+    sides = [
+        side for side in ("right", "left") if any(f"mano_pose_{side}" in r for _, r, _ in rows)
+    ]
+    if not sides:
+        raise BadInput("is missing", where=folder.pickles[0], field="record 0: mano_pose_right")
+    known = {*FRAME_KEYS, *(f"{key}_{side}" for key in SIDE_KEYS for side in ("right", "left"))}
+    return OfficialRecords(
+        numbers=np.array([number for number, _, _ in rows]),
+        images=tuple(_file(row, "img_path", pickle) for _, row, pickle in rows),
+        masks=tuple(_file(_with_mask(row), "mask_sam1_path", pickle) for _, row, pickle in rows),
+        focal=_focal(rows),
+        boxes=tuple(_box(row, pickle, number) for number, row, pickle in rows),
+        root_rel=_stack(rows, "root_rel", (3,), optional="left" not in sides),
+        sides={side: _side(rows, side) for side in sides},
+        unknown=tuple(sorted({str(key) for _, row, _ in rows for key in row} - known)),
+        reordered=numbers != sorted(numbers),
+    )
+
+
+Rows = Sequence[tuple[int, dict[str, Any], Path]]
+
+
+def _number(row: Any, index: int, pickle: Path) -> int:
+    if not isinstance(row, dict):
+        raise BadInput(f"record {index} is no dict", where=pickle)
+    path = row.get("img_path")
+    if not isinstance(path, str):
+        problem = "is missing" if path is None else f"is a {type(path).__name__}, not a text"
+        raise BadInput(problem, where=pickle, field=f"record {index}: img_path")
+    found = re.search(r"\d{1,15}", re.split(r"[\\/]", path)[-1])
+    if found is None:
+        raise BadInput(
+            f"{path[-80:]!r} has no number", where=pickle, field=f"record {index}: img_path"
+        )
+    return int(found.group())
+
+
+def _file(row: Mapping[str, Any], key: str, pickle: Path) -> Path:
+    named = row[key]
+    if not isinstance(named, str):
+        raise BadInput(f"is a {type(named).__name__}, not a text", where=pickle, field=key)
+    return find_file(pickle.parent, named, where=pickle, field=key)
+
+
+def _with_mask(row: dict[str, Any]) -> dict[str, Any]:
+    if "mask_sam1_path" in row:
+        return row
+    stem, dot, ending = row["img_path"].rpartition(".")
+    return {**row, "mask_sam1_path": f"{stem}_sam1_mask{dot}{ending}"}
+
+
+def _focal(rows: Rows) -> np.ndarray:
+    values = []
+    for number, row, pickle in rows:
+        value = _array(row, "scaled_focal_length", pickle, number)
+        if value.size != 1 or not 0 < float(value.ravel()[0]) < 1e7:
+            raise BadInput(
+                f"frame {number}: is no focal length in pixels",
+                where=pickle,
+                field="scaled_focal_length",
+            )
+        values.append(float(value.ravel()[0]))
+    return np.array(values)
+
+
+def _box(row: Mapping[str, Any], pickle: Path, number: int) -> np.ndarray | None:
+    if "bbox_inter" not in row:
+        return None
+    box = _array(row, "bbox_inter", pickle, number)
+    finite = box.shape == (4,) and np.isfinite(box).all()
+    if not finite or not (box[2] > box[0] and box[3] > box[1]) or np.abs(box).max() > 1e6:
+        raise BadInput(
+            f"frame {number}: is no box x1, y1, x2, y2", where=pickle, field="bbox_inter"
+        )
+    return box
+
+
+def _side(rows: Rows, side: str) -> SideRecords:
+    arrays = {key: _stack(rows, f"{key}_{side}", shape) for key, shape in SIDE_KEYS.items()}
+    flat = [array.reshape(len(rows), -1) for array in arrays.values()]
+    return SideRecords(
+        pose=arrays["mano_pose"].reshape(-1, 16, 3),
+        shape=arrays["mano_shape"],
+        vertices=arrays["verts3d_world"] + arrays["cam_aligned"][:, None],
+        camera=arrays["cam_aligned"],
+        landmarks=arrays["joints2d_world"],
+        valid=np.isfinite(np.concatenate(flat, axis=1)).all(axis=1),
+    )
+
+
+def _stack(rows: Rows, key: str, shape: tuple[int, ...], *, optional: bool = False) -> np.ndarray:
+    stacked = np.zeros((len(rows), *shape))
+    for index, (number, row, pickle) in enumerate(rows):
+        if optional and key not in row:
+            continue
+        value = _array(row, key, pickle, number)
+        if value.shape not in ((1, *shape), shape):
+            raise BadInput(
+                f"frame {number}: has shape {value.shape} where {(1, *shape)} is expected",
+                where=pickle,
+                field=key,
+            )
+        stacked[index] = value.reshape(shape)
+    return stacked
+
+
+def _array(row: Mapping[str, Any], key: str, pickle: Path, number: int) -> np.ndarray:
+    if key not in row:
+        raise BadInput(f"frame {number}: is missing", where=pickle, field=key)
+    value = row[key]
+    if isinstance(value, bool) or not isinstance(value, int | float | np.ndarray | np.generic):
+        raise BadInput(
+            f"frame {number}: is a {type(value).__name__}, not an array", where=pickle, field=key
+        )
+    array = np.asarray(value)
+    if array.dtype.kind not in "fiu":
+        raise BadInput(f"frame {number}: holds {array.dtype}", where=pickle, field=key)
+    return array
