@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench import __version__
-from hwp_bench.capture import open_capture
+from hwp_bench.capture import Capture, open_capture
 from hwp_bench.errors import BadCapture
 from hwp_bench.evaluate.capture_run import Job, evaluate_capture
 from hwp_bench.methods.contract import Budget
@@ -78,52 +78,103 @@ def evaluate(
         BadMethod: the method directory is wrong.
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
     """
-    manifest = read_manifest(find_method(method))
-    preset = manifest.preset(settings.preset, settings.suite)
-    chosen = {**manifest.presets.get(preset, {}), **settings.overrides}
-    run = RunSettings(chosen, settings.seed, settings.budget, settings.frames)
-    networks = load_available()
-    jobs = _jobs(captures, splits, manifest, run, settings, networks)
-    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    plan = make_plan(read_manifest(find_method(method)), open_captures(captures, splits), settings)
     finished: list[CaptureResult] = []
-    for index, job in enumerate(jobs):
+    for index, job in enumerate(plan.jobs):
         name = job.capture.info.id
-        update = on_capture(index, len(jobs), name) if on_capture else None
+        update = on_capture(index, len(plan.jobs), name) if on_capture else None
         finished.append(evaluate_capture(job, out / "captures" / name, update))
-    results = Results(
-        method=MethodId(manifest.name, manifest.title, manifest.digest, preset, chosen),
-        suite=settings.suite,
-        seed=settings.seed,
-        budget={"seconds": settings.budget.seconds, "steps": settings.budget.steps},
-        frames=settings.frames,
-        protocols={protocol.name: protocol.as_dict() for protocol in PROTOCOLS},
-        environment=environment(),
-        started=started,
-        captures=finished,
-        toolkit=__version__,
-    )
+    results = plan.results(finished)
     write_results(out / "results.json", results)
     return results
 
 
-def _jobs(
-    captures: Sequence[Path],
-    splits: Mapping[str, Split] | None,
+@dataclass(frozen=True)
+class Plan:
+    """The jobs of an evaluation; `evaluate_capture` runs one."""
+
+    #: The method.
+    manifest: MethodManifest
+    #: How it is evaluated.
+    settings: EvaluationSettings
+    #: Name of the preset that is taken.
+    preset: str
+    #: The preset with what overrides it.
+    chosen: Mapping[str, Any]
+    #: One job a capture.
+    jobs: tuple[Job, ...]
+    #: When the plan was made, ISO 8601, UTC.
+    started: str
+
+    def results(self, finished: Sequence[CaptureResult]) -> Results:
+        """Return the record of the captures that are finished."""
+        settings, manifest = self.settings, self.manifest
+        return Results(
+            method=MethodId(
+                manifest.name, manifest.title, manifest.digest, self.preset, dict(self.chosen)
+            ),
+            suite=settings.suite,
+            seed=settings.seed,
+            budget={"seconds": settings.budget.seconds, "steps": settings.budget.steps},
+            frames=settings.frames,
+            protocols={protocol.name: protocol.as_dict() for protocol in PROTOCOLS},
+            environment=environment(),
+            started=self.started,
+            captures=list(finished),
+            toolkit=__version__,
+        )
+
+
+def make_plan(
     manifest: MethodManifest,
-    run: RunSettings,
+    captures: Sequence[tuple[Capture, Split]],
     settings: EvaluationSettings,
-    networks: Mapping[str, Network],
-) -> list[Job]:
-    jobs: list[Job] = []
-    for path in captures:
+    networks: Mapping[str, Network] | None = None,
+) -> Plan:
+    """Plan an evaluation; nothing runs yet.
+
+    Args:
+        manifest: the method.
+        captures: what `open_captures` returned.
+        settings: suite, preset, seed, budget, limits.
+        networks: LPIPS by backbone; None loads those whose weights are at hand.
+
+    Raises:
+        BadMethod: there is no such preset.
+    """
+    preset = manifest.preset(settings.preset, settings.suite)
+    chosen = {**manifest.presets.get(preset, {}), **settings.overrides}
+    run = RunSettings(chosen, settings.seed, settings.budget, settings.frames)
+    known = load_available() if networks is None else networks
+    jobs = tuple(
+        Job(manifest, capture, split, run, settings.time_limit, known)
+        for capture, split in captures
+    )
+    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return Plan(manifest, settings, preset, chosen, jobs, started)
+
+
+def open_captures(
+    paths: Sequence[Path], splits: Mapping[str, Split] | None = None
+) -> list[tuple[Capture, Split]]:
+    """Open captures, each with its split.
+
+    Args:
+        paths: capture folders.
+        splits: splits by capture id; None applies the 80/10/10 rule.
+
+    Raises:
+        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong, or two have one id.
+    """
+    opened: list[tuple[Capture, Split]] = []
+    for path in paths:
         capture = open_capture(path)
-        if any(job.capture.info.id == capture.info.id for job in jobs):
+        if any(other.info.id == capture.info.id for other, _ in opened):
             raise BadCapture(
                 f"another capture has the id {capture.info.id!r} too",
                 where=path,
                 field="id",
                 remedy="Evaluate them one by one, each into its own folder.",
             )
-        split = split_for(capture.info.id, len(capture), splits)
-        jobs.append(Job(manifest, capture, split, run, settings.time_limit, networks))
-    return jobs
+        opened.append((capture, split_for(capture.info.id, len(capture), splits)))
+    return opened
