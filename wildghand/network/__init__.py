@@ -1,0 +1,18 @@
+"""The Gaussian prediction network, in two sizes: `compact` and `paper`."""
+
+from wildghand.network.groups import parameter_groups
+from wildghand.network.network import Prediction, PredictionNetwork, Refinement
+from wildghand.network.settings import NetworkSettings, network_settings
+from wildghand.network.surface import SurfacePoints, mirrored_anchors, surface_points
+
+__all__ = [
+    "NetworkSettings",
+    "Prediction",
+    "PredictionNetwork",
+    "Refinement",
+    "SurfacePoints",
+    "mirrored_anchors",
+    "network_settings",
+    "parameter_groups",
+    "surface_points",
+]

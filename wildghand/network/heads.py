@@ -1,0 +1,140 @@
+"""The four prediction heads. At the start each of them says what it is told to say."""
+
+from __future__ import annotations
+
+import math
+
+import torch
+from torch import Tensor, nn
+
+from wildghand.attributes import CHANNELS, RawAttributes
+from wildghand.network.encoding import POSITION_CHANNELS
+from wildghand.network.initial import DIRECT_GAINS
+from wildghand.network.settings import NetworkSettings
+
+
+def mlp(inputs: int, width: int, outputs: int, layers: int) -> nn.Sequential:
+    """Linear layers with SiLU between them.
+
+    Args:
+        inputs: channels in.
+        width: of each hidden layer.
+        outputs: channels out.
+        layers: number of hidden layers; 0 makes it linear.
+    """
+    parts: list[nn.Module] = []
+    for _ in range(layers):
+        parts += [nn.Linear(inputs, width), nn.SiLU()]
+        inputs = width
+    return nn.Sequential(*parts, nn.Linear(inputs, outputs))
+
+
+class AttributeHead(nn.Module):
+    """Head (i): raw attributes from both branches.
+
+    Args:
+        settings: widths; `direct` adds the map's first channels to the attributes.
+        texture: channels of the texture features.
+        geometry: channels of the geometry features.
+    """
+
+    def __init__(self, settings: NetworkSettings, texture: int, geometry: int) -> None:
+        super().__init__()
+        width = settings.head_width
+        self.texture = mlp(texture, width, width, settings.head_layers)
+        self.geometry = mlp(geometry, width, width, settings.head_layers)
+        # One linear layer for each attribute, side by side.
+        self.attributes = zeroed(nn.Linear(width, CHANNELS))
+        self.direct: nn.Linear | None = None
+        if settings.direct:
+            self.direct = nn.Linear(settings.identity_channels, CHANNELS, bias=False)
+            with torch.no_grad():
+                self.direct.weight.zero_()
+                self.direct.weight[:, :CHANNELS] = torch.diag(torch.tensor(DIRECT_GAINS))
+
+    def forward(self, x_t: Tensor, x_g: Tensor, initial: RawAttributes) -> RawAttributes:
+        """Predict.
+
+        Args:
+            x_t: (N, Ft) texture features; with `direct`, the identity features come first.
+            x_g: (B, N, Fg) geometry features.
+            initial: (N, k), what is predicted at the start.
+
+        Returns:
+            (B, N, k).
+        """
+        change = self.attributes(self.texture(x_t) + self.geometry(x_g))
+        canonical = initial.concatenate().to(change.dtype)
+        if self.direct is not None:
+            canonical = canonical + self.direct(x_t[:, : self.direct.in_features])
+        return RawAttributes.split(canonical + change)
+
+
+class ShadowHead(nn.Module):
+    """Head (ii): the shadow coefficient from geometry features alone.
+
+    The logit is linear in the features plus a small network: light on a matte surface is linear
+    in the harmonics of the normal.
+    """
+
+    def __init__(self, settings: NetworkSettings, geometry: int) -> None:
+        super().__init__()
+        self.start = math.log(settings.initial_shadow / (1.0 - settings.initial_shadow))
+        self.light = zeroed(nn.Linear(geometry, 1, bias=False))
+        self.detail = zeroed(mlp(geometry, settings.head_width, 1, settings.head_layers))
+
+    def forward(self, x_g: Tensor) -> Tensor:
+        """(B, N, Fg) to (B, N, 1) in (0, 1)."""
+        return torch.sigmoid(self.start + self.light(x_g) + self.detail(x_g))
+
+
+class TemplateHead(nn.Module):
+    """Head (iii): offsets of the template from texture features and the encoded position."""
+
+    def __init__(self, settings: NetworkSettings, texture: int) -> None:
+        super().__init__()
+        self.bound = settings.max_template_offset
+        inputs = texture + POSITION_CHANNELS
+        self.offsets = zeroed(mlp(inputs, settings.head_width, 3, settings.head_layers))
+
+    def forward(self, x_t: Tensor, position: Tensor) -> Tensor:
+        """(N, Ft) and (N, 18) to (N, 3) m in the anchors' frames, each at most the bound."""
+        return self.bound * torch.tanh(self.offsets(torch.cat((x_t, position), dim=-1)))
+
+
+class RefinementHead(nn.Module):
+    """Head (iv): corrections of pose, shape and translation from the mean of both features.
+
+    The shape belongs to the hand, not to a frame: it sees the texture features alone.
+    """
+
+    def __init__(self, settings: NetworkSettings, texture: int, geometry: int) -> None:
+        super().__init__()
+        self.bounds = (settings.max_pose, settings.max_betas, settings.max_transl)
+        width, layers = settings.head_width, settings.head_layers
+        self.frame = zeroed(mlp(texture + geometry, width, 48 + 3, layers))
+        self.shape = zeroed(mlp(texture, width, 10, layers))
+
+    def forward(self, x_t: Tensor, x_g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """(N, Ft) and (B, N, Fg) to (B, 16, 3) rad, (10,), (B, 3) m."""
+        max_pose, max_betas, max_transl = self.bounds
+        hand = x_t.mean(dim=0)
+        frame = x_g.mean(dim=1)
+        seen = torch.cat((hand.expand(len(frame), -1), frame), dim=-1)
+        values = torch.tanh(self.frame(seen))
+        betas = max_betas * torch.tanh(self.shape(hand))
+        return (
+            max_pose * values[:, :48].unflatten(1, (16, 3)),
+            betas,
+            max_transl * values[:, 48:],
+        )
+
+
+def zeroed(module: nn.Linear | nn.Sequential) -> nn.Module:
+    """Set the last linear layer to zero, so that training starts from no effect."""
+    last = module[-1] if isinstance(module, nn.Sequential) else module
+    assert isinstance(last, nn.Linear)
+    nn.init.zeros_(last.weight)
+    if last.bias is not None:
+        nn.init.zeros_(last.bias)
+    return module

@@ -1,0 +1,50 @@
+"""What the attributes are before anything is learned: discs that cover the skin."""
+
+from __future__ import annotations
+
+import torch
+
+from wildghand.anchored import flat_gaussians
+from wildghand.attributes import SIZES, RawAttributes
+from wildghand.network.settings import NetworkSettings
+from wildghand.network.surface import SurfacePoints
+
+# How far a raw attribute moves with its channel of the identity map. One rate of Adam moves all
+# channels alike, so these are the ratios of the rates at which attributes are best fitted.
+_GAINS = {
+    "offsets": 1.0,
+    "log_scales": 0.4,
+    "quats": 0.4,
+    "logit_opacities": 1.6,
+    "logit_colors": 1.0,
+}
+#: `_GAINS` for each of the 14 channels.
+DIRECT_GAINS = tuple(gain for name, gain in _GAINS.items() for _ in range(SIZES[name]))
+
+#: Share of the brightest sRGB that an albedo may start from, so that it can still grow.
+BRIGHTEST = 0.95
+
+
+def initial_attributes(
+    settings: NetworkSettings, surface: SurfacePoints, log_scale_bias: float
+) -> RawAttributes:
+    """Flat discs of the hand's mean colour, as seen through the initial shadow coefficient.
+
+    Args:
+        settings: opacity and shadow coefficient at the start.
+        surface: spacing and colour.
+        log_scale_bias: what the activation adds to the log scales.
+
+    Returns:
+        (N, k) each, float32.
+    """
+    spacing = torch.full((len(surface),), float(surface.spacing))
+    albedo = (surface.color / settings.initial_shadow).clamp(0.0, BRIGHTEST)
+    discs = flat_gaussians(spacing, albedo, opacity=settings.initial_opacity)
+    return RawAttributes(
+        offsets=discs.offsets,
+        log_scales=discs.log_scales - log_scale_bias,
+        quats=discs.quats,
+        logit_opacities=discs.logit_opacities[:, None],
+        logit_colors=discs.logit_colors,
+    )
