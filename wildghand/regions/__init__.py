@@ -1,5 +1,6 @@
 """The hand y_h and the regions y_u of a frame."""
 
+from wildghand.regions.cache import RegionCache, Segmenter
 from wildghand.regions.frame_regions import (
     FrameRegions,
     Regions,
@@ -7,5 +8,21 @@ from wildghand.regions.frame_regions import (
     partition,
     stack_regions,
 )
+from wildghand.regions.hand import graph_cut_hands, hand_of_mask
+from wildghand.regions.sam import SegmentAnything, open_sam
+from wildghand.regions.superpixels import Superpixels
 
-__all__ = ["FrameRegions", "Regions", "overlapping", "partition", "stack_regions"]
+__all__ = [
+    "FrameRegions",
+    "RegionCache",
+    "Regions",
+    "SegmentAnything",
+    "Segmenter",
+    "Superpixels",
+    "graph_cut_hands",
+    "hand_of_mask",
+    "open_sam",
+    "overlapping",
+    "partition",
+    "stack_regions",
+]
