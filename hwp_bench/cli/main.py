@@ -15,12 +15,17 @@ def command_tree() -> Command:
         "wildghand": Command("make captures of the official release", f"{here}.import_wildghand"),
         "video": Command("make a capture of a video", f"{here}.import_video"),
     }
+    hands = {"convert": Command("express hands in another hand model", f"{here}.hands_convert")}
     data = {
         "check": Command("check a capture and say what is wrong", f"{here}.data_check"),
         "show": Command("draw a contact sheet of a capture", f"{here}.data_show"),
         "audit": Command("prove that a capture's split is fair", f"{here}.data_audit"),
+        "get": Command("download a public data set", f"{here}.data_get"),
         "import": Command("make captures of other data", commands=imports),
         "import-video": Command("make a capture of a video", f"{here}.import_video"),
+        "publish": Command(
+            "divide captures into a public and a sealed part", f"{here}.data_publish"
+        ),
     }
     return Command(
         "benchmark for hand avatars from perturbed in-the-wild video",
@@ -31,6 +36,7 @@ def command_tree() -> Command:
             "table": Command("print tables of results", f"{here}.table"),
             "list": Command("list captures, suites, methods, metrics", f"{here}.list"),
             "data": Command("make, check and show captures", commands=data),
+            "hands": Command("hand models", commands=hands),
             "sim": Command("simulate captures", f"{here}.sim"),
             "stability": Command("run the numerical hard cases", f"{here}.stability"),
         },

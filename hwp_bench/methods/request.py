@@ -126,18 +126,11 @@ class TrainingCapture:
         Raises:
             BadInput: the template that is installed here is another than the capture's.
         """
-        from hwp_bench.hands import load_template
+        from hwp_bench.hands.matching import load_matching_template
 
         if side not in self.sides:
             raise UsageError(f"this capture has no {side} hand", where=self.root)
-        template = load_template(self.hand_model.source, side)
-        if template.name != self.hand_model.name:
-            raise BadInput(
-                f"belongs to hand model {self.hand_model.name}, not {template.name}",
-                where=self.root,
-                field="hand_model",
-            )
-        return template
+        return load_matching_template(self.hand_model, self.sides, side, where=self.root)
 
 
 def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) -> Path:

@@ -76,8 +76,8 @@ def _folder(path: Path, identifier: str | None) -> OfficialFolder:
     match = _NAME.fullmatch(name)
     if identifier is None and (match is None or match.group(1) not in catalogue()):
         raise BadInput(
-            f"{name!r} is no name of the release (captureN_subsampleK, N from 0 to 10, for one hand "
-            "with _single)",
+            f"{name!r} is no name of the release (captureN_subsampleK, N from 0 to 10, "
+            "for one hand with _single)",
             where=path,
             remedy="Say which capture it is with --id.",
         )

@@ -1,0 +1,47 @@
+"""`hwp-bench hands convert`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import asdict
+from pathlib import Path
+
+_EXAMPLES = """examples:
+  hwp-bench hands convert my_capture as_mano --hand mano:mano_v1_2/models
+  hwp-bench hands convert mano_capture as_free --hand anny --json
+
+Writes the capture again with its hands in another hand model, by fitting, and prints what the fit
+misses. True hand parameters are left out: they belong to the old model.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.description = "Convert a capture's hands to another hand model."
+    parser.epilog = _EXAMPLES
+    parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
+    parser.add_argument("out", type=Path, metavar="OUT", help="capture folder to make")
+    parser.add_argument(
+        "--hand", required=True, metavar="MODEL", help="anny, mano:PATH or mano-hd:PATH"
+    )
+    parser.add_argument("--force", action="store_true", help="replace an existing capture")
+    parser.add_argument("--json", action="store_true", help="print the errors as JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.capture import open_capture
+    from hwp_bench.hands.convert import convert_capture
+
+    errors = convert_capture(open_capture(args.capture), args.out, args.hand, overwrite=args.force)
+    if args.json:
+        print(json.dumps({side: asdict(error) for side, error in errors.items()}, indent=1))
+        return 0
+    for side, error in errors.items():
+        print(
+            f"{side} hand: skin {error.skin_mm:.2f} mm (worst frame {error.worst_skin_mm:.2f}), "
+            f"landmarks {error.landmark_mm:.2f} mm"
+        )
+    print(f"capture: {args.out}")
+    return 0

@@ -1,0 +1,59 @@
+"""A digest that binds a data set's keeper to hidden frames without telling anything of them.
+
+The public manifest holds the commitments, the sealed part the salt. Without the salt nobody can
+test a guess of the hidden content; with it anybody can check, once the sealed part is opened,
+that it was not changed after the publication.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from hwp_bench.capture import Capture
+from hwp_bench.files import canonical_json
+from hwp_bench.images import pixel_digest
+from hwp_bench.splits import Split
+
+#: Version of what is committed to.
+SCHEME = "hwp-commitment/1"
+#: Length of a salt in bytes: too long to be guessed.
+SALT_BYTES = 32
+
+
+def target_content(capture: Capture, split: Split) -> dict[str, Any]:
+    """Describe by digests what test frames are scored against.
+
+    Args:
+        capture: the capture.
+        split: its split.
+
+    Returns:
+        JSON: id, split digest, and for every test frame the SHA-256 of its decoded pixels and of
+        its scoring mask, with whether the mask is exact coverage.
+
+    Raises:
+        BadImage: a test frame or mask is missing or damaged.
+    """
+    frames = []
+    for frame in split.test.tolist():
+        mask, exact = capture.scoring_mask(frame)
+        frames.append([frame, pixel_digest(capture.frame(frame)), pixel_digest(mask), exact])
+    return {"id": capture.info.id, "split": split.digest, "frames": frames}
+
+
+def commitment(content: Mapping[str, Any], salt: str) -> str:
+    """Return the SHA-256 (hex) of a salted content.
+
+    Args:
+        content: what `target_content` returned.
+        salt: at least `SALT_BYTES` random bytes in hex.
+    """
+    text = f"{SCHEME}\n{salt}\n{canonical_json(dict(content))}"
+    return hashlib.sha256(text.encode()).hexdigest()
+
+
+def joint_commitment(commitments: Sequence[str]) -> str:
+    """Return one digest (hex) of the commitments of all captures, in the manifest's order."""
+    return hashlib.sha256("\n".join([SCHEME, *commitments]).encode()).hexdigest()

@@ -1,0 +1,110 @@
+"""Open a sealed part and prove that it is what its keeper committed to."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hwp_bench.capture import open_capture
+from hwp_bench.capture.schema import check_id
+from hwp_bench.errors import BadInput
+from hwp_bench.files import read_json
+from hwp_bench.publish.commitment import SALT_BYTES, commitment, joint_commitment, target_content
+from hwp_bench.publish.parts import KEY, MANIFEST, PUBLIC_SCHEMA, SEALED_SCHEMA
+from hwp_bench.splits import Split
+
+
+@dataclass(frozen=True)
+class SealedPart:
+    """A sealed part whose content matches its commitments."""
+
+    #: Capture folders, in the manifest's order.
+    captures: tuple[Path, ...]
+    #: Splits by capture id.
+    splits: Mapping[str, Split]
+    #: Digest of all commitments (hex); equal to the public manifest's.
+    commitment: str
+
+
+def open_sealed(
+    path: str | os.PathLike[str], manifest: str | os.PathLike[str] | None = None
+) -> SealedPart:
+    """Open a sealed part; every test frame and mask is read and compared.
+
+    Args:
+        path: the folder `sealed`, or the publication that holds it.
+        manifest: the public manifest (or its folder) to compare with; None takes the one beside
+            the sealed part where there is one.
+
+    Returns:
+        Captures and splits to score submissions with.
+
+    Raises:
+        BadInput: no sealed part, or its content, its key and the public manifest contradict
+            each other; the capture is named.
+    """
+    root = Path(path)
+    root = root / "sealed" if (root / "sealed" / KEY).is_file() else root
+    key = root / KEY
+    value = _read(key, SEALED_SCHEMA)
+    salt = value.get("salt")
+    if not isinstance(salt, str) or len(salt) < 2 * SALT_BYTES:
+        raise BadInput("is missing or too short", where=key, field="salt")
+    captures, splits, commitments = [], {}, []
+    for entry in _entries(value, key):
+        name, split = entry["id"], Split.from_json(entry.get("split"), where=os.fspath(key))
+        check_id(name, os.fspath(key))
+        capture = open_capture(root / name)
+        if capture.info.id != name or split.capture != name or len(capture) != split.frame_count:
+            raise BadInput("split and capture do not belong together", where=key, field=name)
+        committed = commitment(target_content(capture, split), salt)
+        if committed != entry.get("commitment"):
+            raise BadInput(
+                "is not what was committed to: its test frames, masks, split or salt were changed",
+                where=key,
+                field=name,
+                remedy="Get the sealed part again from its keeper.",
+            )
+        captures.append(root / name)
+        splits[name] = split
+        commitments.append(committed)
+    joint = joint_commitment(commitments)
+    _compare_public(root, manifest, joint, value)
+    return SealedPart(tuple(captures), splits, joint)
+
+
+def _compare_public(
+    root: Path, manifest: str | os.PathLike[str] | None, joint: str, value: Mapping[str, Any]
+) -> None:
+    if value.get("commitment") != joint:
+        raise BadInput("does not match the captures", where=root / KEY, field="commitment")
+    beside = root.parent / "public" / MANIFEST
+    if manifest is None and not beside.is_file():
+        return
+    path = beside if manifest is None else Path(manifest)
+    path = path / MANIFEST if path.is_dir() else path
+    if _read(path, PUBLIC_SCHEMA).get("commitment") != joint:
+        raise BadInput(
+            "publishes another commitment than this sealed part has",
+            where=path,
+            field="commitment",
+            remedy="The two parts are not of one publication, or one of them was changed.",
+        )
+
+
+def _read(path: Path, schema: str) -> dict[str, Any]:
+    value = read_json(path)
+    if not isinstance(value, dict) or value.get("schema") != schema:
+        raise BadInput(f"is no file of schema {schema}", where=path)
+    return value
+
+
+def _entries(value: Mapping[str, Any], where: Path) -> list[dict[str, Any]]:
+    entries = value.get("captures")
+    good = isinstance(entries, list) and entries
+    if not good or not all(isinstance(e, dict) and isinstance(e.get("id"), str) for e in entries):
+        raise BadInput("is no list of captures", where=where, field="captures")
+    return list(entries)
