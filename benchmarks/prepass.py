@@ -1,0 +1,194 @@
+"""How well and how fast the pre-pass judges frames, against the truth of simulated captures.
+
+Run from the repository: `python -m benchmarks.prepass CAPTURE... [--pictures FOLDER]`, with
+captures made by `hwp-bench sim render`. The truth is read here and never by the pre-pass.
+
+For every capture: seconds of the second call (the first compiles) with images in memory;
+Spearman correlation of 1 - clean with the true severity (the largest of its perturbations) and
+the area under the ROC curve of clean against perturbed frames; median absolute error of the log
+gains; and, over pixels of the hand in frames with objects, the area under the curve of the pixel
+weights for visible against covered pixels, beside that of the estimated mask alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import torch
+from scipy.stats import rankdata, spearmanr
+
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.hands import load_template
+from hwp_bench.splits import contiguous_split
+from wildghand.prepass import Judgement, PrepassInput, judge_frames
+from wildghand.prepass.intensity import log_light_table
+
+
+def load(capture: Capture) -> PrepassInput:
+    """What the pre-pass may see of a capture's training frames."""
+    train = contiguous_split(capture.info.id, len(capture)).train
+    source = capture.info.hand_model.source
+    return PrepassInput(
+        indices=train,
+        images=np.stack([capture.frame(frame) for frame in train.tolist()]),
+        masks=np.stack([capture.mask(frame) for frame in train.tolist()]),
+        hands=capture.hands,
+        cameras=capture.cameras,
+        templates={side: load_template(source, side) for side in capture.info.sides},
+    )
+
+
+def severities(capture: Capture, frames: np.ndarray) -> dict[str, np.ndarray]:
+    return {
+        name: np.array(values)[frames]
+        for name, values in capture.info.perturbations.items()
+        if values is not None
+    }
+
+
+def area_under_curve(scores: np.ndarray, positive: np.ndarray) -> float:
+    """Chance that a positive scores above a negative; ties count half."""
+    ones, zeros = int(positive.sum()), int((~positive).sum())
+    if not ones or not zeros:
+        return float("nan")
+    return float((rankdata(scores)[positive].sum() - ones * (ones + 1) / 2) / (ones * zeros))
+
+
+def gain_error(capture: Capture, judgement: Judgement) -> tuple[float, float]:
+    """Median and 90 % quantile of the absolute error of the log gains."""
+    table, errors = log_light_table(), []
+    for row, frame in enumerate(judgement.indices.tolist()):
+        hand = capture.true_mask(frame) > 250
+        if judgement.usable[row] and hand.any():
+            change = table[capture.frame(frame)] - table[capture.clean(frame)]
+            errors.append(np.abs(judgement.log_gains[row] - np.median(change[hand], axis=0)))
+    return float(np.median(errors)), float(np.quantile(errors, 0.9))
+
+
+def covered_pixels(capture: Capture, judgement: Judgement) -> tuple[float, float]:
+    """Area under the curve of the weights and of the mask alone, visible against covered."""
+    severity = severities(capture, judgement.indices).get("hand_object_interaction")
+    weights, masks, visible = [], [], []
+    for row, frame in enumerate(judgement.indices.tolist()):
+        if severity is None or not severity[row] or not _has_clean_mask(capture, frame):
+            continue
+        hand = capture.clean_mask(frame) > 250
+        truth = capture.true_mask(frame)
+        known = hand & ((truth > 250) | (truth < 5))
+        weights.append(judgement.pixel_weights[row][known])
+        masks.append(capture.mask(frame)[known])
+        visible.append(truth[known] > 250)
+    if not weights:
+        return float("nan"), float("nan")
+    shown = np.concatenate(visible)
+    return (
+        area_under_curve(np.concatenate(weights), shown),
+        area_under_curve(np.concatenate(masks), shown),
+    )
+
+
+def _has_clean_mask(capture: Capture, frame: int) -> bool:
+    return (capture.root / "truth" / "clean_masks" / f"{frame:06d}.png").is_file()
+
+
+def draw(capture: Capture, given: PrepassInput, judgement: Judgement, folder: Path) -> None:
+    """Draw the judgement over time beside the truth, and some frames with their weights."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(2, 1, figsize=(9, 3.6), sharex=True, layout="constrained")
+    for name, values in severities(capture, judgement.indices).items():
+        axes[0].step(judgement.indices, values, where="mid", label=f"{name.replace('_', ' ')}")
+    axes[0].set_ylabel("true severity")
+    axes[0].legend(fontsize=7, loc="upper right")
+    axes[1].plot(judgement.indices, judgement.clean, color="black", label="clean")
+    for name in ("gain", "blur", "misplacement", "hidden", "residual"):
+        deviation = getattr(judgement, f"{name}_deviation")
+        axes[1].plot(judgement.indices, np.minimum(deviation / 10, 1), lw=0.8, label=f"{name} / 10")
+    axes[1].plot(
+        judgement.indices[judgement.refine_pose],
+        np.full(int(judgement.refine_pose.sum()), 1.05),
+        "v",
+        ms=3,
+        label="refine pose",
+    )
+    axes[1].set_xlabel("training frame")
+    axes[1].legend(fontsize=6, loc="upper right", ncols=4)
+    figure.savefig(folder / f"{capture.info.id}-time.png", dpi=110)
+    plt.close(figure)
+    rows = np.linspace(1, len(judgement) - 2, 10).astype(int)
+    strips = []
+    for row in rows.tolist():
+        image = given.images[row]
+        weights = judgement.pixel_weights[row].astype(np.float32)[..., None] / 255.0
+        overlay = image * weights + (1.0 - weights) * np.array([255.0, 0.0, 255.0])
+        both = np.concatenate([image, overlay.astype(np.uint8)])
+        label = f"{judgement.indices[row]}: {judgement.clean[row]:.2f}"
+        strips.append(
+            cv2.putText(
+                np.ascontiguousarray(both),
+                label,
+                (3, 12),
+                cv2.FONT_HERSHEY_SIMPLEX,
+                0.4,
+                (255,) * 3,
+            )
+        )
+    sheet = np.concatenate(strips, axis=1)[..., ::-1]
+    cv2.imwrite(
+        str(folder / f"{capture.info.id}-weights.jpg"), sheet, [cv2.IMWRITE_JPEG_QUALITY, 85]
+    )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("captures", nargs="+", type=Path, help="capture folders")
+    parser.add_argument("--pictures", type=Path, help="folder for pictures")
+    parser.add_argument("--threads", type=int, default=1, help="threads (1)")
+    args = parser.parse_args()
+    torch.set_num_threads(args.threads)
+    cv2.setNumThreads(args.threads)
+    if args.pictures:
+        args.pictures.mkdir(parents=True, exist_ok=True)
+
+    print(
+        "| capture | frames | px | perturbed | s | Spearman | AUC | gain error (90 %) "
+        "| pixel AUC (mask alone) |"
+    )
+    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
+    for path in args.captures:
+        capture = open_capture(path)
+        given = load(capture)
+        judge_frames(given)
+        start = time.perf_counter()
+        judgement = judge_frames(given)
+        seconds = time.perf_counter() - start
+        row = [capture.info.id, str(len(judgement)), str(given.size[0])]
+        truth = severities(capture, judgement.indices)
+        if truth and capture.has_clean:
+            worst = np.max(list(truth.values()), axis=0)
+            error = gain_error(capture, judgement)
+            pixels = covered_pixels(capture, judgement)
+            row += [
+                str(int((worst > 0).sum())),
+                f"{seconds:.2f}",
+                f"{spearmanr(1 - judgement.clean, worst).statistic:.2f}",
+                f"{area_under_curve(1 - judgement.clean, worst > 0):.2f}",
+                f"{error[0]:.3f} ({error[1]:.3f})",
+                f"{pixels[0]:.2f} ({pixels[1]:.2f})",
+            ]
+        else:
+            row += ["?", f"{seconds:.2f}", "", "", "", ""]
+        print(f"| {' | '.join(row)} |", flush=True)
+        if args.pictures:
+            draw(capture, given, judgement, args.pictures)
+
+
+if __name__ == "__main__":
+    main()

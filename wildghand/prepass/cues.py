@@ -1,0 +1,92 @@
+"""What one frame shows against what the intensity model expects of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from wildghand.prepass.footprint import Footprint
+from wildghand.prepass.intensity import IntensityModel
+
+# Standard deviations of the two blurs whose difference is texture, px.
+_FINE, _COARSE = 0.8, 3.0
+#: Pixels below which a frame says nothing.
+LEAST_PIXELS = 20
+# Passes of the vote for a gain.
+_PASSES = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Explained:
+    """One frame under the intensity model; P pixels of the silhouette."""
+
+    #: (P,) float32 mean absolute residual of the channels, log.
+    residual: np.ndarray
+    #: (3,) gain that most pixels agree on, log of linear light.
+    gain: np.ndarray
+    #: Median residual of the inner pixels.
+    level: float
+    #: Share of the expected fine structure that the frame shows, about 1 in a sharp frame whose
+    #: hand is where it should be; not a number where nothing can be compared.
+    texture: float
+
+
+def explain(
+    model: IntensityModel, footprint: Footprint, light: np.ndarray, inner: np.ndarray
+) -> Explained:
+    """Compare a frame with the intensity model.
+
+    Args:
+        model: fitted to all frames.
+        footprint: what its P pixels show.
+        light: (P, 3) log light.
+        inner: (P,) bool, at least one: the pixels that lie well inside hand and mask and are
+            neither dark nor clipped.
+    """
+    expected = model.predict(footprint.cells, footprint.normals)
+    rest = light - expected
+    gain = _agreed_gain(rest[inner], 2.5 * model.scale)
+    residual = np.abs(rest - gain).mean(axis=1)
+    return Explained(
+        residual=residual.astype(np.float32),
+        gain=gain,
+        level=float(np.median(residual[inner])),
+        texture=_texture(
+            light[inner].mean(axis=1),
+            expected[inner].mean(axis=1),
+            footprint.pixels[inner],
+            footprint.silhouette.shape,
+        ),
+    )
+
+
+def _agreed_gain(rest: np.ndarray, reach: float) -> np.ndarray:
+    """The gain that most pixels agree on; no gain at all wins a tie.
+
+    Where something covers most of the hand, the median is its colour and no gain.
+    """
+    best, votes = np.zeros(3), -1.0
+    for start in (np.zeros(3), np.median(rest, axis=0)):
+        gain = start
+        for _ in range(_PASSES):
+            weights = 1.0 / (1.0 + (np.abs(rest - gain).mean(axis=1) / reach) ** 4)
+            gain = (weights[:, None] * rest).sum(axis=0) / max(float(weights.sum()), 1e-9)
+        if weights.sum() > votes:
+            best, votes = gain, float(weights.sum())
+    return best
+
+
+def _texture(
+    shown: np.ndarray, expected: np.ndarray, pixels: np.ndarray, size: tuple[int, ...]
+) -> float:
+    """Slope of the shown fine structure on the expected one, which noise does not change."""
+    planes = np.zeros((size[0] * size[1], 3), dtype=np.float32)
+    planes[pixels] = np.column_stack([shown, expected, np.ones(len(shown))])
+    image = planes.reshape(size[0], size[1], 3)
+    fine = cv2.GaussianBlur(image, (0, 0), _FINE).reshape(-1, 3)[pixels]
+    coarse = cv2.GaussianBlur(image, (0, 0), _COARSE).reshape(-1, 3)[pixels]
+    detail = fine[:, :2] / fine[:, 2:] - coarse[:, :2] / coarse[:, 2:]
+    power = float((detail[:, 1] ** 2).sum())
+    return float((detail[:, 0] * detail[:, 1]).sum() / power) if power > 1e-6 else float("nan")

@@ -1,0 +1,150 @@
+"""A model of intensity without a network: log light = albedo + shading + gain, fitted robustly."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from wildghand.prepass.mode import densest
+from wildghand.prepass.settings import PrepassSettings
+from wildghand.shading import sh_basis
+
+#: 8-bit values outside this range say nothing about the light: noise, or clipped.
+LOWEST, HIGHEST = 4, 250
+# Added to linear light before the logarithm, so that noise in the dark stays small.
+_FOOT = 0.004
+_DEGREE = 2
+# Ridge on shading, in samples; the basis has unit mean square.
+_RIDGE = 20.0
+# Gain deviation at which a frame counts half in albedo and shading.
+_FRAME_SCALE = 0.25
+# Distance from the skin colour at which a cell counts half in it.
+_SKIN_SCALE = 0.3
+
+
+def log_light_table() -> np.ndarray:
+    """(256,) float32: log of linear light for each 8-bit sRGB value (IEC 61966-2-1)."""
+    srgb = np.arange(256) / 255.0
+    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+    return np.log(linear + _FOOT).astype(np.float32)
+
+
+def shading_basis(normals: np.ndarray) -> np.ndarray:
+    """(P, 8) float32 spherical harmonics of degree 1 and 2 at unit normals (P, 3)."""
+    return sh_basis(torch.from_numpy(normals), _DEGREE).numpy()[:, 1:]
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """M pixels of R frames, ordered by frame."""
+
+    #: (R + 1,) int64: frame r has the samples starts[r] to starts[r + 1].
+    starts: np.ndarray
+    #: (M,) int64 cell.
+    cells: np.ndarray
+    #: (M, 3) float32 log light.
+    light: np.ndarray
+    #: (M, 8) float32 shading basis.
+    basis: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class IntensityModel:
+    """What log light the hands have where; gains are relative to the mode of the gains."""
+
+    #: (C, 3) float32 log albedo of every cell.
+    albedo: np.ndarray
+    #: (8, 3) float32 coefficients of `shading_basis`.
+    shading: np.ndarray
+    #: (R, 3) log gain of every frame, linear light.
+    gains: np.ndarray
+    #: Median absolute residual of a channel in the frames around the mode.
+    scale: float
+
+    def predict(self, cells: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(P, 3) log light at gain 0."""
+        return self.albedo[cells] + shading_basis(normals) @ self.shading
+
+
+def fit_intensity(
+    samples: Samples, cell_normals: np.ndarray, settings: PrepassSettings
+) -> IntensityModel:
+    """Fit albedo, shading and gains by turns, with weights that leave outliers out.
+
+    Args:
+        samples: at least one.
+        cell_normals: (C, 3) normal of every cell on the rest surface; zeros where unknown.
+        settings: share of clean frames, prior and passes.
+    """
+    counts = np.diff(samples.starts)
+    rows = np.repeat(np.arange(len(counts)), counts)
+    cell_count = len(cell_normals)
+    used = np.flatnonzero(np.bincount(samples.cells, minlength=cell_count))
+    dense = np.zeros(cell_count, dtype=np.int64)
+    dense[used] = np.arange(len(used))
+    cells = dense[samples.cells]
+    sides = np.column_stack([np.ones(len(used)), shading_basis(cell_normals[used])])
+    light = samples.light.astype(np.float64)
+    basis = samples.basis.astype(np.float64)
+    weights = np.ones(len(light))
+    shading = np.zeros((basis.shape[1], 3))
+    gains = np.zeros((len(counts), 3))
+    shade = np.zeros_like(light)
+    scale = 1.0
+    for _ in range(settings.iterations):
+        trust = weights / (1.0 + (np.linalg.norm(gains, axis=1) / _FRAME_SCALE)[rows] ** 2)
+        rest = light - shade - gains[rows]
+        albedo, skin = _albedo(cells, rest, trust, sides, settings.albedo_prior)
+        rest = light - albedo[cells] - gains[rows]
+        weighted = basis * trust[:, None]
+        normal = weighted.T @ basis + _RIDGE * np.eye(basis.shape[1])
+        shading = np.linalg.solve(normal, weighted.T @ rest)
+        shade = basis @ shading
+        rest = light - albedo[cells] - shade
+        gains = _frame_medians(rest, samples.starts)
+        centre, part = densest(gains, settings.clean_share)
+        gains = gains - centre
+        residual = np.abs(rest - centre - gains[rows]).mean(axis=1)
+        scale = max(float(np.median(residual[part[rows]])), 0.01)
+        weights = 1.0 / (1.0 + (residual / (2.5 * scale)) ** 4)
+    everywhere = np.column_stack([np.ones(cell_count), shading_basis(cell_normals)])
+    full = everywhere @ skin + centre
+    full[used] = albedo + centre
+    return IntensityModel(full.astype(np.float32), shading.astype(np.float32), gains, scale)
+
+
+def _albedo(
+    cells: np.ndarray, rest: np.ndarray, weights: np.ndarray, sides: np.ndarray, prior: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Weighted means of the cells, drawn towards the skin colour of their side of the hand.
+
+    The skin colour is a smooth function of the normal on the rest hand: palms are lighter than
+    backs, and without it a turned hand looks like a change of the light.
+    """
+    count = len(sides)
+    mass = np.bincount(cells, weights, minlength=count)
+    sums = np.stack(
+        [np.bincount(cells, weights * rest[:, k], minlength=count) for k in range(3)], axis=1
+    )
+    own = sums / np.maximum(mass, 1e-9)[:, None]
+    trust = mass / (mass + prior)
+    skin = np.zeros((sides.shape[1], 3))
+    skin[0] = np.median(own[mass > 0], axis=0) if (mass > 0).any() else rest.mean(axis=0)
+    ridge = np.diag([1e-6] + [0.01 * count] * (sides.shape[1] - 1))
+    for _ in range(3):
+        off = np.linalg.norm(own - sides @ skin, axis=1)
+        weighted = sides * (trust / (1.0 + (off / _SKIN_SCALE) ** 2))[:, None]
+        skin = np.linalg.solve(weighted.T @ sides + ridge, weighted.T @ own)
+    return (sums + prior * (sides @ skin)) / (mass + prior)[:, None], skin
+
+
+def _frame_medians(values: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """(R, 3) median of each frame's samples; zeros where it has none."""
+    result = np.zeros((len(starts) - 1, values.shape[1]))
+    for row in range(len(result)):
+        part = values[starts[row] : starts[row + 1]]
+        if len(part):
+            result[row] = np.median(part, axis=0)
+    return result

@@ -1,0 +1,105 @@
+"""What the pre-pass says about the training frames."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+#: Exponent between sRGB values and linear light around the middle of the scale.
+_DISPLAY_EXPONENT = 1.0 / 2.2
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """R training frames, in the order in which they were given.
+
+    Deviations are in robust standard deviations of the frames that agree, one-sided: 0 = as
+    normal as most frames, 3 = clearly off.
+    """
+
+    #: (R,) which frames of the capture they are.
+    indices: np.ndarray
+    #: (R,) bool: the estimated hands are valid, lie in the picture, and mask and frame show
+    #: something. Other frames are judged unclean with gain 0.
+    usable: np.ndarray
+    #: (R,) probability in [0, 1] that nothing perturbs the frame.
+    clean: np.ndarray
+    #: (R,) weight of the frame in the fit, from the floor to 1.
+    frame_weights: np.ndarray
+    #: (R,) chance that omega is dropped in training: only where the frame is judged clean.
+    omega_dropout: np.ndarray
+    #: (R,) bool: sharp frames whose mask says that the hand is elsewhere.
+    refine_pose: np.ndarray
+    #: (R, 3) log gain of linear light by channel, relative to the mode of the gains.
+    log_gains: np.ndarray
+    #: (R,) deviation of the gain from the mode.
+    gain_deviation: np.ndarray
+    #: (R,) median log residual of the hand under the intensity model, in [0, inf).
+    residual: np.ndarray
+    #: (R,) deviation of the log of `residual`.
+    residual_deviation: np.ndarray
+    #: (R,) sharpness: share of the expected texture that shows; about 1 or more when sharp.
+    sharpness: np.ndarray
+    #: (R,) deviation of border width and texture towards blur, the larger of the two.
+    blur_deviation: np.ndarray
+    #: (R,) estimated extent of the blur in its strongest direction, px.
+    blur_extent: np.ndarray
+    #: (R,) mean distance of the mask's outline outside the silhouette, share of the hand's size.
+    misplacement: np.ndarray
+    #: (R,) deviation of `misplacement`.
+    misplacement_deviation: np.ndarray
+    #: (R,) share of the hand, where masks show it in other frames, that this mask lacks.
+    hidden: np.ndarray
+    #: (R,) deviation of `hidden`.
+    hidden_deviation: np.ndarray
+    #: (R,) median way of the projected hand since the frame before, px; 0 where that is no
+    #: training frame. Parameters alone; it does not enter `clean`.
+    motion: np.ndarray
+    #: (R, H, W) uint8, 255 = full weight: initial weights of the pixels.
+    pixel_weights: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.indices)
+
+    @property
+    def display_log_gains(self) -> np.ndarray:
+        """(R, 3) the gains as factors on sRGB values, log: about `log_gains` / 2.2."""
+        return self.log_gains * _DISPLAY_EXPONENT
+
+
+def neutral_judgement(
+    indices: np.ndarray, usable: np.ndarray, size: tuple[int, int], omega_dropout: float
+) -> Judgement:
+    """Everything that can be used is clean: where there is too little to compare.
+
+    Args:
+        indices: (R,) frames.
+        usable: (R,) bool.
+        size: height and width.
+        omega_dropout: chance for clean frames.
+    """
+    count = len(indices)
+    good = usable.astype(np.float64)
+    zeros = np.zeros(count)
+    return Judgement(
+        indices=indices,
+        usable=usable,
+        clean=good,
+        frame_weights=np.ones(count),
+        omega_dropout=omega_dropout * good,
+        refine_pose=np.zeros(count, dtype=bool),
+        log_gains=np.zeros((count, 3)),
+        gain_deviation=zeros,
+        residual=zeros,
+        residual_deviation=zeros,
+        sharpness=np.ones(count),
+        blur_deviation=zeros,
+        blur_extent=zeros,
+        misplacement=zeros,
+        misplacement_deviation=zeros,
+        hidden=zeros,
+        hidden_deviation=zeros,
+        motion=zeros,
+        pixel_weights=np.full((count, *size), 255, dtype=np.uint8),
+    )
