@@ -13,6 +13,7 @@ def command_tree() -> Command:
     here = "hwp_bench.cli"
     imports = {
         "wildghand": Command("make captures of the official release", f"{here}.import_wildghand"),
+        "interhand26m": Command("make a capture of InterHand2.6M", f"{here}.import_interhand"),
         "video": Command("make a capture of a video", f"{here}.import_video"),
     }
     hands = {"convert": Command("express hands in another hand model", f"{here}.hands_convert")}
@@ -32,6 +33,9 @@ def command_tree() -> Command:
         commands={
             "demo": Command("simulate a capture, fit a baseline, score it", f"{here}.demo"),
             "evaluate": Command("run a method on captures and score it", f"{here}.evaluate"),
+            "ablate": Command("say what components of a method buy and cost", f"{here}.ablate"),
+            "cost": Command("show accuracy against time", f"{here}.cost"),
+            "verify": Command("recompute digests and scores of results", f"{here}.verify"),
             "compare": Command("say how sure the differences are", f"{here}.compare"),
             "table": Command("print tables of results", f"{here}.table"),
             "list": Command("list captures, suites, methods, metrics", f"{here}.list"),

@@ -1,0 +1,12 @@
+"""InterHand2.6M: annotations, hands, capture."""
+
+from hwp_bench.importers.interhand.importing import InterHandImport, import_interhand
+from hwp_bench.importers.interhand.sequences import PAPER_SEQUENCES, Sequence, find_sequence
+
+__all__ = [
+    "PAPER_SEQUENCES",
+    "InterHandImport",
+    "Sequence",
+    "find_sequence",
+    "import_interhand",
+]
