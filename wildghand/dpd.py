@@ -28,7 +28,7 @@ class Temporal:
     omega: Tensor
 
     def with_omega(self, omega: Tensor) -> Temporal:
-        """The same embedding under other weights, after `DynamicPerturbation.drop`."""
+        """The same embedding under other weights, after `drop`."""
         return Temporal(self.z, omega)
 
 
@@ -121,36 +121,6 @@ class DynamicPerturbation(nn.Module):
             made[name] = omega[:, None, None] * (g @ of_g.mT + shift[:, None])
         return RawAttributes(**made)
 
-    @staticmethod
-    def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator) -> Tensor:
-        """Set temporal weights to 0 at random, so that the canonical attributes stand alone.
-
-        Training only; the paper's probability is 0.3 for every frame.
-
-        Args:
-            omega: (B,).
-            probability: in [0, 1], one for all or (B,): frames that are known to be perturbed may
-                keep their weights, with 0.
-            generator: draws B numbers for each call, whatever the probabilities are.
-
-        Returns:
-            (B,); a dropped frame passes no gradient.
-
-        Raises:
-            UsageError: a probability outside [0, 1].
-            ShapeMismatch: as many probabilities as frames are wanted.
-        """
-        chance = torch.as_tensor(probability, dtype=torch.float32).detach().cpu()
-        if not bool(((chance >= 0.0) & (chance <= 1.0)).all()):
-            raise UsageError("is outside [0, 1]", field="probability")
-        if chance.ndim and chance.shape != omega.shape:
-            raise ShapeMismatch(
-                f"has shape {tuple(chance.shape)}, omega {tuple(omega.shape)}", field="probability"
-            )
-        drawn = torch.rand(omega.shape, generator=generator, device=generator.device)
-        kept = drawn >= chance.to(drawn.device)
-        return torch.where(kept.to(omega.device), omega, torch.zeros_like(omega))
-
 
 def encode_frames(frames: Tensor, frame_count: int) -> Tensor:
     """l / L and the sines and cosines of its octaves.
@@ -171,3 +141,33 @@ def encode_frames(frames: Tensor, frame_count: int) -> Tensor:
     angles = math.pi * place[:, None] * octaves
     waves = torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)
     return torch.cat([waves, place[:, None]], dim=-1).float()
+
+
+def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator) -> Tensor:
+    """Set temporal weights to 0 at random, so that the canonical attributes stand alone.
+
+    Training only; the paper's probability is 0.3 for every frame.
+
+    Args:
+        omega: (B,).
+        probability: in [0, 1], one for all or (B,): frames that are known to be perturbed may
+            keep their weights, with 0.
+        generator: draws B numbers for each call, whatever the probabilities are.
+
+    Returns:
+        (B,); a dropped frame passes no gradient.
+
+    Raises:
+        UsageError: a probability outside [0, 1].
+        ShapeMismatch: as many probabilities as frames are wanted.
+    """
+    chance = torch.as_tensor(probability, dtype=torch.float32).detach().cpu()
+    if not bool(((chance >= 0.0) & (chance <= 1.0)).all()):
+        raise UsageError("is outside [0, 1]", field="probability")
+    if chance.ndim and chance.shape != omega.shape:
+        raise ShapeMismatch(
+            f"has shape {tuple(chance.shape)}, omega {tuple(omega.shape)}", field="probability"
+        )
+    drawn = torch.rand(omega.shape, generator=generator, device=generator.device)
+    kept = drawn >= chance.to(drawn.device)
+    return torch.where(kept.to(omega.device), omega, torch.zeros_like(omega))

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from hwp_bench.errors import ShapeMismatch, UsageError
 from wildghand.attributes import SIZES, RawAttributes
-from wildghand.dpd import DynamicPerturbation, encode_frames
+from wildghand.dpd import DynamicPerturbation, drop, encode_frames
 
 
 def attributes(*lead: int, seed: int = 0) -> RawAttributes:
@@ -138,21 +138,21 @@ def test_drop_keeps_its_probability_frame_by_frame_and_repeats() -> None:
     omega = torch.full((4000,), 0.5)
     chance = torch.zeros(4000)
     chance[:2000] = 0.3
-    first = DynamicPerturbation.drop(omega, chance, torch.Generator().manual_seed(1))
-    again = DynamicPerturbation.drop(omega, chance, torch.Generator().manual_seed(1))
+    first = drop(omega, chance, torch.Generator().manual_seed(1))
+    again = drop(omega, chance, torch.Generator().manual_seed(1))
     assert torch.equal(first, again)
     assert (first[2000:] == 0.5).all()
     # Four standard deviations of a binomial share.
     assert abs(float((first[:2000] == 0.0).float().mean()) - 0.3) < 4 * math.sqrt(0.21 / 2000)
     generator = torch.Generator().manual_seed(1)
-    assert (DynamicPerturbation.drop(omega, 1.0, generator) == 0.0).all()
-    assert torch.equal(DynamicPerturbation.drop(omega, 0.0, generator), omega)
+    assert (drop(omega, 1.0, generator) == 0.0).all()
+    assert torch.equal(drop(omega, 0.0, generator), omega)
 
 
 def test_drop_draws_nothing_from_the_global_generator_and_stops_the_gradient() -> None:
     omega = torch.tensor([0.2, 0.4], requires_grad=True)
     state = torch.get_rng_state()
-    kept = DynamicPerturbation.drop(omega, torch.tensor([1.0, 0.0]), torch.Generator())
+    kept = drop(omega, torch.tensor([1.0, 0.0]), torch.Generator())
     assert torch.equal(state, torch.get_rng_state())
     kept.sum().backward()
     assert omega.grad.tolist() == [0.0, 1.0]
@@ -167,8 +167,8 @@ def test_bad_arguments_are_named() -> None:
     with pytest.raises(ShapeMismatch):
         module.biases(attributes(3, 4), temporal.z, temporal.omega)
     with pytest.raises(UsageError, match="probability"):
-        module.drop(temporal.omega, float("nan"), torch.Generator())
+        drop(temporal.omega, float("nan"), torch.Generator())
     with pytest.raises(ShapeMismatch, match="probability"):
-        module.drop(temporal.omega, torch.zeros(3), torch.Generator())
+        drop(temporal.omega, torch.zeros(3), torch.Generator())
     with pytest.raises(UsageError, match="frame_count"):
         DynamicPerturbation(0)
