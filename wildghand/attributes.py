@@ -115,6 +115,10 @@ class Activation:
     max_offset: float = 0.01875
     #: Added to the raw logarithms of the scales; exp(-5) is 6.7 mm (the authors' value).
     log_scale_bias: float = -5.0
+    #: Smallest standard deviation, m; thinner than paper explains nothing of a hand.
+    min_scale: float = 2e-5
+    #: Largest standard deviation, m; nor does a Gaussian as wide as a finger, and it costs time.
+    max_scale: float = 1e-2
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.max_offset) and self.max_offset > 0.0):
@@ -125,9 +129,15 @@ class Activation:
             raise UsageError(
                 f"is {self.log_scale_bias}", field="log_scale_bias", remedy="Use a finite number."
             )
+        if not 0.0 < self.min_scale <= self.max_scale < math.inf:
+            raise UsageError(
+                f"are {self.min_scale} and {self.max_scale}",
+                field="min_scale, max_scale",
+                remedy="Use lengths in m above 0, the smaller one first.",
+            )
 
     def __call__(self, raw: RawAttributes) -> Attributes:
-        """Activate: bounded offsets, exponentials, unit quaternions, sigmoids.
+        """Activate: bounded offsets and exponentials, unit quaternions, sigmoids.
 
         Args:
             raw: (..., N, k) each.
@@ -138,7 +148,11 @@ class Activation:
         return Attributes(
             # tanh(x / 2) = 2 (sigmoid(x) - 0.5)
             offsets=self.max_offset * torch.tanh(0.5 * raw.offsets),
-            scales=torch.exp(raw.log_scales + self.log_scale_bias),
+            scales=torch.exp(
+                (raw.log_scales + self.log_scale_bias).clamp(
+                    math.log(self.min_scale), math.log(self.max_scale)
+                )
+            ),
             quats=torch.nn.functional.normalize(raw.quats, dim=-1),
             opacities=raw.logit_opacities.squeeze(-1).sigmoid(),
             colors=raw.logit_colors.sigmoid(),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import sys
 from typing import Any
@@ -10,9 +11,11 @@ from typing import Any
 _EXAMPLES = """examples:
   wildghand info
   wildghand info --json
+  wildghand info --network paper
 
 Draws a small scene with every rasterizer backend that this machine has and compares it with the
 float64 reference. Exit status 0: every backend that is there is right; 1: one is not.
+With --network it lists the parameters of the prediction network for two hands instead.
 """
 
 #: Largest difference to the float64 reference, on colours in [0, 1], that counts as right.
@@ -22,11 +25,17 @@ TOLERANCE = 1e-4
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
+    parser.add_argument(
+        "--network", choices=("compact", "paper"), help="list the parameters of the network"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    if args.network:
+        _print_network(args.network, args.json)
+        return 0
     from hwp_bench.report.table import Column, Table, print_table
     from hwp_bench.results.environment import environment
 
@@ -43,6 +52,42 @@ def run(args: argparse.Namespace) -> int:
         cells = tuple((b["backend"], b["state"], b["largest_error"]) for b in backends)
         print_table(Table("Rasterizer", columns, cells))
     return 1 if any(backend["state"] == "wrong" for backend in backends) else 0
+
+
+def _print_network(size: str, as_json: bool) -> None:
+    """List the parameters of one size of the network."""
+    from hwp_bench.report.table import Column, Table, print_table
+    from wildghand.network.settings import network_settings
+    from wildghand.network.table import blank_network, parameter_table
+
+    settings = network_settings(size)
+    rows = parameter_table(blank_network(settings))
+    parts: dict[str, int] = {}
+    for row in rows:
+        parts[row.part] = parts.get(row.part, 0) + row.parameters
+    total = sum(parts.values())
+    if as_json:
+        layers = [
+            {**dataclasses.asdict(row), "part": row.part, "parameters": row.parameters}
+            for row in rows
+        ]
+        facts = {"settings": settings.to_json(), "layers": layers, "parts": parts, "total": total}
+        json.dump(facts, sys.stdout, indent=1)
+        print()
+        return
+    columns = (
+        Column("layer"),
+        Column("weights"),
+        Column("each"),
+        Column("times"),
+        Column("parameters"),
+    )
+    cells = [
+        (row.layer, row.weights, f"{row.each:,}", row.times, f"{row.parameters:,}") for row in rows
+    ]
+    print_table(Table(f"Network {size!r}, two hands", columns, tuple(cells), ranked=False))
+    sums = [(part, f"{count:,}") for part, count in [*parts.items(), ("total", total)]]
+    print_table(Table("Parts", (Column("part"), Column("parameters")), tuple(sums), ranked=False))
 
 
 def _check(backend: str) -> dict[str, Any]:

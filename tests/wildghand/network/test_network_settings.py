@@ -1,0 +1,63 @@
+"""Settings: every field refuses what makes no sense, by name."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import pytest
+
+from hwp_bench.errors import BadMethod, UsageError
+from hwp_bench.methods.settings import settings_from
+from wildghand.network import NetworkSettings, network_settings
+
+
+def test_paper_has_the_papers_dimensions() -> None:
+    paper = network_settings("paper")
+    assert (paper.identity_resolution, paper.identity_channels) == (64, 33)
+    assert (paper.plane_resolution, paper.plane_width, paper.point_width) == (32, 512, 128)
+    assert (paper.transformer_layers, paper.attention_heads) == (10, 8)
+    assert (paper.head_width, paper.head_layers) == (256, 2)
+
+
+@pytest.mark.parametrize("size", ["compact", "paper"])
+def test_settings_survive_json(size: str) -> None:
+    chosen = network_settings(size)
+    assert settings_from(NetworkSettings, chosen.to_json(), "avatar") == chosen
+
+
+@pytest.mark.parametrize(
+    "item",
+    [item for item in dataclasses.fields(NetworkSettings) if "range" in item.metadata],
+    ids=lambda item: item.name,
+)
+def test_numbers_beyond_their_range_are_refused(item: dataclasses.Field[Any]) -> None:
+    low, high = item.metadata["range"]
+    for bad in (low - 1, high + 1, float("nan"), "1", True, None):
+        with pytest.raises(UsageError, match=item.name):
+            network_settings("compact", **{item.name: bad})
+
+
+@pytest.mark.parametrize(
+    ("size", "changes", "field"),
+    [
+        ("huge", {}, "size"),
+        ("compact", {"widht": 3}, "widht"),
+        ("compact", {"direct": 1}, "direct"),
+        ("compact", {"identity_channels": 13}, "identity_channels"),
+        ("compact", {"plane_resolution": 42}, "plane_resolution"),
+        ("compact", {"identity_resolution": 100}, "identity_resolution"),
+        ("paper", {"plane_width": 500}, "plane_width"),
+        ("paper", {"plane_width": 24}, "plane_width"),
+    ],
+)
+def test_settings_that_do_not_fit_together_are_refused(
+    size: str, changes: dict[str, Any], field: str
+) -> None:
+    with pytest.raises(UsageError, match=field):
+        network_settings(size, **changes)
+
+
+def test_a_methods_table_with_a_bad_network_is_refused() -> None:
+    with pytest.raises(BadMethod, match="head_width"):
+        settings_from(NetworkSettings, {"head_width": 0}, "wildghand")
