@@ -23,7 +23,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
     parser.add_argument(
-        "results", nargs="+", metavar="RESULTS", help="results folder or results.json, two or more"
+        "results",
+        nargs="+",
+        metavar="RESULTS",
+        help="results folder, results.json, or ablation folder",
     )
     parser.add_argument(
         "--metric",
@@ -51,14 +54,14 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.metrics import metric
     from hwp_bench.report.summary import HEADLINE
     from hwp_bench.report.table import print_table, spell
-    from hwp_bench.results import read_results
+    from hwp_bench.results import read_all
     from hwp_bench.statistics.compare import compare, standings
     from hwp_bench.statistics.pairing import common_metrics, group_runs, refuse_unlike
     from hwp_bench.statistics.tables import differences_table, standings_table
 
     if not 100 <= args.resamples <= 1_000_000:
         raise UsageError(f"{args.resamples} is not between 100 and 1000000", field="--resamples")
-    runs = group_runs([read_results(path) for path in args.results])
+    runs = group_runs(read_all(args.results))
     refuse_unlike(runs)
     if len(runs) < 2:
         raise UsageError(

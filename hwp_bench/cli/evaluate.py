@@ -31,6 +31,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "method", metavar="METHOD_DIR", help="method directory, or the name of a shipped method"
     )
+    add_evaluation_arguments(parser)
+    parser.add_argument("-o", "--out", help="results folder (default runs/METHOD-SUITE)")
+    parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
+    parser.add_argument("--json", action="store_true", help="print the result file")
+
+
+def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add what every command that runs a method takes: captures, settings, limits."""
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         "--suite",
@@ -41,7 +49,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     what.add_argument(
         "--capture", nargs="+", metavar="PATH", help="capture folders, instead of a suite"
     )
-    parser.add_argument("--out", help="results folder (default runs/METHOD-SUITE)")
     parser.add_argument("--splits", help="split file (default: the 80/10/10 rule)")
     parser.add_argument("--preset", help="preset of the method (default: the suite's, if any)")
     parser.add_argument(
@@ -57,7 +64,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default="perturbed",
         help="training frames to give; all but the first are oracles on simulated captures",
     )
-    parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
     parser.add_argument("--budget", type=float, metavar="SECONDS", help="limit of the fit's time")
     parser.add_argument("--steps", type=int, help="limit of the fit's optimiser steps")
     parser.add_argument(
@@ -67,7 +73,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="kill the method after this time on one capture (default 3600)",
     )
-    parser.add_argument("--json", action="store_true", help="print the result file")
 
 
 def run(args: argparse.Namespace) -> int:
@@ -81,10 +86,10 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.report.table import print_table
     from hwp_bench.splits import read_splits
 
-    settings = _settings(args)
+    settings = evaluation_settings(args)
     # A wrong method directory must be said before a suite is rendered for it.
     read_manifest(find_method(args.method))
-    captures = [Path(path) for path in args.capture] if args.capture else _suite(args.suite)
+    captures = chosen_captures(args)
     method = Path(args.method.rstrip("/")).name
     oracle = "" if args.frames == "perturbed" else f"-{args.frames}"
     out = Path(args.out or f"runs/{method}-{settings.suite}{oracle}")
@@ -123,7 +128,12 @@ def report_outcome(out: Path, results: Results) -> int:
     return 1 if failed else 0
 
 
-def _settings(args: argparse.Namespace) -> EvaluationSettings:
+def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
+    """Return the settings that `add_evaluation_arguments` and `--seed` gave.
+
+    Raises:
+        UsageError: a limit is not above 0, or an override is not NAME=VALUE.
+    """
     from hwp_bench.errors import UsageError
     from hwp_bench.evaluate.evaluation import EvaluationSettings
     from hwp_bench.methods.contract import Budget
@@ -157,7 +167,10 @@ def _override(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def _suite(name: str) -> list[Path]:
+def chosen_captures(args: argparse.Namespace) -> list[Path]:
+    """Return the capture folders that were named, or those of the suite, rendered if need be."""
+    if args.capture:
+        return [Path(path) for path in args.capture]
     from hwp_bench.sim import ensure_suite
 
-    return ensure_suite(name)
+    return ensure_suite(args.suite)

@@ -19,7 +19,8 @@ PROGRESS_INTERVAL = 0.5
 def schedule(budget: Budget) -> list[float]:
     """Return the seconds at which checkpoints are due: dense at the start, then regular.
 
-    1, 2, 4, 8, ... s, and every tenth of the budget where one in seconds is set.
+    1, 2, 4, 8, ... s, and every tenth of the budget where one in seconds is set. (Tenths of a
+    budget in steps are `ReportClock`'s business.)
     """
     horizon = budget.seconds or 24 * 3600.0
     due = {float(2**power) for power in range(18) if 2**power <= horizon}
@@ -42,6 +43,7 @@ class ReportClock:
         self, budget: Budget, record: Callable[[int, Avatar], None], progress_file: Path
     ) -> None:
         self._due = schedule(budget)
+        self._due_steps = [budget.steps * tenth / 10 for tenth in range(1, 10) if budget.steps]
         self._record = record
         self._progress_file = progress_file
         self._last_progress = 0.0
@@ -56,7 +58,8 @@ class ReportClock:
 
     def __call__(self, step: int, avatar: Avatar) -> None:
         """Take a checkpoint if one is due."""
-        if self._due and self.elapsed >= self._due[0]:
+        in_time = self._due and self.elapsed >= self._due[0]
+        if in_time or (self._due_steps and step >= self._due_steps[0]):
             self.take(step, avatar)
 
     def take(self, step: int, avatar: Avatar) -> None:
@@ -64,6 +67,7 @@ class ReportClock:
         seconds = self.elapsed
         entered = time.perf_counter()
         self._due = [moment for moment in self._due if moment > seconds]
+        self._due_steps = [due for due in self._due_steps if due > step]
         self._record(len(self.checkpoints), avatar)
         self.checkpoints.append(Checkpoint(step, seconds, peak_memory()))
         self._paused += time.perf_counter() - entered

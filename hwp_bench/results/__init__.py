@@ -1,5 +1,6 @@
 """Results: one JSON file with every frame's scores, and all that is needed to trust them."""
 
+from hwp_bench.results.find import read_all, result_files
 from hwp_bench.results.schema import (
     CaptureResult,
     CurvePoint,
@@ -16,6 +17,8 @@ __all__ = [
     "FrameResult",
     "MethodId",
     "Results",
+    "read_all",
     "read_results",
+    "result_files",
     "write_results",
 ]

@@ -197,3 +197,20 @@ def test_the_clock_stands_still_while_a_checkpoint_is_taken(tmp_path: Path) -> N
     assert clock.checkpoints[0].step == 5
     clock(6, None)  # type: ignore[arg-type]
     assert taken == [0]
+
+
+def test_a_budget_in_steps_is_checkpointed_every_tenth(tmp_path: Path) -> None:
+    clock = ReportClock(Budget(steps=40), lambda index, avatar: None, tmp_path / "p.json")
+    for step in range(1, 41):
+        clock(step, None)  # type: ignore[arg-type]
+    assert [checkpoint.step for checkpoint in clock.checkpoints] == [
+        4,
+        8,
+        12,
+        16,
+        20,
+        24,
+        28,
+        32,
+        36,
+    ]

@@ -1,0 +1,162 @@
+"""`hwp-bench ablate`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hwp_bench.cli.evaluate import add_evaluation_arguments
+
+if TYPE_CHECKING:
+    from hwp_bench.ablate.run import AblationRuns
+
+_EXAMPLES = """examples:
+  hwp-bench ablate --suite mini                          # 2 x 2 of DPD and PAO, three seeds
+  hwp-bench ablate --no-dpd                              # the full method, and without DPD
+  hwp-bench ablate --no-dpd --no-pao --no-heads          # each out of the full method, all out
+  hwp-bench ablate --binary-mask                         # a binary mask in place of PAO's weights
+  hwp-bench ablate --only dpd pao heads                  # 2 x 2 x 2
+  hwp-bench ablate my_method --without loss --budget 60  # what a third party's method declares
+
+Which variants are run:
+  no flag         the first two components that the method declares, crossed: 2 x 2
+  --only A B ...  the named components, crossed: 2^k
+  other flags     the full method; each named component out of it (alternatives: put in), alone;
+                  and, of two components or more, all of them out
+
+Started again with the same arguments, it takes finished jobs as they are. Exit status 1: the
+method failed on a capture or left out frames.
+"""
+#: Flags of the reference method's switches.
+_FLAGS = {
+    "dpd": "take out the dynamic perturbation disentanglement",
+    "pao": "take out the perturbation-aware optimisation",
+    "heads": "take out heads (iii) and (iv)",
+}
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    parser.add_argument(
+        "method",
+        metavar="METHOD",
+        nargs="?",
+        default="wildghand",
+        help="method directory or name (default wildghand)",
+    )
+    for name, text in _FLAGS.items():
+        parser.add_argument(
+            f"--no-{name}", dest="thrown", action="append_const", const=name, help=text
+        )
+    parser.add_argument(
+        "--binary-mask",
+        dest="thrown",
+        action="append_const",
+        const="binary-mask",
+        help="put a binary mask in place of the weights",
+    )
+    parser.add_argument(
+        "--without",
+        dest="thrown",
+        action="append",
+        metavar="SWITCH",
+        help="throw a switch of the method's method.toml; may be given again",
+    )
+    parser.add_argument(
+        "--only", nargs="+", default=[], metavar="COMPONENT", help="cross these components"
+    )
+    add_evaluation_arguments(parser)
+    parser.add_argument("--seeds", type=int, default=3, help="number of seeds (default 3)")
+    parser.add_argument("-o", "--out", help="folder (default runs/ablation-METHOD-SUITE)")
+    parser.add_argument("--json", action="store_true", help="print the record, ablation.json")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.ablate.design import make_design
+    from hwp_bench.ablate.run import run_ablation
+    from hwp_bench.ablate.view import AblationView
+    from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings
+    from hwp_bench.errors import UsageError
+    from hwp_bench.methods.manifest import find_method, read_manifest
+    from hwp_bench.progress import notice
+    from hwp_bench.splits import read_splits
+
+    if not 1 <= args.seeds <= 100:
+        raise UsageError(f"{args.seeds} is not between 1 and 100", field="--seeds")
+    args.seed = 0
+    settings = evaluation_settings(args)
+    # A wrong method or switch must be said before a suite is rendered for it.
+    manifest = read_manifest(find_method(args.method))
+    design = make_design(manifest, args.thrown or [], args.only)
+    captures = chosen_captures(args)
+    out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}")
+    splits = read_splits(args.splits) if args.splits else None
+    names = ", ".join(variant.name for variant in design.variants)
+    notice(f"{len(design.variants)} variants: {names}")
+    with AblationView() as view:
+        ablation = run_ablation(
+            manifest,
+            design,
+            captures,
+            out,
+            settings,
+            range(args.seeds),
+            splits=splits,
+            on_job=view.start,
+        )
+    return _report(ablation, out, print_json=args.json)
+
+
+def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
+    from hwp_bench.ablate.effects import cost_effects, score_effects
+    from hwp_bench.ablate.record import ablation_record, write_record
+    from hwp_bench.ablate.tables import ablation_tables
+    from hwp_bench.progress import notice
+    from hwp_bench.report.summary import HEADLINE, write_tables
+    from hwp_bench.report.table import print_table
+    from hwp_bench.statistics.pairing import common_metrics
+
+    metrics = common_metrics(list(ablation.runs.values()), HEADLINE)
+    effects = score_effects(ablation, metrics)
+    costs = cost_effects(ablation)
+    tables = ablation_tables(ablation, effects, costs)
+    record = ablation_record(ablation, effects, costs, tables)
+    write_tables(out / "tables", tables)
+    if print_json:
+        json.dump(record, sys.stdout, indent=1, allow_nan=False)
+        print()
+    else:
+        for name in ("ablation", "effects", "component_cost"):
+            print_table(tables[name])
+    _draw(ablation, out)
+    notice(f"record: {write_record(out, record)}; tables: {out / 'tables'}")
+    failures = [
+        f"failed: {result.method.title}, seed {result.seed}, {capture.id}: "
+        f"{capture.failed_frames} of {len(capture.frames)} frames: "
+        f"{capture.failure or next(f.failure for f in capture.frames if f.failure)}"
+        for result in ablation.results
+        for capture in result.captures
+        if capture.failed_frames
+    ]
+    for text in failures:
+        notice(text)
+    return 1 if failures else 0
+
+
+def _draw(ablation: AblationRuns, out: Path) -> None:
+    from hwp_bench.cost.analysis import analyse_cost, write_cost
+    from hwp_bench.errors import UsageError
+    from hwp_bench.progress import notice
+
+    try:
+        analysis = analyse_cost(list(ablation.runs.values()), "psnr")
+    except UsageError as error:
+        notice(f"no picture of accuracy against time: {error.problem}")
+        return
+    for picture in write_cost(out / "cost", analysis):
+        notice(f"picture: {picture}")

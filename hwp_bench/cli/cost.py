@@ -1,0 +1,85 @@
+"""`hwp-bench cost`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+
+_EXAMPLES = """examples:
+  hwp-bench cost runs/plain-mini runs/mine-mini
+  hwp-bench cost runs/mine-mini --reference runs/plain-mini -o runs/cost
+  hwp-bench cost runs/ablation --metric oriented_distance     # every variant of an ablation
+  hwp-bench cost runs/* --budgets 10 30 120 --json
+
+Prints scores after fixed times, times to given scores, where the time goes, and who leads when;
+writes the tables and the picture of score against seconds (PNG and SVG) to the output folder.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    parser.add_argument(
+        "results",
+        nargs="+",
+        metavar="RESULTS",
+        help="results folder, results.json, or ablation folder; seeds of a method go together",
+    )
+    parser.add_argument(
+        "--reference",
+        metavar="RESULTS",
+        help="result whose final score is a target (default: the plain baseline, if it is there)",
+    )
+    parser.add_argument("--metric", default="psnr", help="metric of the curves (default psnr)")
+    parser.add_argument(
+        "--budgets",
+        nargs="+",
+        type=float,
+        default=[5.0, 15.0, 60.0, 300.0],
+        metavar="SECONDS",
+        help="times at which scores are read (default 5 15 60 300, those that are reached)",
+    )
+    parser.add_argument(
+        "-o", "--out", default="hwp-cost", help="folder to write (default hwp-cost)"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON with the curves")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from pathlib import Path
+
+    from hwp_bench.cost.analysis import analyse_cost, write_cost
+    from hwp_bench.errors import UsageError
+    from hwp_bench.metrics import metric
+    from hwp_bench.progress import notice
+    from hwp_bench.report.table import print_table
+    from hwp_bench.results import read_all
+    from hwp_bench.statistics.pairing import group_runs
+
+    metric(args.metric)
+    for budget in args.budgets:
+        if not 0 < budget < float("inf"):
+            raise UsageError(f"{budget} is not above 0", field="--budgets")
+    reference = None
+    if args.reference:
+        named = group_runs(read_all([args.reference]))
+        if len(named) != 1:
+            raise UsageError("names more than one method", field="--reference")
+        reference = named[0]
+    analysis = analyse_cost(
+        group_runs(read_all(args.results)),
+        args.metric,
+        budgets=sorted(set(args.budgets)),
+        reference=reference,
+    )
+    if args.json:
+        json.dump(analysis.as_object(), sys.stdout, indent=1, allow_nan=False)
+        print()
+    else:
+        for table in analysis.tables.values():
+            print_table(table)
+    for picture in write_cost(Path(args.out), analysis):
+        notice(f"picture: {picture}")
+    return 0
