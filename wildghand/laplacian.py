@@ -100,6 +100,7 @@ def surface_laplacian(
                 torch.from_numpy(scipy_matrix.data).to(dtype),
                 size=scipy_matrix.shape,
                 device=device,
+                check_invariants=True,
             )
 
     return SurfaceLaplacian(sparse(matrix), sparse(matrix.T.tocsr()), frames, rig.spacing)

@@ -27,26 +27,15 @@ _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 class FilterBank(nn.Module):
     """Oriented edges and colours at four scales, compared after pooling; no file is needed.
 
-    At each octave the luma is filtered by derivatives along four directions, split into its
-    bright-dark and dark-bright halves, and averaged over 2 x 2 pixels, so that an edge that is
-    a pixel off costs less than an edge that is missing. The octaves below the first compare
-    colours too.
+    At each octave below the full resolution, which the reconstruction sees, the luma is
+    differentiated along four directions, split into its bright-dark and dark-bright halves, and
+    averaged over 2 x 2 pixels, so that an edge that is a pixel off costs less than an edge that
+    is missing. Colours are compared too.
 
     Source: the plan of a perceptual loss (Johnson et al., "Perceptual losses for real-time style
     transfer and super-resolution") with Freeman and Adelson's idea of oriented filters instead of
     learnt ones.
     """
-
-    kernels: Tensor
-    luma: Tensor
-
-    def __init__(self) -> None:
-        super().__init__()
-        along = torch.tensor([[-1.0, 0.0, 1.0], [-2.0, 0.0, 2.0], [-1.0, 0.0, 1.0]]) / 8.0
-        slant = torch.tensor([[-2.0, -1.0, 0.0], [-1.0, 0.0, 1.0], [0.0, 1.0, 2.0]]) / 8.0
-        bank = torch.stack([along, along.T, slant, slant.flip(0)])[:, None]
-        self.register_buffer("kernels", bank, persistent=False)
-        self.register_buffer("luma", torch.tensor(_LUMA), persistent=False)
 
     def forward(self, prediction: Tensor, target: Tensor, weights: Tensor) -> Tensor:
         """Mean over scales of the mean difference of responses.
@@ -62,15 +51,10 @@ class FilterBank(nn.Module):
         Raises:
             ShapeMismatch: the three do not describe the same images.
         """
-        images = _weighted(prediction, target, weights)
+        images = _pool(_weighted(prediction, target, weights))
         total = prediction.new_zeros(())
-        for scale in range(SCALES):
-            luma = torch.einsum("bchw,c->bhw", images, self.luma.to(images))[:, None]
-            edges = nn.functional.conv2d(luma, self.kernels.to(images), padding=1)
-            halves = torch.cat([torch.relu(edges), torch.relu(-edges)], dim=1)
-            total = total + _difference(_pool(halves))
-            if scale:
-                total = total + _difference(images)
+        for _ in range(SCALES):
+            total = total + _difference(images) + _edge_difference(_luma(images))
             if min(images.shape[-2:]) < _LEAST_EDGE:
                 break
             images = _pool(images)
@@ -136,6 +120,29 @@ def _weighted(prediction: Tensor, target: Tensor, weights: Tensor) -> Tensor:
 def _difference(responses: Tensor) -> Tensor:
     first, second = responses.chunk(2)
     return (first - second).abs().mean()
+
+
+def _luma(images: Tensor) -> Tensor:
+    red, green, blue = images.unbind(1)
+    return _LUMA[0] * red + _LUMA[1] * green + _LUMA[2] * blue
+
+
+def _edge_difference(luma: Tensor) -> Tensor:
+    """Difference of the pooled halves of four derivatives of (2 B, H, W)."""
+    if min(luma.shape[-2:]) < 3:
+        return luma.new_zeros(())
+    slopes = torch.stack(
+        [
+            luma[:, 1:-1, 2:] - luma[:, 1:-1, :-2],
+            luma[:, 2:, 1:-1] - luma[:, :-2, 1:-1],
+            luma[:, 2:, 2:] - luma[:, :-2, :-2],
+            luma[:, 2:, :-2] - luma[:, :-2, 2:],
+        ],
+        dim=1,
+    )
+    rising = _pool(torch.relu(slopes))
+    # Rising minus falling half is the slope itself.
+    return _difference(rising) + _difference(rising - _pool(slopes))
 
 
 def _pool(images: Tensor) -> Tensor:
