@@ -132,5 +132,5 @@ def write_release(
 def write_pickles(folder: Path, rows: list[dict[str, Any]], pickles: int = 1) -> None:
     for part in range(pickles):
         name = "output.pkl" if part == 0 else f"output_{part}.pkl"
-        share = rows[part::pickles]
+        share = rows if pickles == 1 else rows[part::pickles]
         (folder / name).write_bytes(pickle.dumps(share))

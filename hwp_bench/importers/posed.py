@@ -25,12 +25,14 @@ class PosedClip:
         pixels: (F, V, 2) px, pixel centres at +0.5.
         landmarks: (F, 21, 2) px, OpenPose order.
         faces: (T, 3) int.
+        valid: (F,) bool, false where there is no such hand.
     """
 
     vertices: np.ndarray
     pixels: np.ndarray
     landmarks: np.ndarray
     faces: np.ndarray
+    valid: np.ndarray
 
 
 def pose_clip(template: HandTemplate, hand: HandParameters, cameras: Cameras) -> PosedClip:
@@ -46,7 +48,9 @@ def pose_clip(template: HandTemplate, hand: HandParameters, cameras: Cameras) ->
         pixels, _ = project(posed.vertices, viewmats, Ks)
         landmarks, _ = project(posed.landmarks, viewmats, Ks)
         vertices = posed.vertices @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
-    return PosedClip(vertices.numpy(), pixels.numpy(), landmarks.numpy(), template.faces)
+    return PosedClip(
+        vertices.numpy(), pixels.numpy(), landmarks.numpy(), template.faces, hand.valid
+    )
 
 
 def sheet_frames(count: int) -> list[int]:
@@ -86,9 +90,12 @@ def posed_sheet(
                 caption=f"frame {frame}",
                 picture=picture,
                 mask=masks[frame],
-                vertices=np.concatenate([clip.vertices[frame] for clip in clips.values()]),
+                # Triangles of no size are not drawn: a hand that is not there stays away.
+                vertices=np.concatenate(
+                    [clip.vertices[frame] * clip.valid[frame] for clip in clips.values()]
+                ),
                 pixels=np.concatenate([clip.pixels[frame] for clip in clips.values()]),
-                fitted=first.landmarks[frame],
+                fitted=np.where(first.valid[frame], first.landmarks[frame], -9.0),
                 tracked=None if dots is None else dots[np.isfinite(dots).all(axis=1)],
             )
         )

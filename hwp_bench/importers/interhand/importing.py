@@ -249,6 +249,11 @@ def _write(
             for side, clip in clips.items():
                 if hands[side].valid[frame]:
                     mask |= draw_silhouette(clip.pixels[frame], clip.faces, options.size)
+            # Beyond the camera's frame there is no hand to be seen.
+            inside = cut(
+                np.full((height, width), 255, np.uint8), windows.corners[frame], windows.side
+            )
+            mask[resample(inside, options.size) < 255] = 0
             writer.frame(frame, picture)
             writer.mask(frame, mask)
             if frame in shown:

@@ -73,6 +73,8 @@ def test_mano_hands_lie_on_the_images(
             # The stored rotation has six digits.
             assert np.abs(clip.pixels[frame] - expected).max() < 0.05
             crop = capture.frame(frame)
+    # The hands reach over the frame's edge: no mask beyond it, where the crop is black.
+    assert not capture.mask(11)[:, :2].any()
     # Masks are on skin: the picture is bright where they are and dark where not.
     mask = capture.mask(11) > 0
     assert crop[mask].mean() > 130
