@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 #: Packages whose version can move a number.
@@ -19,11 +21,16 @@ PACKAGES = (
     "trimesh",
     "embreex",
     "gsplat",
+    "lpips",
 )
 
 
 def environment() -> dict[str, Any]:
-    """Return the versions, the processor and the system; no host name and no path."""
+    """Return the versions, the processor and the system; no host name and no path.
+
+    `code` is the digest of the toolkit's own modules, which a version number alone does not tell
+    while it is being developed.
+    """
     versions = {}
     for package in PACKAGES:
         try:
@@ -38,7 +45,18 @@ def environment() -> dict[str, Any]:
         if hasattr(os, "sched_getaffinity")
         else os.cpu_count(),
         "packages": versions,
+        "code": code_digest(),
     }
+
+
+def code_digest() -> str:
+    """Return the SHA-256 (hex) of the toolkit's own modules: names and contents."""
+    root = Path(__file__).resolve().parents[1]
+    total = hashlib.sha256()
+    for path in sorted(root.rglob("*.py")):
+        total.update(f"{path.relative_to(root).as_posix()}\0".encode())
+        total.update(hashlib.sha256(path.read_bytes()).digest())
+    return total.hexdigest()
 
 
 def _processor() -> str:

@@ -1,0 +1,105 @@
+"""`hwp-bench verify`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from hwp_bench.evaluate.verify import Verification
+
+_EXAMPLES = """examples:
+  hwp-bench verify runs/plain-mini
+  hwp-bench verify runs/mine --captures my_captures
+  hwp-bench verify runs/ablation --json          # every result of an ablation
+
+Recomputes the digests of captures, splits and predictions, and every score, from the predictions
+that lie beside the result. Exit status 0: all is as the result says; 1: something differs.
+"""
+#: Discrepancies that are printed for one result.
+_SHOWN = 20
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    parser.add_argument(
+        "results",
+        nargs="+",
+        metavar="RESULTS",
+        help="results folder, results.json, or ablation folder",
+    )
+    parser.add_argument(
+        "--captures",
+        nargs="+",
+        metavar="DIR",
+        help="captures, or folders of captures (default: the result's suite)",
+    )
+    parser.add_argument("--splits", help="split file (default: the 80/10/10 rule)")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from dataclasses import asdict
+
+    from hwp_bench.evaluate.verify import verify_results
+    from hwp_bench.progress import track
+    from hwp_bench.results import result_files
+    from hwp_bench.splits import read_splits
+
+    splits = read_splits(args.splits) if args.splits else None
+    files = [file for path in args.results for file in result_files(path)]
+    outcomes = []
+    for file in track(files, "verify"):
+        outcomes.append(verify_results(file, _captures(args, file), splits))
+    if args.json:
+        json.dump([asdict(outcome) for outcome in outcomes], sys.stdout, indent=1)
+        print()
+    else:
+        for outcome in outcomes:
+            _print(outcome)
+    return 1 if any(outcome.discrepancies for outcome in outcomes) else 0
+
+
+def _captures(args: argparse.Namespace, file: Path) -> list[Path]:
+    from hwp_bench.errors import UsageError
+    from hwp_bench.evaluate.verify import capture_folders
+    from hwp_bench.results import read_results
+    from hwp_bench.sim import ensure_suite
+    from hwp_bench.sim.suites import suite_names
+
+    if args.captures:
+        folders = capture_folders([Path(place) for place in args.captures])
+        if not folders:
+            raise UsageError("there is no capture", field="--captures")
+        return folders
+    suite = read_results(file).suite
+    if suite not in suite_names():
+        raise UsageError(
+            f"was made on captures of its own ({suite})",
+            where=file,
+            field="suite",
+            remedy="Say where they lie with --captures.",
+        )
+    return ensure_suite(suite)
+
+
+def _print(outcome: Verification) -> None:
+    from hwp_bench.report.table import Column, Table, print_table
+
+    shown = outcome.discrepancies[:_SHOWN]
+    if shown:
+        titles = ("capture", "what", "the result says", "found")
+        rows = tuple((d.capture or "all", d.what, d.recorded, d.found) for d in shown)
+        print_table(Table(outcome.file, tuple(map(Column, titles)), rows, ranked=False))
+        rest = len(outcome.discrepancies) - len(shown)
+        if rest:
+            print(f"and {rest} more")
+    verdict = f"{len(outcome.discrepancies)} differences" if shown else "holds"
+    print(f"{outcome.file}: {verdict} ({outcome.captures} captures, {outcome.frames} frames)")
+    for note in outcome.notes:
+        print(f"  {note}")

@@ -1,0 +1,109 @@
+"""Verification. Oracle: an untouched result holds; every kind of tampering is named."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_captures import CaptureMaker
+from toy_method import write_toy_method
+
+from hwp_bench.capture import Capture
+from hwp_bench.cli.main import main
+from hwp_bench.images import write_image
+
+
+@pytest.fixture
+def capture(make_capture: CaptureMaker) -> Capture:
+    return make_capture("tiny", frames=20, size=32)
+
+
+@pytest.fixture
+def result(capture: Capture, tmp_path: Path) -> Path:
+    method, out = write_toy_method(tmp_path / "toy"), tmp_path / "out"
+    assert main(["evaluate", str(method), "--capture", str(capture.root), "-o", str(out)]) == 0
+    return out
+
+
+def verify(result: Path, capture: Capture, capsys) -> tuple[int, dict]:
+    capsys.readouterr()
+    status = main(["verify", str(result), "--captures", str(capture.root.parent), "--json"])
+    return status, json.loads(capsys.readouterr().out)[0]
+
+
+def edit(result: Path, change) -> None:
+    file = result / "results.json"
+    value = json.loads(file.read_text())
+    change(value)
+    file.write_text(json.dumps(value))
+
+
+def test_an_untouched_result_holds(result: Path, capture: Capture, capsys) -> None:
+    status, found = verify(result, capture, capsys)
+    assert (status, found["discrepancies"]) == (0, [])
+    assert (found["captures"], found["frames"], found["notes"]) == (1, 2, [])
+    assert main(["verify", str(result), "--captures", str(capture.root)]) == 0
+    assert "holds (1 captures, 2 frames)" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("change", "what"),
+    [
+        (lambda c: c["frames"][1]["scores"].update(psnr=40.0), "frame 19, psnr"),
+        (lambda c: c["frames"][0]["scores"].update(other=1.0), "frame 18, other"),
+        (lambda c: c["frames"][0].update(failure="gone"), "frame 18, failure"),
+        (lambda c: c.update(predictions_digest="0"), "predictions"),
+        (lambda c: c.update(split_digest="0"), "split"),
+        (lambda c: c.update(digest="0"), "capture"),
+        (lambda c: c["frames"].pop(), "frames"),
+        (lambda c: c["frames"][0].update(frame=99), "frames"),
+    ],
+)
+def test_an_edited_result_is_found_out(result, capture, capsys, change, what: str) -> None:
+    edit(result, lambda value: change(value["captures"][0]))
+    status, found = verify(result, capture, capsys)
+    assert status == 1
+    assert what in {item["what"] for item in found["discrepancies"]}
+    assert found["discrepancies"][0]["capture"] == "tiny"
+
+
+def test_edited_predictions_and_captures_are_found_out(result, capture, capsys) -> None:
+    picture = result / "captures" / "tiny" / "predictions" / "000018.png"
+    write_image(picture, np.zeros((32, 32, 3), np.uint8))
+    status, found = verify(result, capture, capsys)
+    assert status == 1
+    whats = {item["what"] for item in found["discrepancies"]}
+    assert {"predictions", "frame 18, psnr"} <= whats
+    assert not any("frame 19" in what for what in whats)
+    picture.unlink()
+    whats = {item["what"] for item in verify(result, capture, capsys)[1]["discrepancies"]}
+    assert "frame 18, failure" in whats
+    write_image(capture.root / "frames" / "000003.png", np.zeros((32, 32, 3), np.uint8))
+    status, found = verify(result, capture, capsys)
+    assert (status, found["frames"]) == (1, 0)
+    assert [item["what"] for item in found["discrepancies"]] == ["capture"]
+
+
+def test_other_code_protocols_and_missing_captures_are_named(result, capture, capsys) -> None:
+    edit(result, lambda value: value["protocols"].clear())
+    edit(result, lambda value: value["environment"].update(code="0"))
+    edit(result, lambda value: value["environment"]["packages"].update(numpy="0.1"))
+    status, found = verify(result, capture, capsys)
+    assert status == 1
+    assert [item["what"] for item in found["discrepancies"]] == ["protocols"]
+    assert "other code" in found["notes"][0]
+    assert "numpy 0.1" in found["notes"][1]
+    assert main(["verify", str(result)]) == 2
+    assert "Say where they lie with --captures" in capsys.readouterr().err
+    shutil.rmtree(capture.root)
+    assert main(["verify", str(result), "--captures", str(capture.root.parent)]) == 2
+
+
+def test_a_name_cannot_lead_out_of_the_folder(result, capture, capsys) -> None:
+    edit(result, lambda value: value["captures"][0].update(id="../../elsewhere"))
+    status, found = verify(result, capture, capsys)
+    assert status == 1
+    assert found["discrepancies"][0]["found"] == "no capture of this id"
