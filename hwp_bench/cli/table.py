@@ -4,11 +4,20 @@ from __future__ import annotations
 
 import argparse
 
+_TABLES = (
+    *("overall", "captures", "perturbations", "details", "micro", "paper"),
+    *("robustness", "severity", "bias", "seeds"),
+)
 _EXAMPLES = """examples:
   hwp-bench table runs/plain-mini
   hwp-bench table runs/plain-mini runs/mine-mini --by perturbations
   hwp-bench table runs/* --by overall --format tex > table.tex
-  hwp-bench table runs/plain-mini --by paper --format csv
+  hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
+  hwp-bench table runs/mine-seed* --by seeds
+  hwp-bench table runs/mine-mini runs/plain-mini --paper 5 --published   # layout of table 5
+  hwp-bench table --published                                            # the paper's numbers
+
+docs/tables.md says what each table shows and which command makes each table of the paper.
 """
 
 
@@ -16,13 +25,36 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
     parser.add_argument(
-        "results", nargs="+", metavar="RESULTS", help="results folder or results.json"
+        "results",
+        nargs="*",
+        metavar="RESULTS",
+        help="results folder, results.json, or ablation folder",
+    )
+    which = parser.add_mutually_exclusive_group()
+    which.add_argument(
+        "--by", choices=_TABLES, default="overall", help="which table (default overall)"
+    )
+    which.add_argument(
+        "--paper",
+        type=int,
+        choices=range(1, 11),
+        metavar="N",
+        help="the layout of the paper's table N, 1 to 10, in protocol paper-wildghand",
     )
     parser.add_argument(
-        "--by",
-        choices=("overall", "captures", "perturbations", "details", "micro", "paper"),
-        default="overall",
-        help="which table (default overall)",
+        "--published",
+        action="store_true",
+        help="append the paper's own numbers, marked as published on other data",
+    )
+    parser.add_argument(
+        "--base", metavar="NAME", help="robustness: method that the gap is counted from"
+    )
+    parser.add_argument(
+        "--captures",
+        nargs="+",
+        default=[],
+        metavar="FOLDER",
+        help="capture folders, for severities (simulated ones are found in the cache)",
     )
     parser.add_argument(
         "--format",
@@ -35,11 +67,19 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.report.summary import all_tables
+    from hwp_bench.report.choose import TableRequest, make_table
     from hwp_bench.report.table import print_table, spell
-    from hwp_bench.results import read_results
 
-    table = all_tables([read_results(path) for path in args.results])[args.by]
+    table = make_table(
+        TableRequest(
+            paths=args.results,
+            by=args.by,
+            paper=args.paper,
+            published=args.published,
+            base=args.base,
+            captures=args.captures,
+        )
+    )
     form = "json" if args.json else args.format
     if form == "terminal":
         print_table(table)

@@ -38,7 +38,7 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
     Raises:
         UsageError: evaluations of one name were made on different data.
     """
-    _same_data(results)
+    same_data(results)
     means = [aggregate(score_rows(result)) for result in results]
     groups = _groups(means)
     return {
@@ -87,10 +87,10 @@ def mean_table(
     """Return one row a method: means of `metrics` in each group of columns."""
     names = _present(results, metrics)
     columns = [Column("Method")]
-    columns += [_column(name, title) for title in groups for name in names]
+    columns += [score_column(name, title) for title in groups for name in names]
     rows = [
         (label, *(means[index].get(name) for means in groups.values() for name in names))
-        for index, label in enumerate(_labels(results))
+        for index, label in enumerate(labels(results))
     ]
     scope = f"Every mean is over captures of means over test frames; {_scope(results)}."
     if MACRO in groups:
@@ -115,19 +115,26 @@ def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Tab
     """Return one row a method and capture."""
     names = _present(results, HEADLINE)
     columns = [Column("Capture"), Column("Hands"), Column("Method")]
-    columns += [_column(name) for name in names]
+    columns += [score_column(name) for name in names]
     columns += [Column("Fit [s]", 1), Column("Failed frames", 0)]
-    rows = []
+    rows: list[tuple[Cell, ...]] = []
+    breaks = []
     for identifier in dict.fromkeys(c.id for result in results for c in result.captures):
-        for label, result, mean in zip(_labels(results), results, means, strict=True):
+        breaks.append(len(rows))
+        for label, result, mean in zip(labels(results), results, means, strict=True):
             for capture in result.captures:
                 if capture.id == identifier:
                     scores = [mean.overall.captures[identifier].get(name) for name in names]
                     hands = "interacting" if capture.hands == "both" else "single"
                     tail = (capture.fit_seconds, capture.failed_frames)
                     rows.append((identifier, hands, label, *scores, *tail))
-    # Captures are of unequal difficulty: ranks over all rows would compare what cannot be.
-    return Table("Per capture", tuple(columns), tuple(rows), ranked=False)
+    # Captures are of unequal difficulty: only methods on one capture are ranked. Lines between
+    # captures are wanted where there are several methods.
+    separate = tuple(breaks[1:])
+    ranked = len(results) > 1
+    return Table(
+        "Per capture", tuple(columns), tuple(rows), ranked=ranked, breaks=separate if ranked else ()
+    )
 
 
 def perturbation_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Table:
@@ -135,19 +142,24 @@ def perturbation_table(results: Sequence[Results], means: Sequence[Aggregate]) -
     names = _present(results, HEADLINE[:3])
     present = [p for p in PERTURBATIONS if any(p in mean.overall.perturbations for mean in means)]
     columns = [Column("Method")]
-    columns += [_column(name, perturbation(p).heading) for p in present for name in names]
+    columns += [score_column(name, perturbation(p).heading) for p in present for name in names]
     rows = [
         (
             label,
             *(mean.overall.perturbations.get(p, {}).get(name) for p in present for name in names),
         )
-        for label, mean in zip(_labels(results), means, strict=True)
+        for label, mean in zip(labels(results), means, strict=True)
     ]
     note = "Mean over the captures that carry the perturbation; a capture may carry several."
     return Table("Per perturbation", tuple(columns), tuple(rows), (note,))
 
 
-def _same_data(results: Sequence[Results]) -> None:
+def same_data(results: Sequence[Results]) -> None:
+    """Refuse captures of one name that are not the same data, or not split alike.
+
+    Raises:
+        UsageError: naming the capture.
+    """
     seen: dict[str, tuple[str, str]] = {}
     for result in results:
         for capture in result.captures:
@@ -160,7 +172,8 @@ def _same_data(results: Sequence[Results]) -> None:
                 )
 
 
-def _column(name: str, group: str = "") -> Column:
+def score_column(name: str, group: str = "") -> Column:
+    """Return the column of a metric: label and unit, digits, direction."""
     facts = metric(name)
     title = f"{facts.label} [{facts.unit}]" if facts.unit else facts.label
     return Column(title, facts.digits, facts.higher_is_better, group)
@@ -175,16 +188,16 @@ def _of_protocol(protocol: Protocol) -> tuple[str, ...]:
     return tuple(facts.name for facts in METRICS if facts.protocol == protocol.name)
 
 
-def _labels(results: Sequence[Results]) -> list[str]:
+def labels(results: Sequence[Results]) -> list[str]:
     """Return a title for each evaluation, told apart by what differs where titles repeat."""
     titles = [result.method.title for result in results]
-    labels = []
+    told = []
     for result in results:
         title = result.method.title
         if titles.count(title) > 1:
             title += f" ({result.method.preset}, {result.frames} frames, seed {result.seed})"
-        labels.append(title)
-    return labels
+        told.append(title)
+    return told
 
 
 def _cost(result: Results) -> list[Cell]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import json
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 #: Spellings of a table by file ending.
@@ -48,6 +48,17 @@ class Table:
     notes: tuple[str, ...] = ()
     #: Rank the rows of each scored column (best bold, second underlined).
     ranked: bool = True
+    #: Rows at which a further block begins; rows are ranked within their block.
+    breaks: tuple[int, ...] = ()
+    #: Rows that are shown but never ranked, such as published numbers.
+    unranked: frozenset[int] = frozenset()
+
+    def block(self, row: int) -> list[int]:
+        """Return the ranked rows of the block that a row is in."""
+        edges = [0, *self.breaks, len(self.rows)]
+        start = max(edge for edge in edges if edge <= row)
+        stop = min(edge for edge in edges if edge > row)
+        return [index for index in range(start, stop) if index not in self.unranked]
 
     def text(self, row: int, column: int) -> str:
         """Return a cell as it is printed."""
@@ -61,21 +72,37 @@ class Table:
     def rank(self, row: int, column: int) -> int | None:
         """Return 0 for the best and 1 for the second best of a scored column, else None.
 
-        Equal printed values share a rank; a column of a single value has none.
+        Equal printed values share a rank; a single value in a block has none.
         """
         better = self.columns[column].higher_is_better
-        values = [cells[column] for cells in self.rows]
+        value = self.rows[row][column]
+        if not self.ranked or better is None or not isinstance(value, float):
+            return None
+        block = self.block(row)
         numbers = {
-            round(value, self.columns[column].digits)
-            for value in values
-            if isinstance(value, float)
+            round(number, self.columns[column].digits)
+            for number in (self.rows[index][column] for index in block)
+            if isinstance(number, float)
         }
-        value = values[row]
-        if not self.ranked or better is None or not isinstance(value, float) or len(numbers) < 2:
+        if row not in block or len(numbers) < 2:
             return None
         order = sorted(numbers, reverse=better)
         place = order.index(round(value, self.columns[column].digits))
         return place if place < 2 else None
+
+
+def without_empty_columns(table: Table) -> Table:
+    """Return the table without the columns in which no row has anything."""
+    kept = [
+        index
+        for index in range(len(table.columns))
+        if any(cells[index] is not None for cells in table.rows)
+    ]
+    return replace(
+        table,
+        columns=tuple(table.columns[index] for index in kept),
+        rows=tuple(tuple(cells[index] for index in kept) for cells in table.rows),
+    )
 
 
 def spell(table: Table, form: str) -> str:
@@ -140,10 +167,9 @@ def to_latex(table: Table) -> str:
         "    " + " & ".join(_latex_text(c.heading) for c in table.columns) + r" \\",
         r"    \midrule",
     ]
-    lines += [
-        "    " + " & ".join(cell(row, column) for column in range(count)) + r" \\"
-        for row in range(len(table.rows))
-    ]
+    for row in range(len(table.rows)):
+        lines += [r"    \midrule"] if row in table.breaks else []
+        lines.append("    " + " & ".join(cell(row, column) for column in range(count)) + r" \\")
     lines += [r"    \bottomrule", r"  \end{tabular}"]
     lines += [rf"  \\ \footnotesize {_latex_text(note)}" for note in table.notes]
     return "\n".join([*lines, r"\end{table}"]) + "\n"
@@ -184,6 +210,8 @@ def _latex_text(text: str) -> str:
         "–": "--",
         "×": r"$\times$",
         "≤": r"$\leq$",
+        "±": r"$\pm$",
+        "✓": r"\checkmark",
         "\n": " ",
     }
     return "".join(escapes.get(char, char) for char in text)
@@ -236,6 +264,8 @@ def print_table(table: Table) -> None:
         grid.add_column(Text(head), justify="right" if numeric else "left")
     styles = {0: "bold", 1: "underline", None: ""}
     for row in range(len(table.rows)):
+        if row in table.breaks:
+            grid.add_section()
         grid.add_row(
             *(
                 Text(table.text(row, column), style=styles[table.rank(row, column)])

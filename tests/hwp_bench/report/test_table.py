@@ -5,8 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import json
+from dataclasses import replace
 
-from hwp_bench.report.table import Column, Table, print_table, spell
+from hwp_bench.report.table import Column, Table, print_table, spell, without_empty_columns
 
 TABLE = Table(
     "Scores & more",
@@ -72,3 +73,19 @@ def test_terminal_output_is_plain_and_complete_in_a_pipe(capsys) -> None:
     assert "\x1b" not in text
     for word in ("plain_fit", "best|one", "22.00", "0.250", "A note: 100 %."):
         assert word in text
+
+
+def test_rows_are_ranked_within_their_block_and_published_ones_never() -> None:
+    table = replace(TABLE, rows=(*TABLE.rows, ("fourth", 30.0, 0.1, 3)), breaks=(2,))
+    assert [table.rank(row, 1) for row in range(4)] == [1, 0, 1, 0]
+    kept = replace(table, unranked=frozenset({3}))
+    assert [kept.rank(row, 1) for row in range(4)] == [1, 0, None, None]
+    # A line between the blocks, and the one under the heading.
+    assert spell(table, "tex").count(r"\midrule") == 2
+
+
+def test_columns_without_any_value_are_dropped() -> None:
+    rows = tuple((name, psnr, None, frames) for name, psnr, _, frames in TABLE.rows)
+    kept = without_empty_columns(replace(TABLE, rows=rows))
+    assert [column.title for column in kept.columns] == ["Method", "PSNR", "Frames"]
+    assert kept.rows[0] == ("plain_fit", 20.123456, 3)

@@ -1,0 +1,150 @@
+"""From what `hwp-bench table` is asked for to the table."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from hwp_bench.errors import BadResult, UsageError
+from hwp_bench.files import inside, read_json
+from hwp_bench.report.paper_layouts import (
+    DISTANCE,
+    LAYOUTS,
+    METRIC_OF,
+    bias_layout,
+    fact_table,
+    layout_table,
+    seeds_layout,
+)
+from hwp_bench.report.sources import Source, find_captures, read_sources
+from hwp_bench.report.study_tables import (
+    LEVEL_NOTE,
+    bias_rows,
+    bias_table,
+    refused_bias,
+    robustness_table,
+    seeds_table,
+    severity_table,
+)
+from hwp_bench.report.summary import all_tables, same_data
+from hwp_bench.report.table import Table
+from hwp_bench.results import read_results
+from hwp_bench.results.find import ABLATION
+from hwp_bench.statistics.pairing import group_runs
+
+#: Table of the paper whose numbers go with a table of ours.
+PAPER_OF = {"overall": 3, "paper": 3, "perturbations": 5, "bias": 9, "seeds": 10}
+
+
+@dataclass(frozen=True)
+class TableRequest:
+    """Which table of which results."""
+
+    #: Results folders, `results.json` files or ablation folders.
+    paths: Sequence[str | os.PathLike[str]]
+    #: Name of the table.
+    by: str = "overall"
+    #: Number of the table of the paper whose layout is asked for, in place of `by`.
+    paper: int | None = None
+    #: Whether published rows are appended.
+    published: bool = False
+    #: Name of the method that the robustness table counts from.
+    base: str | None = None
+    #: Capture folders, for the severities.
+    captures: Sequence[str | os.PathLike[str]] = ()
+
+
+def make_table(request: TableRequest) -> Table:
+    """Make the table.
+
+    Raises:
+        BadInput, BadResult: a result is missing or damaged.
+        UsageError: the results do not hold what the table needs.
+    """
+    number = request.paper
+    if number is None and request.published:
+        if request.by not in PAPER_OF:
+            raise UsageError(
+                f"the paper publishes no numbers for the table {request.by!r}",
+                field="--published",
+                remedy=f"It does for {', '.join(PAPER_OF)}, and for --paper 3 to 10.",
+            )
+        number = PAPER_OF[request.by]
+    if number in (1, 2):
+        return fact_table(number)
+    if not request.paths and not (number and request.published):
+        raise UsageError("results are needed", field="RESULTS")
+    return _paper(number, request) if number else _ours(request)
+
+
+def _ours(request: TableRequest) -> Table:
+    sources = read_sources(request.paths)
+    results = [source.results for source in sources]
+    if request.by == "robustness":
+        same_data(results)
+        return robustness_table(sources, request.base)
+    if request.by == "seeds":
+        return seeds_table(sources)
+    if request.by == "severity":
+        same_data(results)
+        return severity_table(sources, find_captures(results, request.captures))
+    if request.by == "bias":
+        return bias_table(sources, find_captures(results, request.captures))
+    return all_tables(results)[request.by]
+
+
+def _paper(number: int, request: TableRequest) -> Table:
+    sources = read_sources(request.paths)
+    results = [source.results for source in sources]
+    same_data(results)
+    runs = group_runs(results)
+    if number == 10:
+        return seeds_layout(runs, request.published)
+    if number == 9:
+        return _bias_layout(sources, request)
+    marks = _marks(request.paths) if number == 6 else None
+    if number == 6 and runs and not marks:
+        raise UsageError(
+            "table 6 is made of an ablation",
+            field="RESULTS",
+            remedy="Give the folder that `hwp-bench ablate` wrote.",
+        )
+    return layout_table(LAYOUTS[number], runs, request.published, marks)
+
+
+def _bias_layout(sources: Sequence[Source], request: TableRequest) -> Table:
+    measured = [set(source.results.metrics) for source in sources]
+    names = tuple(
+        name
+        for name in (*METRIC_OF.values(), DISTANCE)
+        if all(name in known for known in measured)
+        or (request.published and name in METRIC_OF.values())
+    )
+    captures = find_captures([source.results for source in sources], request.captures)
+    rows = bias_rows(sources, captures, names)
+    if sources and not rows:
+        raise refused_bias()
+    table = bias_layout(rows, names, request.published)
+    return replace(table, notes=(LEVEL_NOTE, *table.notes)) if rows else table
+
+
+def _marks(paths: Sequence[str | os.PathLike[str]]) -> Mapping[str, Mapping[str, bool]]:
+    """Return which components are in each variant of the ablations among some paths, by title."""
+    marks: dict[str, dict[str, bool]] = {}
+    for path in paths:
+        place = Path(path)
+        file = place / ABLATION if place.is_dir() else place
+        if file.name != ABLATION or not file.is_file():
+            continue
+        record = read_json(file)
+        try:
+            components = [item for item in record["switches"] if not item["alternative"]]
+            for variant in record["variants"]:
+                thrown = variant["thrown"]
+                title = read_results(inside(file.parent, variant["results"][0])).method.title
+                marks[title] = {item["title"]: item["name"] not in thrown for item in components}
+        except (KeyError, TypeError, IndexError) as error:
+            raise BadResult("does not list its variants", where=file, field="variants") from error
+    return marks

@@ -1,0 +1,153 @@
+"""What reports are made of: results with the folder they lie in, and the captures' severities."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.capture.schema import CaptureInfo
+from hwp_bench.errors import BadResult, HwpError
+from hwp_bench.files import cache_root, inside, read_json, sha256_json
+from hwp_bench.records import parse_record
+from hwp_bench.results import Results, read_results, result_files
+
+#: Largest file of temporal weights that is read, bytes.
+MAX_WEIGHT_BYTES = 16 * 1024 * 1024
+
+
+@dataclass(frozen=True)
+class Source:
+    """One evaluation and where it lies."""
+
+    #: The evaluation.
+    results: Results
+    #: Its folder, with `captures/ID/`; None where only the result itself is at hand.
+    folder: Path | None
+
+    def place(self, capture: str, *parts: str) -> Path | None:
+        """Return a place inside the folder of a capture; None where there is no folder.
+
+        Raises:
+            BadInput: the capture's name leads out of the results folder.
+        """
+        if self.folder is None:
+            return None
+        return inside(self.folder, os.path.join("captures", capture, *parts))
+
+
+@dataclass(frozen=True)
+class TemporalWeights:
+    """The weight that a method gave to each frame: how perturbed it takes the frame to be."""
+
+    #: Indices of training frames.
+    frames: list[int]
+    #: One weight a frame, at least 0.
+    weights: list[float]
+
+
+def read_sources(paths: Iterable[str | os.PathLike[str]]) -> list[Source]:
+    """Read every evaluation that some paths stand for, in order.
+
+    Raises:
+        BadInput, BadResult: one is missing or damaged.
+    """
+    files = [file for path in paths for file in result_files(path)]
+    return [Source(read_results(file), file.parent) for file in files]
+
+
+def temporal_weights(source: Source, capture: str) -> dict[str, TemporalWeights]:
+    """Return the temporal weights that a method left, by side (`right`, `left`, or empty).
+
+    Raises:
+        BadResult: a file does not hold as many finite weights at least 0 as frames.
+        BadInput: a file is damaged.
+    """
+    folder = source.place(capture, "diagnostics")
+    found = {}
+    for side in ("", "right", "left"):
+        path = folder / f"{side}{'-' if side else ''}temporal.json" if folder else None
+        if path is None or not path.is_file():
+            continue
+        value = read_json(path, max_bytes=MAX_WEIGHT_BYTES)
+        item = parse_record(TemporalWeights, value, where=os.fspath(path))
+        if len(item.frames) != len(item.weights) or not item.frames:
+            raise BadResult("must hold one weight a frame", where=path, field="weights")
+        if min(item.weights) < 0 or min(item.frames) < 0:
+            raise BadResult("must not be below 0", where=path, field="weights")
+        order = np.argsort(item.frames, kind="stable")
+        found[side] = TemporalWeights(
+            [item.frames[i] for i in order], [item.weights[i] for i in order]
+        )
+    return found
+
+
+def mean_temporal_weight(source: Source, capture: str) -> float | None:
+    """Return the mean temporal weight over sides and frames, or None where none was left."""
+    found = temporal_weights(source, capture)
+    if not found:
+        return None
+    return float(np.mean([np.mean(item.weights) for item in found.values()]))
+
+
+def find_captures(
+    results: Iterable[Results], folders: Sequence[str | os.PathLike[str]] = ()
+) -> dict[str, CaptureInfo]:
+    """Find what the evaluated captures say of themselves; nothing is rendered for it.
+
+    Args:
+        results: evaluations.
+        folders: capture folders to look at; simulated captures in the toolkit's cache are
+            found without.
+
+    Returns:
+        By digest; captures that are nowhere to be found are left out.
+    """
+    wanted = {c.digest: c.id for result in results for c in result.captures}
+    places = [Path(folder) for folder in folders]
+    rendered = cache_root() / "sim" / "captures"
+    for identifier in sorted(set(wanted.values())):
+        places += sorted(rendered.glob(f"{_literal(identifier)}-*"))
+    found = {}
+    for place in places:
+        path = place / "capture.json"
+        try:
+            info = CaptureInfo.from_json(read_json(path), where=os.fspath(path))
+        except HwpError:
+            continue
+        digest = sha256_json(info.to_json())
+        if digest in wanted:
+            found[digest] = info
+    return found
+
+
+def _literal(text: str) -> str:
+    """Return a glob pattern that matches a name from outside and nothing else."""
+    return "".join(f"[{char}]" if char in "*?[" else char for char in text.replace("/", "_"))
+
+
+def mean_severity(
+    info: CaptureInfo, test: Iterable[int], *, perturbed_only: bool = False
+) -> dict[str, float]:
+    """Return the mean severity of each declared perturbation over the frames to learn from.
+
+    Args:
+        info: the capture.
+        test: the test frames, which are left out.
+        perturbed_only: average over the frames where the perturbation is present.
+
+    Returns:
+        By perturbation, 0 to 5; those of unknown severity are left out.
+    """
+    hidden = set(test)
+    found = {}
+    for name, values in info.perturbations.items():
+        if values is None:
+            continue
+        seen = [value for frame, value in enumerate(values) if frame not in hidden]
+        chosen = [value for value in seen if value or not perturbed_only]
+        found[name] = sum(chosen) / len(chosen) if chosen else 0.0
+    return found
