@@ -70,6 +70,12 @@ def _print(report: AuditReport) -> None:
             f"{closest[1]}, RMS {closest[2]:.2f} levels; none with a guard gap of "
             f"{report.guard_needed} frames"
         )
+    hashes = "none"
+    if report.same_hashes:
+        hashes = (
+            f"{len(report.same_hashes)} pairs; none with a guard gap of "
+            f"{report.guard_needed_by_hash} frames"
+        )
     perturbed = ", ".join(f"{frame} ({name})" for frame, name in report.perturbed_test[:10])
     rows = (
         ("frames", ", ".join(f"{part} {count}" for part, count in report.counts.items())),
@@ -78,6 +84,7 @@ def _print(report: AuditReport) -> None:
         ("perturbed test frames", perturbed or "none known"),
         ("severity unknown for", ", ".join(report.unknown_severity) or "none"),
         ("near-copies across the border", near),
+        ("one perceptual hash across the border", hashes),
     )
     verdict = "fair" if report.ok else "NOT FAIR"
     columns = (Column("question"), Column("answer"))

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from hwp_bench.evaluate.evaluation import EvaluationSettings
+    from hwp_bench.publish import SealedPart
     from hwp_bench.results import Results
 
 _EXAMPLES = """examples:
@@ -18,6 +19,7 @@ _EXAMPLES = """examples:
   hwp-bench evaluate my_method --suite mini --budget 60 --seed 1
   hwp-bench evaluate my_method --suite mini --set gaussians=20000 --json
   hwp-bench evaluate baselines/plain --suite mini --frames clean     # what no method can beat
+  hwp-bench evaluate submission --sealed publication/sealed
 
 An evaluation that is started again with the same arguments takes finished captures as they are.
 Exit status 0: every frame was scored; 1: the method failed on a capture or left out frames
@@ -32,6 +34,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "method", metavar="METHOD_DIR", help="method directory, or the name of a shipped method"
     )
     add_evaluation_arguments(parser)
+    parser.add_argument(
+        "--sealed",
+        metavar="DIR",
+        help="sealed part of a publication, instead of captures; checked against its commitment",
+    )
     parser.add_argument("-o", "--out", help="results folder (default runs/METHOD-SUITE)")
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
     parser.add_argument("--json", action="store_true", help="print the result file")
@@ -77,7 +84,7 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from dataclasses import asdict
+    from dataclasses import asdict, replace
 
     from hwp_bench.evaluate.evaluation import evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
@@ -87,13 +94,18 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.splits import read_splits
 
     settings = evaluation_settings(args)
+    sealed = _sealed_part(args)
+    if sealed is not None:
+        settings = replace(settings, suite=f"sealed-{sealed.commitment[:12]}")
     # A wrong method directory must be said before a suite is rendered for it.
     read_manifest(find_method(args.method))
-    captures = chosen_captures(args)
+    captures = chosen_captures(args) if sealed is None else list(sealed.captures)
     method = Path(args.method.rstrip("/")).name
     oracle = "" if args.frames == "perturbed" else f"-{args.frames}"
     out = Path(args.out or f"runs/{method}-{settings.suite}{oracle}")
     splits = read_splits(args.splits) if args.splits else None
+    if sealed is not None:
+        splits = sealed.splits
     with JobProgress() as jobs:
         results = evaluate(
             args.method, captures, out, settings, splits=splits, on_capture=jobs.start
@@ -107,6 +119,21 @@ def run(args: argparse.Namespace) -> int:
         for name in ("overall", "captures"):
             print_table(tables[name])
     return report_outcome(out, results)
+
+
+def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
+    """Open the sealed part that is asked for, and tell its commitment."""
+    if args.sealed is None:
+        return None
+    from hwp_bench.errors import UsageError
+    from hwp_bench.progress import notice
+    from hwp_bench.publish import open_sealed
+
+    if args.capture or args.splits:
+        raise UsageError("brings its captures and splits itself", field="--sealed")
+    sealed = open_sealed(args.sealed)
+    notice(f"sealed part is as committed to: {sealed.commitment}")
+    return sealed
 
 
 def report_outcome(out: Path, results: Results) -> int:

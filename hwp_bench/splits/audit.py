@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -18,6 +19,9 @@ if TYPE_CHECKING:
 NEAR_DUPLICATE_RMS = 2.0
 #: Edge of the thumbnails, px.
 THUMBNAIL = 32
+#: Perceptual hashes (64 bits) that differ in at most this many bits count as one picture; unlike
+#: the RMS they see through another exposure, contrast or compression.
+SAME_PICTURE_BITS = 4
 
 
 @dataclass(frozen=True)
@@ -40,6 +44,11 @@ class AuditReport:
     near_duplicates: tuple[tuple[int, int, float], ...]
     #: Smallest guard gap (frames before the test clip) that leaves no near-copy.
     guard_needed: int
+    #: Test frames whose perceptual hash is that of a training or validation frame, but for a few
+    #: bits: (test, other, bits that differ).
+    same_hashes: tuple[tuple[int, int, int], ...]
+    #: Smallest guard gap that leaves no such frame.
+    guard_needed_by_hash: int
 
     @property
     def ok(self) -> bool:
@@ -48,7 +57,11 @@ class AuditReport:
 
 
 def audit_split(
-    capture: Capture, split: Split, *, threshold: float = NEAR_DUPLICATE_RMS
+    capture: Capture,
+    split: Split,
+    *,
+    threshold: float = NEAR_DUPLICATE_RMS,
+    bits: int = SAME_PICTURE_BITS,
 ) -> AuditReport:
     """Audit the split of a capture.
 
@@ -57,6 +70,7 @@ def audit_split(
         split: its split.
         threshold: RMS difference of 32x32 thumbnails, in 8-bit levels, below which two frames
             count as near-copies.
+        bits: most bits in which the perceptual hashes of one picture differ.
 
     Returns:
         The report; near-copies are reported, not judged, because neighbouring frames of a still
@@ -75,6 +89,7 @@ def audit_split(
         if values is not None and values[frame] > 0
     ]
     duplicates = _near_duplicates(capture, split, threshold)
+    hashes = _same_hashes(capture, split, bits)
     return AuditReport(
         capture=capture.info.id,
         counts={part: len(frames) for part, frames in parts.items()},
@@ -83,7 +98,33 @@ def audit_split(
         perturbed_test=tuple(perturbed),
         unknown_severity=tuple(n for n, values in perturbations.items() if values is None),
         near_duplicates=duplicates,
-        guard_needed=max((split.test_range[0] - other for _, other, _ in duplicates), default=0),
+        guard_needed=_guard(split, (other for _, other, _ in duplicates)),
+        same_hashes=hashes,
+        guard_needed_by_hash=_guard(split, (other for _, other, _ in hashes)),
+    )
+
+
+def _guard(split: Split, others: Iterable[int]) -> int:
+    return max((split.test_range[0] - other for other in others), default=0)
+
+
+def _same_hashes(capture: Capture, split: Split, bits: int) -> tuple[tuple[int, int, int], ...]:
+    """Pairs of frames with nearly one perceptual hash (OpenCV's PHash, 64 bits)."""
+    import cv2
+
+    def hashed(frame: int) -> np.ndarray:
+        return np.unpackbits(cv2.img_hash.pHash(capture.frame(frame)[:, :, ::-1].copy()).ravel())
+
+    others = np.concatenate([split.train, split.validation])
+    with ThreadPoolExecutor() as pool:
+        test = np.stack(list(pool.map(hashed, split.test.tolist()))).astype(np.int32)
+        seen = np.stack(list(pool.map(hashed, others.tolist()))).astype(np.int32)
+    # Bits that differ: |a| + |b| - 2 a.b for vectors of zeros and ones.
+    distance = test.sum(1)[:, None] + seen.sum(1)[None] - 2 * test @ seen.T
+    pairs = np.argwhere(distance <= bits)
+    return tuple(
+        (int(split.test[row]), int(others[column]), int(distance[row, column]))
+        for row, column in pairs
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -123,3 +124,30 @@ def test_an_exact_copy_across_the_border_is_found(make_capture: CaptureMaker) ->
     report = audit_split(capture, contiguous_split("tiny", 20), threshold=0.5)
     assert [(test, other) for test, other, _ in report.near_duplicates] == [(18, 5)]
     assert report.near_duplicates[0][2] == pytest.approx(0, abs=1e-5)
+
+
+def test_perceptual_hashes_see_through_exposure(make_capture: CaptureMaker) -> None:
+    # A brighter copy of a training frame: far in RMS, the same in its hash. Oracle: OpenCV's
+    # own comparison of hashes.
+    import cv2
+
+    from hwp_bench.images import read_rgb, write_image
+
+    capture = make_capture(frames=20, size=64)
+    rng = np.random.default_rng(0)
+    frames = capture.root / "frames"
+    for frame in range(20):  # unlike each other
+        noise = cv2.resize(rng.integers(0, 200, (6, 6, 3)).astype(np.uint8), (64, 64))
+        write_image(frames / f"{frame:06d}.png", noise)
+    brighter = np.clip(read_rgb(frames / "000005.png") * 1.2 + 10, 0, 255).astype(np.uint8)
+    write_image(frames / "000018.png", brighter)
+    report = audit_split(capture, contiguous_split("tiny", 20))
+    assert report.near_duplicates == ()
+    assert [(test, other) for test, other, _ in report.same_hashes] == [(18, 5)]
+    assert report.guard_needed_by_hash == 13
+    hasher = cv2.img_hash.PHash_create()
+    first, second = (
+        hasher.compute(read_rgb(frames / name)[:, :, ::-1].copy())
+        for name in ("000005.png", "000018.png")
+    )
+    assert report.same_hashes[0][2] == hasher.compare(first, second)
