@@ -96,7 +96,7 @@ def publish(
         os.chmod(root / SEALED, 0o700)
     folder = Path(out)
     return Publication(
-        folder / PUBLIC, folder / SEALED, joint, tuple(entry["id"] for entry in entries)
+        folder / PUBLIC, folder / SEALED, joint, tuple(capture.info.id for capture, _ in pairs)
     )
 
 

@@ -104,7 +104,8 @@ def _read(path: Path, schema: str) -> dict[str, Any]:
 
 def _entries(value: Mapping[str, Any], where: Path) -> list[dict[str, Any]]:
     entries = value.get("captures")
-    good = isinstance(entries, list) and entries
-    if not good or not all(isinstance(e, dict) and isinstance(e.get("id"), str) for e in entries):
+    if not isinstance(entries, list) or not entries:
         raise BadInput("is no list of captures", where=where, field="captures")
-    return list(entries)
+    if not all(isinstance(e, dict) and isinstance(e.get("id"), str) for e in entries):
+        raise BadInput("holds a capture without an id", where=where, field="captures")
+    return entries

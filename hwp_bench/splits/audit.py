@@ -113,7 +113,8 @@ def _same_hashes(capture: Capture, split: Split, bits: int) -> tuple[tuple[int, 
     import cv2
 
     def hashed(frame: int) -> np.ndarray:
-        return np.unpackbits(cv2.img_hash.pHash(capture.frame(frame)[:, :, ::-1].copy()).ravel())
+        code = cv2.img_hash.pHash(capture.frame(frame)[:, :, ::-1].copy())
+        return np.unpackbits(np.asarray(code, dtype=np.uint8).ravel())
 
     others = np.concatenate([split.train, split.validation])
     with ThreadPoolExecutor() as pool:
