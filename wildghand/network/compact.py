@@ -50,11 +50,12 @@ class CompactTexture(nn.Module):
 
     def forward(self, chart: Chart, identity: IdentityMap, side: str) -> Tensor:
         """Features of N Gaussians: (N, channels), the identity features first."""
-        pooled = identity.pooled(side, self.resolution)
-        where = chart.cell_coordinates.T.unflatten(1, (self.resolution, self.resolution))
-        plane = self.coder(torch.cat((pooled, where[None].to(pooled.dtype)), dim=1))
-        rows = plane[0].flatten(1).T
-        return torch.cat((chart.identity(identity(side)), chart.planes[0](rows)), dim=-1)
+        latent = chart.identity(identity(side))
+        cells = torch.cat((chart.cells(latent), chart.cell_coordinates.to(latent.dtype)), dim=-1)
+        edges = (self.resolution, self.resolution)
+        plane = self.coder(cells.T.unflatten(1, edges)[None])
+        around = chart.planes[0](plane[0].flatten(1).T)
+        return torch.cat((latent, around), dim=-1)
 
 
 class CompactGeometry(nn.Module):

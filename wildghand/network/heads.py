@@ -6,6 +6,7 @@ import math
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import linear
 
 from wildghand.attributes import CHANNELS, RawAttributes
 from wildghand.network.encoding import POSITION_CHANNELS
@@ -13,20 +14,25 @@ from wildghand.network.initial import DIRECT_GAINS
 from wildghand.network.settings import NetworkSettings
 
 
-def mlp(inputs: int, width: int, outputs: int, layers: int) -> nn.Sequential:
-    """Linear layers with SiLU between them.
+def hidden(inputs: int, width: int, layers: int) -> nn.Sequential:
+    """Linear layers, each followed by a SiLU.
 
     Args:
         inputs: channels in.
-        width: of each hidden layer.
-        outputs: channels out.
-        layers: number of hidden layers; 0 makes it linear.
+        width: of each layer.
+        layers: at least 1.
     """
     parts: list[nn.Module] = []
     for _ in range(layers):
         parts += [nn.Linear(inputs, width), nn.SiLU()]
         inputs = width
-    return nn.Sequential(*parts, nn.Linear(inputs, outputs))
+    return nn.Sequential(*parts)
+
+
+def mlp(inputs: int, width: int, outputs: int, layers: int) -> nn.Sequential:
+    """`hidden` layers and a linear one behind them, which starts at zero."""
+    last = nn.Linear(width, outputs)
+    return nn.Sequential(*hidden(inputs, width, layers), zeroed(last))
 
 
 class AttributeHead(nn.Module):
@@ -41,8 +47,8 @@ class AttributeHead(nn.Module):
     def __init__(self, settings: NetworkSettings, texture: int, geometry: int) -> None:
         super().__init__()
         width = settings.head_width
-        self.texture = mlp(texture, width, width, settings.head_layers)
-        self.geometry = mlp(geometry, width, width, settings.head_layers)
+        self.texture = hidden(texture, width, settings.head_layers)
+        self.geometry = hidden(geometry, width, settings.head_layers)
         # One linear layer for each attribute, side by side.
         self.attributes = zeroed(nn.Linear(width, CHANNELS))
         self.direct: nn.Linear | None = None
@@ -81,7 +87,7 @@ class ShadowHead(nn.Module):
         super().__init__()
         self.start = math.log(settings.initial_shadow / (1.0 - settings.initial_shadow))
         self.light = zeroed(nn.Linear(geometry, 1, bias=False))
-        self.detail = zeroed(mlp(geometry, settings.head_width, 1, settings.head_layers))
+        self.detail = mlp(geometry, settings.head_width, 1, settings.head_layers)
 
     def forward(self, x_g: Tensor) -> Tensor:
         """(B, N, Fg) to (B, N, 1) in (0, 1)."""
@@ -95,11 +101,17 @@ class TemplateHead(nn.Module):
         super().__init__()
         self.bound = settings.max_template_offset
         inputs = texture + POSITION_CHANNELS
-        self.offsets = zeroed(mlp(inputs, settings.head_width, 3, settings.head_layers))
+        self.offsets = mlp(inputs, settings.head_width, 3, settings.head_layers)
 
     def forward(self, x_t: Tensor, position: Tensor) -> Tensor:
         """(N, Ft) and (N, 18) to (N, 3) m in the anchors' frames, each at most the bound."""
-        return self.bound * torch.tanh(self.offsets(torch.cat((x_t, position), dim=-1)))
+        first = self.offsets[0]
+        assert isinstance(first, nn.Linear)
+        # The position needs no gradient and x_t no copy: the layer on both is taken apart.
+        width = x_t.shape[-1]
+        seen = linear(x_t, first.weight[:, :width], first.bias)
+        seen = seen + linear(position, first.weight[:, width:])
+        return self.bound * torch.tanh(self.offsets[1:](seen))
 
 
 class RefinementHead(nn.Module):
@@ -112,8 +124,8 @@ class RefinementHead(nn.Module):
         super().__init__()
         self.bounds = (settings.max_pose, settings.max_betas, settings.max_transl)
         width, layers = settings.head_width, settings.head_layers
-        self.frame = zeroed(mlp(texture + geometry, width, 48 + 3, layers))
-        self.shape = zeroed(mlp(texture, width, 10, layers))
+        self.frame = mlp(texture + geometry, width, 48 + 3, layers)
+        self.shape = mlp(texture, width, 10, layers)
 
     def forward(self, x_t: Tensor, x_g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(N, Ft) and (B, N, Fg) to (B, 16, 3) rad, (10,), (B, 3) m."""
@@ -130,11 +142,9 @@ class RefinementHead(nn.Module):
         )
 
 
-def zeroed(module: nn.Linear | nn.Sequential) -> nn.Module:
-    """Set the last linear layer to zero, so that training starts from no effect."""
-    last = module[-1] if isinstance(module, nn.Sequential) else module
-    assert isinstance(last, nn.Linear)
-    nn.init.zeros_(last.weight)
-    if last.bias is not None:
-        nn.init.zeros_(last.bias)
-    return module
+def zeroed(layer: nn.Linear) -> nn.Linear:
+    """Set a layer to zero, so that training starts from no effect."""
+    nn.init.zeros_(layer.weight)
+    if layer.bias is not None:
+        nn.init.zeros_(layer.bias)
+    return layer

@@ -35,17 +35,3 @@ class IdentityMap(nn.Module):
     def forward(self, side: str) -> Tensor:
         """Return a hand's half: (resolution^2, channels), row by row from the top."""
         return self.maps[side]
-
-    def pooled(self, side: str, resolution: int) -> Tensor:
-        """Average blocks of texels.
-
-        Args:
-            side: the hand.
-            resolution: a divisor of the map's.
-
-        Returns:
-            (1, channels, resolution, resolution).
-        """
-        edge = self.resolution // resolution
-        image = self.maps[side].unflatten(0, (resolution, edge, resolution, edge))
-        return image.mean(dim=(1, 3)).permute(2, 0, 1)[None]

@@ -58,6 +58,10 @@ class LocalPointNet(nn.Module):
         """
         features = self.blocks[0](self.enter(points))
         for block in self.blocks[1:]:
-            around = cells(features)[..., cells.cell, :]
+            around = _pooled(features, cells)[:, cells.cell]
             features = block(torch.cat((features, around), dim=-1))
-        return features, cells(self.leave(features))
+        return features, _pooled(self.leave(features), cells)
+
+
+def _pooled(features: Tensor, cells: CellPooling) -> Tensor:
+    return torch.stack([cells(frame) for frame in features])

@@ -11,12 +11,85 @@ from torch.nn.functional import embedding_bag
 from hwp_bench.errors import UsageError
 
 
-class PlaneSampler(nn.Module):
-    """Bilinear reading of a square plane at N fixed points.
+class FixedGather(nn.Module):
+    """Weighted sums of rows, of which index and weight never change: a sparse matrix.
 
-    The points do not move, so texels and weights are computed once, for both directions: the
-    gradient of a texel gathers from the points that read it. Nothing is scattered; the result
-    is the same bit for bit every time.
+    The matrix is kept by rows and by columns, so that the gradient is gathered too. Nothing is
+    ever scattered; the result is the same bit for bit every time, on a GPU as well.
+
+    Args:
+        rows: (K,) int64 in [0, outputs), which sum each term belongs to.
+        columns: (K,) int64 in [0, inputs), which row it takes.
+        weights: (K,) of the terms.
+        outputs: number of sums.
+        inputs: number of rows to take from.
+    """
+
+    index: Tensor
+    weight: Tensor
+    start: Tensor
+    back_index: Tensor
+    back_weight: Tensor
+    back_start: Tensor
+
+    def __init__(
+        self, rows: Tensor, columns: Tensor, weights: Tensor, outputs: int, inputs: int
+    ) -> None:
+        super().__init__()
+        for prefix, to, source, count in (
+            ("", rows, columns, outputs),
+            ("back_", columns, rows, inputs),
+        ):
+            order = torch.argsort(to, stable=True)
+            bags = torch.arange(count, dtype=to.dtype, device=to.device)
+            tables = {
+                "index": source[order],
+                "weight": weights[order],
+                "start": torch.searchsorted(to[order], bags),
+            }
+            for name, tensor in tables.items():
+                self.register_buffer(prefix + name, tensor.contiguous(), persistent=False)
+
+    def forward(self, values: Tensor) -> Tensor:
+        """(inputs, C) to (outputs, C)."""
+        return _Gather.apply(
+            values,
+            self.index,
+            self.weight,
+            self.start,
+            self.back_index,
+            self.back_weight,
+            self.back_start,
+        )
+
+
+class _Gather(torch.autograd.Function):
+    """A sum over bags of rows; its transpose is another one."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, *tables: Tensor) -> Tensor:
+        ctx.save_for_backward(*tables[3:])
+        return _sum_bags(values, *tables[:3])
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
+        return (_sum_bags(grads[0], *ctx.saved_tensors), *(None,) * 6)
+
+
+def _sum_bags(values: Tensor, index: Tensor, weight: Tensor, start: Tensor) -> Tensor:
+    return embedding_bag(
+        index,
+        values.contiguous(),
+        start,
+        mode="sum",
+        per_sample_weights=weight.to(values.dtype),
+    )
+
+
+class PlaneSampler(FixedGather):
+    """Bilinear reading of a square plane at N fixed points: (resolution^2, C) to (N, C).
+
+    The plane's rows go from its top left texel, row by row.
 
     Args:
         uv: (N, 2) in [0, 1], origin at the bottom left.
@@ -27,67 +100,18 @@ class PlaneSampler(nn.Module):
         UsageError: `resolution` is below 1.
     """
 
-    index: Tensor
-    weight: Tensor
-    reader: Tensor
-    reader_weight: Tensor
-    reader_start: Tensor
-
     def __init__(self, uv: Tensor, resolution: int) -> None:
-        super().__init__()
         if resolution < 1:
             raise UsageError(f"is {resolution}", field="resolution", remedy="Use 1 or more.")
         index, weight = bilinear_taps(uv, resolution)
-        flat = index.flatten()
-        order = torch.argsort(flat, stable=True)
-        texels = torch.arange(resolution**2, dtype=flat.dtype, device=flat.device)
-        buffers = {
-            "index": index,
-            "weight": weight,
-            "reader": order // index.shape[1],
-            "reader_weight": weight.flatten()[order],
-            "reader_start": torch.searchsorted(flat[order], texels),
-        }
-        for name, tensor in buffers.items():
-            self.register_buffer(name, tensor.contiguous(), persistent=False)
-
-    def forward(self, plane: Tensor) -> Tensor:
-        """Read the plane.
-
-        Args:
-            plane: (resolution^2, C), row by row from the top.
-
-        Returns:
-            (N, C).
-        """
-        return _Read.apply(
-            plane, self.index, self.weight, self.reader, self.reader_weight, self.reader_start
-        )
+        rows = torch.arange(len(uv), device=uv.device).repeat_interleave(index.shape[1])
+        super().__init__(rows, index.flatten(), weight.flatten(), len(uv), resolution**2)
 
 
-class _Read(torch.autograd.Function):
-    """A weighted sum of rows, and its transpose as another one."""
+class CellPooling(FixedGather):
+    """Means over the points of each cell of a square plane: (N, C) to (resolution^2, C).
 
-    @staticmethod
-    def forward(ctx: Any, plane: Tensor, *taps: Tensor) -> Tensor:
-        index, weight, *reverse = taps
-        ctx.save_for_backward(*reverse)
-        return embedding_bag(
-            index, plane.contiguous(), mode="sum", per_sample_weights=weight.to(plane.dtype)
-        )
-
-    @staticmethod
-    def backward(ctx: Any, *grads: Tensor) -> tuple[Tensor | None, ...]:
-        reader, weight, start = ctx.saved_tensors
-        grad = grads[0].contiguous()
-        into_plane = embedding_bag(
-            reader, grad, start, mode="sum", per_sample_weights=weight.to(grad.dtype)
-        )
-        return into_plane, None, None, None, None, None
-
-
-class CellPooling(nn.Module):
-    """Means over the points of each cell of a square plane.
+    A cell without a point holds 0.
 
     Args:
         uv: (N, 2) in [0, 1], origin at the bottom left.
@@ -95,30 +119,16 @@ class CellPooling(nn.Module):
     """
 
     cell: Tensor
-    share: Tensor
 
     def __init__(self, uv: Tensor, resolution: int) -> None:
-        super().__init__()
         column = (uv[:, 0] * resolution).long().clamp(0, resolution - 1)
         row = ((1.0 - uv[:, 1]) * resolution).long().clamp(0, resolution - 1)
         cell = row * resolution + column
-        self.count = resolution**2
+        members = torch.bincount(cell, minlength=resolution**2)
+        points = torch.arange(len(uv), device=uv.device)
+        super().__init__(cell, points, 1.0 / members[cell].to(uv.dtype), resolution**2, len(uv))
+        #: (N,) the cell of each point.
         self.register_buffer("cell", cell, persistent=False)
-        members = torch.bincount(cell, minlength=self.count)
-        self.register_buffer("share", 1.0 / members[cell].to(uv.dtype)[:, None], persistent=False)
-
-    def forward(self, features: Tensor) -> Tensor:
-        """Average.
-
-        Args:
-            features: (..., N, C).
-
-        Returns:
-            (..., resolution^2, C); 0 where a cell has no point.
-        """
-        shape = (*features.shape[:-2], self.count, features.shape[-1])
-        weighted = features * self.share.to(features.dtype)
-        return weighted.new_zeros(shape).index_add(-2, self.cell, weighted)
 
 
 def bilinear_taps(uv: Tensor, resolution: int) -> tuple[Tensor, Tensor]:

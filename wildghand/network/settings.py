@@ -48,7 +48,7 @@ class NetworkSettings:
     #: Hidden width of the heads.
     head_width: int = number(32, 1, 4096)
     #: Hidden layers of each head.
-    head_layers: int = number(1, 0, 10)
+    head_layers: int = number(1, 1, 10)
     #: Opacity of every Gaussian at the start.
     initial_opacity: float = number(0.9, 0.01, 0.99)
     #: Shadow coefficient of every Gaussian at the start.
@@ -91,12 +91,6 @@ class NetworkSettings:
         if self.size == "paper" and self.plane_width % 16:
             raise UsageError(
                 f"is {self.plane_width}", field="plane_width", remedy="Use a multiple of 16."
-            )
-        if self.size == "compact" and self.identity_resolution % self.plane_resolution:
-            raise UsageError(
-                f"of {self.identity_resolution} is no multiple of plane_resolution "
-                f"{self.plane_resolution}",
-                field="identity_resolution",
             )
         if self.direct and self.identity_channels < CHANNELS:
             raise UsageError(

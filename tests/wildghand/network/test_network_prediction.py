@@ -233,3 +233,16 @@ def test_wrong_calls_are_refused_by_name() -> None:
         PredictionNetwork(small("compact"), {})
     with pytest.raises(UsageError, match="sides"):
         PredictionNetwork(small("compact"), {"middle": surfaces(20)["right"]})
+
+
+@pytest.mark.slow
+def test_paper_at_its_real_size_predicts_every_gaussian() -> None:
+    """N = 49,281 and all the paper's dimensions, forward only: about 10 s and 1.5 GB."""
+    count = 49_281
+    net = PredictionNetwork(network_settings("paper"), {"right": surfaces(count)["right"]})
+    with torch.no_grad():
+        prediction = net("right", *frames(count, 1))
+    assert prediction.texture.shape == (count, 480 + 128)
+    assert prediction.raw.concatenate().shape == (1, count, 14)
+    assert prediction.raw.concatenate().isfinite().all()
+    assert prediction.shadow.isfinite().all()

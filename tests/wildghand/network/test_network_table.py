@@ -47,8 +47,8 @@ def test_paper_counts_by_hand() -> None:
     wanted = {"identity.maps": 64 * 128 * 33}
     wanted |= {f"texture_branch.coder{name}": n for name, n in branch(2 + 18 + 33).items()}
     wanted |= {f"geometry_branch.coder{name}": n for name, n in branch(2 + 18 + 768 + 8).items()}
-    wanted |= head("attribute_head.texture", 608, 256, 256, 256)
-    wanted |= head("attribute_head.geometry", 608, 256, 256, 256)
+    wanted |= head("attribute_head.texture", 608, 256, 256)
+    wanted |= head("attribute_head.geometry", 608, 256, 256)
     wanted |= {"attribute_head.attributes": linear(256, 3 + 3 + 4 + 1 + 3)}
     wanted |= {"shadow_head.light": 608}
     wanted |= head("shadow_head.detail", 608, 256, 256, 1)
