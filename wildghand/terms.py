@@ -31,7 +31,7 @@ class TermWeights:
     opacity: float = 0.0
     #: `SurfaceLaplacian.offsets`: template offsets (head iii).
     laplacian_offsets: float = 1e-3
-    #: `SurfaceLaplacian.roughness` of the scales, in units of the anchors' spacing.
+    #: `SurfaceLaplacian.roughness` of the log scales.
     laplacian_scales: float = 1e-3
     #: `SurfaceLaplacian.roughness` of the colours.
     laplacian_colors: float = 1e-3
