@@ -3,9 +3,10 @@
 Run from the repository: `python -m benchmarks.prepass CAPTURE... [--pictures FOLDER]`, with
 captures made by `hwp-bench sim render`. The truth is read here and never by the pre-pass.
 
-For every capture: seconds of the second call (the first compiles) with images in memory;
+For every capture: processor seconds of the second call (the first compiles), images in memory;
 Spearman correlation of 1 - clean with the true severity (the largest of its perturbations) and
-the area under the ROC curve of clean against perturbed frames; median absolute error of the log
+the area under the ROC curve of clean against perturbed frames; the share of clean frames judged
+clean and of frames of severity 3 to 5 judged not; median absolute error of the log
 gains; and, over pixels of the hand in frames with objects, the area under the curve of the pixel
 weights for visible against covered pixels, beside that of the estimated mask alone.
 """
@@ -103,10 +104,12 @@ def draw(capture: Capture, given: PrepassInput, judgement: Judgement, folder: Pa
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(2, 1, figsize=(9, 3.6), sharex=True, layout="constrained")
-    for name, values in severities(capture, judgement.indices).items():
-        axes[0].step(judgement.indices, values, where="mid", label=f"{name.replace('_', ' ')}")
-    axes[0].set_ylabel("true severity")
-    axes[0].legend(fontsize=7, loc="upper right")
+    truth = severities(capture, judgement.indices)
+    for name, values in truth.items():
+        axes[0].step(judgement.indices, values, where="mid", label=name.replace("_", " "))
+    axes[0].set_ylabel("true severity" if truth else "severity unknown")
+    if truth:
+        axes[0].legend(fontsize=7, loc="upper right")
     axes[1].plot(judgement.indices, judgement.clean, color="black", label="clean")
     for name in ("gain", "blur", "misplacement", "hidden", "residual"):
         deviation = getattr(judgement, f"{name}_deviation")
@@ -119,7 +122,7 @@ def draw(capture: Capture, given: PrepassInput, judgement: Judgement, folder: Pa
         label="refine pose",
     )
     axes[1].set_xlabel("training frame")
-    axes[1].legend(fontsize=6, loc="upper right", ncols=4)
+    axes[1].legend(fontsize=6, loc="center left", bbox_to_anchor=(1.0, 0.5))
     figure.savefig(folder / f"{capture.info.id}-time.png", dpi=110)
     plt.close(figure)
     rows = np.linspace(1, len(judgement) - 2, 10).astype(int)
@@ -158,17 +161,17 @@ def main() -> None:
         args.pictures.mkdir(parents=True, exist_ok=True)
 
     print(
-        "| capture | frames | px | perturbed | s | Spearman | AUC | gain error (90 %) "
-        "| pixel AUC (mask alone) |"
+        "| capture | frames | px | perturbed | s | Spearman | AUC | clean kept | strong caught "
+        "| gain error (90 %) | pixel AUC (mask alone) |"
     )
-    print("| --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |")
+    print("| --- |" + " ---: |" * 10)
     for path in args.captures:
         capture = open_capture(path)
         given = load(capture)
         judge_frames(given)
-        start = time.perf_counter()
+        start = time.process_time()
         judgement = judge_frames(given)
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
         row = [capture.info.id, str(len(judgement)), str(given.size[0])]
         truth = severities(capture, judgement.indices)
         if truth and capture.has_clean:
@@ -180,11 +183,13 @@ def main() -> None:
                 f"{seconds:.2f}",
                 f"{spearmanr(1 - judgement.clean, worst).statistic:.2f}",
                 f"{area_under_curve(1 - judgement.clean, worst > 0):.2f}",
+                f"{np.mean(judgement.clean[worst == 0] > 0.5):.0%}",
+                f"{np.mean(judgement.clean[worst >= 3] < 0.5):.0%}",
                 f"{error[0]:.3f} ({error[1]:.3f})",
-                f"{pixels[0]:.2f} ({pixels[1]:.2f})",
+                "" if np.isnan(pixels[0]) else f"{pixels[0]:.2f} ({pixels[1]:.2f})",
             ]
         else:
-            row += ["?", f"{seconds:.2f}", "", "", "", ""]
+            row += ["?", f"{seconds:.2f}", "", "", "", "", "", ""]
         print(f"| {' | '.join(row)} |", flush=True)
         if args.pictures:
             draw(capture, given, judgement, args.pictures)

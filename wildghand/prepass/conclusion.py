@@ -12,7 +12,7 @@ from wildghand.prepass.judgement import Judgement
 from wildghand.prepass.mode import densest, excess, normal_value
 from wildghand.prepass.settings import PrepassSettings
 from wildghand.prepass.verdict import clean_probability, evidence
-from wildghand.prepass.weights import pixel_weights
+from wildghand.prepass.weights import normal_residuals, pixel_weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,6 +23,8 @@ class Look:
     explained: Explained
     #: (P,) int32 row-major numbers of the silhouette's pixels.
     pixels: np.ndarray
+    #: (P,) int32 cells that they show.
+    cells: np.ndarray
     #: Share of the hand that the mask lacks.
     hidden: float
     #: `wildghand.prepass.outlines.misplacement`.
@@ -37,6 +39,7 @@ def conclude(
     indices: np.ndarray,
     masks: np.ndarray,
     looks: Mapping[int, Look],
+    cell_count: int,
     settings: PrepassSettings,
 ) -> Judgement:
     """Compare the frames with each other and judge them.
@@ -45,6 +48,7 @@ def conclude(
         indices: (R,) ascending frame numbers.
         masks: (R, H, W) uint8.
         looks: by row; rows that are missing cannot be used. Not empty.
+        cell_count: number of cells of the surface.
         settings: floors and thresholds.
     """
     count, share = len(indices), settings.clean_share
@@ -81,14 +85,21 @@ def conclude(
     sharp_border = float(np.exp(normal_value(np.log(border), share)[0]))
     extent = np.sqrt(np.maximum(np.nan_to_num(border) ** 2 - sharp_border**2, 0.0))
     refine = (off_place > settings.clear_deviation) & (off_border < settings.clear_deviation)
-    normal_level = normal_value(level, share)[0]
+    normal = normal_residuals(
+        [look.explained.residual for look in found],
+        [look.cells for look in found],
+        clean[rows].tolist(),
+        cell_count,
+        normal_value(level, share)[0],
+        settings.residual_prior,
+    )
     pixels = np.full(masks.shape, 255, dtype=np.uint8)
     for row, look in looks.items():
         pixels[row] = pixel_weights(
             look.explained.residual,
             look.pixels,
             masks[row],
-            normal_level,
+            normal[look.cells],
             settings.residual_scale,
         )
     return Judgement(

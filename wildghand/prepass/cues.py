@@ -14,8 +14,9 @@ from wildghand.prepass.intensity import IntensityModel
 _FINE, _COARSE = 0.8, 3.0
 #: Pixels below which a frame says nothing.
 LEAST_PIXELS = 20
-# Passes of the vote for a gain.
+# Passes of the vote for a gain, and pixels that vote.
 _PASSES = 5
+_VOTERS = 1500
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,18 +49,23 @@ def explain(
     expected = model.predict(footprint.cells, footprint.normals)
     rest = light - expected
     gain = _agreed_gain(rest[inner], 2.5 * model.scale)
-    residual = np.abs(rest - gain).mean(axis=1)
+    residual = channel_mean(np.abs(rest - gain.astype(np.float32)))
     return Explained(
-        residual=residual.astype(np.float32),
+        residual=residual,
         gain=gain,
         level=float(np.median(residual[inner])),
         texture=_texture(
-            light[inner].mean(axis=1),
-            expected[inner].mean(axis=1),
+            channel_mean(light[inner]),
+            channel_mean(expected[inner]),
             footprint.pixels[inner],
             footprint.silhouette.shape,
         ),
     )
+
+
+def channel_mean(values: np.ndarray) -> np.ndarray:
+    """(P,) mean of the three channels of (P, 3); several times faster than over an axis."""
+    return (values[:, 0] + values[:, 1] + values[:, 2]) / 3.0
 
 
 def _agreed_gain(rest: np.ndarray, reach: float) -> np.ndarray:
@@ -67,11 +73,12 @@ def _agreed_gain(rest: np.ndarray, reach: float) -> np.ndarray:
 
     Where something covers most of the hand, the median is its colour and no gain.
     """
+    rest = rest[:: max(1, len(rest) // _VOTERS)]
     best, votes = np.zeros(3), -1.0
     for start in (np.zeros(3), np.median(rest, axis=0)):
         gain = start
         for _ in range(_PASSES):
-            weights = 1.0 / (1.0 + (np.abs(rest - gain).mean(axis=1) / reach) ** 4)
+            weights = 1.0 / (1.0 + (channel_mean(np.abs(rest - gain)) / reach) ** 4)
             gain = (weights[:, None] * rest).sum(axis=0) / max(float(weights.sum()), 1e-9)
         if weights.sum() > votes:
             best, votes = gain, float(weights.sum())

@@ -5,14 +5,18 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
+from hwp_bench.sim.colors import srgb_to_linear
+
 # Reach of a profile to either side of the border, share of the picture's edge.
-_REACH = 0.07
+_REACH = 0.1
 # Step along a profile, px.
 _STEP = 0.5
 # Least difference between inside and outside, sRGB in [0, 1].
 _CONTRAST = 0.12
 # Directions are told apart modulo a half turn in so many bins.
 _BINS = 6
+# Profiles of a frame.
+_POINTS = 250
 # Profiles that a bin needs.
 _LEAST = 6
 
@@ -21,7 +25,8 @@ def border_width(image: np.ndarray, mask: np.ndarray) -> float:
     """Width of the border between hand and background, in its most blurred direction.
 
     Profiles across the outline of the mask are projected on the difference of the colours at
-    their ends, so that their steepest place tells the width: 1 / slope. The outline itself may
+    their ends and scaled to a range of 1, so that their steepest place tells the width:
+    1 / slope. The outline itself may
     be off by some pixels. Widths are medians over the profiles of like direction.
 
     Args:
@@ -53,13 +58,14 @@ def border_width(image: np.ndarray, mask: np.ndarray) -> float:
     )
     third = len(steps) // 3
     inner, outer = profiles[:, :third].mean(axis=1), profiles[:, -third:].mean(axis=1)
-    way = inner - outer
-    contrast = np.linalg.norm(way, axis=1)
-    clear = contrast > _CONTRAST
+    clear = np.linalg.norm(inner - outer, axis=1) > _CONTRAST
     if np.count_nonzero(clear) < _LEAST:
         return float("nan")
-    unit = way[clear] / contrast[clear, None] ** 2
-    along = np.einsum("nsk,nk->ns", profiles[clear], unit)
+    # Shutters add up light, so that a streak is a straight ramp in light, not in sRGB.
+    profiles = srgb_to_linear(profiles[clear])
+    way = profiles[:, :third].mean(axis=1) - profiles[:, -third:].mean(axis=1)
+    along = np.einsum("nsk,nk->ns", profiles, way / np.linalg.norm(way, axis=1)[:, None])
+    along /= np.maximum(np.ptp(along, axis=1), 1e-6)[:, None]
     # Differences over 2 px: noise counts less, and a sharp border is that wide anyway.
     gap = round(2.0 / _STEP)
     slope = np.abs(along[:, gap:] - along[:, :-gap]).max(axis=1) / (gap * _STEP)
@@ -77,7 +83,8 @@ def _outline(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     outward = cv2.distanceTransform(1 - solid, cv2.DIST_L2, 3) - inward
     smooth = cv2.GaussianBlur(outward, (0, 0), 2.0)
     rows, columns = np.nonzero(mask & (outward > -1.5))
-    rows, columns = rows[::2], columns[::2]
+    every = max(2, len(rows) // _POINTS)
+    rows, columns = rows[::every], columns[::every]
     slope = np.stack(
         [
             cv2.Sobel(smooth, cv2.CV_32F, 1, 0)[rows, columns],

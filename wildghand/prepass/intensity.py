@@ -106,7 +106,7 @@ def fit_intensity(
         gains = _frame_medians(rest, samples.starts)
         centre, part = densest(gains, settings.clean_share)
         gains = gains - centre
-        residual = np.abs(rest - centre - gains[rows]).mean(axis=1)
+        residual = np.abs(rest - centre - gains[rows]) @ np.full(3, 1.0 / 3.0)
         scale = max(float(np.median(residual[part[rows]])), 0.01)
         weights = 1.0 / (1.0 + (residual / (2.5 * scale)) ** 4)
     everywhere = np.column_stack([np.ones(cell_count), shading_basis(cell_normals)])

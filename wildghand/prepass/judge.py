@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 from hwp_bench.capture import Cameras
@@ -23,7 +25,7 @@ from wildghand.prepass.intensity import (
     log_light_table,
     shading_basis,
 )
-from wildghand.prepass.judgement import Judgement, neutral_judgement
+from wildghand.prepass.judgement import Judgement, enlarged, neutral_judgement
 from wildghand.prepass.outlines import ShownCells, interior, misplacement
 from wildghand.prepass.settings import PrepassSettings
 
@@ -63,6 +65,23 @@ class PrepassInput:
         """Height and width."""
         return (self.images.shape[1], self.images.shape[2])
 
+    def shrunk(self, factor: int) -> PrepassInput:
+        """The same at `1 / factor` of the resolution, sizes rounded down."""
+        height, width = (edge // factor for edge in self.size)
+        scale = np.array([[width / self.size[1]], [height / self.size[0]], [1.0]])
+
+        def small(pictures: np.ndarray) -> np.ndarray:
+            return np.stack(
+                [cv2.resize(p, (width, height), interpolation=cv2.INTER_AREA) for p in pictures]
+            )
+
+        return replace(
+            self,
+            images=small(self.images),
+            masks=small(self.masks),
+            cameras=Cameras(self.cameras.Ks * scale, self.cameras.viewmats),
+        )
+
 
 def judge_capture(training: TrainingCapture, settings: PrepassSettings | None = None) -> Judgement:
     """Read and judge all training frames of a request.
@@ -90,6 +109,8 @@ def judge_capture(training: TrainingCapture, settings: PrepassSettings | None = 
 def judge_frames(given: PrepassInput, settings: PrepassSettings | None = None) -> Judgement:
     """Judge frames that are already in memory; deterministic.
 
+    Beyond `settings.pixel_budget` pixels the frames are judged at a lower resolution, and
+    weights and lengths are brought back to theirs.
     Fewer usable frames than `settings.least_frames` cannot be compared: all of them are judged
     clean.
 
@@ -97,6 +118,14 @@ def judge_frames(given: PrepassInput, settings: PrepassSettings | None = None) -
         BadInput: no frame can be used: no hand is valid, in the picture and in the mask.
     """
     settings = settings or PrepassSettings()
+    excess_pixels = given.masks.size / settings.pixel_budget
+    if excess_pixels <= 1.0:
+        return _judge(given, settings)
+    factor = math.ceil(math.sqrt(excess_pixels))
+    return enlarged(_judge(given.shrunk(factor), settings), factor, given.size)
+
+
+def _judge(given: PrepassInput, settings: PrepassSettings) -> Judgement:
     surfaces = HandSurfaces(given.templates, settings.patch_size)
     usable = _measurable(given)
     survey = _survey(given, surfaces, usable, settings)
@@ -118,12 +147,13 @@ def judge_frames(given: PrepassInput, settings: PrepassSettings | None = None) -
         looks[row] = Look(
             explained=explain(model, footprint, table[values], inner),
             pixels=footprint.pixels,
+            cells=footprint.cells,
             hidden=survey.shown.hidden_share(footprint.cells, masked.reshape(-1)[footprint.pixels]),
             misplacement=float(survey.misplacement[row]),
             border=float(survey.border[row]),
             motion=float(survey.motion[row]),
         )
-    return conclude(given.indices, given.masks, looks, settings)
+    return conclude(given.indices, given.masks, looks, len(surfaces.cell_normals), settings)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,8 +200,7 @@ def _inner(footprint: Footprint, masked: np.ndarray, values: np.ndarray) -> np.n
     return (
         inside.reshape(-1)[footprint.pixels]
         & (footprint.facing > _FACING)
-        & (values.min(axis=1) >= LOWEST)
-        & (values.max(axis=1) <= HIGHEST)
+        & ((values >= LOWEST) & (values <= HIGHEST)).all(axis=1)
     )
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 
 #: Exponent between sRGB values and linear light around the middle of the scale.
@@ -102,4 +103,24 @@ def neutral_judgement(
         hidden_deviation=zeros,
         motion=zeros,
         pixel_weights=np.full((count, *size), 255, dtype=np.uint8),
+    )
+
+
+def enlarged(judgement: Judgement, factor: int, size: tuple[int, int]) -> Judgement:
+    """A judgement of shrunk frames, brought back to their size.
+
+    Args:
+        judgement: of frames at 1 / factor of the resolution.
+        factor: at least 1.
+        size: height and width of the frames.
+    """
+    weights = [
+        cv2.resize(weight, size[::-1], interpolation=cv2.INTER_LINEAR)
+        for weight in judgement.pixel_weights
+    ]
+    return replace(
+        judgement,
+        pixel_weights=np.stack(weights),
+        blur_extent=judgement.blur_extent * factor,
+        motion=judgement.motion * factor,
     )

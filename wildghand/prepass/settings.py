@@ -13,6 +13,8 @@ class PrepassSettings:
     patch_size: float = 0.004
     #: Pixels of all frames together from which the intensity model is fitted.
     sample_count: int = 120_000
+    #: Pixels of all frames together beyond which they are judged at a lower resolution.
+    pixel_budget: int = 30_000_000
     #: Passes of the robust fit.
     iterations: int = 10
     #: Samples that the mean skin colour is worth in the albedo of a cell.
@@ -42,7 +44,10 @@ class PrepassSettings:
     omega_dropout: float = 0.3
     #: A frame is clean for `omega_dropout` from this probability on.
     clean_threshold: float = 0.5
-    #: Residual, in medians of the clean frames, at which a pixel's weight has halved.
+    #: Residual, in those of the clean frames at the same place, at which a pixel's weight has
+    #: halved.
     residual_scale: float = 2.5
+    #: Pixels that the median of all residuals is worth in the residual of a place.
+    residual_prior: float = 20.0
     #: Fewer usable frames than this cannot be compared: all are judged clean.
     least_frames: int = 4

@@ -1,0 +1,232 @@
+"""The pre-pass on frames with injected perturbations. Oracle: what was injected."""
+
+from __future__ import annotations
+
+from dataclasses import fields, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from lit_hand import FRAMES, SIZE, as_input, cameras, developed, hand_parameters, only
+
+from hwp_bench.capture import CaptureInfo, CaptureWriter, HandModelId, open_capture
+from hwp_bench.errors import BadInput, ShapeMismatch
+from hwp_bench.hands import load_template
+from hwp_bench.methods.contract import Budget
+from hwp_bench.methods.request import RunSettings, open_request, write_request
+from hwp_bench.splits import contiguous_split
+from wildghand.prepass import Judgement, PrepassInput, PrepassSettings, judge_capture, judge_frames
+
+Lit = tuple[np.ndarray, np.ndarray]
+#: Frames that the tests perturb.
+HIT = np.arange(8, 14)
+SPARED = np.setdiff1d(np.arange(FRAMES), np.arange(7, 15))
+
+
+def check_ranges(judgement: Judgement, count: int) -> None:
+    """Every field is finite and in its range."""
+    for field in fields(Judgement):
+        values = getattr(judgement, field.name)
+        assert len(values) == count, field.name
+        assert np.isfinite(values.astype(np.float64)).all(), field.name
+    assert ((judgement.clean >= 0) & (judgement.clean <= 1)).all()
+    assert ((judgement.frame_weights >= 0.1) & (judgement.frame_weights <= 1)).all()
+    assert set(judgement.omega_dropout.tolist()) <= {0.0, 0.3}
+    assert judgement.pixel_weights.dtype == np.uint8
+
+
+def test_clean_frames_are_judged_clean(lit_frames: Lit) -> None:
+    judgement = judge_frames(as_input(developed(lit_frames[0]), lit_frames[1]))
+    check_ranges(judgement, FRAMES)
+    assert judgement.usable.all()
+    assert (judgement.clean > 0.5).all()
+    assert not judgement.refine_pose.any()
+    assert np.abs(judgement.log_gains).max() < 0.05
+    assert judgement.pixel_weights[lit_frames[1]].mean() > 0.85 * 255
+
+
+def test_known_gains_are_recovered_to_0_05(lit_frames: Lit) -> None:
+    gains = np.zeros((FRAMES, 3))
+    gains[HIT] = np.array([-0.5, -0.35, -0.2]) + np.linspace(-0.3, 0.3, len(HIT))[:, None]
+    linear = lit_frames[0] * np.exp(gains)[:, None, None]
+    judgement = judge_frames(as_input(developed(linear), lit_frames[1]))
+    check_ranges(judgement, FRAMES)
+    np.testing.assert_allclose(judgement.log_gains, gains, atol=0.05)
+    assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
+    assert (judgement.omega_dropout[SPARED] == 0.3).all()
+    # Around the middle of the scale an sRGB value follows light to the power 1 / 2.2.
+    np.testing.assert_allclose(judgement.display_log_gains, judgement.log_gains / 2.2)
+
+
+def test_blurred_frames_are_flagged_and_measured(lit_frames: Lit) -> None:
+    length = 9
+    linear = lit_frames[0].copy()
+    kernel = np.full((1, length), 1.0 / length)
+    for frame in HIT:
+        linear[frame] = cv2.filter2D(linear[frame], -1, kernel)
+    judgement = judge_frames(as_input(developed(linear), lit_frames[1]))
+    check_ranges(judgement, FRAMES)
+    assert (judgement.blur_deviation[HIT] > 3).all()
+    assert (judgement.clean[HIT] < 0.5).all()
+    assert (judgement.clean[SPARED] > 0.5).all()
+    assert (judgement.omega_dropout[HIT] == 0).all()
+    # A streak wider than a finger never shows the finger's full colour: the extent is low.
+    assert (judgement.blur_extent[HIT] > 0.5 * length).all()
+    assert (judgement.blur_extent[HIT] < 1.1 * length).all()
+    assert judgement.blur_extent[SPARED].max() < 2.0
+
+
+def test_covered_pixels_lose_their_weight(lit_frames: Lit) -> None:
+    linear, masks = lit_frames[0].copy(), lit_frames[1].copy()
+    covered = np.zeros_like(masks)
+    for frame in HIT:
+        rows, columns = np.nonzero(masks[frame])
+        middle = np.median(rows).astype(int), np.median(columns).astype(int)
+        box = np.s_[middle[0] - 9 : middle[0] + 9, middle[1] - 9 : middle[1] + 9]
+        linear[frame][box] = [0.05, 0.1, 0.4]
+        covered[frame][box] = masks[frame][box]
+        # The segmenter takes the left half of the object for hand.
+        masks[frame][box][:, 9:] = False
+    judgement = judge_frames(as_input(developed(linear), masks))
+    check_ranges(judgement, FRAMES)
+    weights = judgement.pixel_weights[HIT]
+    visible = lit_frames[1][HIT] & ~covered[HIT]
+    assert weights[covered[HIT]].mean() < 0.1 * 255
+    assert weights[visible].mean() > 0.7 * 255
+    assert (judgement.hidden_deviation[HIT] > 3).all()
+    assert (judgement.misplacement_deviation[HIT] < 3).all()
+    assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
+
+
+def test_misplaced_hands_ask_for_refinement(lit_frames: Lit) -> None:
+    given = as_input(developed(lit_frames[0]), lit_frames[1])
+    hand = hand_parameters()
+    transl = hand.transl.copy()
+    transl[HIT, 0] += 0.012
+    judgement = judge_frames(replace(given, hands={"right": replace(hand, transl=transl)}))
+    check_ranges(judgement, FRAMES)
+    assert np.flatnonzero(judgement.refine_pose).tolist() == HIT.tolist()
+    assert (judgement.clean[HIT] < 0.5).all()
+    assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
+
+
+def test_same_frames_same_judgement(lit_frames: Lit) -> None:
+    given = as_input(developed(lit_frames[0]), lit_frames[1])
+    first, second = judge_frames(given), judge_frames(given)
+    for field in fields(Judgement):
+        np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name))
+
+
+def test_many_pixels_are_judged_at_a_lower_resolution(lit_frames: Lit) -> None:
+    linear = lit_frames[0].copy()
+    linear[HIT] *= np.exp(-0.6)
+    given = as_input(developed(linear), lit_frames[1])
+    judgement = judge_frames(given, PrepassSettings(pixel_budget=FRAMES * SIZE * SIZE // 3))
+    check_ranges(judgement, FRAMES)
+    assert judgement.pixel_weights.shape == (FRAMES, SIZE, SIZE)
+    # Shrinking averages sRGB values, and half the pixels are left: 0.08 instead of 0.05.
+    np.testing.assert_allclose(judgement.log_gains[HIT], -0.6, atol=0.08)
+    assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_frames_are_all_judged_clean(lit_frames: Lit, count: int) -> None:
+    given = as_input(developed(lit_frames[0]), lit_frames[1])
+    judgement = judge_frames(only(given, np.arange(count)))
+    check_ranges(judgement, count)
+    assert (judgement.clean == 1).all()
+    assert (judgement.frame_weights == 1).all()
+    assert (judgement.pixel_weights == 255).all()
+
+
+def _black(given: PrepassInput) -> PrepassInput:
+    given.images[5] = 0
+    return given
+
+
+def _constant(given: PrepassInput) -> PrepassInput:
+    given.images[5] = 128
+    return given
+
+
+def _saturated(given: PrepassInput) -> PrepassInput:
+    given.images[5] = 255
+    return given
+
+
+def _unmasked(given: PrepassInput) -> PrepassInput:
+    given.masks[5] = 0
+    return given
+
+
+def _invalid(given: PrepassInput) -> PrepassInput:
+    given.hands["right"].valid[5] = False
+    return given
+
+
+def _off_screen(given: PrepassInput) -> PrepassInput:
+    given.hands["right"].transl[5] = [5.0, 0.0, 0.4]
+    return given
+
+
+def _behind(given: PrepassInput) -> PrepassInput:
+    given.hands["right"].transl[5] = [0.0, 0.0, -1.0]
+    return given
+
+
+@pytest.mark.parametrize(
+    "spoil", [_black, _constant, _saturated, _unmasked, _invalid, _off_screen, _behind]
+)
+def test_a_frame_without_a_hand_is_set_apart(lit_frames: Lit, spoil: object) -> None:
+    assert callable(spoil)
+    judgement = judge_frames(spoil(as_input(developed(lit_frames[0]), lit_frames[1])))
+    check_ranges(judgement, FRAMES)
+    assert np.flatnonzero(~judgement.usable).tolist() == [5]
+    assert judgement.clean[5] == 0
+    assert judgement.frame_weights[5] == pytest.approx(0.1)
+    assert (judgement.pixel_weights[5] == 255).all()
+    assert (np.delete(judgement.clean, 5) > 0.5).all()
+
+
+def test_no_usable_frame_is_an_error(lit_frames: Lit) -> None:
+    given = as_input(np.zeros((FRAMES, SIZE, SIZE, 3), dtype=np.uint8), lit_frames[1])
+    with pytest.raises(BadInput, match="none of 24 training frames"):
+        judge_frames(given)
+
+
+def test_arrays_of_other_frames_are_refused(lit_frames: Lit) -> None:
+    given = as_input(developed(lit_frames[0]), lit_frames[1])
+    with pytest.raises(ShapeMismatch):
+        replace(given, masks=given.masks[:3])
+
+
+def test_a_request_is_judged_like_its_frames(lit_frames: Lit, tmp_path: Path) -> None:
+    images, template = developed(lit_frames[0]), load_template("anny", "right")
+    given = as_input(images, lit_frames[1])
+    info = CaptureInfo(
+        id="lit",
+        hands="right",
+        action="Waving",
+        device="Test",
+        fps=30.0,
+        width=SIZE,
+        height=SIZE,
+        frame_count=FRAMES,
+        hand_model=HandModelId(template.name, template.digest),
+        perturbations={},
+        source={"kind": "test"},
+        licence="CC0",
+    )
+    with CaptureWriter(tmp_path / "lit", info, {"right": hand_parameters()}, cameras()) as writer:
+        for frame in range(FRAMES):
+            writer.frame(frame, images[frame])
+            writer.mask(frame, given.masks[frame])
+    split = contiguous_split("lit", FRAMES)
+    run = RunSettings({}, 0, Budget())
+    request = write_request(tmp_path / "request", open_capture(tmp_path / "lit"), split, run)
+    judgement = judge_capture(open_request(request))
+    expected = judge_frames(only(given, split.train))
+    assert judgement.indices.tolist() == split.train.tolist()
+    # hands.npz may hold the parameters in single precision.
+    np.testing.assert_allclose(judgement.clean, expected.clean, atol=1e-3)

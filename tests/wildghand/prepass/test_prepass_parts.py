@@ -1,0 +1,123 @@
+"""Parts of the pre-pass against other ways to the same number."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from hwp_bench.importers.silhouette import draw_silhouette
+from hwp_bench.sim.colors import linear_to_srgb
+from wildghand.prepass.edges import border_width
+from wildghand.prepass.mode import densest, excess, normal_value
+from wildghand.prepass.outlines import misplacement
+from wildghand.prepass.verdict import clean_probability, evidence
+from wildghand.prepass.zbuffer import draw_faces, mix_corners
+
+
+def test_faces_cover_what_the_importer_fills() -> None:
+    random = np.random.default_rng(0)
+    pixels = random.uniform(-10, 74, (90, 2))
+    faces = np.arange(90).reshape(30, 3)
+    face, _ = draw_faces(pixels, np.ones(90), faces, (64, 64))
+    # A pixel centre on an edge may fall to either side in the last digit: none does here.
+    np.testing.assert_array_equal(face >= 0, draw_silhouette(pixels, faces, 64) > 0)
+
+
+def test_the_nearer_face_wins_and_corners_mix() -> None:
+    pixels = np.array([[0, 0], [40.3, 0], [0, 40.3]] * 2, dtype=np.float64)
+    depth = np.array([2.0, 2.0, 2.0, 1.0, 3.0, 3.0])
+    faces = np.array([[0, 1, 2], [3, 4, 5]])
+    face, mix = draw_faces(pixels, depth, faces, (32, 32))
+    # The second is nearer where 1 + 2 (x + y) / 40.3 < 2.
+    x, y = np.meshgrid(np.arange(32) + 0.5, np.arange(32) + 0.5)
+    inside = x + y < 40.3
+    np.testing.assert_array_equal(face[inside], np.where(x + y < 20.15, 1, 0)[inside])
+    shown = face.reshape(-1) >= 0
+    mixed = mix_corners(pixels, faces, face.reshape(-1)[shown], mix.reshape(-1, 2)[shown])
+    places = np.stack([x.reshape(-1)[shown], y.reshape(-1)[shown]], axis=1)
+    np.testing.assert_allclose(mixed, places, atol=1e-4)
+
+
+def test_faces_behind_the_camera_or_not_finite_are_left_out() -> None:
+    pixels = np.array([[0, 0], [40, 0], [0, 40], [np.nan, 0], [40, 0], [0, 40]])
+    depth = np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
+    face, _ = draw_faces(pixels, depth, np.array([[0, 1, 2], [3, 4, 5]]), (8, 8))
+    assert (face == -1).all()
+
+
+def test_normal_values_of_a_normal_distribution() -> None:
+    values = np.random.default_rng(1).normal(3.0, 0.5, 4000)
+    outliers = np.full(2000, 40.0)
+    middle, deviation = normal_value(np.concatenate([values, outliers, [np.nan]]), 0.35)
+    assert middle == pytest.approx(3.0, abs=0.1)
+    # 0.35 of all values are 0.525 of the sound ones: their half width is 0.71 deviations, and
+    # 0.35 of a normal distribution would lie within 0.45.
+    assert deviation == pytest.approx(0.5 * 0.71 / 0.45, rel=0.1)
+
+
+@given(
+    arrays(np.float64, st.integers(1, 40), elements=st.floats(-1e6, 1e6) | st.just(float("nan"))),
+    st.floats(0.05, 1.0),
+)
+def test_excess_is_finite_and_ordered(values: np.ndarray, share: float) -> None:
+    result = excess(values, share, 0.1)
+    assert np.isfinite(result).all()
+    assert (result >= 0).all()
+    known = np.isfinite(values)
+    order = np.argsort(values[known], kind="stable")
+    assert (np.diff(result[known][order]) >= 0).all()
+
+
+def test_densest_part_is_the_cluster() -> None:
+    random = np.random.default_rng(2)
+    values = np.concatenate([random.uniform(-2, 2, (12, 3)), random.normal(0.7, 0.01, (8, 3))])
+    centre, part = densest(values, 0.35)
+    np.testing.assert_allclose(centre, 0.7, atol=0.02)
+    assert not part[:12].any()
+
+
+def test_misplacement_grows_with_the_shift_and_ignores_what_is_hidden() -> None:
+    hand = np.zeros((64, 64), dtype=bool)
+    hand[20:44, 16:48] = True
+    assert misplacement(hand, hand) == 0.0
+    bitten = hand.copy()
+    bitten[20:32] = False
+    assert misplacement(bitten, hand) == 0.0
+    shifts = [misplacement(np.roll(hand, shift, axis=1), hand) for shift in (2, 4, 6)]
+    assert 0 < shifts[0] < shifts[1] < shifts[2]
+
+
+def test_border_width_of_a_ramp() -> None:
+    columns = np.arange(96) + 0.5
+    mask = np.repeat((columns < 48)[None], 96, axis=0)
+    widths = []
+    for length in (4.0, 8.0):
+        # A streak is straight in light.
+        ramp = 0.05 + 0.5 * np.clip(0.5 - (columns - 48) / length, 0.0, 1.0)
+        image = np.round(255 * linear_to_srgb(np.repeat(ramp[None], 96, axis=0)))
+        image = np.repeat(image[..., None], 3, axis=2)
+        widths.append(border_width(image.astype(np.uint8), mask))
+    assert widths == pytest.approx([4.0, 8.0], rel=0.1)
+
+
+def test_border_width_is_unknown_without_contrast() -> None:
+    image = np.full((48, 48, 3), 90, dtype=np.uint8)
+    mask = np.zeros((48, 48), dtype=bool)
+    assert np.isnan(border_width(image, mask))
+    mask[10:30, 10:30] = True
+    assert np.isnan(border_width(image, mask))
+    assert np.isnan(border_width(image, ~np.zeros((48, 48), dtype=bool)))
+
+
+def test_evidence_is_shared_with_neighbours_only() -> None:
+    deviation = np.array([0.0, 9.0, 0.0, 0.0])
+    alone = np.log1p(9.0)
+    shared = evidence([deviation], np.array([0, 1, 2, 9]))
+    np.testing.assert_allclose(shared, alone * np.array([0.25, 0.5, 0.25, 0.0]))
+    # Beyond a gap a frame has no neighbour and speaks for itself.
+    apart = evidence([deviation], np.array([0, 4, 8, 12]))
+    np.testing.assert_allclose(apart, alone * np.array([0.0, 1.0, 0.0, 0.0]))
+    assert clean_probability(np.array([0.0, 1.2]), 1.2).tolist() == [1.0, 0.5]
