@@ -1,0 +1,57 @@
+"""`hwp-bench report`."""
+
+from __future__ import annotations
+
+import argparse
+
+_EXAMPLES = """examples:
+  hwp-bench report runs/plain-mini -o reports/plain
+  hwp-bench report runs/mine-mini runs/plain-mini -o reports/mine
+  hwp-bench report runs/mine-mini runs/mine-mini-clean runs/plain-mini --base plain -o reports/mine
+  hwp-bench report runs/mine-captures --captures my_captures/* -o reports/mine
+
+Writes one HTML page, index.html, that needs no network: tables, score against seconds, scores by
+perturbation with intervals, a strip for every capture, pictures, environment and digests.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    parser.add_argument(
+        "results",
+        nargs="+",
+        metavar="RESULTS",
+        help="results folder, results.json, or ablation folder",
+    )
+    parser.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the page")
+    parser.add_argument(
+        "--captures",
+        nargs="+",
+        default=[],
+        metavar="FOLDER",
+        help="capture folders, for severities (simulated ones are found in the cache)",
+    )
+    parser.add_argument(
+        "--base", metavar="NAME", help="method that shares of the gap are counted from"
+    )
+    parser.add_argument("--title", help="heading of the page (default: the methods)")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from pathlib import Path
+
+    from hwp_bench.progress import notice
+    from hwp_bench.report.page.render import write_report
+    from hwp_bench.report.sources import read_sources
+
+    page = write_report(
+        Path(args.out),
+        read_sources(args.results),
+        args.captures,
+        base=args.base,
+        title=args.title,
+    )
+    notice(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")
+    return 0

@@ -1,0 +1,279 @@
+"""Everything that a report shows, gathered from results before a word of HTML is written."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+
+from markupsafe import Markup
+
+from hwp_bench.capture.schema import CaptureInfo
+from hwp_bench.cost.analysis import CostAnalysis, analyse_cost
+from hwp_bench.errors import UsageError
+from hwp_bench.metrics import metric as metric_facts
+from hwp_bench.report.page.pictures import Album, frame_sheets, mask_sheet
+from hwp_bench.report.page.plots import Bar, bar_plot, pareto_plot
+from hwp_bench.report.page.strips import StripMethod, strip_plot
+from hwp_bench.report.page.tables import to_html
+from hwp_bench.report.sources import Source, find_captures, temporal_weights
+from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
+from hwp_bench.report.summary import all_tables, same_data
+from hwp_bench.report.table import Table
+from hwp_bench.results import Results
+from hwp_bench.statistics.bootstrap import bootstrap_mean
+from hwp_bench.statistics.compare import compare, macro_by_seed, standings
+from hwp_bench.statistics.pairing import MethodRuns, group_runs, refuse_unlike, scopes
+from hwp_bench.statistics.tables import differences_table, standings_table
+from hwp_bench.taxonomy import PERTURBATIONS, perturbation
+
+#: The metric of the plots and of the summary sentence.
+HEADLINE = "psnr"
+#: Name of the plain baseline, which others are compared with where it is among them.
+PLAIN = "plain"
+
+
+@dataclass(frozen=True)
+class CaptureSection:
+    """What is shown of one capture."""
+
+    #: Its id.
+    id: str
+    #: What is known of it, in words.
+    facts: str
+    #: Its strip.
+    strip: Markup
+    #: Whether severities are known.
+    severities: bool
+    #: Sheets of worst, median and best frame: (method, data URI).
+    frames: Sequence[tuple[str, str]]
+    #: Sheets of weight masks: (method, data URI, number of masks).
+    masks: Sequence[tuple[str, str, int]]
+
+
+@dataclass(frozen=True)
+class Report:
+    """Everything on the page."""
+
+    #: One or two sentences that say what the results say.
+    summary: str
+    #: Labels of the methods, in the order of their colours.
+    methods: Sequence[str]
+    #: Tables: the first few of everything, then those that need more.
+    tables: Sequence[Markup]
+    #: Score over seconds, or None without curves.
+    pareto: Markup | None
+    #: Tables of accuracy against time.
+    cost_tables: Sequence[Markup]
+    #: Bars by perturbation, or None where no capture carries one.
+    bars: Markup | None
+    #: Tables of differences with intervals.
+    differences: Sequence[Markup]
+    #: One entry a capture.
+    captures: Sequence[CaptureSection]
+    #: One row a result: what it was made with.
+    provenance: Sequence[Mapping[str, str]]
+    #: Digests of captures, splits and predictions.
+    digests: Sequence[Mapping[str, str]]
+    #: Pictures that found no room.
+    left_out: int
+
+
+def gather(
+    sources: Sequence[Source],
+    capture_folders: Sequence[str | os.PathLike[str]] = (),
+    *,
+    base: str | None = None,
+    picture_bytes: int | None = None,
+) -> Report:
+    """Gather a report.
+
+    Args:
+        sources: the evaluations; those on clean frames only enter the robustness table.
+        capture_folders: capture folders, for severities.
+        base: name of the method that shares of the gap are counted from; None takes the plain
+            baseline where it is among them.
+        picture_bytes: budget of the pictures; None takes the default.
+
+    Raises:
+        UsageError: there is no result, or the results are of different data or protocols.
+    """
+    if not sources:
+        raise UsageError("results are needed", field="RESULTS")
+    results = [source.results for source in sources]
+    same_data(results)
+    chosen = [s for s in sources if s.results.frames == "perturbed"] or list(sources)
+    runs = group_runs([source.results for source in chosen])
+    refuse_unlike(runs)
+    infos = find_captures(results, capture_folders)
+    album = Album() if picture_bytes is None else Album(picture_bytes)
+    order = {run.label: index for index, run in enumerate(runs)}
+    start = base or next((r.first.method.name for r in runs if r.first.method.name == PLAIN), None)
+    cost = _cost(runs)
+    tables = all_tables([source.results for source in chosen])
+    shown = [tables[name] for name in ("overall", "perturbations", "captures", "paper")]
+    shown += _optional(
+        lambda: robustness_table(sources, start),
+        lambda: severity_table(chosen, infos),
+        lambda: bias_table(chosen, infos),
+        lambda: _seeds(chosen, runs),
+    )
+    return Report(
+        summary=summary_sentence(runs),
+        methods=list(order),
+        tables=[to_html(table) for table in shown if len(table.columns) > 1],
+        pareto=pareto_plot(cost.curves, cost.front, HEADLINE, order) if cost else None,
+        cost_tables=[to_html(table) for table in cost.tables.values()] if cost else [],
+        bars=_bars(runs),
+        differences=[to_html(table) for table in _differences(runs)],
+        captures=_captures(chosen, runs, infos, album),
+        provenance=[_provenance(result) for result in results],
+        digests=[row for result in results for row in _digests(result)],
+        left_out=album.left_out,
+    )
+
+
+def summary_sentence(runs: Sequence[MethodRuns]) -> str:
+    """Return what the results say, in words."""
+    facts = metric_facts(HEADLINE)
+    first = runs[0].first
+    frames = sum(len(capture.frames) for capture in first.captures)
+    means = {run.label: float(macro_by_seed(run, HEADLINE).mean()) for run in runs}
+    order = sorted(means, key=lambda name: -means[name])
+    best = f"{order[0]} has {means[order[0]]:.{facts.digits}f} {facts.unit}"
+    where = f"On {len(first.captures)} captures ({first.suite}, {frames} test frames)"
+    failed = sum(c.failed_frames for run in runs for r in run.seeds.values() for c in r.captures)
+    tail = f" {failed} frames failed and count with their penalties." if failed else ""
+    if len(runs) == 1:
+        return f"{where} {best} {facts.label} (macro mean).{tail}"
+    found = compare([run for name in order[:2] for run in runs if run.label == name], HEADLINE)
+    macro = next(item for item in found if item.scope == "macro").estimate
+    text = f"{where} {best} {facts.label} (macro mean), {macro.value:+.{facts.digits}f} "
+    text += f"{facts.unit} against {order[1]}, the next"
+    if macro.low is not None and macro.high is not None:
+        text += f" (95 % interval {macro.low:+.2f} to {macro.high:+.2f}"
+        text += ")" if macro.low > 0 or macro.high < 0 else ": not told apart)"
+    return f"{text}.{tail}"
+
+
+def _cost(runs: Sequence[MethodRuns]) -> CostAnalysis | None:
+    try:
+        return analyse_cost(runs, HEADLINE)
+    except UsageError:
+        # No method left a curve; everything else can be shown all the same.
+        return None
+
+
+def _optional(*makers: Callable[[], Table | None]) -> list[Table]:
+    """Return the tables that these results hold enough for."""
+    found = []
+    for make in makers:
+        try:
+            table = make()
+        except UsageError:
+            continue
+        found += [table] if table is not None else []
+    return found
+
+
+def _seeds(chosen: Sequence[Source], runs: Sequence[MethodRuns]) -> Table | None:
+    return seeds_table(chosen) if any(len(run.seeds) > 1 for run in runs) else None
+
+
+def _bars(runs: Sequence[MethodRuns]) -> Markup | None:
+    groups = {}
+    for name, weights in scopes(runs[0].first).items():
+        if name in PERTURBATIONS:
+            groups[perturbation(name).heading] = [
+                Bar(
+                    index,
+                    bootstrap_mean(
+                        [run.values(c, HEADLINE, sorted(run.seeds)) for c in weights],
+                        list(weights.values()),
+                        resamples=2000,
+                    ),
+                )
+                for index, run in enumerate(runs)
+            ]
+    return bar_plot(groups, HEADLINE) if groups else None
+
+
+def _differences(runs: Sequence[MethodRuns]) -> list[Table]:
+    if len(runs) < 2:
+        return []
+    try:
+        found = compare(runs, HEADLINE)
+    except UsageError:
+        # No seed in common.
+        return []
+    return [
+        standings_table(HEADLINE, standings(runs, HEADLINE, found)),
+        differences_table(HEADLINE, found),
+    ]
+
+
+def _captures(
+    sources: Sequence[Source],
+    runs: Sequence[MethodRuns],
+    infos: Mapping[str, CaptureInfo],
+    album: Album,
+) -> list[CaptureSection]:
+    first = {run.label: run.first for run in runs}
+    shown = [
+        (label, source) for label, f in first.items() for source in sources if source.results is f
+    ]
+    sections = []
+    for capture in runs[0].first.captures:
+        info = infos.get(capture.digest)
+        methods, frames, masks = [], [], []
+        for index, (label, source) in enumerate(shown):
+            own = next(c for c in source.results.captures if c.id == capture.id)
+            weights = temporal_weights(source, capture.id)
+            methods.append(StripMethod(index, label, own, weights))
+            if uri := frame_sheets(source, capture.id, album):
+                frames.append((label, uri))
+            if found := mask_sheet(source, capture.id, album):
+                masks.append((label, *found))
+        hands = "two hands" if capture.hands == "both" else f"{capture.hands} hand"
+        carried = ", ".join(perturbation(name).title for name in capture.perturbations)
+        text = f"{hands}; {carried or 'no perturbation'}"
+        if info:
+            text = f"{info.action}: {text}; {info.frame_count} frames, {info.width}x{info.height}"
+        strip = strip_plot(methods, info, HEADLINE)
+        sections.append(CaptureSection(capture.id, text, strip, info is not None, frames, masks))
+    return sections
+
+
+def _provenance(result: Results) -> dict[str, str]:
+    environment = result.environment
+    packages = environment.get("packages", {})
+    devices = sorted({capture.device for capture in result.captures if capture.device})
+    limits = [f"{value:g} {name}" for name, value in result.budget.items() if value]
+    return {
+        "Method": f"{result.method.title} ({result.method.name}), preset {result.method.preset}",
+        "Settings": ", ".join(f"{k} = {v}" for k, v in result.method.settings.items()) or "none",
+        "Suite, frames, seed": f"{result.suite}, {result.frames}, {result.seed}",
+        "Budget": ", ".join(limits) or "none",
+        "Started": result.started,
+        "Device": ", ".join(devices) or "not said",
+        "System": f"{environment.get('system', '?')}, {environment.get('processor', '?')}, "
+        f"{environment.get('cores', '?')} cores, Python {environment.get('python', '?')}",
+        "Packages": ", ".join(f"{k} {v}" for k, v in packages.items())
+        if isinstance(packages, dict)
+        else "?",
+        "Toolkit": result.toolkit,
+        "Method digest": result.method.digest,
+    }
+
+
+def _digests(result: Results) -> list[dict[str, str]]:
+    return [
+        {
+            "method": f"{result.method.title}, seed {result.seed}",
+            "capture": capture.id,
+            "data": capture.digest,
+            "split": capture.split_digest,
+            "predictions": capture.predictions_digest,
+        }
+        for capture in result.captures
+    ]

@@ -1,0 +1,80 @@
+"""From a gathered report to one HTML file that needs nothing else."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from hwp_bench.files import atomic_write
+from hwp_bench.report.page.content import Report, gather
+from hwp_bench.report.sources import Source
+
+#: Name of the page.
+PAGE = "index.html"
+
+
+def style_sheet() -> Markup:
+    """Return the style sheet of every page; it is ours and goes in as it is."""
+    folder = resources.files("hwp_bench.report.page").joinpath("templates")
+    return Markup(folder.joinpath("style.css").read_text("utf-8"))
+
+
+def render_template(package: str, name: str, **values: Any) -> str:
+    """Return a filled template; every value that is no `Markup` is escaped.
+
+    Args:
+        package: package with a folder `templates`.
+        name: the template in it.
+        values: what it shows.
+    """
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader(package),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    return environment.get_template(name).render(**values)
+
+
+def render_report(report: Report, title: str) -> str:
+    """Return the page of a report."""
+    return render_template(
+        "hwp_bench.report.page",
+        "report.html.j2",
+        report=report,
+        title=title,
+        style=style_sheet(),
+    )
+
+
+def write_report(
+    folder: Path,
+    sources: Sequence[Source],
+    captures: Sequence[str | os.PathLike[str]] = (),
+    *,
+    base: str | None = None,
+    title: str | None = None,
+) -> Path:
+    """Write the report of some results; returns the page.
+
+    Args:
+        folder: where `index.html` goes.
+        sources: the evaluations.
+        captures: capture folders, for severities.
+        base: method that shares of the gap are counted from.
+        title: heading; None names the methods.
+
+    Raises:
+        UsageError: the results cannot stand on one page.
+    """
+    report = gather(sources, captures, base=base)
+    heading = title or "HWP bench: " + ", ".join(report.methods)
+    return atomic_write(folder / PAGE, render_report(report, heading))
