@@ -7,6 +7,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hwp_bench.cost.front import FrontPart, MeanCurve
 from hwp_bench.files import atomic_write
 from hwp_bench.metrics import metric as metric_facts
@@ -42,7 +44,9 @@ def draw_pareto(curves: Sequence[MeanCurve], front: Sequence[FrontPart], metric:
         curve = by_label[part.label]
         inside = (curve.seconds >= part.start) & (curve.seconds <= part.stop)
         seconds = [part.start, *curve.seconds[inside], part.stop]
-        scores = [part.first_score, *curve.scores[inside], part.last_score]
+        # Where the leader falls back for a while, the front keeps the best score so far.
+        best = np.maximum if facts.higher_is_better else np.minimum
+        scores = best.accumulate([part.first_score, *curve.scores[inside], part.last_score])
         label = "Pareto front" if index == 0 else None
         axes.plot(seconds, scores, color="#F0C808", linewidth=9, alpha=0.55, label=label,
                   solid_capstyle="round", zorder=1)  # fmt: skip
@@ -78,8 +82,6 @@ def draw_pareto(curves: Sequence[MeanCurve], front: Sequence[FrontPart], metric:
 
 def _limit(axes: Any, curves: Sequence[MeanCurve]) -> None:
     """Let the curves fill the picture: wide bands of few captures would press them flat."""
-    import numpy as np
-
     scores = np.concatenate([curve.scores for curve in curves])
     span = max(float(np.ptp(scores)), 1e-9)
     bottom, top = float(scores.min()) - 0.35 * span, float(scores.max()) + 0.35 * span

@@ -55,6 +55,8 @@ STUDIES = (
     Study(11, 15, weighted=True, seeds=3),
     Study(8, 6, skewed=True),
     Study(11, 15, skewed=True),
+    Study(4, 6, within=0.3, skewed=True),
+    Study(8, 6, within=0.3, skewed=True),
 )
 
 
