@@ -33,10 +33,10 @@ class OfficialFolder:
 def find_folders(
     path: str | os.PathLike[str], identifier: str | None = None
 ) -> list[OfficialFolder]:
-    """Find the captures of a folder: itself, or its subfolders.
+    """Find the captures of a folder: itself, or its subfolders down to the third level.
 
     Args:
-        path: a folder with `output.pkl`, or a folder of such folders.
+        path: a folder with `output.pkl`, or one that such folders lie in, as in a download.
         identifier: id of the capture where the folder has no name of the release.
 
     Raises:
@@ -46,7 +46,9 @@ def find_folders(
     root = Path(path)
     if not root.is_dir():
         raise BadInput("is no folder", where=root)
-    candidates = [root] if _pickles(root) else sorted(p for p in root.iterdir() if _pickles(p))
+    deeper = ("*", "*/*", "*/*/*")
+    below = sorted({file.parent for level in deeper for file in root.glob(f"{level}/output*.pkl")})
+    candidates = [root] if _pickles(root) else below
     if not candidates:
         raise BadInput(
             "holds no output.pkl, neither in itself nor in its folders",
@@ -68,7 +70,7 @@ def find_folders(
 
 
 def _pickles(folder: Path) -> tuple[Path, ...]:
-    return tuple(sorted(folder.glob("output*.pkl"))) if folder.is_dir() else ()
+    return tuple(sorted(folder.glob("output*.pkl")))
 
 
 def _folder(path: Path, identifier: str | None) -> OfficialFolder:
