@@ -7,7 +7,7 @@ import numpy as np
 from hwp_bench.sim.scene import CLEAN_FROM, EffectCall, Scene
 
 #: Share of an episode in which it rises, and in which it falls.
-RAMP = 0.3
+RAMP = 0.2
 #: A level below this rounds to severity 0: the effect is absent.
 ACTIVE_FROM = 0.5
 # Moments at which the share of clean frames is measured.

@@ -11,13 +11,19 @@ from hwp_bench.sim.scene import Scene
 from hwp_bench.sim.seeds import generator
 
 #: Error of a good estimator on an easy frame: rad and m.
-EASY_ERROR = (0.005, 0.0004)
+EASY_ERROR = (0.003, 0.00025)
 #: How much of a frame's error is the last frame's.
 CORRELATION = 0.85
+#: Share of the error's variance that is the estimator's habit: the same in every hard frame of a
+#: capture, as a regressor leans towards the poses it knows.
+HABIT = 0.5
 #: Chance of a gross failure in a frame of severity 4 or 5 of an effect that moves the hand.
 FAILURE_CHANCE = 0.06
 #: Least and largest share of an occluder over the hand that a segmenter takes for hand.
-OCCLUDER_TAKEN = (0.2, 0.9)
+OCCLUDER_TAKEN = (0.35, 1.0)
+#: Share of hand from which a segmenter takes a pixel for hand: in sharp pictures, and where the
+#: shutter smears hand and background into each other.
+TAKEN_FROM = (0.5, 0.2)
 _MOVING = ("complex_poses", "motion_blur")
 
 
@@ -26,8 +32,9 @@ def estimate_hands(
 ) -> dict[str, HandParameters]:
     """Hand parameters as an estimator gives them.
 
-    The noise is correlated in time and grows with the effects that act. A gross failure keeps
-    finite parameters, far off, and is flagged by `valid`.
+    The error grows with the effects that act. One part of it wanders in time, the other is the
+    estimator's habit, which no averaging over frames removes. A gross failure keeps finite
+    parameters, far off, and is flagged by `valid`.
 
     Args:
         scene: the scene.
@@ -41,7 +48,9 @@ def estimate_hands(
     estimates = {}
     for side, exact in truth.items():
         rng = generator(scene.seed, "estimator", side, len(plans))
-        noise = _correlated(rng.normal(size=(len(plans), 17, 3)))
+        wander = _correlated(rng.normal(size=(len(plans), 17, 3)))
+        habit = generator(scene.seed, "habit", side).normal(size=(17, 3))
+        noise = np.sqrt(1.0 - HABIT) * wander + np.sqrt(HABIT) * habit
         failed = hard & (rng.uniform(size=len(plans)) < FAILURE_CHANCE)
         gross = np.where(failed, 5.0, 1.0)
         turn = (angle * gross)[:, None, None] * noise[:, :16]
@@ -63,7 +72,7 @@ def estimate_mask(
     """Visible-hand mask as a segmenter gives it.
 
     Soft and slightly displaced borders, bites around occluders, parts of occluders taken for
-    hand, and now and then a missed part.
+    hand, smeared borders taken for hand, and now and then a missed part.
 
     Args:
         scene: the scene.
@@ -92,7 +101,8 @@ def estimate_mask(
         soft = np.maximum(soft, gaussian_filter(covered * _taken(covered, rng), unit))
     if rng.uniform() < (0.10 if plan.strength else 0.02) and coverage.sum() > 10:
         soft = soft * _missed_part(coverage, rng)
-    mask = np.clip((soft - 0.5 + wobble) / 0.35 + 0.5, 0.0, 1.0)
+    taken_from = TAKEN_FROM["shutter" in plan.passes]
+    mask = np.clip((soft - taken_from + wobble) / 0.35 + 0.5, 0.0, 1.0)
     return np.round(255.0 * mask).astype(np.uint8)
 
 

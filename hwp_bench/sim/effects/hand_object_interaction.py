@@ -132,7 +132,7 @@ class _HandObjectInteraction(Effect):
         return tuple(placements)
 
     def estimate_error(self, strength: float) -> tuple[float, float]:
-        return 0.012 * strength, 0.0015 * strength
+        return 0.06 * strength, 0.003 * strength
 
 
 def _settings(scene: Scene) -> tuple[tuple[Item, ...], dict[str, HandKey]]:
