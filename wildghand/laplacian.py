@@ -40,7 +40,7 @@ class SurfaceLaplacian:
             values: (..., N, C).
 
         Returns:
-            (..., N, C).
+            (..., N, C) in the matrix's type.
 
         Raises:
             ShapeMismatch: not N rows.
@@ -50,7 +50,7 @@ class SurfaceLaplacian:
             raise ShapeMismatch(
                 f"has shape {tuple(values.shape)}, wanted (..., {count}, C)", field="values"
             )
-        rows = values.movedim(-2, 0).reshape(count, -1)
+        rows = values.movedim(-2, 0).reshape(count, -1).to(self.matrix.dtype)
         made = _Product.apply(rows, self.matrix, self.transposed)
         return made.reshape(count, *values.shape[:-2], values.shape[-1]).movedim(0, -2)
 

@@ -29,7 +29,7 @@ GRADIENT_TOLERANCE = 1e-4
 
 _SIZE = 16
 _GAUSSIANS = 24
-_PRINTED = PaoSettings(normalise_errors=False)
+_PRINTED = PaoSettings(normalise_errors=False, share_of="hand")
 _Entry = tuple[str, str, Callable[[Context], Measured]]
 
 

@@ -37,8 +37,9 @@ class PaoSettings:
     background_threshold: float = 3.0
     #: What mu is a share of: "hand" = |region and hand| / |hand|, the paper's formula, which
     #: wants regions as large as a hand; "region" = |region and hand| / |region|, the paper's
-    #: sentence, which superpixels can reach too.
-    share_of: Literal["hand", "region"] = "hand"
+    #: sentence, which superpixels can reach too. "auto" takes the formula where regions may
+    #: overlap (Segment Anything's) and the sentence for a partition into superpixels.
+    share_of: Literal["auto", "hand", "region"] = "auto"
     #: Stretch the errors of a batch's regions to [0, 1], as the authors do; equal ones become 0.
     normalise_errors: bool = True
     #: Weight outside the hand in the variant "binary".
@@ -53,7 +54,7 @@ class PaoSettings:
                 )
         for name, known in (
             ("variant", ("weights", "binary")),
-            ("share_of", ("hand", "region")),
+            ("share_of", ("auto", "hand", "region")),
         ):
             if getattr(self, name) not in known:
                 raise UsageError(
@@ -139,7 +140,10 @@ class PerturbationAwareWeights(nn.Module):
         errors = regions.sums(error * counted) / pixels.clamp(min=1.0)
         if self.settings.normalise_errors:
             errors = _stretch(errors, pixels > 0.0)
-        if self.settings.share_of == "hand":
+        share_of = self.settings.share_of
+        if share_of == "auto":
+            share_of = "region" if regions.membership is None else "hand"
+        if share_of == "hand":
             whole = on_hand.flatten(1).sum(dim=1, keepdim=True).to(error)
         else:
             whole = regions.sums(torch.ones_like(error))

@@ -14,7 +14,7 @@ from hwp_bench.errors import ShapeMismatch, UsageError
 from wildghand.pao import PaoSettings, PerturbationAwareWeights
 from wildghand.regions import FrameRegions, Regions, overlapping, partition, stack_regions
 
-PRINTED = PaoSettings(normalise_errors=False)
+PRINTED = PaoSettings(normalise_errors=False, share_of="hand")
 SIZE = 12
 
 
@@ -123,6 +123,25 @@ def test_binary_variant_is_the_hand() -> None:
     soft = PerturbationAwareWeights(replace(chosen, binary_outside=0.03))
     weights = soft(error, regions, hand, torch.ones(2)).weights
     torch.testing.assert_close(weights, torch.where(hand, 1.0, 0.03).to(error))
+
+
+def test_superpixels_qualify_unless_the_formula_is_asked_for() -> None:
+    labels = np.arange(SIZE)[:, None] // 2 * 6 + np.arange(SIZE)[None] // 2
+    error, _, _ = scene(frames=1)
+    hand = torch.zeros(1, SIZE, SIZE, dtype=torch.bool)
+    hand[:, 2:10, 3:10] = True
+    superpixels = stack_regions([partition(labels)])
+    masks = np.stack([labels == u for u in range(36)])
+
+    def share(share_of: str, regions: Regions) -> float:
+        module = PerturbationAwareWeights(PaoSettings(share_of=share_of))
+        weights = module(error, regions, hand, torch.zeros(1)).weights.detach()
+        return float((weights[hand] > 0.0).double().mean())
+
+    # All but the region with the largest error, which is stretched to T_E.
+    assert share("auto", superpixels) == share("region", superpixels) > 0.9
+    assert share("hand", superpixels) == 0.0
+    assert share("auto", stack_regions([overlapping(masks)])) == 0.0
 
 
 def test_a_covered_region_counts_less_than_a_visible_one() -> None:
