@@ -14,7 +14,7 @@ from hwp_bench.results import Results
 from hwp_bench.results.schema import score_rows
 from hwp_bench.statistics.compare import macro_by_seed
 from hwp_bench.statistics.pairing import MethodRuns, common_metrics
-from hwp_bench.statistics.tables import estimate_cells, estimate_columns, scope_title
+from hwp_bench.statistics.tables import ONE_CAPTURE, estimate_cells, estimate_columns, scope_title
 from hwp_bench.taxonomy import PERTURBATIONS
 
 #: Scopes of the effects table; perturbations have one of their own.
@@ -73,8 +73,9 @@ def variant_table(ablation: AblationRuns, metrics: Sequence[str]) -> Table:
         rows.append((*marks, *scores, *_times(run)))
     first = next(iter(ablation.runs.values())).first
     protocol = metric_facts(metrics[0]).protocol
+    suite = "" if first.suite == "captures" else f"{first.suite}: "
     note = (
-        f"{first.suite}: {len(first.captures)} captures, seeds "
+        f"{suite}{len(first.captures)} captures, seeds "
         f"{', '.join(map(str, sorted(next(iter(ablation.runs.values())).seeds)))}; protocol "
         f"{protocol}; means over captures of means over test frames, then over seeds. Step and "
         "fit: means over captures and seeds, on the method's own clock."
@@ -120,6 +121,7 @@ def effect_table(effects: Sequence[ScoreEffect]) -> Table:
         Column("P(better)", 3),
         Column("p", 4),
         Column("p (Holm)", 4),
+        Column("Detectable", 4),
     )
     rows = tuple(
         (
@@ -132,17 +134,21 @@ def effect_table(effects: Sequence[ScoreEffect]) -> Table:
             item.better,
             item.estimate.p,
             item.p_adjusted,
+            item.estimate.detectable,
         )
         for item in effects
     )
-    notes = (
+    notes: tuple[str, ...] = (
         "main: score with the component less score without it, mean over the other components "
         "in and out; interaction: what two bring together beyond the sum of what each brings "
         "alone; out: the full method less the one without; alternative: the method less the one "
         "with the alternative.",
         "95 % intervals: paired bootstrap over captures, then seeds and blocks of frames, read "
-        "with Student's t (docs/statistics.md). p (Holm): over the perturbations.",
+        "with Student's t (docs/statistics.md). p (Holm): over the perturbations. Detectable: the "
+        "true effect that such an ablation finds with 80 % probability.",
     )
+    if any(item.estimate.captures == 1 for item in effects):
+        notes = (*notes, ONE_CAPTURE)
     return Table("Effects", columns, rows, notes)
 
 

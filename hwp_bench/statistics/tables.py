@@ -15,7 +15,8 @@ _INTERVAL = (
     "95 % intervals, P and p: paired bootstrap over captures, then seeds and blocks of frames, "
     "read with Student's t (docs/statistics.md)."
 )
-_ONE = (
+#: Said under a table that has such scopes.
+ONE_CAPTURE = (
     "Scopes of one capture speak only of further frames of that capture, not of further captures."
 )
 
@@ -97,5 +98,5 @@ def differences_table(metric: str, found: Sequence[Difference]) -> Table:
         "Detectable: the true difference that such a comparison finds with 80 % probability.",
     ]
     if any(item.estimate.captures == 1 for item in found):
-        notes.append(_ONE)
+        notes.append(ONE_CAPTURE)
     return Table(f"{facts.label}: differences", columns, rows, tuple(notes))
