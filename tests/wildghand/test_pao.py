@@ -157,7 +157,7 @@ def test_a_covered_region_counts_less_than_a_visible_one() -> None:
     assert float(ratio.detach()) == pytest.approx(0.4 / 0.98, rel=1e-5)
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 @given(
     omega=st.one_of(st.floats(-1.0, 1.0), st.sampled_from([-1e-3, 1e-3, -1.0, 1.0])),
     value=st.sampled_from([0.0, 1.0, 0.5, float("nan"), float("inf")]),

@@ -19,7 +19,7 @@ def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.rand(*shape, generator=generator, dtype=torch.float64)
 
 
-IMAGE, TARGET, WEIGHTS = uniform(2, 9, 8, 3), uniform(2, 9, 8, 3, seed=1), uniform(2, 9, 8, seed=2)
+IMAGE, TARGET, WEIGHTS = uniform(2, 5, 4, 3), uniform(2, 5, 4, 3, seed=1), uniform(2, 5, 4, seed=2)
 
 #: Each term as a function of tensors that get a gradient.
 TERMS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]]] = {
