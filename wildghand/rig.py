@@ -61,9 +61,7 @@ class HandRig:
             torch.cat([part.orientations for part in parts]),
         )
 
-    def follow(
-        self, pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor
-    ) -> AnchorPoses:
+    def follow(self, pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> AnchorPoses:
         """Pose the anchors of a few frames; the positions are differentiable.
 
         Their frames carry no gradient: it would cost as much again, and what a turned splat
@@ -99,9 +97,16 @@ def make_rig(
         UsageError: `count` is below 1.
         BadHandModel: the surface has no area.
     """
+    return rig_of(template, sample_surface(template, count, seed), device)
+
+
+def rig_of(
+    template: HandTemplate, anchors: SurfaceAnchors, device: torch.device | str = "cpu"
+) -> HandRig:
+    """Make a rig of given anchors; see `make_rig`."""
     tensors = template.to_torch(torch.float32, device)
-    anchors = sample_surface(template, count, seed).to_torch(torch.float32, device)
     corners = tensors.vertices[tensors.faces]
     edges = corners[:, 1:] - corners[:, :1]
     area = 0.5 * torch.linalg.cross(edges[:, 0], edges[:, 1]).norm(dim=-1).sum()
-    return HandRig(tensors, anchors, float((area / count).sqrt()))
+    spacing = float((area / len(anchors)).sqrt())
+    return HandRig(tensors, anchors.to_torch(torch.float32, device), spacing)

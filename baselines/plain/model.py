@@ -42,6 +42,10 @@ class PlainModel:
         rest = {name: value for name, value in values.items() if name != "light"}
         return replace(self, gaussians=AnchoredGaussians(**rest), light=values["light"])
 
+    def finite(self) -> bool:
+        """Whether every fitted number is finite."""
+        return all(bool(value.isfinite().all()) for value in self.parameters().values())
+
     def snapshot(self) -> PlainModel:
         """A copy that the fit no longer changes."""
         copies = {name: value.detach().clone() for name, value in self.parameters().items()}

@@ -39,7 +39,7 @@ def settings_from(cls: type[Settings], values: Mapping[str, Any], where: str) ->
     and so does `--set name.field=value`.
 
     Args:
-        cls: a dataclass whose fields are bool, int, float, str, or such dataclasses, each with a
+        cls: a dataclass whose fields are bool, int, float, str, Literal, or such dataclasses, each with a
             default; numbers may be bounded by `number`, words by `choice`. An unbounded number
             must not be negative.
         values: any of its fields; later entries win over earlier ones.
@@ -99,6 +99,9 @@ def _checked(value: Any, kind: Any, rules: Mapping[str, Any], where: str, field:
     def bad(remedy: str) -> BadMethod:
         return BadMethod(f"is {str(value)[:_SHOWN]!r}", where=where, field=field, remedy=remedy)
 
+    choices = rules.get("choices")
+    if typing.get_origin(kind) is typing.Literal:
+        kind, choices = str, typing.get_args(kind)
     if isinstance(kind, types.UnionType):  # X | None
         if value is None:
             return None
@@ -108,7 +111,6 @@ def _checked(value: Any, kind: Any, rules: Mapping[str, Any], where: str, field:
             raise bad("Use true or false.")
         return value
     if kind is str:
-        choices = rules.get("choices")
         if not isinstance(value, str) or (choices and value not in choices):
             raise bad(f"Use one of {', '.join(choices)}." if choices else "Use a text.")
         return value

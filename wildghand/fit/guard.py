@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from typing import Generic, Protocol, TypeVar
-
-import torch
+from typing import Any, Generic, Protocol, TypeVar
 
 from hwp_bench.errors import DidNotConverge
 
@@ -15,23 +12,23 @@ WINDOW = 50
 #: A mean loss of a window beyond this multiple of the best one means divergence.
 MAX_RISE = 3.0
 
+Snapshot = TypeVar("Snapshot", covariant=True)
+Kept = TypeVar("Kept")
 
-class Fitted(Protocol):
+
+class Fitted(Protocol[Snapshot]):
     """A model that is being fitted."""
 
-    def parameters(self) -> Mapping[str, torch.Tensor]:
-        """The fitted tensors by name."""
+    def finite(self) -> bool:
+        """Whether every fitted number is finite."""
         ...
 
-    def snapshot(self: Model) -> Model:
-        """A copy that the fit no longer changes."""
+    def snapshot(self) -> Snapshot:
+        """A copy of the state that the fit no longer changes."""
         ...
 
 
-Model = TypeVar("Model", bound=Fitted)
-
-
-class Guard(Generic[Model]):
+class Guard(Generic[Kept]):
     """Watches the loss of a fit.
 
     Attributes:
@@ -41,10 +38,10 @@ class Guard(Generic[Model]):
     def __init__(self) -> None:
         self.step = 0
         self._best_loss = math.inf
-        self._best: Model | None = None
+        self._best: Kept | None = None
         self._losses: list[float] = []
 
-    def watch(self, step: int, loss: float, model: Model) -> bool:
+    def watch(self, step: int, loss: float, model: Fitted[Kept]) -> bool:
         """Take note of the loss of `model` after `step` steps; False means divergence."""
         if not math.isfinite(loss):
             return False
@@ -53,13 +50,13 @@ class Guard(Generic[Model]):
             return True
         mean = sum(self._losses) / len(self._losses)
         self._losses.clear()
-        if not all(bool(value.isfinite().all()) for value in model.parameters().values()):
+        if not model.finite():
             return False
         if mean < self._best_loss:
             self._best_loss, self._best, self.step = mean, model.snapshot(), step
         return mean <= MAX_RISE * self._best_loss
 
-    def best(self) -> Model:
+    def best(self) -> Kept:
         """The state with the lowest loss.
 
         Raises:
@@ -71,3 +68,19 @@ class Guard(Generic[Model]):
                 remedy="Lower the learning rates, or check the capture's hand parameters.",
             )
         return self._best
+
+    def state_dict(self) -> dict[str, Any]:
+        """What `load_state_dict` takes."""
+        return {
+            "step": self.step,
+            "best_loss": self._best_loss,
+            "best": self._best,
+            "losses": list(self._losses),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.step = int(state["step"])
+        self._best_loss = float(state["best_loss"])
+        self._best = state["best"]
+        self._losses = [float(loss) for loss in state["losses"]]

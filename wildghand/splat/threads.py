@@ -4,8 +4,8 @@ Kernels release the interpreter lock and share out their jobs themselves (see `k
 any threads do. The best are those of torch's own OpenMP: after an operation of torch they spin
 for some milliseconds in wait for the next one, and threads of ours would have to compete with
 them for the cores. Where torch has no OpenMP, in a forked child, whose OpenMP is dead, and on a
-machine that is busy otherwise, plain threads take their place. Numba's own layers are no choice: they forbid two callers at once or end
-the process on a fork.
+machine that is busy otherwise, plain threads take their place. Numba's own layers are no choice:
+they forbid two callers at once or end the process on a fork.
 
 How many threads: `torch.get_num_threads()`. Results do not depend on it.
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 import pytest
 
@@ -14,6 +15,7 @@ from hwp_bench.methods.settings import choice, number, settings_from
 class Inner:
     width: int = number(4, 1, 10)
     kind: str = choice("one", "two")
+    shape: Literal["round", "flat"] = "round"
 
     def __post_init__(self) -> None:
         if self.width == 7:
@@ -49,6 +51,7 @@ def test_what_comes_later_wins() -> None:
         ({"inner": {"width": 11}}, r"inner\.width: is '11'.*1 to 10"),
         ({"inner": {"width": 7}}, "inner: .*width.*is 7"),
         ({"inner.kind": "three"}, "one, two"),
+        ({"inner.shape": "oval"}, r"inner\.shape: is 'oval'.*round, flat"),
         ({"on": 1}, "on: .*true or false"),
         ({"limit": "none"}, "limit: .*a number"),
         ({"rate": {"a": 1}}, "rate"),

@@ -1,0 +1,171 @@
+"""A fit: everything that changes from step to step, and one step."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+
+from hwp_bench.methods.request import TrainingCapture
+from wildghand.assemble import assemble, make_rigs
+from wildghand.avatar import FitRecord, WildGHandAvatar
+from wildghand.fit.clip import TrainingClip
+from wildghand.fit.frames import load_frames
+from wildghand.fit.objective import Objective
+from wildghand.fit.rates import make_optimizer, set_rates
+from wildghand.fit.weighting import Weighting
+from wildghand.model import Drawing
+from wildghand.settings import WildGHandSettings
+
+
+class Fit:
+    """One fit of one capture.
+
+    Args:
+        training: what may be seen of the capture.
+        settings: how.
+        seed: of anchors, initial weights, order of the frames, and dropout.
+        device: where it runs.
+
+    Raises:
+        BadInput: no training frame can be used.
+    """
+
+    def __init__(
+        self,
+        training: TrainingCapture,
+        settings: WildGHandSettings,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self.training = training
+        self.settings = settings
+        self.seed = seed
+        self.device = device
+        self.frames = load_frames(training)
+        templates = {side: training.template(side) for side in training.sides}
+        rigs = make_rigs(templates, settings.gaussians, seed, device)
+        self.mean_color = self.frames.mean_color()
+        self.model = assemble(
+            templates, rigs, settings, self.mean_color, len(self.frames), seed
+        ).to(device)
+        self.clip = TrainingClip(training, self.frames.indices, rigs, device)
+        self.weighting = Weighting(training, self.frames, settings, device)
+        self.objective = Objective(settings, rigs)
+        self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def step(self, rows: torch.Tensor, fraction: float) -> float:
+        """Take one step on a batch.
+
+        Args:
+            rows: (B,) int64, which of the training frames.
+            fraction: share of the budget that is used up.
+
+        Returns:
+            The loss; nothing is changed where it is not finite.
+        """
+        settings, weighting = self.settings, self.weighting
+        set_rates(self.optimizer, settings, fraction)
+        drawing = self.draw(rows, weighting.drop_probability[rows])
+        target = weighting(rows, drawing, fraction)
+        loss = self.objective(self.model, drawing, target, rows, weighting.clean[rows])
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            return value
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        if settings.clip_gradient > 0.0:
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
+        self.optimizer.step()
+        return value
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that steps change; what `load_state_dict` takes."""
+        return {
+            "model": self.model.state_dict(),
+            "thresholds": self.weighting.pao.state_dict(),
+            "median": self.weighting.median,
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.model.load_state_dict(state["model"])
+        self.weighting.pao.load_state_dict(state["thresholds"])
+        self.weighting.median = None if state["median"] is None else float(state["median"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"].cpu())
+
+    def draw(self, rows: torch.Tensor, drop_probability: torch.Tensor | None = None) -> Drawing:
+        """Draw training frames with everything that is particular to them.
+
+        Args:
+            rows: (B,) int64, which of the training frames.
+            drop_probability: (B,) chance that a frame's biases are left out; None: never.
+        """
+        with self._precision():
+            return self.model.draw_frames(
+                self.clip,
+                rows,
+                self.training.width,
+                self.training.height,
+                drop_probability=drop_probability,
+                generator=self.generator,
+                move=self.weighting.moves(rows),
+                refine=self.settings.refines,
+            )
+
+    def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
+        """The avatar as it stands; it goes on changing with the fit.
+
+        Args:
+            steps: optimiser steps behind it.
+            seconds: of fitting.
+            final: also record the temporal weights and weight masks of all frames.
+        """
+        hands = self.training.hands
+        return WildGHandAvatar(
+            self.model,
+            self.settings,
+            self.training.hand_model,
+            {side: hands[side].betas for side in self.model.rigs},
+            self.mean_color,
+            self.seed,
+            FitRecord(
+                frames=self.frames.indices.tolist(),
+                temporal=self._temporal() if final else {},
+                clean=self.weighting.clean.tolist(),
+                steps=steps,
+                seconds=seconds,
+                source={"capture": self.training.id},
+            ),
+            self._weight_masks() if final else None,
+        )
+
+    @torch.no_grad()
+    def _weight_masks(self) -> dict[int, np.ndarray]:
+        """The weights of every training frame as pictures, 255 = the largest of the frame."""
+        masks = {}
+        if self.settings.pao:
+            for row, frame in enumerate(self.frames.indices.tolist()):
+                rows = torch.tensor([row])
+                weights = self.weighting(rows, self.draw(rows), 1.0).weights[0]
+                largest = weights.max().clamp(min=1.0 if self.settings.additions else 1e-12)
+                masks[frame] = (255.0 * weights / largest).byte().cpu().numpy()
+        return masks
+
+    def _precision(self) -> torch.autocast:
+        wanted = self.settings.mixed_precision and self.device.type == "cuda"
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=wanted)
+
+    @torch.no_grad()
+    def _temporal(self) -> dict[str, list[float]]:
+        rows = torch.arange(len(self.frames), device=self.device)
+        return {
+            side: self.model.biases_of(side).temporal(rows).omega.tolist()
+            for side in self.model.perturbation
+        }

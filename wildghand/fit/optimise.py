@@ -1,0 +1,93 @@
+"""The loop of a fit: steps within a budget, checkpoints, and what is kept of a failed one."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from hwp_bench.methods.contract import Budget, Report
+from hwp_bench.progress import notice
+from wildghand.avatar import WildGHandAvatar
+from wildghand.fit.fit import Fit
+from wildghand.fit.guard import Guard
+from wildghand.fit.plateau import Plateau
+from wildghand.fit.schedule import batches, spent
+
+#: Steps between two offers of a checkpoint.
+REPORT_EVERY = 10
+
+
+class Watchers:
+    """What watches the loss of a fit.
+
+    Args:
+        plateau_steps: window of the plateau; 0 never stops early.
+    """
+
+    def __init__(self, plateau_steps: int) -> None:
+        self.guard: Guard[dict[str, torch.Tensor]] = Guard()
+        self.plateau = Plateau(plateau_steps)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What `load_state_dict` takes."""
+        return {"guard": self.guard.state_dict(), "plateau": self.plateau.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.guard.load_state_dict(state["guard"])
+        self.plateau.load_state_dict(state["plateau"])
+
+
+def optimise(
+    fit: Fit,
+    budget: Budget,
+    report: Report,
+    *,
+    start: int = 0,
+    watchers: Watchers | None = None,
+    after_step: Callable[[int, Watchers], None] | None = None,
+) -> WildGHandAvatar:
+    """Take steps until the budget is spent, the loss stands still, or the fit diverges.
+
+    Args:
+        fit: what is fitted.
+        budget: when to stop; without steps the settings' number holds.
+        report: where checkpoints are offered.
+        start: steps that `fit` has behind it.
+        watchers: those of the fit so far, where it goes on.
+        after_step: called with the number of steps after each; saves, for instance.
+
+    Returns:
+        The last state; the best one if the fit diverged later.
+
+    Raises:
+        DidNotConverge: the fit diverged without ever having been better than its start.
+    """
+    settings = fit.settings
+    steps = settings.steps if budget.steps is None else budget.steps
+    order = batches(len(fit.frames), settings.batch, fit.seed)
+    for _ in range(start):
+        next(order)
+    watchers = watchers or Watchers(settings.plateau_steps)
+    step = start
+    while step < steps and (fraction := spent(step, steps, budget, report)) < 1.0:
+        loss = fit.step(next(order), fraction)
+        if not watchers.guard.watch(step, loss, fit.model):
+            fit.model.load_state_dict(watchers.guard.best())
+            notice(
+                f"The fit diverged at step {step}; the state of step {watchers.guard.step} is kept."
+            )
+            step = watchers.guard.step
+            break
+        step += 1
+        report.progress(step, steps)
+        if step % REPORT_EVERY == 0:
+            report(step, fit.avatar(step))
+        if after_step is not None:
+            after_step(step, watchers)
+        if watchers.plateau.reached(loss):
+            notice(f"The loss has stood still for {settings.plateau_steps} steps; finished early.")
+            break
+    return fit.avatar(step, report.elapsed, final=True)

@@ -1,0 +1,47 @@
+"""Adam with a step for each group of parameters, and how the steps fall."""
+
+from __future__ import annotations
+
+import torch
+
+from wildghand.model import WildGHandModel
+from wildghand.network import parameter_groups
+from wildghand.pao import PerturbationAwareWeights
+from wildghand.settings import WildGHandSettings
+
+# Gradients of a mean over all pixels are small beside Adam's usual 1e-8.
+_EPSILON = 1e-15
+_BETAS = (0.9, 0.99)
+
+
+def make_optimizer(
+    model: WildGHandModel, weights: PerturbationAwareWeights, settings: WildGHandSettings
+) -> torch.optim.Adam:
+    """Adam over everything that is fitted; each group keeps its first rate as `start`."""
+    rates = settings.rates
+    groups = {name: list(group) for name, group in parameter_groups(model.network).items()}
+    groups["dpd"] = list(model.perturbation.parameters())
+    groups["thresholds"] = list(weights.parameters())
+    groups["gains"] = [model.log_gains]
+    groups["pose"] = [model.pose_steps]
+    groups["transl"] = [model.transl_steps]
+    return torch.optim.Adam(
+        [
+            {"params": group, "lr": getattr(rates, name), "start": getattr(rates, name)}
+            for name, group in groups.items()
+            if group
+        ],
+        eps=_EPSILON,
+        betas=_BETAS,
+        fused=True,
+    )
+
+
+def set_rates(optimizer: torch.optim.Adam, settings: WildGHandSettings, fraction: float) -> None:
+    """Set the steps for a share of the budget that is used up."""
+    if settings.decay == "halving":
+        factor = 0.5 ** int(fraction * settings.halvings)
+    else:
+        factor = settings.final_rate**fraction
+    for group in optimizer.param_groups:
+        group["lr"] = group["start"] * factor

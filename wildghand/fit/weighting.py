@@ -1,0 +1,135 @@
+"""How much each frame and each pixel of it counts, and what a rendering is compared with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hwp_bench.methods.request import TrainingCapture
+from wildghand.fit.frames import TrainingFrames
+from wildghand.model import Drawing
+from wildghand.pao import PerturbationAwareWeights
+from wildghand.prepass import Judgement, PrepassInput, judge_frames
+from wildghand.regions import FrameRegions, Regions, stack_regions
+from wildghand.regions.cache import RegionCache
+from wildghand.regions.superpixels import Superpixels
+from wildghand.robust import blended_residual, residual_weights, running_median
+from wildghand.settings import WildGHandSettings
+
+
+@dataclass(frozen=True, eq=False)
+class Target:
+    """What the drawing of B frames is compared with."""
+
+    #: (B, H, W, 3) sRGB over black outside the mask.
+    image: Tensor
+    #: (B, H, W) estimated coverage of the visible hand.
+    hand: Tensor
+    #: (B, H, W) weight of each pixel.
+    weights: Tensor
+
+
+class Weighting:
+    """Weights of pixels, by the settings' components.
+
+    Without PAO a pixel counts as the estimated mask says. With it, frames that the pre-pass
+    finds perturbed count less, and so do pixels whose residual stays large; in the mode `paper`
+    the regions' weights of the paper take the place of both.
+
+    Args:
+        training: what may be seen of the capture.
+        frames: the R frames that are fitted.
+        settings: which components are on.
+        device: where the tensors live.
+
+    Attributes:
+        judgement: of the pre-pass; None without it.
+        clean: (R,) probability that a frame is clean; ones without the pre-pass.
+        drop_probability: (R,) chance that a frame's biases are left out.
+        pao: the paper's weights, whose thresholds are learnt.
+    """
+
+    def __init__(
+        self,
+        training: TrainingCapture,
+        frames: TrainingFrames,
+        settings: WildGHandSettings,
+        device: torch.device,
+    ) -> None:
+        count = len(frames)
+        self.frames, self.settings, self.device = frames, settings, device
+        self.judgement = judge(training, frames, settings) if settings.judges else None
+        self.clean = torch.ones(count)
+        self.drop_probability = torch.full((count,), settings.omega_dropout)
+        self._move = torch.zeros(count, dtype=torch.bool)
+        self._frame_weights = torch.ones(count, device=device)
+        self._initial: Tensor | None = None
+        if self.judgement is not None:
+            self.clean = torch.from_numpy(self.judgement.clean).float()
+            self.drop_probability = torch.from_numpy(self.judgement.omega_dropout).float()
+            self._move = torch.from_numpy(self.judgement.refine_pose)
+            if settings.weighs_frames:
+                weights = torch.from_numpy(self.judgement.frame_weights).float()
+                self._frame_weights = weights.to(device)
+                self._initial = torch.from_numpy(self.judgement.pixel_weights)
+        self.pao = PerturbationAwareWeights(settings.weights_of(len(training.sides))).to(device)
+        self._regions: list[FrameRegions] | None = None
+        if settings.uses_regions:
+            self._regions = RegionCache().clip(frames.images.numpy(), Superpixels())
+        self.median: float | None = None
+
+    def moves(self, rows: Tensor) -> bool:
+        """Whether the pose of any frame of a batch is refined."""
+        return self.settings.moves_poses and bool(self._move[rows].any())
+
+    def __call__(self, rows: Tensor, drawing: Drawing, fraction: float) -> Target:
+        """Say what a batch is compared with.
+
+        Args:
+            rows: (B,) int64, which of the R frames.
+            drawing: of these frames.
+            fraction: share of the budget that is used up.
+        """
+        settings = self.settings
+        hand = self.frames.masks[rows].to(self.device).float() / 255.0
+        image = self.frames.images[rows].to(self.device).float() / 255.0 * hand[..., None]
+        outside = settings.outside_weight
+        plain = outside + (1.0 - outside) * hand
+        if not settings.pao or settings.binary_mask:
+            return Target(image, hand, (hand > 0.5).float() if settings.binary_mask else plain)
+        error = (drawing.image.detach() - image).abs().mean(dim=-1)
+        if not settings.additions:
+            found = self.pao(error, self._batch_regions(rows), hand, drawing.omega)
+            return Target(image, hand, found.weights)
+        weights = plain * self._frame_weights[rows][:, None, None]
+        if settings.robust and fraction >= settings.robust_start:
+            residual = blended_residual(error, self._batch_regions(rows), hand)
+            self.median = running_median(self.median, residual, hand)
+            weights = weights * residual_weights(residual, self.median)
+        elif self._initial is not None:
+            weights = weights * self._initial[rows].to(self.device).float() / 255.0
+        return Target(image, hand, weights)
+
+    def _batch_regions(self, rows: Tensor) -> Regions:
+        assert self._regions is not None
+        return stack_regions([self._regions[row] for row in rows.tolist()], self.device)
+
+
+def judge(
+    training: TrainingCapture, frames: TrainingFrames, settings: WildGHandSettings
+) -> Judgement:
+    """Run the pre-pass on the frames that are fitted."""
+    return judge_frames(
+        PrepassInput(
+            indices=frames.indices,
+            images=np.asarray(frames.images),
+            masks=np.asarray(frames.masks),
+            hands=training.hands,
+            cameras=training.cameras,
+            templates={side: training.template(side) for side in training.sides},
+        ),
+        settings.judge,
+    )
