@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -190,14 +190,27 @@ def _of_protocol(protocol: Protocol) -> tuple[str, ...]:
 
 def labels(results: Sequence[Results]) -> list[str]:
     """Return a title for each evaluation, told apart by what differs where titles repeat."""
-    titles = [result.method.title for result in results]
     told = []
     for result in results:
-        title = result.method.title
-        if titles.count(title) > 1:
-            title += f" ({result.method.preset}, {result.frames} frames, seed {result.seed})"
-        told.append(title)
+        twins = [other for other in results if other.method.title == result.method.title]
+        parts = [text(result) for text in _TELLING if len({text(twin) for twin in twins}) > 1] or [
+            text(result) for text in _TELLING if len(twins) > 1
+        ]
+        told.append(result.method.title + (f" ({', '.join(parts)})" if parts else ""))
     return told
+
+
+#: What tells evaluations of one title apart.
+_TELLING: tuple[Callable[[Results], str], ...] = (
+    lambda result: result.method.preset,
+    lambda result: f"{result.frames} frames",
+    lambda result: (
+        ", ".join(f"{value:g} {name}" for name, value in result.budget.items() if value)
+        or "no limit"
+    ),
+    lambda result: f"seed {result.seed}",
+    lambda result: result.method.digest[:8],
+)
 
 
 def _cost(result: Results) -> list[Cell]:

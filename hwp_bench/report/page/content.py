@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from markupsafe import Markup
 
@@ -111,7 +111,8 @@ def gather(
     start = base or next((r.first.method.name for r in runs if r.first.method.name == PLAIN), None)
     cost = _cost(runs)
     tables = all_tables([source.results for source in chosen])
-    shown = [tables[name] for name in ("overall", "perturbations", "captures", "paper")]
+    shown = [tables[name] for name in ("overall", "perturbations", "captures")]
+    shown.append(replace(tables["paper"], caption="Protocol paper-wildghand"))
     shown += _optional(
         lambda: robustness_table(sources, start),
         lambda: severity_table(chosen, infos),

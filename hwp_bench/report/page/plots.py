@@ -23,7 +23,7 @@ from hwp_bench.report.page.svg import (
 )
 from hwp_bench.statistics.bootstrap import Estimate
 
-_LEFT, _RIGHT, _TOP, _BOTTOM = 44.0, WIDTH - 10.0, 12.0, 232.0
+_LEFT, _RIGHT, _TOP, _BOTTOM = 44.0, WIDTH - 18.0, 14.0, 232.0
 #: Height of one bar, and of the gap under a group.
 _BAR, _GAP = 14.0, 22.0
 #: Where bars begin.

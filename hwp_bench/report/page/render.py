@@ -70,11 +70,12 @@ def write_report(
         sources: the evaluations.
         captures: capture folders, for severities.
         base: method that shares of the gap are counted from.
-        title: heading; None names the methods.
+        title: heading; None takes the methods' titles.
 
     Raises:
         UsageError: the results cannot stand on one page.
     """
     report = gather(sources, captures, base=base)
-    heading = title or "HWP bench: " + ", ".join(report.methods)
+    titles = dict.fromkeys(source.results.method.title for source in sources)
+    heading = title or "HWP bench: " + ", ".join(titles)
     return atomic_write(folder / PAGE, render_report(report, heading))

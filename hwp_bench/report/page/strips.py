@@ -82,9 +82,9 @@ def strip_plot(methods: Sequence[StripMethod], info: CaptureInfo | None, metric:
             parts += rows
     if info is not None or any(method.weights for method in methods):
         parts += [
-            label(x(tick), height + 10, f"{tick:g}", "middle") for tick in ticks(0, count - 1)
+            label(x(tick), height + 10, f"{tick:g}", "middle") for tick in ticks(0, count - 1)[1:]
         ]
-        parts.append(label(_LEFT - 5, height + 10, "frame", "end"))
+        parts.append(label(2, height + 10, "frame"))
         height += 16
     facts = metric_facts(metric)
     return drawing(height, f"{facts.label} of the test frames of {methods[0].result.id}", parts)

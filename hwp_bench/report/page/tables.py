@@ -15,7 +15,7 @@ def to_html(table: Table) -> Markup:
     heads = []
     if any(column.group for column in table.columns):
         heads.append(tag("tr", join(_groups(table))))
-    titles = [tag("th", column.heading, scope="col") for column in table.columns]
+    titles = [tag("th", _unbroken(column.heading), scope="col") for column in table.columns]
     heads.append(tag("tr", join(titles)))
     bodies: list[Markup] = []
     rows: list[Markup] = []
@@ -47,6 +47,11 @@ def _groups(table: Table) -> list[Markup]:
         else join([Markup(f'<td colspan="{width}"></td>')])
         for group, width in cells
     ]
+
+
+def _unbroken(heading: str) -> str:
+    """Return a heading that keeps its arrow and unit on the line of its last word."""
+    return heading.replace(" ↑", "\u00a0↑").replace(" ↓", "\u00a0↓").replace(" [", "\u00a0[")
 
 
 def _cell(table: Table, row: int, column: int) -> Markup:

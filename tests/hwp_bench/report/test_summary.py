@@ -78,8 +78,8 @@ def test_results_on_different_data_are_not_compared(two) -> None:
 def test_titles_that_repeat_are_told_apart(two) -> None:
     rows = all_tables([two[0], replace(two[0], seed=3)])["overall"].rows
     assert [row[0] for row in rows] == [
-        "Plain (default, perturbed frames, seed 0)",
-        "Plain (default, perturbed frames, seed 3)",
+        "Plain (seed 0)",
+        "Plain (seed 3)",
     ]
 
 
