@@ -12,7 +12,14 @@ def command_tree() -> Command:
     """Return every command of `wildghand`."""
     return Command(
         "anti-perturbation Gaussian hand avatars",
-        commands={"info": Command("show what renders here, and check it", "wildghand.cli.info")},
+        commands={
+            "fit": Command("fit an avatar to a capture or a video", "wildghand.cli.fit"),
+            "render": Command(
+                "draw an avatar along the poses of a capture", "wildghand.cli.render"
+            ),
+            "export": Command("write an avatar as Gaussians for viewers", "wildghand.cli.export"),
+            "info": Command("show what renders here, and check it", "wildghand.cli.info"),
+        },
     )
 
 

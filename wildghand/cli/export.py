@@ -1,0 +1,58 @@
+"""`wildghand export`."""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+_EXAMPLES = """examples:
+  wildghand export my_avatar --ply hand.ply
+  wildghand export my_avatar --ply hand.ply --poses my_capture --frame 100
+
+The PLY file has the layout of 3DGS, which viewers of Gaussian splats read: metres, the hands at
+rest unless a capture and a frame are named.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    parser.add_argument("avatar", type=Path, help="avatar folder")
+    parser.add_argument("--ply", type=Path, required=True, metavar="FILE", help="file to write")
+    parser.add_argument("--poses", type=Path, metavar="CAPTURE", help="capture to take a pose from")
+    parser.add_argument("--frame", type=int, default=0, help="its frame (default: 0)")
+    parser.add_argument("--hand", metavar="MODEL", help="hand model: anny or mano:PATH")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.capture import open_capture
+    from hwp_bench.errors import UsageError
+    from hwp_bench.methods.contract import HandPose
+    from wildghand.avatar_files import load_avatar
+    from wildghand.playback import rest_poses
+    from wildghand.ply import write_ply
+
+    avatar = load_avatar(args.avatar, hand=args.hand)
+    hands = rest_poses(avatar)
+    if args.poses is not None:
+        capture = open_capture(args.poses)
+        if not 0 <= args.frame < capture.info.frame_count:
+            raise UsageError(
+                f"there is no frame {args.frame} of {capture.info.frame_count}", field="--frame"
+            )
+        hands = {
+            side: HandPose(side, hand.pose[args.frame], hand.betas, hand.transl[args.frame])
+            for side, hand in capture.hands.items()
+            if side in avatar.sides
+        }
+    drawn = avatar.gaussians(hands)
+    write_ply(
+        args.ply,
+        *(
+            getattr(drawn, name)[0].cpu().numpy()
+            for name in ("means", "quats", "scales", "opacities", "colors")
+        ),
+    )
+    print(f"{args.ply}: {drawn.means.shape[1]} Gaussians")
+    return 0

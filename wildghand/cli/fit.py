@@ -1,0 +1,120 @@
+"""`wildghand fit`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import Any
+
+_EXAMPLES = """examples:
+  wildghand fit my_capture -o my_avatar
+  wildghand fit my_capture -o my_avatar --seconds 60
+  wildghand fit hand.mp4 --landmarks hand.npz -o my_avatar
+  wildghand fit my_capture -o paper --set mode=paper --set network.size=paper --set device=cuda
+
+A capture is a folder (`hwp-bench data import-video`, `hwp-bench sim render`). A video becomes one
+first, beside the avatar. A stopped fit goes on when the same command is given again.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    parser.add_argument("source", type=Path, metavar="CAPTURE|VIDEO", help="what to fit")
+    parser.add_argument("-o", "--out", type=Path, required=True, help="avatar folder to make")
+    parser.add_argument("--landmarks", type=Path, metavar="NPZ", help="landmarks of a video")
+    parser.add_argument(
+        "--side", choices=("right", "left"), default="right", help="the hand in a video"
+    )
+    parser.add_argument(
+        "--hand", default="anny", metavar="MODEL", help="hand model for a video: anny or mano:PATH"
+    )
+    parser.add_argument("--steps", type=int, help="optimiser steps")
+    parser.add_argument("--seconds", type=float, help="most seconds of fitting")
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
+    parser.add_argument(
+        "--all-frames", action="store_true", help="fit validation and test frames too"
+    )
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a setting (wildghand/settings.py); may be given again",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing avatar")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.errors import UsageError
+    from hwp_bench.methods.contract import Budget
+    from wildghand.fit.session import fit_capture
+
+    if args.steps is not None and args.steps < 1:
+        raise UsageError(f"is {args.steps}", field="--steps", remedy="Use 1 or more.")
+    if args.seconds is not None and not args.seconds > 0.0:
+        raise UsageError(f"is {args.seconds}", field="--seconds", remedy="Use more than 0.")
+    if args.seed < 0:
+        raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
+    avatar = fit_capture(
+        _capture(args),
+        args.out,
+        settings=dict(_setting(text) for text in args.set),
+        budget=Budget(seconds=args.seconds, steps=args.steps),
+        seed=args.seed,
+        all_frames=args.all_frames,
+        overwrite=args.overwrite,
+    )
+    record = avatar.record
+    if args.json:
+        facts = {"avatar": str(args.out), "steps": record.steps, "seconds": record.seconds}
+        print(json.dumps({**facts, "hands": list(avatar.sides), "frames": len(record.frames)}))
+    else:
+        hands = " and ".join(avatar.sides)
+        print(
+            f"{args.out}: {hands} hand, {len(record.frames)} frames, {record.steps} steps "
+            f"in {record.seconds:.0f} s"
+        )
+    return 0
+
+
+def _capture(args: argparse.Namespace) -> Path:
+    """The capture folder; made of a video where the source is one."""
+    from hwp_bench.errors import UsageError
+
+    if args.source.is_dir() or not args.source.exists():
+        return args.source
+    if args.landmarks is None:
+        raise UsageError(
+            "is a file; a video needs the landmarks that a tracker found in it",
+            where=args.source,
+            field="--landmarks",
+            remedy="docs/video.md says how to make them.",
+        )
+    from hwp_bench.importers.options import VideoImport
+    from hwp_bench.importers.video import import_video
+
+    folder = args.out.with_name(args.out.name + ".capture")
+    if not folder.is_dir():
+        import_video(
+            args.source,
+            args.landmarks,
+            folder,
+            VideoImport(hand=args.side, hand_model=args.hand),
+        )
+    return folder
+
+
+def _setting(text: str) -> tuple[str, Any]:
+    from hwp_bench.errors import UsageError
+
+    name, found, value = text.partition("=")
+    if not found or not name:
+        raise UsageError(f"{text!r} is not NAME=VALUE", field="--set")
+    try:
+        return name, json.loads(value)
+    except json.JSONDecodeError:
+        return name, value

@@ -1,0 +1,134 @@
+"""A fit from a capture folder to an avatar folder, which can be stopped and goes on."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.errors import HwpError, UsageError
+from hwp_bench.files import sha256_file, sha256_json
+from hwp_bench.methods.contract import Avatar, Budget
+from hwp_bench.methods.request import REQUEST, RunSettings, open_request, write_request
+from hwp_bench.progress import notice, progress
+from hwp_bench.splits import Split, contiguous_split
+from wildghand.avatar import WildGHandAvatar
+from wildghand.avatar_files import save_avatar
+from wildghand.device import choose_device
+from wildghand.fit.fit import Fit
+from wildghand.fit.optimise import Watchers, optimise
+from wildghand.fit.saved import load_state, save_state
+from wildghand.settings import read_settings
+
+#: Seconds between two saved states.
+SAVE_EVERY = 20.0
+#: Name of the saved state in the work folder.
+STATE = "state.pt"
+
+
+class _Clock:
+    """The `Report` of a fit that nobody scores.
+
+    Args:
+        before: seconds that earlier runs of the fit took.
+        show: takes the number of steps that are done.
+    """
+
+    def __init__(self, before: float, show: Any) -> None:
+        self._start = time.perf_counter() - before
+        self._show = show
+
+    def __call__(self, step: int, avatar: Avatar) -> None:
+        """No checkpoint is ever due."""
+
+    def progress(self, done: int, total: int) -> None:
+        """Show how far the fit is."""
+        self._show(done)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of fitting, those of earlier runs included."""
+        return time.perf_counter() - self._start
+
+
+def fit_capture(
+    source: Path,
+    out: Path,
+    *,
+    settings: Mapping[str, Any],
+    budget: Budget,
+    seed: int = 0,
+    all_frames: bool = False,
+    overwrite: bool = False,
+) -> WildGHandAvatar:
+    """Fit an avatar to a capture and write it.
+
+    The state is saved beside `out` every 20 seconds. The same call goes on with it after a stop;
+    with a budget in steps the result is that of a fit that was never stopped.
+
+    Args:
+        source: the capture folder.
+        out: the avatar folder.
+        settings: overrides of the defaults.
+        budget: when to stop.
+        seed: of everything random.
+        all_frames: fit the validation and test frames too: for an avatar, not for a score.
+        overwrite: replace an avatar that is there.
+
+    Raises:
+        UsageError: `out` exists.
+        BadInput: no training frame can be used, or the saved state is of another fit.
+        DidNotConverge: the fit diverged at once.
+    """
+    if out.exists() and not overwrite:
+        raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
+    chosen = read_settings(settings)
+    capture = open_capture(source)
+    split = _all_frames(capture) if all_frames else _split(capture)
+    work = out.with_name(out.name + ".fit")
+    run = RunSettings(dict(settings), seed, budget)
+    training = open_request(write_request(work / "request", capture, split, run))
+    digest = sha256_json(
+        [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
+    )
+    fit = Fit(training, chosen, seed, choose_device(chosen.device))
+    watchers, start, before = Watchers(chosen.plateau_steps), 0, 0.0
+    state = work / STATE
+    if state.is_file():
+        start, before = load_state(state, fit, watchers, digest)
+        notice(f"Going on after {start} steps.")
+    steps = chosen.steps if budget.steps is None else budget.steps
+    with progress(f"Fitting {capture.info.id}", steps) as show:
+        clock = _Clock(before, show)
+        saved = time.perf_counter()
+
+        def save(step: int, watched: Watchers) -> None:
+            nonlocal saved
+            if time.perf_counter() - saved >= SAVE_EVERY:
+                save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
+                saved = time.perf_counter()
+
+        avatar = optimise(fit, budget, clock, start=start, watchers=watchers, after_step=save)
+    save_avatar(avatar, out, overwrite=overwrite)
+    shutil.rmtree(work, ignore_errors=True)
+    return avatar
+
+
+def _split(capture: Capture) -> Split:
+    try:
+        return contiguous_split(capture.info.id, capture.info.frame_count)
+    except HwpError as error:
+        raise UsageError(
+            f"is too short for a split ({error})",
+            where=capture.root,
+            remedy="Fit all of it with --all-frames.",
+        ) from error
+
+
+def _all_frames(capture: Capture) -> Split:
+    """Every frame but the last two, which stand for the parts that a split must have."""
+    count = capture.info.frame_count
+    return Split(capture.info.id, count, (0, count - 2), (count - 2, count - 1), (count - 1, count))
