@@ -1,0 +1,64 @@
+"""`hwp-bench leaderboard`."""
+
+from __future__ import annotations
+
+import argparse
+
+_EXAMPLES = """examples:
+  hwp-bench leaderboard add runs/mine-mini runs/plain-mini
+  hwp-bench leaderboard check
+  hwp-bench leaderboard build -o site
+  hwp-bench leaderboard build -o site --with runs/mine-mini    # reports with pictures
+
+An entry is a whole result file with its digest. Only results of a suite, on perturbed frames and
+in this version's protocols are taken. The site is static: copy the folder anywhere.
+"""
+
+
+def add_arguments(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXAMPLES
+    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    add = actions.add_parser("add", help="make entries of results")
+    add.add_argument("results", nargs="+", metavar="RESULTS", help="results folder or results.json")
+    check = actions.add_parser("check", help="check schema, digests and comparability of entries")
+    build = actions.add_parser("build", help="write the static site")
+    build.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the site")
+    build.add_argument(
+        "--with",
+        dest="folders",
+        nargs="+",
+        default=[],
+        metavar="RESULTS",
+        help="results folders of entries, for the pictures of their reports",
+    )
+    for action in (add, check, build):
+        action.add_argument(
+            "--entries", metavar="DIR", help="folder of the entries (default leaderboard/entries)"
+        )
+
+
+def run(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from pathlib import Path
+
+    from hwp_bench.leaderboard.entries import add_entry, check_entries, read_entries
+    from hwp_bench.leaderboard.place import leaderboard_folder
+    from hwp_bench.progress import notice
+
+    folder = Path(args.entries) if args.entries else leaderboard_folder() / "entries"
+    if args.action == "add":
+        from hwp_bench.results import read_all
+
+        for results in read_all(args.results):
+            notice(f"entry: {add_entry(folder, results)}")
+    elif args.action == "check":
+        count = len(check_entries(read_entries(folder)))
+        print(f"{count} entries, all sound")
+    else:
+        from hwp_bench.leaderboard.site import build_site
+        from hwp_bench.report.sources import read_sources
+
+        page = build_site(Path(args.out), read_entries(folder), read_sources(args.folders))
+        notice(f"site: {page}")
+    return 0

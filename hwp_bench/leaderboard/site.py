@@ -1,0 +1,171 @@
+"""The leaderboard's site: one page of measured and published rows, and a report for each row."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from markupsafe import Markup
+
+from hwp_bench.errors import UsageError
+from hwp_bench.files import atomic_folder, canonical_json
+from hwp_bench.leaderboard.entries import SUITES, Entry, check_entries, digest
+from hwp_bench.leaderboard.published import NOTE, read_published
+from hwp_bench.metrics import metric as metric_facts
+from hwp_bench.metrics.aggregate import aggregate
+from hwp_bench.report.page.render import render_template, style_sheet, write_report
+from hwp_bench.report.sources import Source
+from hwp_bench.results.schema import score_rows
+from hwp_bench.taxonomy import PERTURBATIONS, perturbation
+
+#: Metrics of the board.
+METRICS = ("psnr", "ssim", "oriented_distance")
+#: Scopes that can be chosen, with their headings.
+SCOPES = {
+    "macro": "All perturbations (macro mean)",
+    "single": "Single hands",
+    "interacting": "Interacting hands",
+    **{name: perturbation(name).heading for name in PERTURBATIONS},
+}
+#: Title of the site.
+TITLE = "HWP bench leaderboard"
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured row."""
+
+    #: Name of the entry.
+    name: str
+    #: Title of the method.
+    title: str
+    #: Its suite.
+    suite: str
+    #: Its budget in words.
+    budget: str
+    #: Device that the method says it ran on.
+    device: str
+    #: Seed of everything random.
+    seed: int
+    #: Day of the evaluation, ISO 8601.
+    date: str
+    #: Scores by scope and metric; None where the suite has no such capture.
+    scores: Mapping[str, Mapping[str, float | None]]
+    #: Mean seconds of a fit.
+    fit: float | None
+    #: Frames that failed.
+    failed: int
+
+
+def make_row(entry: Entry) -> Row:
+    """Return the row of an entry."""
+    results = entry.results
+    mean = aggregate(score_rows(results))
+    found: dict[str, Mapping[str, float]] = {
+        "macro": mean.overall.macro,
+        "single": mean.single.capture_mean if mean.single else {},
+        "interacting": mean.interacting.capture_mean if mean.interacting else {},
+        **mean.overall.perturbations,
+    }
+    fits = [c.fit_seconds for c in results.captures if c.fit_seconds is not None]
+    return Row(
+        name=entry.name,
+        title=results.method.title,
+        suite=results.suite,
+        budget=budget_text(results.budget),
+        device=", ".join(sorted({c.device for c in results.captures if c.device})) or "not said",
+        seed=results.seed,
+        date=results.started[:10],
+        scores={
+            scope: {name: found.get(scope, {}).get(name) for name in METRICS} for scope in SCOPES
+        },
+        fit=sum(fits) / len(fits) if fits else None,
+        failed=sum(capture.failed_frames for capture in results.captures),
+    )
+
+
+def budget_text(budget: Mapping[str, Any]) -> str:
+    """Return a budget in words: `60 s`, `500 steps`, `60 s, 500 steps` or `no limit`."""
+    units = {"seconds": "s", "steps": "steps"}
+    parts = [f"{budget[name]:g} {unit}" for name, unit in units.items() if budget.get(name)]
+    return ", ".join(parts) or "no limit"
+
+
+def build_site(
+    folder: Path, entries: Sequence[Entry], results_folders: Sequence[Source] = ()
+) -> Path:
+    """Write the site into a folder that it replaces; returns its first page.
+
+    Args:
+        folder: where to.
+        entries: the measured rows.
+        results_folders: results with their folders; entries of the same results get pictures.
+
+    Raises:
+        UsageError: entries do not go together; the folder holds something that is no site.
+    """
+    check_entries(entries)
+    if folder.is_dir() and any(folder.iterdir()) and not (folder / "board.js").is_file():
+        raise UsageError("holds something that is no leaderboard", where=folder, field="-o")
+    folders = {digest(source.results): source.folder for source in results_folders}
+    with atomic_folder(folder, overwrite=True) as temporary:
+        (temporary / "index.html").write_text(board_page(entries), encoding="utf-8")
+        (temporary / "board.js").write_text(script(), encoding="utf-8")
+        for entry in entries:
+            source = Source(entry.results, folders.get(digest(entry.results)))
+            write_report(temporary / "reports" / entry.name, [source])
+    return folder / "index.html"
+
+
+def board_page(entries: Sequence[Entry]) -> str:
+    """Return the page of the board."""
+    rows = sorted(
+        (make_row(entry) for entry in entries),
+        key=lambda row: (SUITES.index(row.suite), -(row.scores["macro"]["psnr"] or 0.0), row.name),
+    )
+    return render_template(
+        "hwp_bench.leaderboard",
+        "board.html.j2",
+        title=TITLE,
+        style=style_sheet(),
+        rows=rows,
+        scopes=SCOPES,
+        metrics=[metric_facts(name) for name in METRICS],
+        suites=[suite for suite in SUITES if any(row.suite == suite for row in rows)],
+        budgets=list(dict.fromkeys(row.budget for row in rows)),
+        published=_published(),
+        note=NOTE,
+        scores_json=_scores_json,
+    )
+
+
+def _scores_json(row: Row, metric: str) -> str:
+    """Return the scores of a row in every scope that it has, for the page's script."""
+    scores = {scope: values[metric] for scope, values in row.scores.items()}
+    return canonical_json({scope: score for scope, score in scores.items() if score is not None})
+
+
+def _published() -> list[dict[str, Any]]:
+    """Return the published rows that compare methods on the paper's captures."""
+    return [
+        {
+            "method": item.method,
+            # The paper's table by perturbation is of interacting hands alone.
+            "scope": ("Interacting hands: " if table.number == 5 else "") + SCOPES[item.scope],
+            "table": table.number,
+            "scores": item.scores,
+        }
+        for table in read_published().tables
+        if table.number in (3, 5)
+        for item in table.measurements
+        if item.scope in SCOPES
+    ]
+
+
+def script() -> Markup:
+    """Return the page's script."""
+    folder = resources.files("hwp_bench.leaderboard").joinpath("templates")
+    return Markup(folder.joinpath("board.js").read_text("utf-8"))

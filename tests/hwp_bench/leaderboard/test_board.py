@@ -1,0 +1,195 @@
+"""The leaderboard's page. Oracles: a JavaScript engine, and headless Chromium where it is."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hwp_bench.leaderboard.entries import Entry, entry_name
+from hwp_bench.leaderboard.site import board_page, budget_text, build_site, make_row, script
+from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.results import FrameResult
+
+CHROMIUM = Path("/usr/bin/chromium")
+DRIVER = Path("/usr/bin/chromedriver")
+EVIL = '"><img src=x onerror=alert(1)>'
+FLAGS = (
+    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+)
+
+
+@pytest.fixture
+def entries(make_results) -> list[Entry]:
+    """Three methods; the best overall is not the best on motion blur; one on another suite."""
+    protocols = json.loads(json.dumps({p.name: p.as_dict() for p in PROTOCOLS}))
+    found = []
+    rows = (
+        (EVIL, "smoke", None, {"illumination": 30.0, "motion_blur": 10.0}),
+        ("Beta", "smoke", 60, {"illumination": 15.0, "motion_blur": 21.0}),
+        ("Gamma", "mini", None, {"illumination": 18.0}),
+    )
+    for number, (title, suite, seconds, scores) in enumerate(rows):
+        result = make_results(f"m{number}")
+        captures = [
+            replace(
+                result.captures[0],
+                id=f"capture-{name}",
+                perturbations=[name],
+                frames=[
+                    FrameResult(18, {"psnr": psnr, "ssim": 0.5, "oriented_distance": 0.01}, None)
+                ],
+            )
+            for name, psnr in scores.items()
+        ]
+        result = replace(
+            result,
+            method=replace(result.method, title=title),
+            suite=suite,
+            protocols=protocols,
+            budget={"seconds": seconds, "steps": None},
+            captures=captures,
+        )
+        found.append(Entry(entry_name(result), result))
+    return found
+
+
+def test_rows_hold_the_means_of_every_scope(entries) -> None:
+    row = make_row(entries[0])
+    assert row.scores["macro"]["psnr"] == pytest.approx(20.0)
+    assert row.scores["motion_blur"]["psnr"] == pytest.approx(10.0)
+    assert row.scores["interacting"]["psnr"] is None
+    assert row.fit == pytest.approx(2.0)
+    assert budget_text({"seconds": 60.0, "steps": 500}) == "60 s, 500 steps"
+    assert budget_text({"seconds": None, "steps": None}) == "no limit"
+
+
+def test_names_are_escaped_and_published_rows_stand_apart(entries) -> None:
+    page = board_page(entries)
+    assert EVIL not in page
+    assert "&lt;img src=x" in page
+    measured, published = page.split('id="published"')
+    assert "InterGaussianHand" in published
+    assert "InterGaussianHand" not in measured
+    assert "Published, on other data" in measured
+    # Without script every row is there, best macro mean of each suite first.
+    assert measured.index("Beta") > measured.index("&lt;img")
+    assert "There is no entry yet" in board_page([])
+
+
+@pytest.fixture
+def board() -> Any:
+    engine = pytest.importorskip("quickjs").Context()
+    engine.eval(str(script()))
+    return engine
+
+
+def test_sorting_puts_what_was_not_measured_last(board) -> None:
+    def order(cells: list, descending: bool) -> list[int]:
+        spelled = f"JSON.stringify(Board.order({json.dumps(cells)}, {json.dumps(descending)}))"
+        return json.loads(board.eval(spelled))
+
+    assert order([3, 1, None, 2, 10], False) == [1, 3, 0, 4, 2]
+    assert order([3, 1, None, 2, 10], True) == [4, 0, 3, 1, 2]
+    assert order(["b", "a", "b"], True) == [0, 2, 1]
+    assert order([1, 1, 1], True) == [0, 1, 2]
+
+
+def test_filters_and_addresses(board) -> None:
+    shown = "Board.shown({suite: 'mini', budget: '60 s'}, {suite: %s, budget: %s})"
+    for suite, budget, wanted in (("", "", True), ("mini", "60 s", True), ("smoke", "", False)):
+        assert board.eval(shown % (json.dumps(suite), json.dumps(budget))) is wanted
+    state = {"suite": "mini", "budget": "60 s, 5 steps", "sort": "psnr", "down": ""}
+    spelled = board.eval(f"Board.write({json.dumps(state)})")
+    assert spelled == "suite=mini&budget=60%20s%2C%205%20steps&sort=psnr"
+    back = json.loads(board.eval(f"JSON.stringify(Board.read('#{spelled}&x=%E0%A4%A'))"))
+    assert back == {"suite": "mini", "budget": "60 s, 5 steps", "sort": "psnr"}
+
+
+@pytest.fixture
+def browser(entries, tmp_path) -> Iterator[Any]:
+    """Chromium at the site, driven by the keyboard and the mouse."""
+    if not (CHROMIUM.exists() and DRIVER.exists()):
+        pytest.skip("Chromium is not here")
+    webdriver = pytest.importorskip("selenium.webdriver")
+    from selenium.webdriver.chrome.service import Service
+
+    page = build_site(tmp_path / "site", entries)
+    options = webdriver.ChromeOptions()
+    options.binary_location = str(CHROMIUM)
+    for flag in (*FLAGS, f"--user-data-dir={tmp_path / 'profile'}"):
+        options.add_argument(flag)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
+    driver = webdriver.Chrome(options=options, service=Service(str(DRIVER)))
+    try:
+        driver.get(page.as_uri())
+        yield driver
+        assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
+    finally:
+        driver.quit()
+
+
+def visible(browser: Any) -> list[str]:
+    script = (
+        "return [...document.querySelectorAll('#measured tbody tr')]"
+        ".filter(row => !row.hidden).map(row => row.cells[0].textContent.trim())"
+    )
+    return browser.execute_script(script)
+
+
+@pytest.mark.slow
+def test_the_board_in_chromium(browser) -> None:
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+    from selenium.webdriver.support.ui import Select
+
+    assert visible(browser) == [EVIL, "Beta", "Gamma"]
+    # By keyboard; Enter turns the order round. Macro means: 20, 18, 18; equal rows keep theirs.
+    psnr = browser.find_element(By.CSS_SELECTOR, "button[data-sort=psnr]")
+    psnr.send_keys(Keys.ENTER)
+    assert visible(browser) == ["Beta", "Gamma", EVIL]
+    head = browser.find_element(By.CSS_SELECTOR, "th[aria-sort=ascending]")
+    assert "PSNR" in head.text
+    psnr.send_keys(Keys.SPACE)
+    Select(browser.find_element(By.ID, "scope")).select_by_value("motion_blur")
+    assert visible(browser) == ["Beta", EVIL, "Gamma"]
+    cells = browser.find_elements(By.CSS_SELECTOR, '#measured [data-key="psnr"]')
+    assert [cell.text for cell in cells] == ["21.00", "10.00", "–"]
+    Select(browser.find_element(By.ID, "suite")).select_by_value("smoke")
+    assert visible(browser) == ["Beta", EVIL]
+    Select(browser.find_element(By.ID, "budget")).select_by_value("60 s")
+    assert visible(browser) == ["Beta"]
+    assert browser.find_element(By.ID, "status").text == "1 of 3 rows"
+    # The address holds the choice, so that it can be passed on.
+    address = browser.current_url
+    browser.get("about:blank")
+    browser.get(address)
+    assert visible(browser) == ["Beta"]
+    # A row is opened by keyboard as well.
+    browser.find_element(By.LINK_TEXT, "Beta").send_keys(Keys.ENTER)
+    assert "/reports/m1-smoke-60s" in browser.current_url
+    assert "HWP bench: Beta" in browser.title
+
+
+@pytest.mark.slow
+def test_everything_is_reached_with_the_tab_key(browser) -> None:
+    from selenium.webdriver.common.by import By
+    from selenium.webdriver.common.keys import Keys
+
+    reached = []
+    for _ in range(24):
+        browser.switch_to.active_element.send_keys(Keys.TAB)
+        active = browser.switch_to.active_element
+        if active.tag_name == "body":
+            break
+        reached.append(
+            active.get_attribute("data-sort") or active.get_attribute("id") or active.text
+        )
+    wanted = ["suite", "scope", "budget", "method", "psnr", "Beta", "Gamma"]
+    assert [name for name in wanted if name not in reached] == []
+    assert browser.find_elements(By.CSS_SELECTOR, "img") == []

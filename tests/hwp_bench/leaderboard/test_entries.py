@@ -1,0 +1,119 @@
+"""Entries of the leaderboard. Oracle: what a changed byte must cause."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hwp_bench.cli.main import main
+from hwp_bench.errors import BadResult, UsageError
+from hwp_bench.leaderboard.entries import add_entry, check_entries, entry_name, read_entries
+from hwp_bench.leaderboard.place import leaderboard_folder
+from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.results import FrameResult, Results, write_results
+
+
+@pytest.fixture
+def make_entry(make_results):
+    """Return a function that makes results fit for the leaderboard."""
+
+    def make(name: str = "plain", psnr: float = 20.0, **changes: object) -> Results:
+        result = make_results(name, psnr)
+        frames = [
+            FrameResult(18 + i, {"psnr": psnr + i, "ssim": 0.5, "oriented_distance": 0.01}, None)
+            for i in range(2)
+        ]
+        protocols = json.loads(json.dumps({p.name: p.as_dict() for p in PROTOCOLS}))
+        captures = [replace(result.captures[0], frames=frames)]
+        return replace(result, **{"captures": captures, "protocols": protocols, **changes})
+
+    return make
+
+
+def test_an_entry_is_the_whole_result(make_entry, tmp_path: Path) -> None:
+    results = make_entry("plain")
+    file = add_entry(tmp_path, results)
+    assert file.stem == entry_name(results)
+    assert file.stem.startswith("plain-smoke-seed0-")
+    assert [entry.results for entry in read_entries(tmp_path)] == [results]
+    add_entry(tmp_path, results)
+    add_entry(tmp_path, make_entry("mine", 22.0, budget={"seconds": 60, "steps": None}))
+    assert [entry.name.split("-seed")[0] for entry in read_entries(tmp_path)] == [
+        "mine-smoke-60s",
+        "plain-smoke",
+    ]
+    check_entries(read_entries(tmp_path))
+
+
+def test_a_changed_score_is_found(make_entry, tmp_path) -> None:
+    file = add_entry(tmp_path, make_entry())
+    file.write_text(file.read_text().replace('"psnr": 20.0', '"psnr": 29.0'))
+    with pytest.raises(BadResult, match="changed by hand"):
+        read_entries(tmp_path)
+
+
+def test_other_names_and_fields_are_refused(make_entry, tmp_path) -> None:
+    file = add_entry(tmp_path, make_entry())
+    moved = file.rename(tmp_path / "other.json")
+    with pytest.raises(BadResult, match="must be called"):
+        read_entries(tmp_path)
+    value = json.loads(moved.read_text())
+    moved.write_text(json.dumps({**value, "note": "x"}))
+    with pytest.raises(BadResult, match="note"):
+        read_entries(tmp_path)
+    moved.write_text("{}")
+    with pytest.raises(BadResult, match="no entry of schema"):
+        read_entries(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("changes", "problem"),
+    [
+        ({"suite": "captures"}, "no suite that everybody has"),
+        ({"frames": "clean"}, "clean frames"),
+        ({"protocols": {}}, "other protocols"),
+    ],
+)
+def test_what_cannot_be_ranked_is_refused(make_entry, tmp_path, changes, problem) -> None:
+    with pytest.raises(UsageError, match=problem):
+        add_entry(tmp_path, make_entry(**changes))
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_other_data_in_one_suite_is_refused(make_entry, tmp_path) -> None:
+    add_entry(tmp_path, make_entry())
+    other = make_entry("mine")
+    other = replace(other, captures=[replace(other.captures[0], digest="other")])
+    with pytest.raises(UsageError, match="other captures, splits or test frames"):
+        add_entry(tmp_path, other)
+    # In another suite there is nothing that it would have to be like.
+    add_entry(tmp_path, replace(other, suite="mini"))
+
+
+def test_a_result_without_the_headline_metrics_is_refused(
+    make_results, make_entry, tmp_path
+) -> None:
+    bare = replace(make_results(), protocols=make_entry().protocols)
+    with pytest.raises(BadResult, match="lacks a headline metric"):
+        add_entry(tmp_path, bare)
+
+
+def test_the_entries_that_ship_are_sound() -> None:
+    check_entries(read_entries(leaderboard_folder() / "entries"))
+
+
+def test_the_command(make_entry, tmp_path, capsys) -> None:
+    write_results(tmp_path / "run" / "results.json", make_entry())
+    entries = ["--entries", str(tmp_path / "entries")]
+    assert main(["leaderboard", "add", str(tmp_path / "run"), *entries]) == 0
+    assert main(["leaderboard", "check", *entries]) == 0
+    assert capsys.readouterr().out == "1 entries, all sound\n"
+    assert main(["leaderboard", "build", "-o", str(tmp_path / "site"), *entries]) == 0
+    assert (tmp_path / "site" / "index.html").is_file()
+    # Building again replaces the site, but never another folder.
+    assert main(["leaderboard", "build", "-o", str(tmp_path / "site"), *entries]) == 0
+    assert main(["leaderboard", "build", "-o", str(tmp_path / "run"), *entries]) == 2
+    assert (tmp_path / "run" / "results.json").is_file()
