@@ -39,9 +39,9 @@ class FittingSettings:
     """How long and how hard is fitted."""
 
     #: Steps to landmarks and lines of sight alone.
-    landmark_steps: int = 240
+    landmark_steps: int = 150
     #: Steps with the skin.
-    skin_steps: int = 90
+    skin_steps: int = 60
     #: The nearest skin is looked up again after this many steps.
     refresh: int = 15
     #: Weight of the landmarks once the skin counts: models put joints in different places.

@@ -16,6 +16,8 @@ from hwp_bench.errors import BadInput
 from hwp_bench.importers.official.folders import OfficialFolder, find_file
 from hwp_bench.unpickle import load_pickle
 
+#: Largest pickle that is read, bytes: each record holds a mask of the whole frame.
+MAX_PICKLE_BYTES = 4 * 1024 * 1024 * 1024
 #: Keys of one hand, and their shapes without the batch axis of 1.
 SIDE_KEYS: Mapping[str, tuple[int, ...]] = {
     "mano_pose": (48,),
@@ -94,7 +96,7 @@ def read_records(folder: OfficialFolder) -> OfficialRecords:
     """
     rows: list[tuple[int, dict[str, Any], Path]] = []
     for pickle in folder.pickles:
-        content = load_pickle(pickle)
+        content = load_pickle(pickle, max_bytes=MAX_PICKLE_BYTES)
         if not isinstance(content, list) or not content:
             raise BadInput("is no list of frame records", where=pickle)
         rows += [(_number(row, i, pickle), row, pickle) for i, row in enumerate(content)]
