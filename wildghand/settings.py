@@ -31,7 +31,7 @@ class Rates:
     #: Head iv.
     refinement: float = number(1e-3)
     #: The other layers of the network.
-    network: float = number(1e-3)
+    network: float = number(0.01)
     #: DPD.
     dpd: float = number(1e-3)
     #: Thresholds of PAO.
@@ -71,8 +71,9 @@ class WildGHandSettings:
     prepass: bool = True
     #: Addition to DPD: a gain of each frame's colours, held near that of clean frames.
     gains: bool = True
-    #: Addition to PAO: robust weights of residuals in place of the weights of regions.
-    robust: bool = True
+    #: Addition to PAO: robust weights of residuals later in the fit, in place of the pre-pass's
+    #: pixel weights. Off: where it was measured it cost more than it brought (docs/wildghand.md).
+    robust: bool = False
     #: Addition to the heads: refine the pose of frames whose mask disagrees with it.
     frame_poses: bool = True
     #: Chance that a frame's biases are left out of a step (of a clean frame's, with `prepass`).
@@ -108,7 +109,7 @@ class WildGHandSettings:
     #: Weights of the regularisers.
     terms: TermWeights = field(default_factory=TermWeights)
     #: The judge of the frames.
-    judge: PrepassSettings = field(default_factory=PrepassSettings)
+    judge: PrepassSettings = field(default_factory=lambda: PrepassSettings(weight_floor=0.02))
 
     @property
     def additions(self) -> bool:
