@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,8 @@ import torch
 
 from hwp_bench.capture.schema import HandModelId
 from hwp_bench.errors import UsageError
+from hwp_bench.files import write_json
+from hwp_bench.images import write_image
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.model import Gaussians, WildGHandModel
 from wildghand.settings import WildGHandSettings
@@ -128,6 +131,16 @@ class WildGHandAvatar:
             opacities=torch.cat([part.opacities.expand(count, -1) for part in parts], dim=1),
             colors=torch.cat([part.colors for part in parts], dim=1),
         )
+
+    def write_diagnostics(self, folder: Path) -> None:
+        """Write temporal weights and weight masks for the benchmark's tables and pictures."""
+        for side, weights in self.record.temporal.items():
+            write_json(
+                folder / f"{side}-temporal.json",
+                {"frames": self.record.frames, "weights": weights},
+            )
+        for frame, mask in self.weight_masks.items():
+            write_image(folder / "weights" / f"{frame:06d}.png", mask)
 
     def _tensors(
         self, hands: Mapping[str, HandPose]

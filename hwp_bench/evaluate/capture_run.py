@@ -25,12 +25,15 @@ from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.methods.predictions import Prediction, read_predictions
 from hwp_bench.methods.request import RunSettings, write_request
 from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
-from hwp_bench.methods.worker import CHECKPOINTS
+from hwp_bench.methods.worker import CHECKPOINTS, DIAGNOSTICS
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.score import Network
 from hwp_bench.records import parse_record
 from hwp_bench.results import CaptureResult, CurvePoint
 from hwp_bench.splits import Split
+
+#: Most bytes of temporal weights and weight masks that are kept of a capture.
+MAX_DIAGNOSTICS = 64 << 20
 
 #: Version of what a stored capture result depends on besides its inputs.
 RECIPE = 1
@@ -190,6 +193,22 @@ def _keep(
     keep_predictions(folder / "predictions", source, [p.frame for p in predictions])
     if (output / "log.txt").is_file():
         shutil.copyfile(output / "log.txt", folder / "log.txt")
+    _keep_diagnostics(output / DIAGNOSTICS, folder / DIAGNOSTICS)
     shutil.rmtree(output, ignore_errors=True)
     if result.failed_frames < len(result.frames):
         write_pictures(folder / "pictures", job.capture, result.frames, predictions)
+
+
+def _keep_diagnostics(source: Path, target: Path) -> None:
+    """Copy temporal weights and weight masks, nothing else, and not without bound."""
+    shutil.rmtree(target, ignore_errors=True)
+    total = 0
+    for path in sorted([*source.glob("*temporal.json"), *source.glob("weights/*.png")]):
+        if path.is_symlink() or path.parent.is_symlink() or not path.is_file():
+            continue
+        total += path.stat().st_size
+        if total > MAX_DIAGNOSTICS:
+            break
+        kept = target / path.relative_to(source)
+        kept.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copyfile(path, kept)

@@ -28,6 +28,8 @@ from hwp_bench.methods.request import TrainingCapture, open_request
 PREDICTIONS = "predictions"
 #: Folder of the validation frames of each checkpoint inside the output folder.
 CHECKPOINTS = "checkpoints"
+#: Folder of what the method says of itself, for pictures and tables; optional.
+DIAGNOSTICS = "diagnostics"
 #: What the run took.
 RUN = "run.json"
 #: How far the fit is.
@@ -101,6 +103,9 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
     fit_seconds = report.elapsed
     steps = max((checkpoint.step for checkpoint in report.checkpoints), default=0)
     final_step = int(getattr(avatar, "steps", steps))
+    explain = getattr(avatar, "write_diagnostics", None)
+    if callable(explain):
+        explain(output / DIAGNOSTICS)
     report.take(final_step, avatar)
     render_seconds = 0.0
     for frame in training.targets.tolist():
