@@ -40,8 +40,8 @@ def settings_from(cls: type[Settings], values: Mapping[str, Any], where: str) ->
 
     Args:
         cls: a dataclass whose fields are bool, int, float, str, Literal, or such dataclasses,
-            each with a default; numbers may be bounded by `number`, words by `choice`. An unbounded number
-            must not be negative.
+            each with a default; numbers may be bounded by `number`, words by `choice`. An
+            unbounded number must not be negative.
         values: any of its fields; later entries win over earlier ones.
         where: what messages call the place, such as the method's folder.
 
