@@ -9,6 +9,7 @@ import numpy as np
 
 from hwp_bench.errors import UsageError
 from hwp_bench.statistics.blocks import Blocks, make_blocks
+from hwp_bench.statistics.skewness import bent, nearest_to_even, reaches, skewness_of_mean
 
 #: Resamples unless told otherwise.
 RESAMPLES = 10_000
@@ -55,7 +56,9 @@ def bootstrap_mean(
       them, which the second level puts back (Davison and Hinkley 1997, section 3.8), and then
       widened for the captures' small number, so that the resamples spread as the mean does;
     - the standard deviation of the resamples is read with Student's t, with one degree of
-      freedom less than captures (than their effective number 1 / sum(w^2), if weighted).
+      freedom less than captures (than their effective number 1 / sum(w^2), if weighted);
+    - from four captures on, the end of the interval on the side of a long tail is moved out as
+      far as the captures' skewness asks for (`statistics.skewness`).
 
     Args:
         samples: one (S, F) float array a capture: the difference for each seed and frame.
@@ -75,13 +78,15 @@ def bootstrap_mean(
     values = np.array([block.value for block in blocks])
     value = float(share @ values)
     random = np.random.default_rng(seed)
+    skew = 0.0
     if len(blocks) == 1:
         freedom = float(blocks[0].degrees_of_freedom)
         draws = blocks[0].errors(resamples, random)
     else:
         freedom = float(1 / (share**2).sum() - 1)
         draws = _draws(blocks, share, values, resamples, random)
-    return _read(value, float(draws.std()), freedom, len(blocks))
+        skew = skewness_of_mean(values, share)
+    return _read(value, float(draws.std()), freedom, skew, len(blocks))
 
 
 def _checked(sample: np.ndarray) -> Blocks:
@@ -124,7 +129,16 @@ def _draws(
     return (chosen * drawn).sum(axis=1) / chosen.sum(axis=1)
 
 
-def _read(value: float, error: float, freedom: float, captures: int) -> Estimate:
+def _read(value: float, error: float, freedom: float, skew: float, captures: int) -> Estimate:
+    """Read the value and the standard deviation of the resamples.
+
+    Args:
+        value: the mean.
+        error: standard deviation of the resamples.
+        freedom: degrees of freedom behind it.
+        skew: skewness of the mean.
+        captures: how many it rests on.
+    """
     from scipy.stats import t
 
     if freedom <= 0:
@@ -134,8 +148,11 @@ def _read(value: float, error: float, freedom: float, captures: int) -> Estimate
         above = 0.5 if value == 0 else float(value > 0)
         return Estimate(value, value, value, above, float(value == 0), 0.0, captures)
     quantile = float(t.ppf(0.5 + LEVEL / 2, freedom))
-    above = float(t.cdf(value / error, freedom))
-    detectable = (quantile + float(t.ppf(POWER, freedom))) * error
-    p = 2 * float(t.sf(abs(value) / error, freedom))
-    reach = quantile * error
-    return Estimate(value, value - reach, value + reach, above, p, detectable, captures)
+    below, beyond = reaches(quantile, skew)
+    above = nearest_to_even(
+        t.cdf(value / error, freedom), t.cdf(bent(value / error, skew), freedom)
+    )
+    detectable = (max(below, beyond) + float(t.ppf(POWER, freedom))) * error
+    p = 2 * min(above, 1 - above)
+    low, high = value - below * error, value + beyond * error
+    return Estimate(value, low, high, above, p, detectable, captures)

@@ -55,8 +55,9 @@ STUDIES = (
     Study(11, 15, weighted=True, seeds=3),
     Study(8, 6, skewed=True),
     Study(11, 15, skewed=True),
-    Study(4, 6, within=0.3, skewed=True),
-    Study(8, 6, within=0.3, skewed=True),
+    *(Study(captures, 6, within=0.3, skewed=True) for captures in (3, 4, 8)),
+    Study(11, 15, within=0.3, skewed=True),
+    Study(8, 6, within=0.3, skewed=True, weighted=True),
 )
 
 

@@ -12,11 +12,12 @@ from hwp_bench.errors import UsageError
 from hwp_bench.statistics.blocks import make_blocks
 from hwp_bench.statistics.bootstrap import bootstrap_mean
 from hwp_bench.statistics.coverage import STUDIES, Study, coverage, simulate
+from hwp_bench.statistics.skewness import FEWEST
 
 
 def test_without_spread_in_captures_it_is_students_interval() -> None:
-    """Tolerance 2 %: the resampling of 20,000 draws."""
-    values = np.array([0.3, 1.1, -0.2, 0.8, 0.5])
+    """Values without a tail. Tolerance 2 %: the resampling of 20,000 draws."""
+    values = np.array([0.3, 1.2, -0.2, 0.7, 0.5])
     estimate = bootstrap_mean([np.full((1, 6), value) for value in values], resamples=20_000)
     low, high = stats.t.interval(0.95, 4, values.mean(), stats.sem(values))
     assert estimate.value == pytest.approx(values.mean(), abs=1e-12)
@@ -28,13 +29,17 @@ def test_without_spread_in_captures_it_is_students_interval() -> None:
 
 
 def test_spread_of_frames_and_seeds_is_counted_once() -> None:
-    """Oracle: Student's interval of the capture means, which hold that spread already; 3 %."""
+    """Oracle: Student's interval of the capture means, which hold that spread already; 3 %.
+
+    A tail moves one end of the interval out; the other is Student's.
+    """
     random = np.random.default_rng(1)
     samples = [random.normal(0, 3, (3, 40)) + random.normal(0, 1, (3, 1)) for _ in range(8)]
     means = np.array([sample.mean() for sample in samples])
     estimate = bootstrap_mean(samples, resamples=20_000)
     low, high = stats.t.interval(0.95, 7, means.mean(), stats.sem(means))
-    assert estimate.high - estimate.low == pytest.approx(high - low, rel=0.03)
+    shorter = min(estimate.high - estimate.value, estimate.value - estimate.low)
+    assert 2 * shorter == pytest.approx(high - low, rel=0.03)
 
 
 def test_weights_move_the_mean_and_widen_the_interval() -> None:
@@ -54,6 +59,18 @@ def test_one_capture_speaks_of_its_frames_and_one_block_of_nothing() -> None:
     assert estimate.high - estimate.low == pytest.approx(2 * 2.26 * 0.1, rel=0.4)
     silent = bootstrap_mean([np.array([[0.7]])])
     assert (silent.value, silent.low, silent.p) == (0.7, None, None)
+
+
+def test_a_long_tail_moves_its_own_end_out() -> None:
+    """Oracle: Student's reach on the other side; interval, p and P(better) say the same."""
+    values = np.array([0.1, 0.2, 0.25, 0.3, 0.35, 3.0])
+    estimate = bootstrap_mean([np.full((1, 6), value) for value in values], resamples=20_000)
+    low, high = stats.t.interval(0.95, 5, values.mean(), stats.sem(values))
+    assert estimate.low == pytest.approx(low, abs=0.02 * (high - low))
+    assert estimate.high > high + 0.3 * (high - low)
+    ended = bootstrap_mean([np.full((1, 6), v - estimate.high) for v in values], resamples=20_000)
+    assert ended.p == pytest.approx(0.05, abs=1e-6)
+    assert ended.above == pytest.approx(0.025, abs=1e-6)
 
 
 def test_no_difference_at_all_is_certain() -> None:
@@ -113,11 +130,11 @@ def test_correlated_frames_spread_blocks_more_than_single_frames() -> None:
 def test_the_interval_covers_as_often_as_it_says(study: Study) -> None:
     """Oracle: 800 simulated studies with true difference 0; the issue asks for 92 to 98 %.
 
-    Exponential captures may fall to 85 %: no method knows a long tail from four captures, and
-    the page on statistics says so.
+    Three captures cannot show a tail; there an exponential one may take the interval to 90 %.
     """
     covered, _, _ = coverage(study, repeats=800, resamples=300, seed=3)
-    assert (0.85 if study.skewed else 0.92) <= covered <= 0.98
+    tailed = study.skewed and study.captures < FEWEST
+    assert (0.90 if tailed else 0.92) <= covered <= 0.98
 
 
 def test_the_textbook_interval_covers_too_rarely_with_few_captures() -> None:
