@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+from dataclasses import MISSING, fields
 from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
@@ -22,14 +22,19 @@ def parse_record(kind: type[Record], value: Any, *, where: str, field: str = "")
         where: the file, for the message.
         field: path of `value` in the file, ending in a full stop.
 
+    Returns:
+        The record; fields that are missing have their default, where there is one.
+
     Raises:
         BadResult: a field is missing, unknown, of the wrong type, or not finite; it is named.
     """
     if not isinstance(value, dict):
         raise BadResult("must be a JSON object", where=where, field=field.rstrip(".") or None)
     hints = get_type_hints(kind)
-    names = {item.name for item in fields(kind)}  # type: ignore[arg-type]
-    for name in sorted(names ^ value.keys()):
+    listed = fields(kind)  # type: ignore[arg-type]
+    names = {item.name for item in listed}
+    spared = {i.name for i in listed if (i.default, i.default_factory) != (MISSING, MISSING)}
+    for name in sorted((names ^ value.keys()) - (spared - value.keys())):
         problem = "is missing" if name in names else "is not known"
         raise BadResult(problem, where=where, field=f"{field}{name}")
     converted = {

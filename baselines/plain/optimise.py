@@ -17,9 +17,6 @@ from wildghand.fit.guard import Guard
 from wildghand.fit.schedule import batches, spent
 from wildghand.losses import photometric_loss
 
-#: Steps between two offers of a checkpoint.
-REPORT_EVERY = 10
-
 # Standard deviations stay within these, m: thinner than paper or wider than a finger explains
 # nothing of a hand.
 _SCALES = (2e-5, 1e-2)
@@ -68,6 +65,7 @@ def fit_model(
     order = batches(len(frames), settings.batch, seed)
     guard: Guard[PlainModel] = Guard()
     step = 0
+    report(step, PlainAvatar(model, step))
     while step < steps and (fraction := spent(step, steps, budget, report)) < 1.0:
         for group, name in zip(optimizer.param_groups, parameters, strict=True):
             group["lr"] = rates[name] * settings.final_rate**fraction
@@ -87,8 +85,7 @@ def fit_model(
         _clamp(model)
         step += 1
         report.progress(step, steps)
-        if step % REPORT_EVERY == 0:
-            report(step, PlainAvatar(model, step))
+        report(step, PlainAvatar(model, step))
     return PlainAvatar(model.snapshot(), step)
 
 

@@ -6,7 +6,7 @@ import shutil
 import tempfile
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from hwp_bench.capture import Capture
@@ -95,6 +95,7 @@ def evaluate_capture(
     stored = _stored(job, folder)
     if stored is not None:
         return stored
+    began = time.perf_counter()
     targets = read_targets(job.capture, job.split.test.tolist())
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
@@ -126,8 +127,10 @@ def evaluate_capture(
         peak_memory=facts.peak_memory,
         device=facts.device[:100] if facts.device else None,
         curve=_curve(job, output, facts),
+        curve_seconds=facts.curve_seconds,
     )
     _keep(job, folder, output, source, predictions, result)
+    result = replace(result, job_seconds=time.perf_counter() - began)
     write_json(folder / "result.json", asdict(result))
     return result
 

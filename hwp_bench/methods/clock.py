@@ -19,8 +19,8 @@ PROGRESS_INTERVAL = 0.5
 def schedule(budget: Budget) -> list[float]:
     """Return the seconds at which checkpoints are due: dense at the start, then regular.
 
-    1, 2, 4, 8, ... s, and every tenth of the budget where one in seconds is set. (Tenths of a
-    budget in steps are `ReportClock`'s business.)
+    1, 2, 4, 8, ... s, and every tenth of the budget where one in seconds is set. (What a method
+    offers first, and tenths of a budget in steps, are `ReportClock`'s business.)
     """
     horizon = budget.seconds or 24 * 3600.0
     due = {float(2**power) for power in range(18) if 2**power <= horizon}
@@ -56,10 +56,16 @@ class ReportClock:
         """Seconds on the method's clock."""
         return time.perf_counter() - self._start - self._paused
 
+    @property
+    def paused(self) -> float:
+        """Seconds that the clock has stood still for checkpoints."""
+        return self._paused
+
     def __call__(self, step: int, avatar: Avatar) -> None:
-        """Take a checkpoint if one is due."""
+        """Take a checkpoint if one is due; what is offered first always is one."""
         in_time = self._due and self.elapsed >= self._due[0]
-        if in_time or (self._due_steps and step >= self._due_steps[0]):
+        in_steps = self._due_steps and step >= self._due_steps[0]
+        if in_time or in_steps or not self.checkpoints:
             self.take(step, avatar)
 
     def take(self, step: int, avatar: Avatar) -> None:

@@ -72,7 +72,9 @@ class Report(Protocol):
     def __call__(self, step: int, avatar: Avatar) -> None:
         """Offer the state after `step` steps; it is scored when a checkpoint is due.
 
-        Cheap when none is due; the method's clock stands still while one is taken.
+        Cheap when none is due, so that a method offers its state after every step; the method's
+        clock stands still while a checkpoint is taken. What is offered first always is one: a
+        method offers the avatar before its first step, with `step` 0.
         """
         ...
 

@@ -32,6 +32,8 @@ class RunFacts:
     fit_seconds: float | None = None
     #: Seconds to render the test frames.
     render_seconds: float | None = None
+    #: Seconds spent on checkpoints, outside the method's clock.
+    curve_seconds: float | None = None
     #: Optimiser steps.
     steps: int | None = None
     #: Peak memory of the process, bytes.

@@ -116,6 +116,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
     facts = RunFacts(
         fit_seconds=fit_seconds,
         render_seconds=render_seconds,
+        curve_seconds=report.paused,
         steps=final_step,
         peak_memory=peak_memory(),
         device=device_name(avatar),

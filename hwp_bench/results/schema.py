@@ -82,6 +82,10 @@ class CaptureResult:
     device: str | None
     #: Validation scores over time.
     curve: list[CurvePoint]
+    #: Seconds that the method's process spent on checkpoints, outside the method's clock.
+    curve_seconds: float | None = None
+    #: Seconds of everything: reading, copying, the method's process, scoring, pictures.
+    job_seconds: float | None = None
 
     @property
     def failed_frames(self) -> int:

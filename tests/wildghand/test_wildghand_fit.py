@@ -113,7 +113,9 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
             )
             raise Stopped
 
-    whole = optimise(Fit(training, settings, 0, device), Budget(), SilentReport())
+    report = SilentReport()
+    whole = optimise(Fit(training, settings, 0, device), Budget(), report)
+    assert [step for step, _ in report.offers] == list(range(31))
     half = Fit(training, settings, 0, device)
     with pytest.raises(Stopped):
         optimise(half, Budget(), SilentReport(), after_step=stop)

@@ -15,9 +15,6 @@ from wildghand.fit.guard import Guard
 from wildghand.fit.plateau import Plateau
 from wildghand.fit.schedule import batches, spent
 
-#: Steps between two offers of a checkpoint.
-REPORT_EVERY = 10
-
 
 class Watchers:
     """What watches the loss of a fit.
@@ -72,6 +69,7 @@ def optimise(
         next(order)
     watchers = watchers or Watchers(settings.plateau_steps)
     step = start
+    report(step, fit.avatar(step))
     while step < steps and (fraction := spent(step, steps, budget, report)) < 1.0:
         loss = fit.step(next(order), fraction)
         if not watchers.guard.watch(step, loss, fit.model):
@@ -83,8 +81,7 @@ def optimise(
             break
         step += 1
         report.progress(step, steps)
-        if step % REPORT_EVERY == 0:
-            report(step, fit.avatar(step))
+        report(step, fit.avatar(step))
         if after_step is not None:
             after_step(step, watchers)
         if watchers.plateau.reached(loss):

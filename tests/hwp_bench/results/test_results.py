@@ -56,6 +56,15 @@ def test_missing_fields_and_files_are_named(make_results, tmp_path: Path) -> Non
         read_results(tmp_path / "nowhere")
 
 
+def test_a_field_with_a_default_may_be_missing(make_results, tmp_path: Path) -> None:
+    results = make_results()
+    file = write_results(tmp_path / "results.json", results)
+    content = json.loads(file.read_text())
+    del content["captures"][0]["job_seconds"]
+    file.write_text(json.dumps(content))
+    assert read_results(file) == results
+
+
 def test_the_environment_names_versions_and_no_place() -> None:
     facts = environment()
     assert facts["packages"]["numpy"]
