@@ -27,7 +27,7 @@ from hwp_bench.sim.frame import carry_out
 from hwp_bench.sim.ledger import Ledger
 from hwp_bench.sim.picture import Lens, take_picture
 from hwp_bench.sim.plan import hands_at, plan
-from hwp_bench.sim.scene import EffectCall, Scene, parse_scene
+from hwp_bench.sim.scene import EffectCall, Scene, Sensor, parse_scene
 from hwp_bench.sim.seeds import generator
 from hwp_bench.sim.shade import steady_light
 from hwp_bench.sim.stage import Stage
@@ -131,7 +131,7 @@ def _frames(scene: Scene, call: EffectCall) -> list[int]:
 def _measure(
     scene: Scene, call: EffectCall, frames: list[int], size: int
 ) -> Callable[[float], float]:
-    alone = replace(with_effects(scene, [call.kind]), noise=0.0)
+    alone = replace(with_effects(scene, [call.kind]), sensor=Sensor(noise=0.0))
     if call.kind == "complex_poses":
         return lambda strength: float(
             np.mean([_pose_loss(alone, frame, size, strength) for frame in frames])

@@ -18,6 +18,11 @@ def linear_to_srgb(linear: np.ndarray) -> np.ndarray:
     return np.where(linear <= 0.0031308, 12.92 * linear, high)
 
 
+def eight_bit_srgb(linear: np.ndarray) -> np.ndarray:
+    """Encode linear light as sRGB in 8 bits; values outside 0-1 are clipped."""
+    return np.round(linear_to_srgb(linear) * 255.0).astype(np.uint8)
+
+
 def lamp_color(kelvin: float) -> np.ndarray:
     """Linear sRGB colour of a black body, scaled to luminance 1 and relative to 5500 K.
 

@@ -45,6 +45,9 @@ class Lens:
     shift: tuple[float, float] = (0.0, 0.0)
     #: Which part of the lamp the rays aim at first.
     turn: int = 0
+    #: Views when the first and when the last row is read, or None where all are read at once.
+    #: The backdrop follows them; what is cast stands where its row sees it (`rolling`).
+    rows: tuple[np.ndarray, np.ndarray] | None = None
 
 
 def take_picture(
@@ -96,6 +99,10 @@ def take_picture(
 def _backdrop(scene: Scene, lens: Lens, lights: Lights) -> np.ndarray:
     whole = (0, lens.size, 0, lens.size)
     _, directions = pixel_rays(lens.K, lens.view, whole, 1)
+    if lens.rows is not None:
+        _, first = pixel_rays(lens.K, lens.rows[0], whole, 1)
+        _, last = pixel_rays(lens.K, lens.rows[1], whole, 1)
+        directions = first + (last - first) * np.linspace(0.0, 1.0, lens.size)[:, None, None]
     seen = look(scene.background, scene.seed, directions)
     return seen * (0.45 * lights.key + 0.5 * lights.sky) * lights.exposure
 

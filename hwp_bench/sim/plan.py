@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.sim.camera import intrinsics
-from hwp_bench.sim.effects import ORDER, registered
+from hwp_bench.sim.effects import ORDER, SENSOR, registered
 from hwp_bench.sim.effects.base import Placement, Shutter
 from hwp_bench.sim.episodes import level, moments, severity
 from hwp_bench.sim.motion import HandMoment, track_moment
@@ -38,6 +38,8 @@ class FramePlan:
     subframes: int
     #: Motion while the shutter is open, or None.
     shutter: Shutter | None
+    #: Time from the reading of the first row to that of the last, s.
+    readout: float
     #: Passes in their order, by name.
     passes: tuple[str, ...]
 
@@ -81,14 +83,8 @@ def plan(
         fours = np.ceil(way / SUBFRAME_STEP / 4.0)
         subframes = int(np.clip(4 * fours, 4, MAX_SUBFRAMES))
     passes = ["hands", "shadow", "sky", "backdrop"]
-    if "hand_object_interaction" in acting:
-        passes.append("objects")
-    if "illumination" in acting:
-        passes.append("light")
-    if shutter is not None:
-        passes.append("shutter")
-    if scene.noise:
-        passes.append("sensor")
+    for kind in (*(kind for kind in ORDER if kind in acting), SENSOR):
+        passes += registered(kind).passes(scene)
     return FramePlan(
         frame=frame,
         seconds=seconds,
@@ -96,6 +92,7 @@ def plan(
         strength=acting,
         subframes=subframes,
         shutter=shutter,
+        readout=registered(SENSOR).readout(scene),
         passes=tuple(passes),
     )
 

@@ -72,6 +72,19 @@ class Light:
 
 
 @dataclass(frozen=True)
+class Sensor:
+    """How light becomes a stored picture; the same for a frame and its clean version."""
+
+    #: Standard deviation of the noise at mid grey, of 1.
+    noise: float
+    #: Quality of the JPEG that the device stores, 1-100; 0 stores without loss.
+    jpeg_quality: int = 0
+    #: Rolling shutter: s from the reading of the first row to that of the last; 0 reads all at
+    #: once.
+    rolling_shutter: float = 0.0
+
+
+@dataclass(frozen=True)
 class HandKey:
     """One hand at one moment of the track."""
 
@@ -153,8 +166,8 @@ class Scene:
     light: Light
     #: Name of a backdrop.
     background: str
-    #: Standard deviation of the sensor's noise at mid grey, of 1.
-    noise: float
+    #: The sensor.
+    sensor: Sensor
     #: What the hands do.
     track: Track
     #: Perturbations.
@@ -171,8 +184,11 @@ class Scene:
         return self.frame_count / self.fps
 
     def to_json(self) -> dict[str, Any]:
-        """Return the whole content as JSON values."""
-        return {"schema": SCHEMA, **asdict(self)}
+        """Return the whole content as JSON values, laid out as a scene file is."""
+        content = {"schema": SCHEMA, **asdict(self)}
+        if self.sensor == Sensor(self.sensor.noise):
+            content["noise"] = content.pop("sensor")["noise"]
+        return content
 
     @property
     def digest(self) -> str:
@@ -245,7 +261,7 @@ def parse_scene(text: str, *, where: str) -> Scene:
         camera=_camera(top.table("camera")),
         light=_light(top.table("light")),
         background=top.text("background"),
-        noise=top.number("noise", 0.0, 0.2),
+        sensor=_sensor(top),
         track=_track(top.table("track"), sides),
         effects=tuple(_effect(row) for row in top.rows("effects")),
     )
@@ -305,6 +321,20 @@ def _light(fields: Fields) -> Light:
         raise fields.wrong("direction", "is zero")
     fields.finish()
     return light
+
+
+def _sensor(top: Fields) -> Sensor:
+    """The table `sensor`, or `noise` at the top where a scene says no more of its sensor."""
+    fields = top.optional_table("sensor")
+    if fields is None:
+        return Sensor(noise=top.number("noise", 0.0, 0.2))
+    sensor = Sensor(
+        noise=fields.number("noise", 0.0, 0.2),
+        jpeg_quality=fields.whole("jpeg_quality", 0, 100, default=0),
+        rolling_shutter=fields.number("rolling_shutter", 0.0, 0.05, default=0.0),
+    )
+    fields.finish()
+    return sensor
 
 
 def _track(fields: Fields, sides: tuple[str, ...]) -> Track:

@@ -116,33 +116,35 @@ class Stage:
     def things(
         self, placements: tuple[Placement, ...], hands: dict[str, HandMoment]
     ) -> Body | None:
-        """The objects of an instant, or None."""
+        """The objects of an instant, ready for rays, or None."""
         if not placements:
             return None
+        with self.ledger.time("objects"):
+            return self.traced(self.objects(placements, hands))
+
+    def objects(self, placements: tuple[Placement, ...], hands: dict[str, HandMoment]) -> Surface:
+        """The objects of an instant, at least one, as one surface."""
         from hwp_bench.sim.objects import build_object
 
-        with self.ledger.time("objects"):
-            parts = []
-            for placement in placements:
-                frame = np.eye(4)
-                frame[:3, 3] = focus_point()
-                if placement.anchor != "world":
-                    moment = hands[placement.anchor]
-                    still = heading_matrix(np.zeros(3), placement.anchor)
-                    frame[:3, :3] = heading_matrix(moment.heading, placement.anchor) @ still.T
-                    frame[:3, 3] += moment.place
-                parts.append(
-                    transformed(build_object(placement.request), frame @ placement.transform)
-                )
-            return self.traced(join(parts))
+        parts = []
+        for placement in placements:
+            frame = np.eye(4)
+            frame[:3, 3] = focus_point()
+            if placement.anchor != "world":
+                moment = hands[placement.anchor]
+                still = heading_matrix(np.zeros(3), placement.anchor)
+                frame[:3, :3] = heading_matrix(moment.heading, placement.anchor) @ still.T
+                frame[:3, 3] += moment.place
+            parts.append(transformed(build_object(placement.request), frame @ placement.transform))
+        return join(parts)
 
 
-def between(bodies: tuple[Surface, Surface, Surface], s: float) -> Surface:
+def between(bodies: tuple[Surface, Surface, Surface], s: float | np.ndarray) -> Surface:
     """A surface between three instants of the same hands.
 
     Args:
         bodies: at the opening, the middle and the closing of the shutter.
-        s: -0.5 to 0.5; the parabola through the three.
+        s: -0.5 to 0.5; the parabola through the three. Or (V, 1), one for each vertex.
     """
     first, middle, last = bodies
     a, b, c = 2.0 * s * s - s, 1.0 - 4.0 * s * s, 2.0 * s * s + s

@@ -1,7 +1,8 @@
-"""Effects, registered by the name of the perturbation that they simulate.
+"""Effects, registered by name: the four perturbations and the sensor.
 
-They compose in the order of `ORDER`: pose first, then objects, light, shutter. The sensor,
-which every frame passes, comes last and is no perturbation.
+They compose in a stated order: first the perturbations in the order of `ORDER` (pose, objects,
+light, shutter), last the `SENSOR`, which is no perturbation: it has no episodes and no severity,
+and every frame and its clean version pass it alike.
 """
 
 from __future__ import annotations
@@ -15,8 +16,10 @@ from hwp_bench.errors import BadInput
 if TYPE_CHECKING:
     from hwp_bench.sim.effects.base import Effect
 
-#: Order in which effects act on a frame.
+#: Order in which the perturbations act on a frame.
 ORDER = ("complex_poses", "hand_object_interaction", "illumination", "motion_blur")
+#: The effect that follows them in every frame.
+SENSOR = "sensor"
 
 
 @cache
@@ -26,7 +29,8 @@ def registered(kind: str) -> Effect:
     Raises:
         BadInput: there is none of that name.
     """
-    if kind not in ORDER:
-        raise BadInput(f"there is no effect {kind!r}", remedy=f"Known: {', '.join(ORDER)}.")
+    known = (*ORDER, SENSOR)
+    if kind not in known:
+        raise BadInput(f"there is no effect {kind!r}", remedy=f"Known: {', '.join(known)}.")
     effect: Effect = importlib.import_module(f"hwp_bench.sim.effects.{kind}").EFFECT
     return effect

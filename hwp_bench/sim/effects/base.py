@@ -48,10 +48,14 @@ class Effect:
 
     #: Name in scenes and captures.
     name: str
-    #: Strengths for severity 1 to 5 where the scene has no calibration.
+    #: Strengths for severity 1 to 5 where the scene has no calibration; perturbations only.
     default_strengths: tuple[float, float, float, float, float]
-    #: Largest strength that makes sense.
+    #: Largest strength that makes sense; perturbations only.
     max_strength: float
+
+    def passes(self, scene: Scene) -> tuple[str, ...]:
+        """Names of the passes that a frame needs because the effect acts in it."""
+        return ()
 
     def check(self, scene: Scene, call: EffectCall, where: str) -> None:
         """Check the settings.
@@ -83,6 +87,20 @@ class Effect:
     ) -> Shutter | None:
         """Open the shutter long enough to see motion."""
         return None
+
+    def readout(self, scene: Scene) -> float:
+        """How long the sensor takes from its first row to its last, s; 0 reads all at once."""
+        return 0.0
+
+    def record(
+        self, scene: Scene, frame: int, colors: tuple[np.ndarray, ...]
+    ) -> tuple[np.ndarray, ...]:
+        """Change the light that is counted: (S, S, 3) linear, of a frame and its clean version."""
+        return colors
+
+    def store(self, scene: Scene, image: np.ndarray) -> np.ndarray:
+        """Change the picture that is stored: (S, S, 3) uint8 sRGB."""
+        return image
 
     def estimate_error(self, strength: float) -> tuple[float, float]:
         """How far off an estimator is: standard deviations in rad and m."""

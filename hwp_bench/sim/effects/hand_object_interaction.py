@@ -85,6 +85,9 @@ class _HandObjectInteraction(Effect):
     default_strengths = (0.25, 0.45, 0.65, 0.85, 1.0)
     max_strength = 1.0
 
+    def passes(self, scene: Scene) -> tuple[str, ...]:
+        return ("objects",)
+
     def check(self, scene: Scene, call: EffectCall, where: str) -> None:
         _read(call.settings, scene.sides, where)
 

@@ -34,6 +34,9 @@ class _Illumination(Effect):
     default_strengths = (0.15, 0.3, 0.5, 0.8, 1.2)
     max_strength = 2.5
 
+    def passes(self, scene: Scene) -> tuple[str, ...]:
+        return ("light",)
+
     def check(self, scene: Scene, call: EffectCall, where: str) -> None:
         _modes(call, where)
 

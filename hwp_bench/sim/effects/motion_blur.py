@@ -24,6 +24,9 @@ class _MotionBlur(Effect):
     default_strengths = (0.008, 0.018, 0.034, 0.06, 0.1)
     max_strength = 0.25
 
+    def passes(self, scene: Scene) -> tuple[str, ...]:
+        return ("shutter",)
+
     def check(self, scene: Scene, call: EffectCall, where: str) -> None:
         _read(call, where)
 

@@ -17,7 +17,7 @@ from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SINGLE, scene_maker
 from hwp_bench.sim.forecast import forecast, plan_table
 from hwp_bench.sim.frame import FrameResult, render_frame
 from hwp_bench.sim.plan import SUBFRAME_STEP, plan
-from hwp_bench.sim.scene import Scene
+from hwp_bench.sim.scene import Scene, Sensor
 from hwp_bench.sim.variants import with_effects
 
 SceneMaker = Callable[..., Scene]
@@ -103,7 +103,7 @@ def test_subframes_follow_the_motion_on_the_screen(make_scene: SceneMaker) -> No
 
 def test_blur_moves_light_but_makes_none(make_scene: SceneMaker) -> None:
     # Oracle: the exposure is a mean of instants, so the picture's mean hardly changes.
-    scene = replace(make_scene(), noise=0.0)
+    scene = replace(make_scene(), sensor=Sensor(noise=0.0))
     result = render_frame(scene, BLUR, COUNT, SIZE)
     assert abs(result.rgb.mean() - result.clean.mean()) < 0.04 * result.clean.mean()
     assert (
@@ -125,7 +125,7 @@ def test_an_object_covers_what_the_mask_loses(render: Callable[[int], FrameResul
 def test_dimming_is_a_factor_on_linear_light(make_scene: SceneMaker) -> None:
     from hwp_bench.sim.colors import srgb_to_linear
 
-    scene = replace(make_scene(), noise=0.0)
+    scene = replace(make_scene(), sensor=Sensor(noise=0.0))
     result = render_frame(scene, LIGHT, COUNT, SIZE)
     bright = srgb_to_linear(result.clean / 255.0)
     dim = srgb_to_linear(result.rgb / 255.0)

@@ -1,0 +1,52 @@
+"""The sensor: noise, rows that are read in turn, and the JPEG that the device stores.
+
+It is no perturbation: a frame and its clean version pass it alike, with the same noise.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hwp_bench.sim.effects.base import Effect
+from hwp_bench.sim.scene import Scene
+from hwp_bench.sim.seeds import generator
+
+
+class _Sensor(Effect):
+    name = "sensor"
+
+    def passes(self, scene: Scene) -> tuple[str, ...]:
+        sensor = scene.sensor
+        asked = {
+            "rolling": sensor.rolling_shutter,
+            "sensor": sensor.noise,
+            "jpeg": sensor.jpeg_quality,
+        }
+        return tuple(name for name, setting in asked.items() if setting)
+
+    def readout(self, scene: Scene) -> float:
+        return scene.sensor.rolling_shutter
+
+    def record(
+        self, scene: Scene, frame: int, colors: tuple[np.ndarray, ...]
+    ) -> tuple[np.ndarray, ...]:
+        if not scene.sensor.noise:
+            return colors
+        rng = generator(scene.seed, "sensor", frame)
+        noise = scene.sensor.noise * rng.normal(size=colors[0].shape)
+        # Counted photons scatter with the square root of their number.
+        return tuple(color + noise * np.sqrt(np.clip(color, 0.02, 1.0)) for color in colors)
+
+    def store(self, scene: Scene, image: np.ndarray) -> np.ndarray:
+        if not scene.sensor.jpeg_quality:
+            return image
+        import cv2
+
+        quality = [cv2.IMWRITE_JPEG_QUALITY, scene.sensor.jpeg_quality]
+        _, packed = cv2.imencode(".jpg", image[..., ::-1], quality)
+        stored = cv2.imdecode(packed, cv2.IMREAD_COLOR)
+        assert stored is not None
+        return np.ascontiguousarray(stored[..., ::-1], dtype=np.uint8)
+
+
+EFFECT = _Sensor()
