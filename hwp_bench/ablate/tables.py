@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 from hwp_bench.ablate.effects import CostEffect, ScoreEffect, seconds
 from hwp_bench.ablate.run import AblationRuns
+from hwp_bench.cost.seconds import seconds_table
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import Scores, aggregate
 from hwp_bench.report.summary import HEADLINE, PAPER
@@ -30,7 +31,8 @@ def ablation_tables(
     """Return every table of an ablation, by name.
 
     `ablation` (a row a variant: the paper's columns, and the time), `paper` (the same in the
-    protocol paper-wildghand), `effects`, `effects_perturbations`, `component_cost`, `seeds`.
+    protocol paper-wildghand), `effects`, `effects_perturbations`, `component_cost`, `seeds`,
+    `seconds` (where those of all runs went).
     """
     runs = list(ablation.runs.values())
     headline = common_metrics(runs, HEADLINE)
@@ -45,6 +47,9 @@ def ablation_tables(
     paper = common_metrics(runs, PAPER)
     if paper:
         tables["paper"] = variant_table(ablation, paper)
+    spent = seconds_table(runs)
+    if spent is not None:
+        tables["seconds"] = spent
     return tables
 
 

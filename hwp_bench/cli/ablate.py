@@ -131,8 +131,9 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
         json.dump(record, sys.stdout, indent=1, allow_nan=False)
         print()
     else:
-        for name in ("ablation", "effects", "component_cost"):
-            print_table(tables[name])
+        for name in ("ablation", "effects", "component_cost", "seconds"):
+            if name in tables:
+                print_table(tables[name])
     _draw(ablation, out)
     notice(f"record: {write_record(out, record)}; tables: {out / 'tables'}")
     failures = [

@@ -9,6 +9,7 @@ from typing import Any
 
 from hwp_bench.cost.figure import draw_pareto, write_figure
 from hwp_bench.cost.front import FrontPart, MeanCurve, mean_curve, pareto_front
+from hwp_bench.cost.seconds import seconds_table
 from hwp_bench.cost.summary import BUDGETS, MethodCost, method_costs, method_curves, window
 from hwp_bench.cost.tables import cost_tables, machine_notes
 from hwp_bench.errors import UsageError
@@ -104,6 +105,9 @@ def analyse_cost(
         stretch=window(methods),
         notes=machine_notes([result for run in runs for result in run.seeds.values()]),
     )
+    seconds = seconds_table(runs)
+    if seconds is not None:
+        tables["seconds"] = seconds
     return CostAnalysis(metric, tuple(costs), tuple(curves), tuple(front), tables)
 
 

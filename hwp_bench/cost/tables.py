@@ -120,7 +120,7 @@ def _times_table(costs: Sequence[MethodCost]) -> Table:
         "Means over captures and seeds; peak memory is the largest. Whole process: start-up, "
         "checkpoints and rendering included."
     )
-    return Table("Where the time goes", columns, rows, (note,))
+    return Table("Times and memory", columns, rows, (note,))
 
 
 def _front_table(front: Sequence[FrontPart], metric: str) -> Table:

@@ -17,6 +17,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.cost.analysis import analyse_cost, write_cost
 from hwp_bench.cost.curves import Curve, curve_of
 from hwp_bench.cost.front import mean_curve, pareto_front
+from hwp_bench.cost.seconds import run_seconds, seconds_table
 from hwp_bench.cost.summary import method_costs
 from hwp_bench.errors import UsageError
 from hwp_bench.results import CurvePoint, write_results
@@ -92,6 +93,26 @@ def test_costs_of_known_curves() -> None:
     assert mine.frames_per_second == pytest.approx(12)
     assert mine.score_seconds == pytest.approx(0.1 / 6)
     assert (mine.curves, mine.fits, mine.devices) == (4, 4, ("cpu",))
+
+
+def test_the_seconds_of_a_run_are_its_parts() -> None:
+    base = made_results("mine", flat, captures=1).captures[0]
+    capture = replace(
+        base, fit_seconds=6.0, curve_seconds=1.5, render_seconds=0.5, wall_seconds=11.0,
+        job_seconds=12.5,
+    )  # fmt: skip
+    parts = {"start": 3.0, "fit": 6.0, "curve": 1.5, "render": 0.5, "score": 1.5}
+    assert run_seconds(capture) == pytest.approx(parts)
+    assert run_seconds(replace(capture, job_seconds=None)) is None
+    # A method that says more than its process took: nothing becomes negative.
+    assert run_seconds(replace(capture, fit_seconds=60.0))["start"] == 0.0
+    whole = replace(made_results("mine", flat), captures=[capture, capture, base])
+    table = seconds_table(group_runs([whole]))
+    found = {row[0]: row[1:4] for row in table.rows}
+    assert found["curve"] == pytest.approx((1.5, 3.0, 12.0))
+    assert found["sum"] == pytest.approx((12.5, 25.0, 100.0))
+    assert "1 of 3 runs say nothing of it." in table.notes
+    assert seconds_table(group_runs([doubling("old")])) is None
 
 
 def test_a_score_that_most_fits_never_reach_has_no_time() -> None:
