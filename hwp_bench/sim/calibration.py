@@ -38,7 +38,7 @@ from hwp_bench.sim.variants import with_effects
 TARGETS: Mapping[str, tuple[float, ...]] = MappingProxyType(
     {
         "hand_object_interaction": (0.05, 0.10, 0.17, 0.26, 0.36),
-        "complex_poses": (27.0, 24.0, 21.0, 19.0, 17.5),
+        "complex_poses": (29.0, 26.0, 24.0, 22.5, 21.5),
         "illumination": (32.0, 28.0, 24.0, 20.0, 17.0),
         "motion_blur": (36.0, 32.0, 29.5, 27.5, 26.0),
     }
