@@ -7,8 +7,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hwp_bench.ablate.design import Design, Variant
-from hwp_bench.evaluate.capture_run import evaluate_capture
+from hwp_bench.engine import Engine, LocalEngine, Needs
+from hwp_bench.evaluate.capture_run import read_result
 from hwp_bench.evaluate.evaluation import EvaluationSettings, Plan, make_plan, open_captures
+from hwp_bench.evaluate.jobs import evaluation_job
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.results import CaptureResult, Results, write_results
@@ -50,6 +52,8 @@ def run_ablation(
     *,
     splits: Mapping[str, Split] | None = None,
     on_job: OnJob | None = None,
+    engine: Engine | None = None,
+    needs: Needs | None = None,
 ) -> AblationRuns:
     """Run an ablation; what is on disk from an earlier start is taken as it is.
 
@@ -65,7 +69,9 @@ def run_ablation(
         settings: of every evaluation; its seed is not used.
         seeds: the seeds.
         splits: splits by capture id; None applies the 80/10/10 rule.
-        on_job: hook for showing progress.
+        on_job: hook for showing progress, where jobs run in turn.
+        engine: where jobs run; one after another in this process if None.
+        needs: what one job takes of a machine.
 
     Raises:
         BadMethod: there is no such preset.
@@ -83,23 +89,30 @@ def run_ablation(
         for variant in design.variants
         for seed in seeds
     }
-    finished: dict[tuple[str, int], list[CaptureResult]] = {key: [] for key in plans}
     order = [
         (seed, number, variant)
         for seed in seeds
         for number in range(len(opened))
         for variant in _rotated(design.variants, number + seed)
     ]
-    for index, (seed, number, variant) in enumerate(order):
-        plan = plans[variant.name, seed]
-        job = plan.jobs[number]
+    # By capture, so that a result file lists captures in one order whichever ended first.
+    finished: dict[tuple[str, int], dict[int, CaptureResult]] = {key: {} for key in plans}
+    jobs = []
+    for seed, number, variant in order:
+        job = plans[variant.name, seed].jobs[number]
         name = job.capture.info.id
+        folder = out / result_folder(variant.name, seed) / "captures" / name
         text = f"{name}, {variant.name}, seed {seed}"
-        update = on_job(index, len(order), text) if on_job else None
-        folder = out / result_folder(variant.name, seed)
+        jobs.append(evaluation_job(job, folder, text, needs or Needs()))
+
+    def on_done(index: int) -> None:
+        seed, number, variant = order[index]
         done = finished[variant.name, seed]
-        done.append(evaluate_capture(job, folder / "captures" / name, update))
-        write_results(folder / "results.json", plan.results(done))
+        done[number] = read_result(jobs[index].output)
+        results = plans[variant.name, seed].results([done[key] for key in sorted(done)])
+        write_results(out / result_folder(variant.name, seed) / "results.json", results)
+
+    (engine or LocalEngine()).run(jobs, on_done, on_job)
     return AblationRuns(design, _runs(design, plans, finished, seeds))
 
 
@@ -115,14 +128,16 @@ def _title(manifest: MethodManifest, variant: Variant) -> str:
 def _runs(
     design: Design,
     plans: Mapping[tuple[str, int], Plan],
-    finished: Mapping[tuple[str, int], list[CaptureResult]],
+    finished: Mapping[tuple[str, int], Mapping[int, CaptureResult]],
     seeds: Sequence[int],
 ) -> dict[str, MethodRuns]:
     return {
         variant.name: MethodRuns(
             plans[variant.name, seeds[0]].manifest.title,
             {
-                seed: plans[variant.name, seed].results(finished[variant.name, seed])
+                seed: plans[variant.name, seed].results(
+                    [result for _, result in sorted(finished[variant.name, seed].items())]
+                )
                 for seed in seeds
             },
         )

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ _EXAMPLES = """examples:
   hwp-bench ablate --binary-mask                         # a binary mask in place of PAO's weights
   hwp-bench ablate --only dpd pao heads                  # 2 x 2 x 2
   hwp-bench ablate my_method --without loss --budget 60  # what a third party's method declares
+  hwp-bench ablate --suite full --engine ray://10.0.0.1:6379 --job-gpus 1
 
 Which variants are run:
   no flag         the first two components that the method declares, crossed: 2 x 2
@@ -81,6 +83,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.ablate.run import run_ablation
     from hwp_bench.ablate.view import AblationView
     from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings
+    from hwp_bench.engine.options import engine_for, needs_of
     from hwp_bench.errors import UsageError
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.progress import notice
@@ -93,22 +96,25 @@ def run(args: argparse.Namespace) -> int:
     # A wrong method or switch must be said before a suite is rendered for it.
     manifest = read_manifest(find_method(args.method))
     design = make_design(manifest, args.thrown or [], args.only)
-    captures = chosen_captures(args)
     out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}")
     splits = read_splits(args.splits) if args.splits else None
     names = ", ".join(variant.name for variant in design.variants)
     notice(f"{len(design.variants)} variants: {names}")
-    with AblationView() as view:
-        ablation = run_ablation(
-            manifest,
-            design,
-            captures,
-            out,
-            settings,
-            range(args.seeds),
-            splits=splits,
-            on_job=view.start,
-        )
+    with engine_for(args) as engine:
+        captures = chosen_captures(args, engine)
+        with AblationView() if engine.in_turn else nullcontext() as view:
+            ablation = run_ablation(
+                manifest,
+                design,
+                captures,
+                out,
+                settings,
+                range(args.seeds),
+                splits=splits,
+                on_job=view.start if view else None,
+                engine=engine,
+                needs=needs_of(args),
+            )
     return _report(ablation, out, print_json=args.json)
 
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from hwp_bench.engine.options import add_engine_arguments
+
 if TYPE_CHECKING:
+    from hwp_bench.engine import Engine
     from hwp_bench.evaluate.evaluation import EvaluationSettings
     from hwp_bench.publish import SealedPart
     from hwp_bench.results import Results
@@ -20,6 +24,8 @@ _EXAMPLES = """examples:
   hwp-bench evaluate my_method --suite mini --set gaussians=20000 --json
   hwp-bench evaluate baselines/plain --suite mini --frames clean     # what no method can beat
   hwp-bench evaluate submission --sealed publication/sealed
+  hwp-bench evaluate my_method --suite mini --jobs 4                 # four captures at once
+  hwp-bench evaluate my_method --suite full --engine ray://10.0.0.1:6379 --job-gpus 1
 
 An evaluation that is started again with the same arguments takes finished captures as they are.
 Exit status 0: every frame was scored; 1: the method failed on a capture or left out frames
@@ -80,12 +86,14 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="kill the method after this time on one capture (default 3600)",
     )
+    add_engine_arguments(parser)
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from dataclasses import asdict, replace
 
+    from hwp_bench.engine.options import engine_for, needs_of
     from hwp_bench.evaluate.evaluation import evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.progress import JobProgress
@@ -99,17 +107,25 @@ def run(args: argparse.Namespace) -> int:
         settings = replace(settings, suite=f"sealed-{sealed.commitment[:12]}")
     # A wrong method directory must be said before a suite is rendered for it.
     read_manifest(find_method(args.method))
-    captures = chosen_captures(args) if sealed is None else list(sealed.captures)
     method = Path(args.method.rstrip("/")).name
     oracle = "" if args.frames == "perturbed" else f"-{args.frames}"
     out = Path(args.out or f"runs/{method}-{settings.suite}{oracle}")
     splits = read_splits(args.splits) if args.splits else None
     if sealed is not None:
         splits = sealed.splits
-    with JobProgress() as jobs:
-        results = evaluate(
-            args.method, captures, out, settings, splits=splits, on_capture=jobs.start
-        )
+    with engine_for(args) as engine:
+        captures = chosen_captures(args, engine) if sealed is None else list(sealed.captures)
+        with JobProgress() if engine.in_turn else nullcontext() as jobs:
+            results = evaluate(
+                args.method,
+                captures,
+                out,
+                settings,
+                splits=splits,
+                on_capture=jobs.start if jobs else None,
+                engine=engine,
+                needs=needs_of(args),
+            )
     tables = all_tables([results])
     write_tables(out / "tables", tables)
     if args.json:
@@ -194,10 +210,11 @@ def _override(text: str) -> tuple[str, Any]:
         return name, value
 
 
-def chosen_captures(args: argparse.Namespace) -> list[Path]:
+def chosen_captures(args: argparse.Namespace, engine: Engine) -> list[Path]:
     """Return the capture folders that were named, or those of the suite, rendered if need be."""
     if args.capture:
         return [Path(path) for path in args.capture]
+    from hwp_bench.engine.options import needs_of
     from hwp_bench.sim import ensure_suite
 
-    return ensure_suite(args.suite)
+    return ensure_suite(args.suite, engine=engine, needs=needs_of(args))

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import argparse
 
+from hwp_bench.engine.options import add_engine_arguments
+
 _EXAMPLES = """examples:
   hwp-bench sim list
   hwp-bench sim plan capture4 --frames 60 --size 176
   hwp-bench sim render --suite mini
   hwp-bench sim render capture0 -o my_capture --frames 60 --size 160 --severity 3
   hwp-bench sim render all -o captures --subject 7
+  hwp-bench sim render --suite full --engine ray://10.0.0.1:6379 --job-cpus 8
   hwp-bench sim preview capture5 -o preview
   hwp-bench sim calibrate my_scene.toml --write
 
@@ -69,6 +72,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--workers", type=int, help="processes (default: as many as pay)")
     parser.add_argument("--exr", action="store_true", help="also linear EXR with extra layers")
     parser.add_argument("--overwrite", action="store_true", help="replace what exists")
+    add_engine_arguments(parser)
 
 
 def _add_preview(parser: argparse.ArgumentParser) -> None:

@@ -23,7 +23,7 @@ ANSWER_SECONDS = 60.0
 #: Port of a Ray head, where none is given.
 HEAD_PORT = 6379
 
-_REMEDY = "Give the address that `ray start --head` printed, and run the command on a node of the cluster."
+_REMEDY = "Give the address that `ray start --head` printed; run the command on a node of it."
 # Ray itself tries for minutes before it gives up; so it is tried in a process that can be ended.
 _PROBE = (
     "import sys, ray\nray.init(address=sys.argv[1], log_to_driver=False, logging_level='error')\n"

@@ -25,7 +25,8 @@ class RayEngine:
     """Runs jobs on a Ray cluster.
 
     Args:
-        address: HOST:PORT of the head; None takes RAY_ADDRESS, else starts a cluster of this machine.
+        address: HOST:PORT of the head; None takes RAY_ADDRESS, else starts a cluster
+            of this machine.
         view: shows the jobs; nothing if None.
         shared: whether nodes may look for inputs at their place here, and take them if the
             content is the same. Inputs that are not found are sent.

@@ -92,7 +92,7 @@ def evaluate_capture(
     Raises:
         BadCapture, BadImage: the capture itself is damaged.
     """
-    stored = _stored(job, folder)
+    stored = stored_result(job, folder)
     if stored is not None:
         return stored
     began = time.perf_counter()
@@ -135,16 +135,26 @@ def evaluate_capture(
     return result
 
 
-def _stored(job: Job, folder: Path) -> CaptureResult | None:
-    path = folder / "result.json"
+def stored_result(job: Job, folder: Path) -> CaptureResult | None:
+    """Return the result of the same job that a folder holds, if the method did not fail in it."""
     # What a submission predicts may change without its method.toml, so it is always scored.
-    if not path.is_file() or job.manifest.kind == "predictions":
+    if not (folder / "result.json").is_file() or job.manifest.kind == "predictions":
         return None
     try:
-        result = parse_record(CaptureResult, read_json(path), where=str(path))
+        result = read_result(folder)
     except HwpError:
         return None
     return result if result.key == job.key and result.failure is None else None
+
+
+def read_result(folder: Path) -> CaptureResult:
+    """Read the result that `evaluate_capture` left in a folder.
+
+    Raises:
+        BadInput, BadResult: it is missing or damaged.
+    """
+    path = folder / "result.json"
+    return parse_record(CaptureResult, read_json(path), where=str(path))
 
 
 def _run(

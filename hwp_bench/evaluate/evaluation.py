@@ -10,8 +10,10 @@ from typing import Any
 
 from hwp_bench import __version__
 from hwp_bench.capture import Capture, open_capture
+from hwp_bench.engine import Engine, LocalEngine, Needs
 from hwp_bench.errors import BadCapture
-from hwp_bench.evaluate.capture_run import Job, evaluate_capture
+from hwp_bench.evaluate.capture_run import Job, read_result
+from hwp_bench.evaluate.jobs import evaluation_job
 from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
 from hwp_bench.methods.request import RunSettings
@@ -56,6 +58,8 @@ def evaluate(
     *,
     splits: Mapping[str, Split] | None = None,
     on_capture: OnCapture | None = None,
+    engine: Engine | None = None,
+    needs: Needs | None = None,
 ) -> Results:
     """Evaluate a method.
 
@@ -69,7 +73,9 @@ def evaluate(
         out: results folder.
         settings: suite, preset, seed, budget, limits.
         splits: splits by capture id; None applies the 80/10/10 rule.
-        on_capture: hook for showing progress.
+        on_capture: hook for showing progress, where captures are evaluated in turn.
+        engine: where captures are evaluated; one after another in this process if None.
+        needs: what one capture takes of a machine.
 
     Returns:
         The results, which `out/results.json` then holds.
@@ -79,12 +85,13 @@ def evaluate(
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
     """
     plan = make_plan(read_manifest(find_method(method)), open_captures(captures, splits), settings)
-    finished: list[CaptureResult] = []
-    for index, job in enumerate(plan.jobs):
-        name = job.capture.info.id
-        update = on_capture(index, len(plan.jobs), name) if on_capture else None
-        finished.append(evaluate_capture(job, out / "captures" / name, update))
-    results = plan.results(finished)
+    folders = [out / "captures" / job.capture.info.id for job in plan.jobs]
+    jobs = [
+        evaluation_job(job, folder, folder.name, needs or Needs())
+        for job, folder in zip(plan.jobs, folders, strict=True)
+    ]
+    (engine or LocalEngine()).run(jobs, lambda index: None, on_capture)
+    results = plan.results([read_result(folder) for folder in folders])
     write_results(out / "results.json", results)
     return results
 

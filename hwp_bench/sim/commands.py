@@ -6,10 +6,13 @@ import argparse
 import json
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hwp_bench.errors import UsageError
 from hwp_bench.sim.scene import Scene, load_scene, scene_names
+
+if TYPE_CHECKING:
+    from hwp_bench.engine import Engine
 
 
 def list_scenes(args: argparse.Namespace) -> int:
@@ -75,7 +78,7 @@ def print_plan(args: argparse.Namespace) -> int:
 
 def render(args: argparse.Namespace) -> int:
     """Render captures and print their folders."""
-    from hwp_bench.sim.production import render_capture
+    from hwp_bench.engine.options import engine_for, needs_of
     from hwp_bench.sim.suites import ensure_suite
 
     if (args.suite is None) == (args.scene is None):
@@ -84,25 +87,47 @@ def render(args: argparse.Namespace) -> int:
     if args.suite is not None:
         if any(change is not None for change in changes) or args.exr:
             raise UsageError("a suite is rendered as it is", field="--suite")
-        for folder in ensure_suite(args.suite, args.out, args.workers):
+        with engine_for(args) as engine:
+            folders = ensure_suite(
+                args.suite, args.out, args.workers, engine=engine, needs=needs_of(args)
+            )
+        for folder in folders:
             print(folder)
         return 0
     if args.out is None:
         raise UsageError("says not where to", field="-o", remedy="Give a folder with -o.")
-    for scene in _scenes([args.scene]):
-        out = Path(args.out) / scene.id if args.scene == "all" else Path(args.out)
-        render_capture(
-            _changed(scene, args.severity, args.subject),
-            out,
-            frame_count=args.frames,
-            size=args.size,
-            seed=args.seed,
-            workers=args.workers,
-            overwrite=args.overwrite,
-            exr=args.exr,
-        )
-        print(out)
+    scenes = [_changed(scene, args.severity, args.subject) for scene in _scenes([args.scene])]
+    with engine_for(args) as engine:
+        folders = _render_scenes(args, scenes, engine)
+    for folder in folders:
+        print(folder)
     return 0
+
+
+def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine) -> list[Path]:
+    from hwp_bench.engine.options import needs_of
+    from hwp_bench.sim.jobs import RenderCapture, render_job, workers_each
+
+    needs = needs_of(args)
+    jobs = []
+    for scene in scenes:
+        out = Path(args.out) / scene.id if args.scene == "all" else Path(args.out)
+        if not args.overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
+            raise UsageError(
+                "exists already", where=out, remedy="Choose another place or --overwrite."
+            )
+        work = RenderCapture(
+            scene,
+            args.frames,
+            args.size,
+            args.seed,
+            workers=workers_each(args.workers, engine, needs),
+            exr=args.exr,
+            overwrite=args.overwrite,
+        )
+        jobs.append(render_job(work, out, needs))
+    engine.run(jobs, lambda index: None)
+    return [job.output for job in jobs]
 
 
 def preview(args: argparse.Namespace) -> int:

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from hwp_bench.errors import HwpError, UsageError
+from hwp_bench.engine import Engine, LocalEngine, Needs
+from hwp_bench.errors import UsageError
 from hwp_bench.files import cache_root
 from hwp_bench.sim.scene import Scene, load_scene, scene_names
 
@@ -64,7 +65,12 @@ def suite(name: str) -> tuple[SuiteItem, ...]:
 
 
 def ensure_suite(
-    name: str, cache: str | os.PathLike[str] | None = None, workers: int | None = None
+    name: str,
+    cache: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    *,
+    engine: Engine | None = None,
+    needs: Needs | None = None,
 ) -> list[Path]:
     """Render the captures of a suite that are not in the cache yet.
 
@@ -72,6 +78,8 @@ def ensure_suite(
         name: a suite.
         cache: folder of captures; the toolkit's cache if None.
         workers: processes for each render.
+        engine: where captures are rendered; one after another in this process if None.
+        needs: what one render takes of a machine.
 
     Returns:
         The capture folders, in the suite's order.
@@ -80,27 +88,20 @@ def ensure_suite(
         UsageError: there is no such suite.
         HwpError: a render failed; captures that were finished stay.
     """
-    from hwp_bench.capture import open_capture
-    from hwp_bench.sim.locks import alone
-    from hwp_bench.sim.production import render_capture, render_key
+    from hwp_bench.sim.jobs import RenderCapture, render_job, workers_each
+    from hwp_bench.sim.production import render_key
 
+    engine, needs = engine or LocalEngine(), needs or Needs()
     root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
-    folders = []
+    each = workers_each(workers, engine, needs)
+    jobs = []
     for item in suite(name):
         key = render_key(item.scene, item.frame_count, item.size)
         folder = root / f"{item.scene.id}-{item.frame_count}x{item.size}-{key[:12]}"
-        with alone(folder.with_name(f"{folder.name}.lock")):
-            try:
-                open_capture(folder)
-            except HwpError:
-                render_capture(
-                    item.scene,
-                    folder,
-                    frame_count=item.frame_count,
-                    size=item.size,
-                    seed=item.seed,
-                    workers=workers,
-                    overwrite=True,
-                )
-        folders.append(folder)
-    return folders
+        work = RenderCapture(
+            item.scene, item.frame_count, item.size, item.seed, workers=each, keep=True
+        )
+        jobs.append(render_job(work, folder, needs))
+    if not all(job.finished() for job in jobs):
+        engine.run(jobs, lambda index: None)
+    return [job.output for job in jobs]
