@@ -45,7 +45,7 @@ class TemporalWeights:
 
     #: Indices of training frames.
     frames: list[int]
-    #: One weight a frame, at least 0.
+    #: One weight a frame, at least 0 once read.
     weights: list[float]
 
 
@@ -62,8 +62,11 @@ def read_sources(paths: Iterable[str | os.PathLike[str]]) -> list[Source]:
 def temporal_weights(source: Source, capture: str) -> dict[str, TemporalWeights]:
     """Return the temporal weights that a method left, by side (`right`, `left`, or empty).
 
+    What is returned is their magnitude: a weight times a learned bias is the same with both signs
+    turned, so that the sign says nothing of how perturbed a frame is.
+
     Raises:
-        BadResult: a file does not hold as many finite weights at least 0 as frames.
+        BadResult: a file does not hold as many finite weights as frames, or a frame below 0.
         BadInput: a file is damaged.
     """
     folder = source.place(capture, "diagnostics")
@@ -76,11 +79,11 @@ def temporal_weights(source: Source, capture: str) -> dict[str, TemporalWeights]
         item = parse_record(TemporalWeights, value, where=os.fspath(path))
         if len(item.frames) != len(item.weights) or not item.frames:
             raise BadResult("must hold one weight a frame", where=path, field="weights")
-        if min(item.weights) < 0 or min(item.frames) < 0:
-            raise BadResult("must not be below 0", where=path, field="weights")
+        if min(item.frames) < 0:
+            raise BadResult("must not be below 0", where=path, field="frames")
         order = np.argsort(item.frames, kind="stable")
         found[side] = TemporalWeights(
-            [item.frames[i] for i in order], [item.weights[i] for i in order]
+            [item.frames[i] for i in order], [abs(item.weights[i]) for i in order]
         )
     return found
 

@@ -116,7 +116,7 @@ class Bar:
 def bar_plot(groups: Mapping[str, Sequence[Bar]], metric: str) -> Markup:
     """Draw one group of bars a perturbation, each with its 95 % interval.
 
-    Bars begin at zero; an interval that leaves the picture is cut there.
+    Bars begin at zero; an interval that leaves the picture is cut there, and has no end mark.
 
     Args:
         groups: by heading; at least one bar in all.
@@ -153,7 +153,8 @@ def bar_plot(groups: Mapping[str, Sequence[Bar]], metric: str) -> Markup:
             if estimate.low is not None and estimate.high is not None:
                 parts.append(line(x(estimate.low), middle, x(estimate.high), middle, "whisker"))
                 for end in (estimate.low, estimate.high):
-                    parts.append(line(x(end), middle - 4, x(end), middle + 4, "whisker"))
+                    if 0 <= end <= high:
+                        parts.append(line(x(end), middle - 4, x(end), middle + 4, "whisker"))
             text = f"{estimate.value:.{facts.digits}f}"
             parts.append(label(WIDTH - 2, middle + 4, text, "end"))
             place += _BAR

@@ -5,23 +5,17 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
+from browser import PHONE, least_contrast, open_page, overflow, show
 
 from hwp_bench.leaderboard.entries import Entry, entry_name
 from hwp_bench.leaderboard.site import board_page, budget_text, build_site, make_row, script
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult
 
-CHROMIUM = Path("/usr/bin/chromium")
-DRIVER = Path("/usr/bin/chromedriver")
 EVIL = '"><img src=x onerror=alert(1)>'
-FLAGS = (
-    *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-)
 
 
 @pytest.fixture
@@ -40,6 +34,7 @@ def entries(make_results) -> list[Entry]:
             replace(
                 result.captures[0],
                 id=f"capture-{name}",
+                device=title,
                 perturbations=[name],
                 frames=[
                     FrameResult(18, {"psnr": psnr, "ssim": 0.5, "oriented_distance": 0.01}, None)
@@ -114,24 +109,8 @@ def test_filters_and_addresses(board) -> None:
 @pytest.fixture
 def browser(entries, tmp_path) -> Iterator[Any]:
     """Chromium at the site, driven by the keyboard and the mouse."""
-    if not (CHROMIUM.exists() and DRIVER.exists()):
-        pytest.skip("Chromium is not here")
-    webdriver = pytest.importorskip("selenium.webdriver")
-    from selenium.webdriver.chrome.service import Service
-
-    page = build_site(tmp_path / "site", entries)
-    options = webdriver.ChromeOptions()
-    options.binary_location = str(CHROMIUM)
-    for flag in (*FLAGS, f"--user-data-dir={tmp_path / 'profile'}"):
-        options.add_argument(flag)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
-    driver = webdriver.Chrome(options=options, service=Service(str(DRIVER)))
-    try:
-        driver.get(page.as_uri())
+    with open_page(build_site(tmp_path / "site", entries), tmp_path / "profile") as driver:
         yield driver
-        assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
-    finally:
-        driver.quit()
 
 
 def visible(browser: Any) -> list[str]:
@@ -193,3 +172,31 @@ def test_everything_is_reached_with_the_tab_key(browser) -> None:
     wanted = ["suite", "scope", "budget", "method", "psnr", "Beta", "Gamma"]
     assert [name for name in wanted if name not in reached] == []
     assert browser.find_elements(By.CSS_SELECTOR, "img") == []
+
+
+@pytest.mark.slow
+def test_a_hostile_address_changes_nothing(browser) -> None:
+    address = browser.current_url.split("#")[0]
+    for state in ("suite=<img src=x>", "sort=__proto__&down=1", "scope=constructor", "budget=%E0"):
+        browser.get("about:blank")
+        browser.get(f"{address}#{state}")
+        assert visible(browser) == [EVIL, "Beta", "Gamma"]
+    assert browser.execute_script("return document.images.length") == 0
+
+
+@pytest.mark.slow
+def test_it_is_legible_on_a_phone_in_the_dark_and_on_paper(browser) -> None:
+    """WCAG AA asks for a contrast of 4.5; a first column of 60 px holds more than a letter."""
+    for width, dark, media in (
+        (1280, False, "screen"),
+        (PHONE, True, "screen"),
+        (PHONE, False, "print"),
+    ):
+        show(browser, width, dark=dark, media=media)
+        assert least_contrast(browser) >= 4.5
+        narrowest = "return Math.min(...[...document.querySelectorAll('td:first-child')]"
+        assert browser.execute_script(f"{narrowest}.map(cell => cell.clientWidth))") >= 60
+        if media == "screen":
+            assert overflow(browser) <= 0
+    # On paper nothing is there to be pressed.
+    assert not browser.find_element("id", "controls").is_displayed()

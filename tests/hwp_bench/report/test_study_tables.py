@@ -80,7 +80,8 @@ def test_severity_is_that_of_the_frames_to_learn_from(on_disk) -> None:
 def test_bias_is_the_mean_weight(on_disk) -> None:
     source, capture = on_disk
     folder = source.place("capture2", "diagnostics")
-    write_json(folder / "temporal.json", {"frames": [1, 0], "weights": [0.003, 0.001]})
+    # The sign of a weight can be turned together with what it weighs: it says nothing.
+    write_json(folder / "temporal.json", {"frames": [1, 0], "weights": [-0.003, 0.001]})
     assert temporal_weights(source, "capture2")[""].weights == [0.001, 0.003]
     row = cells(make_table(TableRequest([source.folder], by="bias", captures=[capture.root])))[0]
     assert row["Mean temporal weight [1e-3]"] == pytest.approx(2.0)
@@ -95,7 +96,7 @@ def test_bias_is_the_mean_weight(on_disk) -> None:
     [
         {"frames": [0], "weights": [1.0, 2.0]},
         {"frames": [], "weights": []},
-        {"frames": [0], "weights": [-1.0]},
+        {"frames": [-1], "weights": [1.0]},
         {"frames": [0], "weights": ["x"]},
         {"weights": [1.0]},
     ],
