@@ -10,9 +10,12 @@ import cv2, numpy as np
 request, output = map(pathlib.Path, sys.argv[1:])
 value = json.loads((request / "request.json").read_text())
 settings, split, seed = value["settings"], value["split"], value["seed"]
-with open(pathlib.Path(__file__).parent / "fits.log", "a") as stream:
-    stream.write(f"{value['id']} {seed} {settings['tone']} {settings['edge']} "
-                 f"{settings['mask']}\\n")
+try:
+    with open(pathlib.Path(__file__).parent / "fits.log", "a") as stream:
+        stream.write(f"{value['id']} {seed} {settings['tone']} {settings['edge']} "
+                     f"{settings['mask']}\\n")
+except OSError:
+    pass  # in a sandbox
 if settings.get("fail") == value["id"]:
     sys.exit("no luck")
 error = 10 + 30 * (not settings["tone"]) + 10 * (not settings["edge"]) + 5 * settings["mask"] + seed
@@ -60,7 +63,7 @@ def write_toy_method(folder: Path) -> Path:
 
     `tone` makes every pixel 30 levels better and a fit 1.5 times as long, `edge` 10 levels and
     1.2 times; `hard-mask` makes it 5 levels worse. A full fit takes 3.6 s on its own clock.
-    Every fit is a line of `fits.log` in the folder.
+    Every fit without a sandbox is a line of `fits.log` in the folder.
     """
     folder.mkdir()
     (folder / "run.py").write_text(_SCRIPT)

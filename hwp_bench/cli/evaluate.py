@@ -86,6 +86,26 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="SECONDS",
         help="kill the method after this time on one capture (default 3600)",
     )
+    parser.add_argument(
+        "--memory-limit",
+        type=float,
+        metavar="GB",
+        help="kill the method when it takes more memory (default: nine tenths of the machine's)",
+    )
+    parser.add_argument(
+        "--isolation",
+        choices=("auto", "required", "none"),
+        default="auto",
+        help="run the method without network and other files where the system allows it (auto), "
+        "or not at all (required), or without these walls (none)",
+    )
+    parser.add_argument(
+        "--expose",
+        nargs="+",
+        default=[],
+        metavar="PATH",
+        help="further files and folders that an isolated method may read, such as weights",
+    )
     add_engine_arguments(parser)
 
 
@@ -180,8 +200,9 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     from hwp_bench.errors import UsageError
     from hwp_bench.evaluate.evaluation import EvaluationSettings
     from hwp_bench.methods.contract import Budget
+    from hwp_bench.sandbox.confinement import Confinement
 
-    for name in ("budget", "steps", "time_limit"):
+    for name in ("budget", "steps", "time_limit", "memory_limit"):
         value = getattr(args, name)
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(f"{value} is not above 0", field=f"--{name.replace('_', '-')}")
@@ -193,6 +214,11 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
         budget=Budget(args.budget, args.steps),
         frames=args.frames,
         time_limit=args.time_limit,
+        confinement=Confinement(
+            mode=args.isolation,
+            memory_limit=None if args.memory_limit is None else int(args.memory_limit * 1e9),
+            exposed=tuple(Path(path) for path in args.expose),
+        ),
     )
 
 

@@ -25,11 +25,13 @@ from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.methods.predictions import Prediction, read_predictions
 from hwp_bench.methods.request import RunSettings, write_request
 from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
+from hwp_bench.methods.surroundings import hand_model_files
 from hwp_bench.methods.worker import CHECKPOINTS, DIAGNOSTICS
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.score import Network
 from hwp_bench.records import parse_record
 from hwp_bench.results import CaptureResult, CurvePoint
+from hwp_bench.sandbox.confinement import Confinement
 from hwp_bench.splits import Split
 
 #: Most bytes of temporal weights and weight masks that are kept of a capture.
@@ -53,6 +55,8 @@ class Job:
     run: RunSettings
     #: Seconds after which the method is killed.
     time_limit: float = DEFAULT_TIME_LIMIT
+    #: How the method's process is kept apart; it decides no score.
+    confinement: Confinement = field(default_factory=Confinement)
     #: LPIPS by backbone, where the weights are at hand.
     networks: Mapping[str, Network] = field(default_factory=dict)
 
@@ -128,6 +132,7 @@ def evaluate_capture(
         device=facts.device[:100] if facts.device else None,
         curve=_curve(job, output, facts),
         curve_seconds=facts.curve_seconds,
+        isolation=record.isolation if record else None,
     )
     _keep(job, folder, output, source, predictions, result)
     result = replace(result, job_seconds=time.perf_counter() - began)
@@ -172,11 +177,23 @@ def _run(
                 request,
                 output,
                 time_limit=job.time_limit,
+                confinement=_confinement(job, output),
                 on_progress=on_progress,
             )
         except (MethodFailed, BadMethod) as error:
             return None, str(error)
     return record, None
+
+
+def _confinement(job: Job, output: Path) -> Confinement:
+    """Hide the capture, and what lies beside the run: pictures of test frames among them."""
+    asked = job.confinement
+    hands = hand_model_files(job.capture.info.hand_model.source)
+    return replace(
+        asked,
+        exposed=(*asked.exposed, *hands),
+        hidden=(*asked.hidden, job.capture.root, output.parent.parent),
+    )
 
 
 def _curve(job: Job, output: Path, facts: RunFacts) -> list[CurvePoint]:

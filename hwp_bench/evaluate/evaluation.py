@@ -23,6 +23,7 @@ from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results, write_results
 from hwp_bench.results.environment import environment
+from hwp_bench.sandbox.confinement import Confinement
 from hwp_bench.splits import Split, split_for
 
 #: Called when a capture's work begins, with (index, count, capture id); returns what is to be
@@ -48,6 +49,8 @@ class EvaluationSettings:
     frames: str = "perturbed"
     #: Seconds after which a method is killed on one capture.
     time_limit: float = DEFAULT_TIME_LIMIT
+    #: How its process is kept apart, and its memory limit.
+    confinement: Confinement = field(default_factory=Confinement)
 
 
 def evaluate(
@@ -154,7 +157,7 @@ def make_plan(
     run = RunSettings(chosen, settings.seed, settings.budget, settings.frames)
     known = load_available() if networks is None else networks
     jobs = tuple(
-        Job(manifest, capture, split, run, settings.time_limit, known)
+        Job(manifest, capture, split, run, settings.time_limit, settings.confinement, known)
         for capture, split in captures
     )
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from hwp_bench.files import read_json
@@ -55,7 +55,4 @@ def read_facts(path: Path) -> RunFacts:
     """
     if not path.is_file():
         return RunFacts()
-    value = read_json(path, max_bytes=MAX_BYTES)
-    if isinstance(value, dict):
-        value = {**asdict(RunFacts()), **value}
-    return parse_record(RunFacts, value, where=str(path))
+    return parse_record(RunFacts, read_json(path, max_bytes=MAX_BYTES), where=str(path))

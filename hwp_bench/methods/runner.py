@@ -3,49 +3,33 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import shutil
 import signal
-import subprocess
 import sys
-import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO
 
 from hwp_bench.errors import BadInput, BadMethod, MethodFailed
 from hwp_bench.files import read_json
 from hwp_bench.methods.facts import RunFacts, read_facts
 from hwp_bench.methods.manifest import MethodManifest
+from hwp_bench.methods.surroundings import apart, inherited
 from hwp_bench.methods.worker import FAILURE, PREDICTIONS, PROGRESS, RUN
+from hwp_bench.sandbox.confinement import Confinement
+from hwp_bench.sandbox.supervise import MAX_PROCESSES, Limits, Outcome, Program, run_program
 
-#: Bytes of a method's output that are kept; the rest is counted and thrown away.
-MAX_LOG_BYTES = 1024 * 1024
 #: Seconds a method may take on one capture unless told otherwise.
 DEFAULT_TIME_LIMIT = 3600.0
-#: Environment variables that a method's process inherits.
-ENVIRONMENT = (
-    "CUDA_VISIBLE_DEVICES",
-    "HOME",
-    "HWP_CACHE",
-    "LANG",
-    "LC_ALL",
-    "LD_LIBRARY_PATH",
-    "MKL_NUM_THREADS",
-    "NUMBA_CACHE_DIR",
-    "NUMBA_NUM_THREADS",
-    "OMP_NUM_THREADS",
-    "PATH",
-    "PYTHONPATH",
-    "TMPDIR",
-    "TORCH_HOME",
-    "VIRTUAL_ENV",
-    "XDG_CACHE_HOME",
-)
+#: What a method printed, inside its output folder.
+LOG = "log.txt"
 
-_POLL_SECONDS = 0.05
+_REMEDIES = {
+    "time": "Raise --time-limit, or give the method a --budget.",
+    "memory": "Raise --memory-limit, or make the method smaller.",
+    "processes": "A method must do with fewer.",
+}
 
 
 @dataclass(frozen=True)
@@ -58,6 +42,9 @@ class RunRecord:
     facts: RunFacts
     #: Wall time of the whole process, start-up included, seconds.
     wall_seconds: float
+    #: How the process was kept apart: `namespaces`, or `processes` with the reason why not more;
+    #: None for submitted predictions.
+    isolation: str | None = None
 
 
 def run_method(
@@ -67,6 +54,7 @@ def run_method(
     output: Path,
     *,
     time_limit: float = DEFAULT_TIME_LIMIT,
+    confinement: Confinement | None = None,
     on_progress: Callable[[int, int], None] | None = None,
 ) -> RunRecord:
     """Run a method on a request.
@@ -77,13 +65,15 @@ def run_method(
         request: the request folder.
         output: a folder of the run's own; emptied first.
         time_limit: seconds after which the process and its children are killed.
+        confinement: how it is kept apart, and its memory limit; None takes the defaults.
         on_progress: called with (done, total) steps now and then.
 
     Returns:
         Where the predictions lie, and what the run took.
 
     Raises:
-        MethodFailed: it crashed, or ran out of time; the message names the log.
+        MethodFailed: it crashed, or ran out of time or memory; the message names the log. Or
+            isolation is required and the system does not allow it.
         BadMethod: a submission has no predictions for this capture.
     """
     if manifest.kind == "predictions":
@@ -95,21 +85,23 @@ def run_method(
                 remedy=f"Put the frames into {manifest.entry}/{capture_id}/.",
             )
         return RunRecord(folder, RunFacts(), 0.0)
+    wanted = confinement or Confinement()
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
-    log = output / "log.txt"
+    limits = Limits(time_limit, wanted.memory_bytes)
     started = time.perf_counter()
-    status = _supervise(_command(manifest, request, output), output, log, time_limit, on_progress)
+    outcome, isolation = _run(manifest, request, output, wanted, limits, on_progress)
     wall = time.perf_counter() - started
-    if status is None:
+    log = output / LOG
+    if outcome.stopped is not None:
         raise MethodFailed(
-            f"{manifest.name} ran out of time on {capture_id} after {time_limit:g} s",
+            f"{manifest.name} {_broken(outcome.stopped, capture_id, limits)}",
             where=log,
-            remedy="Raise --time-limit, or give the method a --budget.",
+            remedy=_REMEDIES[outcome.stopped],
         )
-    if status != 0:
+    if outcome.status != 0:
         raise MethodFailed(
-            f"{manifest.name} failed on {capture_id}: {_reason(output, status)}",
+            f"{manifest.name} failed on {capture_id}: {_reason(output, outcome.status)}",
             where=log,
             remedy="The log holds what it printed.",
         )
@@ -122,7 +114,45 @@ def run_method(
     except BadInput as error:
         problem = f"{manifest.name} wrote a {RUN} that cannot be read ({error.problem})"
         raise MethodFailed(problem, where=log, field=error.field) from error
-    return RunRecord(output / PREDICTIONS, facts, wall)
+    return RunRecord(output / PREDICTIONS, facts, wall, isolation)
+
+
+def _run(
+    manifest: MethodManifest,
+    request: Path,
+    output: Path,
+    wanted: Confinement,
+    limits: Limits,
+    on_progress: Callable[[int, int], None] | None,
+) -> tuple[Outcome, str]:
+    """Run behind the best walls that are wanted and to be had; says which they were."""
+    command = _command(manifest, request, output)
+
+    def poll() -> None:
+        if on_progress is not None:
+            _show_progress(output / PROGRESS, on_progress)
+
+    if wanted.mode != "none":
+        environment, places = apart(manifest, command, request, output, wanted)
+        walled = Program(command, output, environment, places, output / LOG)
+        outcome = run_program(walled, limits, poll)
+        if outcome.refused is None:
+            return outcome, "namespaces"
+        if wanted.mode == "required":
+            raise MethodFailed(
+                f"namespaces are required and not to be had ({outcome.refused})",
+                where=manifest.name,
+                field="isolation",
+                remedy="docs/threat-model.md says what they need.",
+            )
+        isolation = f"processes ({outcome.refused})"
+    else:
+        isolation = "processes"
+    plain = Program(command, output, inherited(), None, output / LOG)
+    outcome = run_program(plain, limits, poll)
+    if outcome.refused is not None:
+        raise MethodFailed(f"could not be started ({outcome.refused})", where=manifest.name)
+    return outcome, isolation
 
 
 def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]:
@@ -144,64 +174,12 @@ def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]
     return words
 
 
-def _supervise(
-    command: Sequence[str],
-    folder: Path,
-    log: Path,
-    time_limit: float,
-    on_progress: Callable[[int, int], None] | None,
-) -> int | None:
-    """Run a command; returns its exit status, or None when it had to be killed for time."""
-    environment = {name: os.environ[name] for name in ENVIRONMENT if name in os.environ}
-    try:
-        process = subprocess.Popen(
-            command,
-            cwd=folder,
-            env=environment,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.STDOUT,
-            start_new_session=True,
-            close_fds=True,
-        )
-    except OSError as error:
-        raise MethodFailed(
-            f"cannot be started ({error.strerror})", where=command[0], field="entry.command"
-        ) from error
-    assert process.stdout is not None
-    drain = threading.Thread(target=_drain, args=(process.stdout, log), daemon=True)
-    drain.start()
-    deadline = time.monotonic() + time_limit
-    next_look = 0.0
-    try:
-        while process.poll() is None:
-            now = time.monotonic()
-            if now > deadline:
-                return None
-            if on_progress is not None and now >= next_look:
-                next_look = now + 0.5
-                _show_progress(folder / PROGRESS, on_progress)
-            time.sleep(_POLL_SECONDS)
-        return process.returncode
-    finally:
-        # Children that outlive the method's process die with it, whatever ended it.
-        with contextlib.suppress(ProcessLookupError, PermissionError):
-            os.killpg(process.pid, signal.SIGKILL)
-        process.wait()
-        drain.join(timeout=5)
-
-
-def _drain(stream: IO[bytes], log: Path) -> None:
-    kept = 0
-    dropped = 0
-    with open(log, "wb") as target:
-        while chunk := stream.read(65536):
-            part = chunk[: MAX_LOG_BYTES - kept]
-            target.write(part)
-            kept += len(part)
-            dropped += len(chunk) - len(part)
-        if dropped:
-            target.write(f"\n[{dropped} further bytes were not kept]\n".encode())
+def _broken(limit: str, capture_id: str, limits: Limits) -> str:
+    return {
+        "time": f"ran out of time on {capture_id} after {limits.seconds:g} s",
+        "memory": f"took more than {limits.memory / 1e9:.3g} GB of memory on {capture_id}",
+        "processes": f"ran more than {MAX_PROCESSES} processes at once on {capture_id}",
+    }[limit]
 
 
 def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
@@ -210,10 +188,10 @@ def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
         on_progress(int(value["done"]), int(value["total"]))
 
 
-def _reason(output: Path, status: int) -> str:
+def _reason(output: Path, status: int | None) -> str:
     with contextlib.suppress(BadInput, KeyError, TypeError):
         return str(read_json(output / FAILURE, max_bytes=100_000)["problem"])
-    if status < 0:
+    if status is not None and status < 0:
         with contextlib.suppress(ValueError):
             return f"killed by {signal.Signals(-status).name}"
     return f"exit status {status}"

@@ -86,6 +86,9 @@ class CaptureResult:
     curve_seconds: float | None = None
     #: Seconds of everything: reading, copying, the method's process, scoring, pictures.
     job_seconds: float | None = None
+    #: How the method's process was kept apart: `namespaces`, or `processes` with the reason why
+    #: not more; None for predictions that came as files, and where nobody noted it.
+    isolation: str | None = None
 
     @property
     def failed_frames(self) -> int:
