@@ -1,0 +1,125 @@
+"""Jobs and methods for the engine's tests: importable from a process of their own."""
+
+from __future__ import annotations
+
+import os
+import signal
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+
+from hwp_bench.engine import Folder, Job, Needs
+from hwp_bench.engine.job import Report
+from hwp_bench.engine.view import NoView
+from hwp_bench.errors import BadInput
+
+
+@dataclass(frozen=True)
+class Write:
+    """Writes a file; fails, dies or waits first where it is told to."""
+
+    text: str
+    #: `refuse`, `break`, or nothing.
+    fault: str = ""
+    #: Times that its process is killed before it gets through; counted in files there.
+    deaths: int = 0
+    #: Where deaths are counted.
+    graves: Path | None = None
+    #: Seconds that it waits.
+    seconds: float = 0.0
+
+    def __call__(self, inputs: Mapping[str, Path], output: Path, report: Report) -> None:
+        report(1, 2)
+        if self.fault == "refuse":
+            raise BadInput("is wrong", where="a.png", field="x", remedy="Mend it.")
+        if self.fault == "break":
+            raise ZeroDivisionError("by nobody")
+        if self.graves is not None and len(list(self.graves.iterdir())) < self.deaths:
+            (self.graves / str(os.getpid())).touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        time.sleep(self.seconds)
+        output.mkdir(parents=True, exist_ok=True)
+        found = "".join((inputs[name] / "a.txt").read_text() for name in sorted(inputs))
+        threads = os.environ.get("NUMBA_NUM_THREADS")
+        (output / "out.txt").write_text(f"{self.text}{found} {threads}")
+
+
+def write_job(folder: Path, work: Write, *inputs: Path, cpus: float = 1.0) -> Job:
+    """A job whose result is `folder/TEXT/out.txt`."""
+    output = folder / work.text
+    folders = {str(number): path for number, path in enumerate(inputs)}
+    return Job(
+        text=work.text,
+        here=lambda report: work(folders, output, report),
+        work=work,
+        output=output,
+        finished=(output / "out.txt").is_file,
+        inputs={name: Folder(path) for name, path in folders.items()},
+        needs=Needs(cpus),
+    )
+
+
+class Told(NoView):
+    """A view that keeps what it is told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.starts: list[tuple[int, str]] = []
+        self.ends: dict[str, str | None] = {}
+        self.said: list[str] = []
+
+    def start(self, index: int, text: str, place: str) -> None:
+        self.starts.append((index, place))
+        super().start(index, text, place)
+
+    def end(self, index: int, text: str, problem: str | None = None) -> None:
+        self.ends[text] = problem
+        super().end(index, text, problem)
+
+    def _say(self, text: str) -> None:
+        self.said.append(text)
+
+
+_METHOD = """
+import time
+import numpy as np
+
+class Gray:
+    steps = 3
+    def __init__(self, settings, seed):
+        self.settings, self.seed = settings, seed
+    def fit(self, training, budget, report):
+        time.sleep(self.settings["seconds"])
+        pixels = [training.frame(frame)[training.mask(frame) > 127] for frame in training.train]
+        noise = np.random.default_rng(self.seed).normal(0, 0.02, 3)
+        self.colour = np.concatenate(pixels).mean(axis=0) / 255 + noise
+        if self.settings["flat"]:
+            self.colour = np.full(3, self.colour.mean())
+        return self
+    def render(self, hands, camera):
+        rgba = np.ones((camera.height, camera.width, 4))
+        rgba[..., :3] = self.colour
+        return rgba
+"""
+
+_MANIFEST = """
+schema = "hwp-method/1"
+name = "gray"
+[entry]
+python = "gray_method:Gray"
+[presets.default]
+flat = false
+seconds = {seconds}
+[switches.colour]
+title = "Colour"
+settings_off = {{flat = true}}
+"""
+
+
+def write_gray_method(folder: Path, seconds: float) -> Path:
+    """A method of NumPy alone that waits, then paints the mean colour of the hand."""
+    folder.mkdir()
+    (folder / "gray_method.py").write_text(_METHOD)
+    (folder / "method.toml").write_text(_MANIFEST.format(seconds=seconds))
+    return folder
