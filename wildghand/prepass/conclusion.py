@@ -81,7 +81,8 @@ def conclude(
     off_hidden = excess(hidden, share, settings.hidden_floor)
     cues = (off_gain, off_level, off_texture, off_border, off_place, off_hidden)
 
-    clean = spread(clean_probability(evidence(cues, indices[rows]), settings.tolerance))
+    found_evidence = evidence(cues, indices[rows], settings.tolerance)
+    clean = spread(clean_probability(found_evidence, settings.tolerance))
     sharp_border = float(np.exp(normal_value(np.log(border), share)[0]))
     extent = np.sqrt(np.maximum(np.nan_to_num(border) ** 2 - sharp_border**2, 0.0))
     refine = (off_place > settings.clear_deviation) & (off_border < settings.clear_deviation)

@@ -115,9 +115,13 @@ def test_border_width_is_unknown_without_contrast() -> None:
 def test_evidence_is_shared_with_neighbours_only() -> None:
     deviation = np.array([0.0, 9.0, 0.0, 0.0])
     alone = np.log1p(9.0)
-    shared = evidence([deviation], np.array([0, 1, 2, 9]))
+    shared = evidence([deviation], np.array([0, 1, 2, 9]), 9.0)
     np.testing.assert_allclose(shared, alone * np.array([0.25, 0.5, 0.25, 0.0]))
+    # Neighbours speak up to the tolerance: on either side of an episode frames stay clean.
+    limited = evidence([deviation], np.array([0, 1, 2, 9]), 1.2)
+    np.testing.assert_allclose(limited, [0.3, 0.5 * alone, 0.3, 0.0])
+    assert (clean_probability(limited, 1.2) > 0.9).tolist() == [True, False, True, True]
     # Beyond a gap a frame has no neighbour and speaks for itself.
-    apart = evidence([deviation], np.array([0, 4, 8, 12]))
+    apart = evidence([deviation], np.array([0, 4, 8, 12]), 1.2)
     np.testing.assert_allclose(apart, alone * np.array([0.0, 1.0, 0.0, 0.0]))
     assert clean_probability(np.array([0.0, 1.2]), 1.2).tolist() == [1.0, 0.5]
