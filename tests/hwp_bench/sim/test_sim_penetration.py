@@ -1,0 +1,101 @@
+"""Skin does not run through skin: how deep is measured, and bounded by what was measured.
+
+Oracles: a sphere, whose depth is its radius less the distance from its centre; for gestures and
+scenes the numbers that `python -m benchmarks.simulation --penetration 40` prints, rounded up.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import trimesh
+
+from hwp_bench.sim.gestures import gestures
+from hwp_bench.sim.motion import moment_of_key
+from hwp_bench.sim.penetration import (
+    Segments,
+    hand_penetration,
+    mutual_penetration,
+    scene_penetration,
+    segments,
+    self_penetration,
+)
+from hwp_bench.sim.scene import HandKey, load_scene, scene_names
+from hwp_bench.sim.subject import MOVING, SubjectHand, scene_hands
+
+#: Deepest that any gesture presses a hand into itself, m. Fists are too tight for this hand:
+#: finger tips sink into palm and thumb.
+GESTURE_DEEPEST = 0.0165
+#: The same over the frames of the scenes, for 99 of 100 frames and for every frame, m.
+SELF_DEEPEST = (0.0175, 0.0185)
+#: How deep one hand presses into the other, likewise.
+MUTUAL_DEEPEST = (0.019, 0.021)
+#: Frames of each scene.
+FRAMES = 10
+
+
+def _sphere(cut: float = 2.0) -> tuple[Segments, np.ndarray]:
+    """A sphere of 10 mm as a hand of one segment, open above `cut` radii."""
+    from hwp_bench.sim.penetration import _cuts
+
+    ball = trimesh.creation.icosphere(subdivisions=3, radius=0.01)
+    below = (ball.vertices[ball.faces][..., 2] < cut * 0.01).all(axis=1)
+    skin = np.asarray(ball.faces[below])
+    count = len(ball.vertices)
+    parts = Segments(
+        owner=np.zeros(count, dtype=np.int64),
+        skin=(skin,),
+        cuts=(_cuts(skin, count),),
+        touching=np.ones((1, 1), dtype=bool),
+        way=np.zeros((count, count)),
+    )
+    return parts, np.asarray(ball.vertices)
+
+
+@pytest.mark.parametrize("cut", [2.0, 0.5])
+def test_depth_in_a_sphere(cut: float) -> None:
+    parts, vertices = _sphere(cut)
+    assert len(parts.cuts[0]) == (1 if cut < 1.0 else 0)
+    rng = np.random.default_rng(3)
+    directions = rng.normal(size=(200, 3))
+    directions[:, 2] = -np.abs(directions[:, 2])
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    radius = rng.uniform(0.001, 0.014, 200)
+    depth = mutual_penetration(radius[:, None] * directions, parts, vertices)
+    # The facets lie within 0.05 mm of the sphere.
+    np.testing.assert_allclose(depth, np.maximum(0.01 - radius, 0.0), atol=6e-5)
+    above = np.array([[0.0, 0.0, 0.009]])
+    assert (mutual_penetration(above, parts, vertices) > 0).all() == (cut > 1.0)
+
+
+@pytest.fixture(scope="module")
+def hand() -> SubjectHand:
+    return scene_hands(load_scene("capture1"), MOVING)["right"]
+
+
+def test_a_finger_pushed_into_another_is_found(hand: SubjectHand) -> None:
+    # Oracle: the outer half of the index finger, moved onto the middle finger's, is inside it by
+    # less than a finger's thickness; the hand at rest is nowhere inside itself.
+    parts = segments(hand.template)
+    vertices = hand.template.vertices.copy()
+    assert self_penetration(parts, vertices).max() < 1e-3
+    index, middle = (np.isin(parts.owner, joints) for joints in ((2, 3), (5, 6)))
+    vertices[index] += vertices[middle].mean(axis=0) - vertices[index].mean(axis=0)
+    depth = self_penetration(parts, vertices)
+    assert 0.002 < depth[index].max() < 0.012
+
+
+@pytest.mark.parametrize("name", sorted(gestures()))
+def test_gestures_are_bounded(hand: SubjectHand, name: str) -> None:
+    depth = hand_penetration(hand, moment_of_key(HandKey(name)), "right")
+    assert depth.max() < GESTURE_DEEPEST
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", scene_names())
+def test_frames_of_scenes_are_bounded(name: str) -> None:
+    moments = (np.arange(FRAMES) + 0.5) / FRAMES
+    for part, depths in scene_penetration(load_scene(name), moments).items():
+        most, deepest = MUTUAL_DEEPEST if part == "both" else SELF_DEEPEST
+        assert np.quantile(depths, 0.99) < most
+        assert depths.max() < deepest
