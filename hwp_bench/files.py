@@ -5,8 +5,10 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import json
+import math
 import os
 import shutil
+import stat
 import tempfile
 from collections.abc import Iterator
 from pathlib import Path
@@ -16,6 +18,10 @@ from hwp_bench.errors import BadInput, HwpError, UsageError
 
 #: Largest JSON file that is read, in bytes; a result of 10,000 frames stays far below it.
 MAX_JSON_BYTES = 256 * 1024 * 1024
+#: Deepest nesting of JSON that is read: no format here needs ten levels.
+MAX_JSON_DEPTH = 100
+#: Largest whole number that is read; above it other programs would round.
+MAX_JSON_INTEGER = 2**63
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
@@ -115,17 +121,15 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
     """Read a JSON file from outside.
 
     Raises:
-        BadInput: the file is missing, larger than `max_bytes`, not UTF-8, not JSON, or nested
-            too deeply.
+        BadInput: the file is missing, no regular file, larger than `max_bytes`, not UTF-8, not
+            JSON, nested too deeply, or holds a number that is infinite or absurdly large.
     """
     path = Path(path)
     try:
-        size = path.stat().st_size
-        if size > max_bytes:
-            raise BadInput(
-                f"holds {size} bytes, more than the {max_bytes} that are read", where=path
-            )
-        return json.loads(path.read_text(encoding="utf-8"), parse_constant=_refuse_constant)
+        text = _read_bounded(path, max_bytes).decode()
+        value = json.loads(
+            text, parse_constant=_refuse_constant, parse_float=_finite, parse_int=_whole
+        )
     except FileNotFoundError as error:
         raise BadInput("does not exist", where=path) from error
     except OSError as error:
@@ -136,10 +140,55 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
         raise BadInput("is nested too deeply", where=path) from error
     except ValueError as error:
         raise BadInput(f"is not valid JSON ({error})", where=path) from error
+    if _deeper_than(value, MAX_JSON_DEPTH):
+        raise BadInput("is nested too deeply", where=path)
+    return value
+
+
+def _read_bounded(path: Path, max_bytes: int) -> bytes:
+    # Not blocking: a named pipe would keep its reader waiting for ever. And what a device or a
+    # growing file holds is not known from its size.
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    with os.fdopen(handle, "rb") as stream:
+        if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+            raise BadInput("is no regular file", where=path)
+        data = stream.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise BadInput(f"holds more than the {max_bytes} bytes that are read", where=path)
+    return data
+
+
+def _deeper_than(value: Any, limit: int) -> bool:
+    level = [value]
+    for _ in range(limit):
+        level = [
+            item
+            for holder in level
+            if isinstance(holder, dict | list)
+            for item in (holder.values() if isinstance(holder, dict) else holder)
+            if isinstance(item, dict | list)
+        ]
+        if not level:
+            return False
+    return True
 
 
 def _refuse_constant(name: str) -> float:
     raise ValueError(f"{name} is no JSON number")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:20]} is too large a number")
+    return number
+
+
+def _whole(text: str) -> int:
+    # Long ones are told from their length: turning them into numbers takes long.
+    if len(text) > 20 or abs(int(text)) > MAX_JSON_INTEGER:
+        raise ValueError(f"{text[:20]}... is too large a number")
+    return int(text)
 
 
 def write_json(path: str | os.PathLike[str], value: Any) -> Path:

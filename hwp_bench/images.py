@@ -10,6 +10,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from hwp_bench.errors import BadImage, HwpError, ShapeMismatch
+from hwp_bench.image_kinds import check_kind
 
 #: Largest image that is decoded, in pixels: a 300 byte PNG can ask for gigabytes.
 MAX_PIXELS = 64 * 1024 * 1024
@@ -21,15 +22,16 @@ def read_rgb(path: str | os.PathLike[str], size: tuple[int, int] | None = None) 
     """Read a colour image.
 
     Args:
-        path: PNG, JPEG or another format that OpenImageIO reads. Gray becomes RGB; an alpha
-            channel is dropped, not composited.
+        path: a PNG, JPEG or BMP file, whatever its name. Gray becomes RGB; an alpha channel is
+            dropped, not composited.
         size: expected (height, width) in pixels.
 
     Returns:
         (H, W, 3) uint8, sRGB.
 
     Raises:
-        BadImage: missing, empty, damaged, not 8-bit, too large, or not of `size`.
+        BadImage: missing, empty, of another format, animated, damaged, not 8-bit, too large, not
+            of `size`, or to be turned before it is shown (EXIF).
     """
     pixels = _read(Path(path), size)
     if pixels.shape[2] < 3:
@@ -50,10 +52,7 @@ def read_gray(path: str | os.PathLike[str], size: tuple[int, int] | None = None)
 
 
 def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
-    if not path.is_file():
-        raise BadImage("does not exist", where=path)
-    if path.stat().st_size == 0:
-        raise BadImage("is empty (0 bytes)", where=path)
+    check_kind(path)
     config = oiio.ImageSpec()
     # Otherwise colours come multiplied by alpha, and a submission's alpha would act as a mask.
     config.attribute("oiio:UnassociatedAlpha", 1)
@@ -71,6 +70,13 @@ def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
             )
         if spec.format.basetype != oiio.UINT8:
             raise BadImage(f"holds {spec.format} samples where 8-bit is expected", where=path)
+        turned = spec.get_int_attribute("Orientation", 1)
+        if turned != 1:
+            raise BadImage(
+                f"asks to be turned when it is shown (EXIF orientation {turned})",
+                where=path,
+                remedy="Store its pixels upright, without that mark.",
+            )
         pixels = source.read_image(format=oiio.UINT8)
         # OpenImageIO fills what a truncated file lacks with zeros and only sets an error.
         problem = source.geterror().strip()

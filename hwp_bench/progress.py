@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from typing import TYPE_CHECKING, TypeVar
 
+from hwp_bench.text import shown
+
 if TYPE_CHECKING:
     from rich.progress import Progress
 
@@ -15,8 +17,8 @@ Item = TypeVar("Item")
 
 
 def notice(text: str) -> None:
-    """Print one line for a person on standard error."""
-    print(text, file=sys.stderr, flush=True)
+    """Print one line for a person on standard error; what steers a terminal is taken out."""
+    print(shown(text), file=sys.stderr, flush=True)
 
 
 def _bar() -> Progress:

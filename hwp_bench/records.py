@@ -8,6 +8,7 @@ from types import UnionType
 from typing import Any, TypeVar, get_args, get_origin, get_type_hints
 
 from hwp_bench.errors import BadResult
+from hwp_bench.text import has_odd_characters, shown
 
 Record = TypeVar("Record")
 
@@ -26,7 +27,8 @@ def parse_record(kind: type[Record], value: Any, *, where: str, field: str = "")
         The record; fields that are missing have their default, where there is one.
 
     Raises:
-        BadResult: a field is missing, unknown, of the wrong type, or not finite; it is named.
+        BadResult: a field is missing, unknown, of the wrong type, not finite, or holds a
+            control character; it is named.
     """
     if not isinstance(value, dict):
         raise BadResult("must be a JSON object", where=where, field=field.rstrip(".") or None)
@@ -57,6 +59,8 @@ def _convert(hint: Any, value: Any, where: str, field: str) -> Any:
             ]
     elif origin is dict:
         if isinstance(value, dict):
+            if any(has_odd_characters(key) for key in value):
+                raise BadResult("holds a control character in a name", where=where, field=field)
             return {
                 key: _convert(arguments[1], item, where, f"{field}.{key}")
                 for key, item in value.items()
@@ -67,6 +71,8 @@ def _convert(hint: Any, value: Any, where: str, field: str) -> Any:
         if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
             return float(value)
     elif hint in (int, str, bool):
+        if isinstance(value, str) and has_odd_characters(value):
+            raise BadResult("holds a control character", where=where, field=shown(field))
         if isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
             return value
     else:

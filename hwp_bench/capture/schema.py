@@ -9,6 +9,7 @@ from typing import Any
 
 from hwp_bench.errors import BadCapture
 from hwp_bench.taxonomy import check_severity, perturbation
+from hwp_bench.text import has_odd_characters
 
 #: Version of the capture format; a reader refuses every other.
 SCHEMA = "hwp-capture/1"
@@ -212,6 +213,8 @@ class _Fields:
         value = self._get(name)
         if not isinstance(value, str) or not value or len(value) > 10_000:
             raise self._refuse(name, "a text of 1 to 10,000 characters")
+        if has_odd_characters(value):
+            raise self._refuse(name, "a text without control characters")
         return value
 
     def whole(self, name: str, low: int, high: int) -> int:

@@ -117,5 +117,5 @@ def keep_predictions(folder: Path, source: Path, frames: Sequence[int]) -> None:
     folder.mkdir(parents=True, exist_ok=True)
     for frame in frames:
         path = source / frame_name(frame)
-        if path.is_file():
+        if path.is_file() and not path.is_symlink():
             shutil.copyfile(path, folder / path.name)

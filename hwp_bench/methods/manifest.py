@@ -14,7 +14,9 @@ from typing import Any
 
 from hwp_bench.errors import BadMethod
 from hwp_bench.files import inside
+from hwp_bench.methods.plain import check_plain
 from hwp_bench.methods.switches import Switch, read_switches
+from hwp_bench.text import has_odd_characters
 
 #: Version of the method contract.
 SCHEMA = "hwp-method/1"
@@ -135,8 +137,11 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         raise BadMethod(f"is larger than {MAX_BYTES} bytes", where=where)
     try:
         value = tomllib.loads(where.read_text(encoding="utf-8"))
-    except (UnicodeDecodeError, tomllib.TOMLDecodeError, RecursionError) as error:
+    # Not only TOMLDecodeError: numbers of thousands of digits raise ValueError.
+    except (ValueError, RecursionError) as error:
         raise BadMethod(f"is no valid TOML ({error})", where=where) from error
+    except OSError as error:
+        raise BadMethod(f"cannot be read ({error.strerror})", where=where) from error
     _known_keys(value, _KEYS, where, "")
     if value.get("schema") != SCHEMA:
         raise BadMethod(
@@ -160,7 +165,7 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
 
 def _text(value: Mapping[str, Any], key: str, where: Path, default: str | None = None) -> str:
     text = value.get(key, default)
-    if not isinstance(text, str) or len(text) > 1000 or any(ord(char) < 32 for char in text):
+    if not isinstance(text, str) or len(text) > 1000 or "\n" in text or has_odd_characters(text):
         raise BadMethod("must be one line of at most 1,000 characters", where=where, field=key)
     return text
 
@@ -201,6 +206,7 @@ def _entry(value: Any, root: Path, where: Path) -> tuple[str, str | tuple[str, .
 def _presets(value: Any, where: Path) -> dict[str, dict[str, Any]]:
     if not isinstance(value, dict) or not all(isinstance(item, dict) for item in value.values()):
         raise BadMethod("must be tables of settings", where=where, field="presets")
+    check_plain(value, where, "presets")
     return value
 
 

@@ -37,10 +37,13 @@ def read_prediction(
         size: the capture's (height, width).
 
     Returns:
-        The pixels, or a named failure: missing, empty, damaged, not 8-bit, of another size. An
-        alpha channel is dropped: the data set owns the mask.
+        The pixels, or a named failure: missing, a link, empty, damaged, not 8-bit, of another
+        size. An alpha channel is dropped: the data set owns the mask.
     """
     path = Path(folder) / frame_name(frame)
+    # A link could lead to the very frame that is to be predicted.
+    if path.is_symlink():
+        return Prediction(frame, None, f"{path.name}: is a link")
     try:
         return Prediction(frame, read_rgb(path, size), None)
     except BadImage as error:

@@ -12,13 +12,15 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hwp_bench.errors import BadInput, BadMethod, MethodFailed
-from hwp_bench.files import read_json
+from hwp_bench.files import inside, read_json
 from hwp_bench.methods.facts import RunFacts, read_facts
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.methods.surroundings import apart, inherited
 from hwp_bench.methods.worker import FAILURE, PREDICTIONS, PROGRESS, RUN
 from hwp_bench.sandbox.confinement import Confinement
+from hwp_bench.sandbox.leftovers import remove_odd_files
 from hwp_bench.sandbox.supervise import MAX_PROCESSES, Limits, Outcome, Program, run_program
+from hwp_bench.text import shown
 
 #: Seconds a method may take on one capture unless told otherwise.
 DEFAULT_TIME_LIMIT = 3600.0
@@ -75,9 +77,10 @@ def run_method(
         MethodFailed: it crashed, or ran out of time or memory; the message names the log. Or
             isolation is required and the system does not allow it.
         BadMethod: a submission has no predictions for this capture.
+        BadInput: the folder of a submission's predictions leads out of the submission.
     """
     if manifest.kind == "predictions":
-        folder = manifest.root / str(manifest.entry) / capture_id
+        folder = inside(manifest.root, f"{manifest.entry}/{capture_id}")
         if not folder.is_dir():
             raise BadMethod(
                 f"has no predictions for {capture_id}",
@@ -92,6 +95,7 @@ def run_method(
     started = time.perf_counter()
     outcome, isolation = _run(manifest, request, output, wanted, limits, on_progress)
     wall = time.perf_counter() - started
+    remove_odd_files(output)
     log = output / LOG
     if outcome.stopped is not None:
         raise MethodFailed(
@@ -183,6 +187,9 @@ def _broken(limit: str, capture_id: str, limits: Limits) -> str:
 
 
 def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
+    # A link may lead to what only the toolkit can read.
+    if path.is_symlink():
+        return
     with contextlib.suppress(BadInput, KeyError, TypeError, ValueError):
         value = read_json(path, max_bytes=10_000)
         on_progress(int(value["done"]), int(value["total"]))
@@ -190,7 +197,7 @@ def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
 
 def _reason(output: Path, status: int | None) -> str:
     with contextlib.suppress(BadInput, KeyError, TypeError):
-        return str(read_json(output / FAILURE, max_bytes=100_000)["problem"])
+        return shown(str(read_json(output / FAILURE, max_bytes=100_000)["problem"])[:2000])
     if status is not None and status < 0:
         with contextlib.suppress(ValueError):
             return f"killed by {signal.Signals(-status).name}"

@@ -9,6 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.errors import BadMethod
+from hwp_bench.methods.plain import check_plain
+from hwp_bench.text import has_odd_characters
 
 #: Kinds of switch by the key that holds its settings.
 KINDS = ("settings_off", "settings_on")
@@ -99,6 +101,7 @@ def _switch(name: str, value: Any, where: Path) -> Switch:
             raise BadMethod(
                 f"{setting!r} is no name of a setting", where=where, field=f"{place}.{kinds[0]}"
             )
+    check_plain(settings, where, f"{place}.{kinds[0]}")
     return Switch(
         name=name,
         title=_line(value.get("title", name), where, f"{place}.title"),
@@ -109,6 +112,6 @@ def _switch(name: str, value: Any, where: Path) -> Switch:
 
 
 def _line(text: Any, where: Path, field: str) -> str:
-    if not isinstance(text, str) or len(text) > 1000 or any(ord(char) < 32 for char in text):
+    if not isinstance(text, str) or len(text) > 1000 or "\n" in text or has_odd_characters(text):
         raise BadMethod("must be one line of at most 1,000 characters", where=where, field=field)
     return text

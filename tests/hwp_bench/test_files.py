@@ -66,7 +66,13 @@ def test_a_full_folder_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
         ("{", "is not valid JSON"),
         ('{"a": NaN}', "NaN is no JSON number"),
         ("[" * 100_000, "nested too deeply"),
-        ('"' + "x" * 300 + '"', "more than the 200"),
+        ("[" * 200 + "]" * 200, "nested too deeply"),
+        ('{"a":' * 150 + "1" + "}" * 150, "nested too deeply"),
+        ('{"a": 1e999}', "1e999 is too large a number"),
+        ('{"a": -1e999}', "-1e999 is too large"),
+        ('{"a": ' + "9" * 5000 + "}", "is too large a number"),
+        ('{"a": 9223372036854775809}', "is too large a number"),
+        ('"' + "x" * 300 + '"', "more than the 200 bytes"),
         (b"\xff\xfe{", "is not UTF-8"),
     ],
 )
@@ -98,3 +104,22 @@ def test_json_digest_ignores_the_order_of_keys_only() -> None:
     assert sha256_json({"a": 1, "b": [1, 2]}) == sha256_json({"b": [1, 2], "a": 1})
     assert sha256_json({"a": 1, "b": [1, 2]}) != sha256_json({"a": 1, "b": [2, 1]})
     assert len(sha256_json(json.loads("{}"))) == 64
+
+
+def test_json_of_ordinary_depth_and_size_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "file.json"
+    value = {"a": [[[1.5, -(2**63), None, True]]], "b": "\u202e"}
+    path.write_text(json.dumps(value))
+    assert read_json(path) == value
+
+
+def test_pipes_devices_and_folders_are_not_waited_for(tmp_path: Path) -> None:
+    import os
+
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for name in ("pipe", "zero"):
+        with pytest.raises(BadInput, match="is no regular file"):
+            read_json(tmp_path / name)
+    with pytest.raises(BadInput, match="cannot be read"):
+        read_json(tmp_path)

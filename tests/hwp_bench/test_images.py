@@ -1,4 +1,4 @@
-"""Images in and out. Oracle: OpenCV's own PNG reader and writer, exact."""
+"""Images in and out. Oracle: OpenCV's and Pillow's own readers and writers, exact."""
 
 from __future__ import annotations
 
@@ -98,3 +98,72 @@ def test_digest_sees_pixels_and_shape_not_compression(picture) -> None:
     changed[3, 4, 1] ^= 1
     assert pixel_digest(picture) != pixel_digest(changed)
     assert pixel_digest(picture) != pixel_digest(picture.reshape(40, 30, 3))
+
+
+def _pillow(path: Path, picture: np.ndarray, form: str, **options: object) -> Path:
+    from PIL import Image
+
+    Image.fromarray(picture).save(path, format=form, **options)
+    return path
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("form", ["JPEG", "PNG"])
+def test_a_mark_to_turn_the_picture_is_refused(
+    tmp_path: Path, picture, form: str, orientation: int
+) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = _pillow(tmp_path / "turned.png", picture, form, exif=exif)
+    with pytest.raises(BadImage, match=f"EXIF orientation {orientation}"):
+        read_rgb(path)
+    exif[0x0112] = 1
+    assert read_rgb(_pillow(path, picture, form, exif=exif)).shape == (30, 40, 3)
+
+
+def test_an_animated_png_is_refused(tmp_path: Path, picture) -> None:
+    from PIL import Image
+
+    frames = [Image.fromarray(255 - picture)]
+    path = _pillow(tmp_path / "moving.png", picture, "PNG", save_all=True, append_images=frames)
+    with pytest.raises(BadImage, match="animated"):
+        read_rgb(path)
+
+
+@pytest.mark.parametrize("form", ["GIF", "TIFF", "WEBP", "TGA", "PPM", "ICO"])
+def test_other_formats_are_refused_whatever_the_name(tmp_path: Path, picture, form: str) -> None:
+    path = _pillow(tmp_path / "000018.png", picture, form)
+    with pytest.raises(BadImage, match="is no image that can be read"):
+        read_rgb(path)
+
+
+@pytest.mark.parametrize("form", ["zip", "tar"])
+def test_an_archive_in_place_of_an_image_is_refused(tmp_path: Path, form: str) -> None:
+    import shutil
+
+    (tmp_path / "content").mkdir()
+    archive = Path(shutil.make_archive(str(tmp_path / "archive"), form, tmp_path / "content"))
+    with pytest.raises(BadImage, match="is no image that can be read"):
+        read_rgb(archive.rename(tmp_path / "000018.png"))
+
+
+def test_palettes_one_bit_and_gray_with_alpha_are_read_as_pillow_does(tmp_path: Path) -> None:
+    from PIL import Image
+
+    rng = np.random.default_rng(1)
+    gray = Image.fromarray(rng.integers(0, 2, (16, 24), dtype=np.uint8) * 255)
+    for mode in ("P", "1", "LA"):
+        path = tmp_path / f"{mode}.png"
+        gray.convert(mode).save(path)
+        np.testing.assert_array_equal(read_rgb(path), np.asarray(gray.convert("RGB")))
+
+
+def test_a_folder_or_a_pipe_is_no_image(tmp_path: Path) -> None:
+    import os
+
+    os.mkfifo(tmp_path / "pipe.png")
+    for name in ("pipe.png", "."):
+        with pytest.raises(BadImage, match="does not exist"):
+            read_rgb(tmp_path / name)

@@ -14,10 +14,12 @@ import sys
 import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hwp_bench.errors import MethodFailed
 from hwp_bench.methods.manifest import read_manifest
+from hwp_bench.methods.predictions import read_prediction
 from hwp_bench.methods.runner import RunRecord, run_method
 from hwp_bench.sandbox.confinement import Confinement
 
@@ -323,3 +325,73 @@ def test_a_command_that_is_not_there_is_one_message(tmp_path: Path, mode: str) -
             tmp_path / "output",
             confinement=Confinement(mode),
         )
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_links_and_pipes_in_the_output_are_not_followed(attack, tmp_path: Path, mode: str) -> None:
+    frame = _folder(tmp_path / "capture") / "000018.png"
+    frame.write_bytes(b"a test frame")
+    script = f"""
+output = pathlib.Path(sys.argv[2])
+(output / "predictions").mkdir()
+(output / "predictions/000018.png").symlink_to({str(frame)!r})
+(output / "checkpoints").symlink_to({str(frame.parent)!r})
+(output / "run.json").symlink_to("/dev/zero")
+os.mkfifo(output / "progress.json")
+time.sleep(0.5)
+"""
+    record, _ = attack(script, mode)
+    assert record.facts.fit_seconds is None
+    left = sorted(path.name for path in (tmp_path / "output").rglob("*"))
+    assert [name for name in left if name != "home"] == ["log.txt", "predictions"]
+    assert frame.read_bytes() == b"a test frame"
+
+
+def test_a_log_that_became_a_link_is_not_passed_on(attack, tmp_path: Path) -> None:
+    secret = _folder(tmp_path / "home") / "secret"
+    secret.write_text("s3cret")
+    script = f"""
+log = pathlib.Path(sys.argv[2]) / "log.txt"
+log.unlink()
+log.symlink_to({str(secret)!r})
+"""
+    with pytest.raises(FileNotFoundError):  # by the test's own look at the log
+        attack(script, "none")
+    assert secret.read_text() == "s3cret"
+
+
+@pytest.mark.parametrize("which", ["frame", "folder"])
+def test_a_submission_of_links_is_refused(tmp_path: Path, which: str) -> None:
+    from hwp_bench.errors import BadInput
+    from hwp_bench.images import write_image
+
+    sealed = _folder(tmp_path / "sealed")
+    write_image(sealed / "000018.png", np.full((8, 8, 3), 9, np.uint8))
+    method = _folder(tmp_path / "entry")
+    (method / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "links"\n[entry]\npredictions = "predictions"\n'
+    )
+    folder = method / "predictions" / "tiny"
+    folder.parent.mkdir()
+    if which == "folder":
+        folder.symlink_to(sealed)
+        with pytest.raises(BadInput, match="leads out of the folder"):
+            run_method(read_manifest(method), "tiny", tmp_path, tmp_path / "output")
+    else:
+        folder.mkdir()
+        (folder / "000018.png").symlink_to(sealed / "000018.png")
+        record = run_method(read_manifest(method), "tiny", tmp_path, tmp_path / "output")
+        assert read_prediction(record.predictions, 18, (8, 8)).failure == "000018.png: is a link"
+
+
+@pytest.mark.parametrize("form", ["zip", "tar"])
+def test_an_archive_is_no_method(tmp_path: Path, form: str) -> None:
+    import shutil
+
+    from hwp_bench.errors import BadMethod
+    from hwp_bench.methods.manifest import find_method
+
+    method = _method(tmp_path / "method", "")
+    archive = shutil.make_archive(str(tmp_path / "archive"), form, method)
+    with pytest.raises(BadMethod, match="is no method directory"):
+        read_manifest(find_method(archive))

@@ -52,6 +52,15 @@ def test_a_manifest_is_read(tmp_path: Path) -> None:
         ("python =", 'command = ["x"]\npython =', "exactly one of python, command, predictions"),
         ("[presets.smoke]\nsteps = 5", "[presets]\nsmoke = 5", "must be tables of settings"),
         ("[entry]", "[entry", "no valid TOML"),
+        ('title = "My method"', 'title = "a\\u009bb"', "title: must be one line"),
+        ('title = "My method"', 'title = "a\\u202eb"', "title: must be one line"),
+        ("steps = 5", "steps = nan", "presets.smoke.steps: is nan, no finite number"),
+        ("steps = 5", "steps = [1, -inf]", "presets.smoke.steps: is -inf, no finite number"),
+        ("steps = 5", "steps = 1979-05-27", "presets.smoke.steps: is a date, neither"),
+        ("steps = 5", f"steps = {'9' * 30}", "presets.smoke.steps: is too large a number"),
+        ("steps = 5", f"steps = {'9' * 5000}", "no valid TOML"),
+        ("steps = 5", f"steps = {'[' * 20}{']' * 20}", "presets.smoke.steps: is nested too deeply"),
+        ("steps = 5", f"steps = {'[' * 3000}{']' * 3000}", "method.toml: is"),
     ],
 )
 def test_faults_are_named(tmp_path: Path, old: str, new: str, problem: str) -> None:
@@ -65,6 +74,8 @@ def test_faults_are_named(tmp_path: Path, old: str, new: str, problem: str) -> N
 def test_a_huge_manifest_and_paths_out_of_the_folder_are_refused(tmp_path: Path) -> None:
     with pytest.raises(BadMethod, match="larger than 65536 bytes"):
         read_manifest(_write(tmp_path, GOOD + "#" * 70_000))
+    with pytest.raises(BadMethod, match="larger than 65536 bytes"):
+        read_manifest(_write(tmp_path, GOOD.replace("My method", "x" * 10_000_000)))
     text = GOOD.replace('python = "package.module:Make"', 'predictions = "../elsewhere"')
     with pytest.raises(HwpError, match="leads out of the folder"):
         read_manifest(_write(tmp_path, text))
