@@ -14,6 +14,7 @@ from hwp_bench.evaluate.jobs import evaluation_job
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.results import CaptureResult, Results, write_results
+from hwp_bench.sole import sole_use
 from hwp_bench.splits import Split
 from hwp_bench.statistics.pairing import MethodRuns
 
@@ -76,6 +77,7 @@ def run_ablation(
     Raises:
         BadMethod: there is no such preset.
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
+        HwpError: another run is writing to `out`, or nobody can.
     """
     opened = open_captures(captures, splits)
     networks = load_available()
@@ -112,7 +114,8 @@ def run_ablation(
         results = plans[variant.name, seed].results([done[key] for key in sorted(done)])
         write_results(out / result_folder(variant.name, seed) / "results.json", results)
 
-    (engine or LocalEngine()).run(jobs, on_done, on_job)
+    with sole_use(out):
+        (engine or LocalEngine()).run(jobs, on_done, on_job)
     return AblationRuns(design, _runs(design, plans, finished, seeds))
 
 

@@ -57,6 +57,13 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
         # The reader of our output (such as `head`) has gone; the flush at exit must not complain.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
+    except OSError as error:
+        # A full disc, a read-only folder: the fault of the place, and the place is named.
+        where = f"{error.filename}: " if error.filename else ""
+        print(
+            f"{program}: error: {_one_line(f'{where}{error.strerror or error}')}", file=sys.stderr
+        )
+        return 1
 
 
 def _one_line(text: str) -> str:

@@ -16,6 +16,7 @@ from hwp_bench.evaluate.capture_run import Job, read_result
 from hwp_bench.evaluate.jobs import evaluation_job
 from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
+from hwp_bench.methods.plain import check_plain
 from hwp_bench.methods.request import RunSettings
 from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT
 from hwp_bench.metrics import PROTOCOLS
@@ -24,6 +25,7 @@ from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results, write_results
 from hwp_bench.results.environment import environment
 from hwp_bench.sandbox.confinement import Confinement
+from hwp_bench.sole import sole_use
 from hwp_bench.splits import Split, split_for
 
 #: Called when a capture's work begins, with (index, count, capture id); returns what is to be
@@ -86,6 +88,7 @@ def evaluate(
     Raises:
         BadMethod: the method directory is wrong.
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
+        HwpError: another evaluation is writing to `out`, or nobody can.
     """
     plan = make_plan(read_manifest(find_method(method)), open_captures(captures, splits), settings)
     folders = [out / "captures" / job.capture.info.id for job in plan.jobs]
@@ -93,9 +96,10 @@ def evaluate(
         evaluation_job(job, folder, folder.name, needs or Needs())
         for job, folder in zip(plan.jobs, folders, strict=True)
     ]
-    (engine or LocalEngine()).run(jobs, lambda index: None, on_capture)
-    results = plan.results([read_result(folder) for folder in folders])
-    write_results(out / "results.json", results)
+    with sole_use(out):
+        (engine or LocalEngine()).run(jobs, lambda index: None, on_capture)
+        results = plan.results([read_result(folder) for folder in folders])
+        write_results(out / "results.json", results)
     return results
 
 
@@ -150,10 +154,11 @@ def make_plan(
         networks: LPIPS by backbone; None loads those whose weights are at hand.
 
     Raises:
-        BadMethod: there is no such preset.
+        BadMethod: there is no such preset, or an override is no plain value.
     """
     preset = manifest.preset(settings.preset, settings.suite)
     chosen = {**manifest.presets.get(preset, {}), **settings.overrides}
+    check_plain(dict(settings.overrides), manifest.name, "settings")
     run = RunSettings(chosen, settings.seed, settings.budget, settings.frames)
     known = load_available() if networks is None else networks
     jobs = tuple(

@@ -14,6 +14,7 @@ from hwp_bench.files import sha256_file, sha256_json
 from hwp_bench.methods.contract import Avatar, Budget
 from hwp_bench.methods.request import REQUEST, RunSettings, open_request, write_request
 from hwp_bench.progress import notice, progress
+from hwp_bench.sole import sole_use
 from hwp_bench.splits import Split, contiguous_split
 from wildghand.avatar import WildGHandAvatar
 from wildghand.avatar_files import save_avatar
@@ -21,7 +22,7 @@ from wildghand.device import choose_device
 from wildghand.fit.fit import Fit
 from wildghand.fit.optimise import Watchers, optimise
 from wildghand.fit.saved import load_state, save_state
-from wildghand.settings import read_settings
+from wildghand.settings import WildGHandSettings, read_settings
 
 #: Seconds between two saved states.
 SAVE_EVERY = 20.0
@@ -82,6 +83,7 @@ def fit_capture(
         UsageError: `out` exists.
         BadInput: no training frame can be used, or the saved state is of another fit.
         DidNotConverge: the fit diverged at once.
+        HwpError: another fit is writing to `out`, or nobody can.
     """
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
@@ -90,17 +92,28 @@ def fit_capture(
     split = _all_frames(capture) if all_frames else _split(capture)
     work = out.with_name(out.name + ".fit")
     run = RunSettings(dict(settings), seed, budget)
+    with sole_use(work):
+        avatar = _fit_in(work, capture, split, run, chosen)
+        save_avatar(avatar, out, overwrite=overwrite)
+        shutil.rmtree(work, ignore_errors=True)
+    return avatar
+
+
+def _fit_in(
+    work: Path, capture: Capture, split: Split, run: RunSettings, chosen: WildGHandSettings
+) -> WildGHandAvatar:
+    """Fit, from the state that is saved in the work folder if there is one."""
     training = open_request(write_request(work / "request", capture, split, run))
     digest = sha256_json(
         [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
     )
-    fit = Fit(training, chosen, seed, choose_device(chosen.device))
+    fit = Fit(training, chosen, run.seed, choose_device(chosen.device))
     watchers, start, before = Watchers(chosen.plateau_steps), 0, 0.0
     state = work / STATE
     if state.is_file():
         start, before = load_state(state, fit, watchers, digest)
         notice(f"Going on after {start} steps.")
-    steps = chosen.steps if budget.steps is None else budget.steps
+    steps = chosen.steps if run.budget.steps is None else run.budget.steps
     with progress(f"Fitting {capture.info.id}", steps) as show:
         clock = _Clock(before, show)
         saved = time.perf_counter()
@@ -111,10 +124,7 @@ def fit_capture(
                 save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
                 saved = time.perf_counter()
 
-        avatar = optimise(fit, budget, clock, start=start, watchers=watchers, after_step=save)
-    save_avatar(avatar, out, overwrite=overwrite)
-    shutil.rmtree(work, ignore_errors=True)
-    return avatar
+        return optimise(fit, run.budget, clock, start=start, watchers=watchers, after_step=save)
 
 
 def _split(capture: Capture) -> Split:
