@@ -15,6 +15,7 @@ from wildghand.network import Prediction, PredictionNetwork
 from wildghand.quaternions import quat_multiply, quat_rotate, quat_third_axis
 from wildghand.rig import AnchorPoses, HandRig
 from wildghand.splat import rasterize
+from wildghand.teaching import taught
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,6 +125,7 @@ class WildGHandModel(nn.Module):
         *,
         drop_probability: Tensor | None = None,
         generator: torch.Generator | None = None,
+        shares: Tensor | None = None,
         move: bool = False,
         refine: bool = False,
     ) -> Drawing:
@@ -135,6 +137,7 @@ class WildGHandModel(nn.Module):
             width, height: px.
             drop_probability: (B,) chance that a frame's biases are left out; None: never.
             generator: draws these chances.
+            shares: (B,) how much the canonical hand learns from each frame, 0-1; None: all.
             move: add `pose_steps` and `transl_steps` to the given parameters.
             refine: apply the network's refinement of the parameters (head iv).
         """
@@ -147,12 +150,13 @@ class WildGHandModel(nn.Module):
                 pose = pose + self.pose_steps[index, rows]
                 transl = transl + self.transl_steps[index, rows]
             prediction = self._predict(side, anchors, pose.detach())
+            learning = prediction if shares is None else taught(prediction, shares)
             if refine:
-                step = prediction.refinement
+                step = learning.refinement
                 pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
             if move or refine:
                 anchors = rig.follow(pose, betas, transl)
-            raw, biases = prediction.raw, None
+            raw, biases = learning.raw, None
             omega = pose.new_zeros(len(rows))
             if side in self.perturbation:
                 module = self.biases_of(side)
@@ -162,7 +166,7 @@ class WildGHandModel(nn.Module):
                     raw, temporal.z, _dropped(temporal, drop_probability, generator)
                 )
                 raw = raw + biases
-            gaussians = self._dress(anchors, prediction, raw)
+            gaussians = self._dress(anchors, learning, raw)
             parts.append(gaussians)
             states[side] = HandState(prediction, biases, omega, gaussians.opacities)
         image, coverage = _rasterize(parts, clip.viewmats[rows], clip.Ks[rows], width, height)

@@ -78,6 +78,8 @@ class WildGHandSettings:
     frame_poses: bool = True
     #: Chance that a frame's biases are left out of a step (of a clean frame's, with `prepass`).
     omega_dropout: float = number(0.3, 0.0, 1.0)
+    #: Weight of the square of the temporal weights, for a frame that is surely clean.
+    omega_weight: float = number(0.3)
     #: Share of D-SSIM in the reconstruction loss; the rest is L1.
     dssim_weight: float = number(0.2, 0.0, 1.0)
     #: Weight of a pixel outside the visible-hand mask, beside 1 inside.

@@ -115,6 +115,7 @@ class Fit:
                 self.training.height,
                 drop_probability=drop_probability,
                 generator=self.generator,
+                shares=self.weighting.shares(rows),
                 move=self.weighting.moves(rows),
                 refine=self.settings.refines,
             )
@@ -154,6 +155,9 @@ class Fit:
             for row, frame in enumerate(self.frames.indices.tolist()):
                 rows = torch.tensor([row])
                 weights = self.weighting(rows, self.draw(rows), 1.0).weights[0]
+                shares = self.weighting.shares(rows)
+                if shares is not None:
+                    weights = weights * shares
                 largest = weights.max().clamp(min=1.0 if self.settings.additions else 1e-12)
                 masks[frame] = (255.0 * weights / largest).byte().cpu().numpy()
         return masks

@@ -74,6 +74,11 @@ class Objective:
         if weights.cross_hand and len(drawing.hands) == 2:
             left, right = (drawing.hands[side].prediction.texture for side in ("left", "right"))
             total = total + weights.cross_hand * terms.cross_hand(left, right)
+        if settings.judges and settings.omega_weight:
+            for hand in drawing.hands.values():
+                # What has no perturbation needs no bias: the pre-pass tells the weights where.
+                size = hand.omega.square()
+                total = total + settings.omega_weight * (clean.to(size) * size).mean()
         if settings.uses_gains:
             # Clean frames have no gain: without this prior gain and colours could trade places.
             size = model.log_gains[rows].square().mean(dim=-1)

@@ -28,16 +28,17 @@ class Target:
     image: Tensor
     #: (B, H, W) estimated coverage of the visible hand.
     hand: Tensor
-    #: (B, H, W) weight of each pixel.
+    #: (B, H, W) weight of each pixel within its frame.
     weights: Tensor
 
 
 class Weighting:
     """Weights of pixels, by the settings' components.
 
-    Without PAO a pixel counts as the estimated mask says. With it, frames that the pre-pass
-    finds perturbed count less, and so do pixels whose residual stays large; in the mode `paper`
-    the regions' weights of the paper take the place of both.
+    Without PAO a pixel counts as the estimated mask says. With it, the canonical hand learns
+    less from frames that the pre-pass finds perturbed (`shares`), and pixels that it finds
+    covered count less; in the mode `paper` the regions' weights of the paper take the place of
+    both.
 
     Args:
         training: what may be seen of the capture.
@@ -85,6 +86,12 @@ class Weighting:
         """Whether the pose of any frame of a batch is refined."""
         return self.settings.moves_poses and bool(self._move[rows].any())
 
+    def shares(self, rows: Tensor) -> Tensor | None:
+        """How much the canonical hand learns from each frame of a batch, (B,); None: all."""
+        if self.judgement is None or not self.settings.weighs_frames:
+            return None
+        return self._frame_weights[rows]
+
     def __call__(self, rows: Tensor, drawing: Drawing, fraction: float) -> Target:
         """Say what a batch is compared with.
 
@@ -104,7 +111,7 @@ class Weighting:
         if not settings.additions:
             found = self.pao(error, self._batch_regions(rows), hand, drawing.omega)
             return Target(image, hand, found.weights)
-        weights = plain * self._frame_weights[rows][:, None, None]
+        weights = plain
         if settings.robust and fraction >= settings.robust_start:
             residual = blended_residual(error, self._batch_regions(rows), hand)
             self.median = running_median(self.median, residual, hand)

@@ -12,9 +12,7 @@ _ONSET = 3.0
 _EXPONENT = 3
 
 
-def evidence(
-    deviations: Sequence[np.ndarray], indices: np.ndarray, tolerance: float
-) -> np.ndarray:
+def evidence(deviations: Sequence[np.ndarray], indices: np.ndarray, tolerance: float) -> np.ndarray:
     """Weigh all cues together, and neighbouring frames with them.
 
     Each cue adds log(1 + (deviation / 3)^2): one cue alone may speak, none outshouts the rest.
