@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import signal
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,10 +68,14 @@ class Told(NoView):
         self.starts: list[tuple[int, str]] = []
         self.ends: dict[str, str | None] = {}
         self.said: list[str] = []
+        self.on_steps: Callable[[int, str], None] = lambda index, place: None
 
     def start(self, index: int, text: str, place: str) -> None:
         self.starts.append((index, place))
         super().start(index, text, place)
+
+    def steps(self, index: int, done: int, total: int) -> None:
+        self.on_steps(index, dict(self.starts).get(index, ""))
 
     def end(self, index: int, text: str, problem: str | None = None) -> None:
         self.ends[text] = problem
@@ -90,6 +94,7 @@ class Gray:
     def __init__(self, settings, seed):
         self.settings, self.seed = settings, seed
     def fit(self, training, budget, report):
+        report.progress(1, 2)
         time.sleep(self.settings["seconds"])
         pixels = [training.frame(frame)[training.mask(frame) > 127] for frame in training.train]
         noise = np.random.default_rng(self.seed).normal(0, 0.02, 3)

@@ -96,6 +96,7 @@ class _Run:
         self._numbers: dict[int, int] = {}
         self._places: dict[int, str] = {}
         self._board = self._start_board()
+        self._picture: Any = None
 
     def all(self) -> None:
         failures = Failures()
@@ -200,12 +201,17 @@ class _Run:
         return self._ray.remote(Board).options(num_cpus=0, scheduling_strategy=place).remote()
 
     def _show(self) -> None:
+        # Asked for now, looked at when it is there: jobs do not wait for their picture.
+        if self._picture is None:
+            self._picture = self._board.read.remote()
+        ready, _ = self._ray.wait([self._picture], timeout=0)
+        if not ready:
+            return
         try:
-            last: Mapping[int, tuple[str, int, int]] = self._ray.get(
-                self._board.read.remote(), timeout=2.0
-            )
+            last: Mapping[int, tuple[str, int, int]] = self._ray.get(self._picture)
         except self._ray.exceptions.RayError:
-            return  # jobs do not wait for their picture
+            last = {}
+        self._picture = self._board.read.remote()
         for index in self._pending.values():
             place, done, total = last.get(self._numbers[index], ("", 0, 0))
             if place and self._places.get(index) != place:
