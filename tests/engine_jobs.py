@@ -24,6 +24,8 @@ class Write:
     fault: str = ""
     #: Times that its process is killed before it gets through; counted in files there.
     deaths: int = 0
+    #: Signal that it is killed by.
+    by: int = signal.SIGKILL
     #: Where deaths are counted.
     graves: Path | None = None
     #: Seconds that it waits.
@@ -37,7 +39,8 @@ class Write:
             raise ZeroDivisionError("by nobody")
         if self.graves is not None and len(list(self.graves.iterdir())) < self.deaths:
             (self.graves / str(os.getpid())).touch()
-            os.kill(os.getpid(), signal.SIGKILL)
+            os.kill(os.getpid(), self.by)
+            time.sleep(60)
         time.sleep(self.seconds)
         output.mkdir(parents=True, exist_ok=True)
         found = "".join((inputs[name] / "a.txt").read_text() for name in sorted(inputs))

@@ -16,7 +16,7 @@ from pathlib import Path
 
 from hwp_bench import errors
 from hwp_bench.engine.job import Needs, Report, Work
-from hwp_bench.engine.worker import FAILURE, GRACE_SECONDS, PROGRESS
+from hwp_bench.engine.worker import FAILURE, GRACE_SECONDS, INTERRUPTED, PROGRESS
 from hwp_bench.errors import BadInput, HwpError
 from hwp_bench.files import read_json
 
@@ -147,6 +147,9 @@ def _raise_failure(status: int, messages: Path) -> None:
         raise parse_error(read_json(failure))
     if status < 0:
         raise WorkerLost(signal.Signals(-status).name)
+    if status == INTERRUPTED:
+        # By somebody else: whoever asks for a stop here does not come so far.
+        raise WorkerLost("interrupted")
     lines = (messages / "log.txt").read_text(errors="replace").strip().splitlines()
     raise HwpError(f"a job broke: {lines[-1][:500] if lines else f'exit status {status}'}")
 

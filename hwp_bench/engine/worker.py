@@ -23,6 +23,8 @@ from hwp_bench.files import write_json
 PROGRESS = "progress.json"
 #: Why it failed.
 FAILURE = "failure.json"
+#: Exit status of a job that was told to stop.
+INTERRUPTED = 130
 #: Seconds between two looks at whether the parent lives, and between two notes of progress.
 LOOK_SECONDS = 0.5
 #: Seconds that an orphan may take to end its own processes.
@@ -48,7 +50,7 @@ def main() -> int:
         write_json(messages / FAILURE, failure)
         return 1
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
     finally:
         if os.getppid() != parent:
             _remove(folders)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from pathlib import Path
 
 import psutil
@@ -78,17 +79,22 @@ def test_finished_jobs_do_not_run_and_threads_follow_the_needs(
     assert texts(tmp_path) == {"old": "kept", "new": "new 3"}
 
 
-def test_a_job_whose_process_is_killed_begins_anew_but_not_for_ever(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("by", "reason"), [(signal.SIGKILL, "SIGKILL"), (signal.SIGTERM, "interrupted")]
+)
+def test_a_job_whose_process_is_killed_begins_anew_but_not_for_ever(
+    tmp_path: Path, by: int, reason: str
+) -> None:
     graves = tmp_path / "graves"
     graves.mkdir()
     view = Told()
-    jobs = [write_job(tmp_path / "out", Write("job", deaths=2, graves=graves))]
+    jobs = [write_job(tmp_path / "out", Write("job", deaths=2, by=by, graves=graves))]
     ParallelEngine(1, view, retries=2).run(jobs, lambda index: None)
     assert len(list(graves.iterdir())) == 2
     assert len(view.starts) == 3
     assert sum("again, its worker was lost" in text for text in view.said) == 2
-    jobs = [write_job(tmp_path / "out", Write("other", deaths=9, graves=graves))]
-    with pytest.raises(HwpError, match=r"'other' was lost 2 times \(SIGKILL\)"):
+    jobs = [write_job(tmp_path / "out", Write("other", deaths=9, by=by, graves=graves))]
+    with pytest.raises(HwpError, match=rf"'other' was lost 2 times \({reason}\)"):
         ParallelEngine(1, retries=1).run(jobs, lambda index: None)
     assert set(texts(tmp_path / "out")) == {"job"}
 
