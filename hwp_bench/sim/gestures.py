@@ -21,6 +21,11 @@ LIMITS = (
     np.array([[-30.0, 70.0], [-35.0, 45.0], [-20.0, 70.0], [-25.0, 85.0]]),
     np.array([[-30.0, 95.0], [-8.0, 112.0], [-12.0, 85.0], [-25.0, 25.0]]),
 )
+#: How far a finger closes before it meets the palm: `CLOSING` times its three flexions, degrees,
+#: at most `CLOSED`, for index, middle, ring and little finger. Solved with
+#: `hwp_bench.sim.penetration` for a tip that presses 3 mm into the palm.
+CLOSING = np.array([0.9, 1.0, 0.3])
+CLOSED = np.array([140.0, 153.0, 150.0, 135.0])
 
 
 @cache
@@ -56,9 +61,15 @@ def finger_back(finger: str) -> np.ndarray:
 
 
 def within_limits(angles: np.ndarray) -> np.ndarray:
-    """Clip (..., 5, 4) degrees to what a hand can do."""
+    """Clip (..., 5, 4) degrees to what a hand can do.
+
+    A finger that would close into the palm keeps the proportions of its flexions and stops where
+    it touches.
+    """
     thumb = np.clip(angles[..., :1, :], LIMITS[0][:, 0], LIMITS[0][:, 1])
     rest = np.clip(angles[..., 1:, :], LIMITS[1][:, 0], LIMITS[1][:, 1])
+    closing = np.maximum(rest[..., :3] @ CLOSING, 1e-9)
+    rest[..., :3] *= np.minimum(1.0, CLOSED / closing)[..., None]
     return np.concatenate([thumb, rest], axis=-2)
 
 
