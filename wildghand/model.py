@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from wildghand.attributes import RawAttributes
-from wildghand.dpd import DynamicPerturbation, Temporal, drop
+from wildghand.dpd import DynamicPerturbation
 from wildghand.fit.clip import TrainingClip
 from wildghand.network import Prediction, PredictionNetwork
 from wildghand.quaternions import quat_multiply, quat_rotate, quat_third_axis
@@ -123,8 +123,7 @@ class WildGHandModel(nn.Module):
         width: int,
         height: int,
         *,
-        drop_probability: Tensor | None = None,
-        generator: torch.Generator | None = None,
+        kept: Mapping[str, Tensor] | None = None,
         shares: Tensor | None = None,
         move: bool = False,
         refine: bool = False,
@@ -135,8 +134,7 @@ class WildGHandModel(nn.Module):
             clip: hands and cameras.
             rows: (B,) int64 positions among the training frames.
             width, height: px.
-            drop_probability: (B,) chance that a frame's biases are left out; None: never.
-            generator: draws these chances.
+            kept: (B,) bool by side: False leaves a frame's biases out; None: never.
             shares: (B,) how much the canonical hand learns from each frame, 0-1; None: all.
             move: add `pose_steps` and `transl_steps` to the given parameters.
             refine: apply the network's refinement of the parameters (head iv).
@@ -162,9 +160,10 @@ class WildGHandModel(nn.Module):
                 module = self.biases_of(side)
                 temporal = module.temporal(rows)
                 omega = temporal.omega
-                biases = module.biases(
-                    raw, temporal.z, _dropped(temporal, drop_probability, generator)
-                )
+                weight = omega
+                if kept is not None:
+                    weight = torch.where(kept[side].to(omega.device), omega, omega.new_zeros(()))
+                biases = module.biases(raw, temporal.z, weight)
                 raw = raw + biases
             gaussians = self._dress(anchors, learning, raw)
             parts.append(gaussians)
@@ -235,14 +234,6 @@ class WildGHandModel(nn.Module):
             opacities=attributes.opacities,
             colors=attributes.colors * prediction.shadow,
         )
-
-
-def _dropped(
-    temporal: Temporal, probability: Tensor | None, generator: torch.Generator | None
-) -> Tensor:
-    if probability is None or generator is None:
-        return temporal.omega
-    return drop(temporal.omega, probability, generator)
 
 
 def _rasterize(

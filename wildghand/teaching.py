@@ -52,8 +52,7 @@ def taught(prediction: Prediction, shares: Tensor) -> Prediction:
         template_offsets=by_frame(prediction.template_offsets.expand(count, -1, -1)),
         refinement=Refinement(
             pose=by_frame(refinement.pose),
-            # The shape is shared by the frames of a batch, and so is its gradient.
-            betas=_Share.apply(refinement.betas, shares.mean().to(refinement.betas)),
+            betas=by_frame(refinement.betas.expand(count, -1)),
             transl=by_frame(refinement.transl),
         ),
     )

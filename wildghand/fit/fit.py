@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ import torch
 from hwp_bench.methods.request import TrainingCapture
 from wildghand.assemble import assemble, make_rigs
 from wildghand.avatar import FitRecord, WildGHandAvatar
+from wildghand.dpd import drop
 from wildghand.fit.clip import TrainingClip
 from wildghand.fit.frames import load_frames
 from wildghand.fit.objective import Objective
@@ -69,7 +71,7 @@ class Fit:
         """
         settings, weighting = self.settings, self.weighting
         set_rates(self.optimizer, settings, fraction)
-        drawing = self.draw(rows, weighting.drop_probability[rows])
+        drawing = self.draw(rows, self._keep(rows))
         target = weighting(rows, drawing, fraction)
         loss = self.objective(self.model, drawing, target, rows, weighting.clean[rows])
         value = float(loss.detach())
@@ -100,12 +102,21 @@ class Fit:
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
 
-    def draw(self, rows: torch.Tensor, drop_probability: torch.Tensor | None = None) -> Drawing:
+    def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
+        """(B,) bool by side: which frames of a batch keep their biases in this step."""
+        ones, chances = torch.ones(len(rows)), self.weighting.drop_probability[rows]
+        return {
+            side: drop(ones, chances, self.generator) > 0.0 for side in self.model.perturbation
+        }
+
+    def draw(
+        self, rows: torch.Tensor, kept: Mapping[str, torch.Tensor] | None = None
+    ) -> Drawing:
         """Draw training frames with everything that is particular to them.
 
         Args:
             rows: (B,) int64, which of the training frames.
-            drop_probability: (B,) chance that a frame's biases are left out; None: never.
+            kept: (B,) bool by side, whether a frame keeps its biases; None: every one does.
         """
         with self._precision():
             return self.model.draw_frames(
@@ -113,8 +124,7 @@ class Fit:
                 rows,
                 self.training.width,
                 self.training.height,
-                drop_probability=drop_probability,
-                generator=self.generator,
+                kept=kept,
                 shares=self.weighting.shares(rows),
                 move=self.weighting.moves(rows),
                 refine=self.settings.refines,
