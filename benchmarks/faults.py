@@ -179,12 +179,13 @@ def _start(words: Sequence[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
 
 
 def _finish(words: Sequence[str]) -> tuple[int, str]:
-    """Run a command to its end; returns its exit status and the last line that it printed."""
+    """Run a command to its end; returns its exit status and the line that says why."""
     with tempfile.TemporaryFile() as log:
         status = _start(words, log).wait(PATIENCE)
         log.seek(0)
         lines = log.read().decode(errors="replace").strip().splitlines()
-    return status, lines[-1] if lines else ""
+    reasons = [line for line in lines if "failed:" in line or "error:" in line]
+    return status, (reasons or lines or [""])[-1]
 
 
 def torture(target: Target, kills: int, work: Path, chance: random.Random) -> Tally:
