@@ -8,7 +8,8 @@ Spearman correlation of 1 - clean with the true severity (the largest of its per
 the area under the ROC curve of clean against perturbed frames; the share of clean frames judged
 clean and of frames of severity 3 to 5 judged not; median absolute error of the log
 gains; and, over pixels of the hand in frames with objects, the area under the curve of the pixel
-weights for visible against covered pixels, beside that of the estimated mask alone.
+weights for visible against covered pixels, beside that of the estimated mask alone. A second table
+compares the estimated severity of every perturbation that the capture carries with the true one.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ from hwp_bench.hands import load_template
 from hwp_bench.splits import contiguous_split
 from wildghand.prepass import Judgement, PrepassInput, judge_frames
 from wildghand.prepass.intensity import log_light_table
+from wildghand.prepass.severity import estimated_severity
 
 
 def load(capture: Capture) -> PrepassInput:
@@ -90,6 +92,17 @@ def covered_pixels(capture: Capture, judgement: Judgement) -> tuple[float, float
         area_under_curve(np.concatenate(weights), shown),
         area_under_curve(np.concatenate(masks), shown),
     )
+
+
+def level_rows(name: str, judgement: Judgement, truth: dict[str, np.ndarray]) -> list[str]:
+    """Rows of the second table: estimated against true levels of what the capture carries."""
+    rows = []
+    for kind, true in truth.items():
+        found = estimated_severity(judgement)[kind]
+        correlation = spearmanr(found, true).statistic
+        error = np.abs(found - true).mean()
+        rows.append(f"| {name} | {kind.replace('_', ' ')} | {correlation:.2f} | {error:.1f} |")
+    return rows
 
 
 def _has_clean_mask(capture: Capture, frame: int) -> bool:
@@ -165,6 +178,7 @@ def main() -> None:
         "| gain error (90 %) | pixel AUC (mask alone) |"
     )
     print("| --- |" + " ---: |" * 10)
+    levels = []
     for path in args.captures:
         capture = open_capture(path)
         given = load(capture)
@@ -176,6 +190,7 @@ def main() -> None:
         truth = severities(capture, judgement.indices)
         if truth and capture.has_clean:
             worst = np.max(list(truth.values()), axis=0)
+            levels += level_rows(capture.info.id, judgement, truth)
             error = gain_error(capture, judgement)
             pixels = covered_pixels(capture, judgement)
             row += [
@@ -193,6 +208,10 @@ def main() -> None:
         print(f"| {' | '.join(row)} |", flush=True)
         if args.pictures:
             draw(capture, given, judgement, args.pictures)
+    print(
+        "\n| capture | perturbation | Spearman | mean error, levels |\n| --- | --- | ---: | ---: |"
+    )
+    print("\n".join(levels))
 
 
 if __name__ == "__main__":

@@ -72,7 +72,8 @@ def test_a_bias_learns_from_all_of_a_frame() -> None:
     prediction = _prediction(1)
     bias = torch.zeros(FRAMES, GAUSSIANS, 1, requires_grad=True)
     (taught(prediction, torch.zeros(FRAMES)).shadow + bias).square().sum().backward()
-    assert prediction.shadow.grad is not None and not prediction.shadow.grad.any()
+    assert prediction.shadow.grad is not None
+    assert not prediction.shadow.grad.any()
     assert bias.grad is not None
     torch.testing.assert_close(bias.grad, 2.0 * prediction.shadow.detach())
 

@@ -14,10 +14,17 @@ def command_tree() -> Command:
         "anti-perturbation Gaussian hand avatars",
         commands={
             "fit": Command("fit an avatar to a capture or a video", "wildghand.cli.fit"),
+            "pretrain": Command(
+                "fit one network to several captures, as a prior for fits",
+                "wildghand.cli.pretrain",
+            ),
             "render": Command(
                 "draw an avatar along the poses of a capture", "wildghand.cli.render"
             ),
             "export": Command("write an avatar as Gaussians for viewers", "wildghand.cli.export"),
+            "judge": Command(
+                "judge the frames of a capture: clean or perturbed", "wildghand.cli.judge"
+            ),
             "info": Command("show what renders here, and check it", "wildghand.cli.info"),
         },
     )
