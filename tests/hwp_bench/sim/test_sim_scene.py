@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from tiny_scene import SINGLE, scene_maker
 
 from hwp_bench.errors import BadInput, UsageError
-from hwp_bench.sim.episodes import clean_share, level, severity
+from hwp_bench.sim.episodes import clean_share, level, moments, severity
 from hwp_bench.sim.scene import (
     CLEAN_FROM,
     MIN_CLEAN_SHARE,
@@ -19,7 +19,9 @@ from hwp_bench.sim.scene import (
     parse_scene,
     scene_names,
 )
+from hwp_bench.sim.suites import suite, suite_names
 from hwp_bench.sim.variants import with_effects, with_severity, with_subject
+from hwp_bench.splits import contiguous_split
 from hwp_bench.taxonomy import catalogue
 
 SceneMaker = Callable[..., Scene]
@@ -42,6 +44,16 @@ def test_scene_says_what_the_catalogue_says(name: str) -> None:
     assert {call.kind for call in scene.effects} == set(entry.perturbations)
     assert scene.camera.handheld == (entry.device == "Mobile phone")
     assert clean_share(scene) >= MIN_CLEAN_SHARE
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_enough_training_frames_of_every_suite_are_clean(name: str) -> None:
+    # Frames are few in small suites, so that a share of the time is not yet one of the frames.
+    for item in suite(name):
+        split = contiguous_split(item.scene.id, item.frame_count)
+        when = moments(item.frame_count)[split.train]
+        clean = [not any(level(call, moment) for call in item.scene.effects) for moment in when]
+        assert sum(clean) >= MIN_CLEAN_SHARE * len(clean), (item.scene.id, sum(clean), len(clean))
 
 
 @pytest.mark.parametrize("name", sorted(catalogue()))
