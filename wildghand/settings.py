@@ -51,6 +51,9 @@ class WildGHandSettings:
     #: `default`: what measurements keep. `paper`: the formulas as printed, made well-posed; the
     #: additions below are then off whatever they say.
     mode: str = choice("default", "paper")
+    #: A prior over subjects that the network starts from, in either mode: a folder made by
+    #: `wildghand pretrain`. A relative path is one within this package; empty: random weights.
+    prior: str = ""
     #: Gaussians on each hand.
     gaussians: int = number(12_337, 1, 1_000_000)
     #: Optimiser steps unless the budget says otherwise.

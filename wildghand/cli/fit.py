@@ -43,6 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="NAME=VALUE",
         help="a setting (wildghand/settings.py); may be given again",
     )
+    parser.add_argument(
+        "--prior", type=Path, metavar="PRIOR", help="start from it (made by `wildghand pretrain`)"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing avatar")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -62,7 +65,7 @@ def run(args: argparse.Namespace) -> int:
     avatar = fit_capture(
         _capture(args),
         args.out,
-        settings=dict(_setting(text) for text in args.set),
+        settings=_settings(args),
         budget=Budget(seconds=args.seconds, steps=args.steps),
         seed=args.seed,
         all_frames=args.all_frames,
@@ -79,6 +82,14 @@ def run(args: argparse.Namespace) -> int:
             f"in {record.seconds:.0f} s"
         )
     return 0
+
+
+def _settings(args: argparse.Namespace) -> dict[str, Any]:
+    """The overrides; a prior's path is the caller's, not the method's."""
+    settings = dict(setting(text) for text in args.set)
+    if args.prior is not None:
+        settings["prior"] = str(args.prior.resolve())
+    return settings
 
 
 def _capture(args: argparse.Namespace) -> Path:
@@ -108,7 +119,8 @@ def _capture(args: argparse.Namespace) -> Path:
     return folder
 
 
-def _setting(text: str) -> tuple[str, Any]:
+def setting(text: str) -> tuple[str, Any]:
+    """Take `NAME=VALUE` apart; a value that is no JSON is a text."""
     from hwp_bench.errors import UsageError
 
     name, found, value = text.partition("=")

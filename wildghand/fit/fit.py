@@ -19,6 +19,7 @@ from wildghand.fit.objective import Objective
 from wildghand.fit.rates import make_optimizer, set_rates
 from wildghand.fit.weighting import Weighting
 from wildghand.model import Drawing
+from wildghand.prior_files import find_prior, load_prior
 from wildghand.settings import WildGHandSettings
 
 
@@ -32,7 +33,7 @@ class Fit:
         device: where it runs.
 
     Raises:
-        BadInput: no training frame can be used.
+        BadInput: no training frame can be used, or the prior is damaged or of another kind.
     """
 
     def __init__(
@@ -53,6 +54,11 @@ class Fit:
         self.model = assemble(
             templates, rigs, settings, self.mean_color, len(self.frames), seed
         ).to(device)
+        self.source = {"capture": training.id}
+        if settings.prior:
+            prior = load_prior(find_prior(settings.prior), settings.network, training.hand_model)
+            prior.initialise(self.model.network)
+            self.source["prior"] = prior.record.weights
         self.clip = TrainingClip(training, self.frames.indices, rigs, device)
         self.weighting = Weighting(training, self.frames, settings, device)
         self.objective = Objective(settings, rigs)
@@ -152,7 +158,7 @@ class Fit:
                 clean=self.weighting.clean.tolist(),
                 steps=steps,
                 seconds=seconds,
-                source={"capture": self.training.id},
+                source=dict(self.source),
             ),
             self._weight_masks() if final else None,
         )

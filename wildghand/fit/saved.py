@@ -7,13 +7,12 @@ import os
 import pickle
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 
 from hwp_bench.errors import BadInput
 from hwp_bench.files import atomic_write
-from wildghand.fit.fit import Fit
 from wildghand.fit.optimise import Watchers
 
 #: Version of the file.
@@ -22,9 +21,24 @@ SCHEMA = "wildghand-fit/1"
 MAX_BYTES = 8 << 30
 
 
+class Resumable(Protocol):
+    """A fit that can be saved and go on: of one capture, or of several at once."""
+
+    #: Where its tensors live.
+    device: torch.device
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that steps change."""
+        ...
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        ...
+
+
 def save_state(
     path: str | os.PathLike[str],
-    fit: Fit,
+    fit: Resumable,
     watchers: Watchers,
     *,
     step: int,
@@ -55,7 +69,7 @@ def save_state(
 
 def load_state(
     path: str | os.PathLike[str],
-    fit: Fit,
+    fit: Resumable,
     watchers: Watchers,
     digest: str,
 ) -> tuple[int, float]:

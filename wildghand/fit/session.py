@@ -89,7 +89,7 @@ def fit_capture(
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
     chosen = read_settings(settings)
     capture = open_capture(source)
-    split = _all_frames(capture) if all_frames else _split(capture)
+    split = every_frame(capture) if all_frames else _split(capture)
     work = out.with_name(out.name + ".fit")
     run = RunSettings(dict(settings), seed, budget)
     with sole_use(work):
@@ -138,7 +138,7 @@ def _split(capture: Capture) -> Split:
         ) from error
 
 
-def _all_frames(capture: Capture) -> Split:
+def every_frame(capture: Capture) -> Split:
     """Every frame but the last two, which stand for the parts that a split must have."""
     count = capture.info.frame_count
     return Split(capture.info.id, count, (0, count - 2), (count - 2, count - 1), (count - 1, count))

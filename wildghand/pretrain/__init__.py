@@ -1,0 +1,1 @@
+"""Fitting one network to captures of several subjects, for a prior."""

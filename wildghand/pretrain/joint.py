@@ -1,0 +1,151 @@
+"""A fit of several captures at once: shared branches and heads, everything else their own."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hwp_bench.methods.request import TrainingCapture
+from wildghand.fit.fit import Fit
+from wildghand.fit.rates import make_optimizer
+from wildghand.fit.schedule import batches
+from wildghand.network import PredictionNetwork
+from wildghand.prior import MAPS, mean_weights
+from wildghand.settings import WildGHandSettings
+
+# Children of a network that belong to its subject.
+_OWN = ("identity", "charts")
+
+
+class JointFit:
+    """Fits of several captures that share the weights of branches and heads.
+
+    Each capture keeps its identity map, and what is particular to its frames: perturbation
+    biases, gains and poses. A step is a batch of one capture; every capture comes once before
+    any comes again.
+
+    Args:
+        trainings: what may be seen of each capture.
+        settings: how each is fitted.
+        seed: of everything random.
+        device: where it runs.
+
+    Raises:
+        BadInput: a capture has no training frame that can be used.
+    """
+
+    def __init__(
+        self,
+        trainings: Sequence[TrainingCapture],
+        settings: WildGHandSettings,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        self.settings = settings
+        self.device = device
+        self.fits: list[Fit] = []
+        for training in trainings:
+            fit = Fit(training, settings, seed, device)
+            if self.fits:
+                _share(self.fits[0].model.network, fit.model.network)
+            self.fits.append(fit)
+        self.optimizer = _joint_optimizer(self.fits)
+        for fit in self.fits:
+            fit.optimizer = self.optimizer
+        self._captures = batches(len(self.fits), 1, seed)
+        self._rows = [
+            batches(len(fit.frames), settings.batch, seed + 1 + index)
+            for index, fit in enumerate(self.fits)
+        ]
+
+    def step(self, fraction: float) -> float:
+        """Take one step on a batch of the next capture.
+
+        Args:
+            fraction: share of the steps that are done.
+
+        Returns:
+            The loss; nothing is changed where it is not finite.
+        """
+        capture, rows = self._next()
+        return self.fits[capture].step(rows, fraction)
+
+    def skip(self, steps: int) -> None:
+        """Pass over the batches of steps that were taken before."""
+        for _ in range(steps):
+            self._next()
+
+    def weights(self) -> dict[str, Tensor]:
+        """The shared weights and the mean identity map of each hand; float32, CPU."""
+        return mean_weights(fit.model.network for fit in self.fits)
+
+    def finite(self) -> bool:
+        """Whether every fitted number is finite."""
+        return all(fit.model.finite() for fit in self.fits)
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """A copy of all models that the fit no longer changes; shared weights are in it once."""
+        return {name: value.detach().clone() for name, value in self._tensors().items()}
+
+    def restore(self, snapshot: dict[str, Tensor]) -> None:
+        """Bring the models back to a snapshot."""
+        current = self._tensors()
+        with torch.no_grad():
+            for name, value in snapshot.items():
+                current[name].copy_(value)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that steps change; what `load_state_dict` takes."""
+        return {
+            "models": self._tensors(),
+            "thresholds": [fit.weighting.pao.state_dict() for fit in self.fits],
+            "medians": [fit.weighting.median for fit in self.fits],
+            "generators": [fit.generator.get_state() for fit in self.fits],
+            "optimizer": self.optimizer.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.restore(state["models"])
+        parts = zip(
+            self.fits, state["thresholds"], state["medians"], state["generators"], strict=True
+        )
+        for fit, thresholds, median, generator in parts:
+            fit.weighting.pao.load_state_dict(thresholds)
+            fit.weighting.median = None if median is None else float(median)
+            fit.generator.set_state(generator.cpu())
+        self.optimizer.load_state_dict(state["optimizer"])
+
+    def _next(self) -> tuple[int, Tensor]:
+        capture = int(next(self._captures)[0])
+        return capture, next(self._rows[capture])
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """The tensors of all models by capture and name; shared ones under the first capture."""
+        tensors = {}
+        for index, fit in enumerate(self.fits):
+            for name, value in fit.model.state_dict().items():
+                shared = name.startswith("network.") and not name.startswith(f"network.{MAPS}")
+                if index == 0 or not shared:
+                    tensors[f"{index}.{name}"] = value
+        return tensors
+
+
+def _share(source: PredictionNetwork, network: PredictionNetwork) -> None:
+    """Make a network use another one's branches and heads."""
+    for name, child in source.named_children():
+        if name not in _OWN:
+            setattr(network, name, child)
+
+
+def _joint_optimizer(fits: Sequence[Fit]) -> torch.optim.Adam:
+    """Adam over the parameters of all fits, each of them once; rates by group as in a fit."""
+    joint, *others = [make_optimizer(fit.model, fit.weighting.pao, fit.settings) for fit in fits]
+    for other in others:
+        for group, more in zip(joint.param_groups, other.param_groups, strict=True):
+            known = {id(parameter) for parameter in group["params"]}
+            group["params"] += [p for p in more["params"] if id(p) not in known]
+    return joint
