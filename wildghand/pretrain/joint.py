@@ -91,8 +91,14 @@ class JointFit:
         return {name: value.detach().clone() for name, value in self._tensors().items()}
 
     def restore(self, snapshot: dict[str, Tensor]) -> None:
-        """Bring the models back to a snapshot."""
+        """Bring the models back to a snapshot.
+
+        Raises:
+            ValueError: it is one of other models.
+        """
         current = self._tensors()
+        if snapshot.keys() != current.keys():
+            raise ValueError("tensors of other models")
         with torch.no_grad():
             for name, value in snapshot.items():
                 current[name].copy_(value)
