@@ -1,9 +1,10 @@
 """How time grows with jobs and workers: measured for 1 and 2 workers, modelled for more.
 
-Run from the repository: `python -m benchmarks.engine [--seconds 5] [--jobs 2 4] [--no-ray]`.
+Run from the repository: `python -m benchmarks.engine [--seconds 3] [--jobs 2 4] [--no-ray]`.
 A job reads 8 MiB, waits (`--seconds`, as for a fit on a device of its own), and writes 1 MiB; so
 what is measured is the engine and not the processors that workers here would share. A Ray worker
-is a node of one processor with a cache of its own, started beforehand; inputs are sent to it.
+is a node of one processor, started beforehand; inputs are sent. One job a worker goes before, so
+that a node has its worker process and its inputs; of `--repeats` runs the fastest counts.
 
 Model: T(J, W) = start + ceil(J / W) * (job + overhead). Job is what is waited; start and overhead
 are the least-squares fit to the measurements with one worker. Two workers are then predicted and
@@ -50,19 +51,29 @@ def make_jobs(folder: Path, source: Path, count: int, seconds: float) -> list[Jo
     return [make(number) for number in range(count)]
 
 
-def measure(engine: Engine, source: Path, count: int, seconds: float) -> float:
-    """Seconds from the first job's order to the last one's result."""
-    with tempfile.TemporaryDirectory() as name, engine:
-        jobs = make_jobs(Path(name), source, count, seconds)
-        began = time.perf_counter()
-        engine.run(jobs, lambda index: None)
-        return time.perf_counter() - began
+def measure(
+    engine: Engine, workers: int, source: Path, counts: Sequence[int], seconds: float, repeats: int
+) -> list[float]:
+    """Seconds from the first job's order to the last one's result, for each number of jobs."""
+
+    def once(count: int, seconds: float) -> float:
+        with tempfile.TemporaryDirectory() as name:
+            jobs = make_jobs(Path(name), source, count, seconds)
+            began = time.perf_counter()
+            engine.run(jobs, lambda index: None)
+            return time.perf_counter() - began
+
+    with engine:
+        once(workers, 1.0)
+        return [min(once(count, seconds) for _ in range(repeats)) for count in counts]
 
 
 def fit(counts: Sequence[int], times: Sequence[float], seconds: float) -> tuple[float, float]:
     """Start and overhead of one worker by least squares, neither below zero."""
     slope, start = np.polyfit(counts, times, 1)
-    return max(float(start), 0.0), max(float(slope) - seconds, 0.0)
+    if start < 0.0:
+        start, slope = 0.0, np.dot(counts, times) / np.dot(counts, counts)
+    return float(start), max(float(slope) - seconds, 0.0)
 
 
 def model(jobs: int, workers: int, job: float, start: float, overhead: float) -> float:
@@ -89,16 +100,19 @@ def report(name: str, counts: Sequence[int], times: dict[int, list[float]], job:
         print(f"{workers:>5} workers {seconds / 3600:>7.2f} h, speed-up {alone / seconds:6.2f}")
 
 
-def measure_local(source: Path, counts: Sequence[int], seconds: float) -> dict[int, list[float]]:
-    turn: list[Engine] = [LocalEngine() for _ in counts]
-    at_once: list[Engine] = [ParallelEngine(2) for _ in counts]
+def measure_local(
+    source: Path, counts: Sequence[int], seconds: float, repeats: int
+) -> dict[int, list[float]]:
+    engines: dict[int, Engine] = {1: LocalEngine(), 2: ParallelEngine(2)}
     return {
-        workers: [measure(e, source, count, seconds) for e, count in zip(row, counts, strict=True)]
-        for workers, row in ((1, turn), (2, at_once))
+        workers: measure(engine, workers, source, counts, seconds, repeats)
+        for workers, engine in engines.items()
     }
 
 
-def measure_ray(source: Path, counts: Sequence[int], seconds: float) -> dict[int, list[float]]:
+def measure_ray(
+    source: Path, counts: Sequence[int], seconds: float, repeats: int
+) -> dict[int, list[float]]:
     from ray.cluster_utils import Cluster
 
     from hwp_bench.engine.ray_engine import RayEngine
@@ -112,17 +126,16 @@ def measure_ray(source: Path, counts: Sequence[int], seconds: float) -> dict[int
         for workers in (1, 2):
             os.environ["HWP_CACHE"] = str(caches / str(workers))
             cluster.add_node(num_cpus=1, object_store_memory=100 << 20, include_dashboard=False)
-            times[workers] = [
-                measure(RayEngine(cluster.address, shared=False), source, count, seconds)
-                for count in counts
-            ]
+            engine = RayEngine(cluster.address, shared=False)
+            times[workers] = measure(engine, workers, source, counts, seconds, repeats)
     return times
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--seconds", type=float, default=5.0, help="that a job waits")
+    parser.add_argument("--seconds", type=float, default=3.0, help="that a job waits")
     parser.add_argument("--jobs", type=int, nargs="+", default=[2, 4], help="numbers of jobs")
+    parser.add_argument("--repeats", type=int, default=2, help="runs, of which the fastest counts")
     parser.add_argument("--no-ray", action="store_true", help="this machine's engines only")
     args = parser.parse_args()
     load = os.getloadavg()[0]
@@ -132,10 +145,10 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         source = Path(name)
         (source / "frames.bin").write_bytes(np.random.default_rng(0).bytes(INPUT_BYTES))
-        local = measure_local(source, args.jobs, args.seconds)
+        local = measure_local(source, args.jobs, args.seconds, args.repeats)
         report("local (in turn; two at once)", args.jobs, local, args.seconds)
         if not args.no_ray:
-            measured = measure_ray(source, args.jobs, args.seconds)
+            measured = measure_ray(source, args.jobs, args.seconds, args.repeats)
             report("Ray (one node; two nodes)", args.jobs, measured, args.seconds)
     print(f"\nload {os.getloadavg()[0]:.1f} at the end")
 
