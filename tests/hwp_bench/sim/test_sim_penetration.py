@@ -23,13 +23,13 @@ from hwp_bench.sim.penetration import (
 from hwp_bench.sim.scene import HandKey, load_scene, scene_names
 from hwp_bench.sim.subject import MOVING, SubjectHand, scene_hands
 
-#: Deepest that any gesture presses a hand into itself, m. Fists are too tight for this hand:
-#: finger tips sink into palm and thumb.
-GESTURE_DEEPEST = 0.0165
+#: Deepest that any gesture presses a hand into itself, m: finger tips give way by a few
+#: millimetres where a real palm does.
+GESTURE_DEEPEST = 0.003
 #: The same over the frames of the scenes, for 99 of 100 frames and for every frame, m.
-SELF_DEEPEST = (0.0175, 0.0185)
+SELF_DEEPEST = (0.0085, 0.0095)
 #: How deep one hand presses into the other, likewise.
-MUTUAL_DEEPEST = (0.019, 0.021)
+MUTUAL_DEEPEST = (0.017, 0.0205)
 #: Frames of each scene.
 FRAMES = 10
 
