@@ -5,14 +5,19 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from wildghand.fit.parallel import World
 
 _EXAMPLES = """examples:
   wildghand fit my_capture -o my_avatar
   wildghand fit my_capture -o my_avatar --seconds 60
   wildghand fit hand.mp4 --landmarks hand.npz -o my_avatar
   wildghand fit my_capture -o paper --set mode=paper --set network.size=paper --set device=cuda
+  torchrun --nproc-per-node 4 -m wildghand.cli.main fit my_capture -o my_avatar --set batch=4
 
+With torchrun each process draws its part of every batch, on a GPU of its own.
 A capture is a folder (`hwp-bench data import-video`, `hwp-bench sim render`). A video becomes one
 first, beside the avatar. A stopped fit goes on when the same command is given again.
 """
@@ -51,7 +56,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command."""
+    """Run the command, alone or with the processes that torchrun started."""
+    from wildghand.device import choose_device
+    from wildghand.fit.parallel import run_in_world
+    from wildghand.settings import read_settings
+
+    return run_in_world(
+        lambda: choose_device(read_settings(_settings(args)).device),
+        lambda world: _run(args, world),
+    )
+
+
+def _run(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.errors import UsageError
     from hwp_bench.methods.contract import Budget
     from wildghand.fit.session import fit_capture
@@ -63,14 +79,17 @@ def run(args: argparse.Namespace) -> int:
     if args.seed < 0:
         raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
     avatar = fit_capture(
-        _capture(args),
+        _shared_capture(args, world),
         args.out,
         settings=_settings(args),
         budget=Budget(seconds=args.seconds, steps=args.steps),
         seed=args.seed,
         all_frames=args.all_frames,
         overwrite=args.overwrite,
+        world=world,
     )
+    if not world.leads:
+        return 0
     record = avatar.record
     if args.json:
         facts = {"avatar": str(args.out), "steps": record.steps, "seconds": record.seconds}
@@ -90,6 +109,16 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
     if args.prior is not None:
         settings["prior"] = str(args.prior.resolve())
     return settings
+
+
+def _shared_capture(args: argparse.Namespace, world: World) -> Path:
+    """The capture folder; the leader makes it where there is none yet."""
+    if not world.leads:
+        world.wait_for_leader()
+        return _capture(args)
+    folder = _capture(args)
+    world.wait_for_leader()
+    return folder
 
 
 def _capture(args: argparse.Namespace) -> Path:

@@ -16,6 +16,7 @@ from wildghand.dpd import drop
 from wildghand.fit.clip import TrainingClip
 from wildghand.fit.frames import load_frames
 from wildghand.fit.objective import Objective
+from wildghand.fit.parallel import ALONE, World, average_gradients, digest_of
 from wildghand.fit.rates import make_optimizer, set_rates
 from wildghand.fit.weighting import Weighting
 from wildghand.model import Drawing
@@ -31,6 +32,7 @@ class Fit:
         settings: how.
         seed: of anchors, initial weights, order of the frames, and dropout.
         device: where it runs.
+        world: the processes that share its batches.
 
     Raises:
         BadInput: no training frame can be used, or the prior is damaged or of another kind.
@@ -42,11 +44,13 @@ class Fit:
         settings: WildGHandSettings,
         seed: int,
         device: torch.device,
+        world: World = ALONE,
     ) -> None:
         self.training = training
         self.settings = settings
         self.seed = seed
         self.device = device
+        self.world = world
         self.frames = load_frames(training)
         templates = {side: training.template(side) for side in training.sides}
         rigs = make_rigs(templates, settings.gaussians, seed, device)
@@ -66,29 +70,56 @@ class Fit:
         self.generator = torch.Generator().manual_seed(seed)
 
     def step(self, rows: torch.Tensor, fraction: float) -> float:
-        """Take one step on a batch.
+        """Take one step on a batch, of which each process draws its part.
 
         Args:
-            rows: (B,) int64, which of the training frames.
+            rows: (B,) int64, which of the training frames; the same in every process.
             fraction: share of the budget that is used up.
 
         Returns:
-            The loss; nothing is changed where it is not finite.
+            The loss, the same in every process; nothing is changed where it is not finite.
+
+        Raises:
+            UsageError: the processes cannot share the batch evenly.
+            PeerLost: another process has ended.
         """
-        settings, weighting = self.settings, self.weighting
+        settings, weighting, world = self.settings, self.weighting, self.world
         set_rates(self.optimizer, settings, fraction)
-        drawing = self.draw(rows, self._keep(rows))
-        target = weighting(rows, drawing, fraction)
-        loss = self.objective(self.model, drawing, target, rows, weighting.clean[rows])
-        value = float(loss.detach())
+        part = world.part(len(rows))
+        mine = rows[part]
+        kept = {side: keep[part] for side, keep in self._keep(rows).items()}
+        drawing = self.draw(mine, kept, move=weighting.moves(rows))
+        target = weighting(rows, drawing, fraction, world)
+        loss = self.objective(self.model, drawing, target, mine, weighting.clean[mine])
+        value = float(world.average_(loss.detach().clone()))
         if not math.isfinite(value):
             return value
         self.optimizer.zero_grad(set_to_none=True)
         loss.backward()
+        average_gradients(
+            (tensor for group in self.optimizer.param_groups for tensor in group["params"]), world
+        )
         if settings.clip_gradient > 0.0:
             torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
         self.optimizer.step()
         return value
+
+    def require_same(self, step: int) -> None:
+        """Check that all processes start from the same state.
+
+        Args:
+            step: steps behind it.
+
+        Raises:
+            HwpError: one does not.
+        """
+        if self.world.size == 1:
+            return
+        weighting = self.weighting
+        numbers = {**self.model.state_dict(), **weighting.pao.state_dict()}
+        numbers |= {"clean": weighting.clean, "dropped": weighting.drop_probability}
+        numbers |= {"frames": torch.from_numpy(self.frames.indices)}
+        self.world.require_same(digest_of(numbers, step))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that steps change; what `load_state_dict` takes."""
@@ -111,18 +142,21 @@ class Fit:
     def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """(B,) bool by side: which frames of a batch keep their biases in this step."""
         ones, chances = torch.ones(len(rows)), self.weighting.drop_probability[rows]
-        return {
-            side: drop(ones, chances, self.generator) > 0.0 for side in self.model.perturbation
-        }
+        return {side: drop(ones, chances, self.generator) > 0.0 for side in self.model.perturbation}
 
     def draw(
-        self, rows: torch.Tensor, kept: Mapping[str, torch.Tensor] | None = None
+        self,
+        rows: torch.Tensor,
+        kept: Mapping[str, torch.Tensor] | None = None,
+        *,
+        move: bool | None = None,
     ) -> Drawing:
         """Draw training frames with everything that is particular to them.
 
         Args:
             rows: (B,) int64, which of the training frames.
             kept: (B,) bool by side, whether a frame keeps its biases; None: every one does.
+            move: refine the poses of the frames; None: if any of them needs it.
         """
         with self._precision():
             return self.model.draw_frames(
@@ -132,7 +166,7 @@ class Fit:
                 self.training.height,
                 kept=kept,
                 shares=self.weighting.shares(rows),
-                move=self.weighting.moves(rows),
+                move=self.weighting.moves(rows) if move is None else move,
                 refine=self.settings.refines,
             )
 

@@ -12,6 +12,7 @@ from hwp_bench.progress import notice
 from wildghand.avatar import WildGHandAvatar
 from wildghand.fit.fit import Fit
 from wildghand.fit.guard import Guard
+from wildghand.fit.parallel import World
 from wildghand.fit.plateau import Plateau
 from wildghand.fit.schedule import batches, spent
 
@@ -57,12 +58,13 @@ def optimise(
         after_step: called with the number of steps after each; saves, for instance.
 
     Returns:
-        The last state; the best one if the fit diverged later.
+        The last state; the best one if the fit diverged later. Of several processes, the leader's
+        has the record of the weights.
 
     Raises:
         DidNotConverge: the fit diverged without ever having been better than its start.
     """
-    settings = fit.settings
+    settings, world = fit.settings, fit.world
     steps = settings.steps if budget.steps is None else budget.steps
     order = batches(len(fit.frames), settings.batch, fit.seed)
     for _ in range(start):
@@ -70,14 +72,17 @@ def optimise(
     watchers = watchers or Watchers(settings.plateau_steps)
     step = start
     report(step, fit.avatar(step))
-    while step < steps and (fraction := spent(step, steps, budget, report)) < 1.0:
+    while step < steps:
+        # All processes go by the leader's clock, or some would stop a step before the others.
+        fraction = world.of_leader(spent(step, steps, budget, report))
+        if fraction >= 1.0:
+            break
         loss = fit.step(next(order), fraction)
         if not watchers.guard.watch(step, loss, fit.model):
             fit.model.load_state_dict(watchers.guard.best())
-            notice(
-                f"The fit diverged at step {step}; the state of step {watchers.guard.step} is kept."
-            )
-            step = watchers.guard.step
+            kept = watchers.guard.step
+            _tell(world, f"The fit diverged at step {step}; the state of step {kept} is kept.")
+            step = kept
             break
         step += 1
         report.progress(step, steps)
@@ -85,6 +90,14 @@ def optimise(
         if after_step is not None:
             after_step(step, watchers)
         if watchers.plateau.reached(loss):
-            notice(f"The loss has stood still for {settings.plateau_steps} steps; finished early.")
+            _tell(
+                world,
+                f"The loss has stood still for {settings.plateau_steps} steps; finished early.",
+            )
             break
-    return fit.avatar(step, report.elapsed, final=True)
+    return fit.avatar(step, report.elapsed, final=world.leads)
+
+
+def _tell(world: World, text: str) -> None:
+    if world.leads:
+        notice(text)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import shutil
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from wildghand.avatar_files import save_avatar
 from wildghand.device import choose_device
 from wildghand.fit.fit import Fit
 from wildghand.fit.optimise import Watchers, optimise
+from wildghand.fit.parallel import ALONE, World
 from wildghand.fit.saved import load_state, save_state
 from wildghand.settings import WildGHandSettings, read_settings
 
@@ -64,6 +66,7 @@ def fit_capture(
     seed: int = 0,
     all_frames: bool = False,
     overwrite: bool = False,
+    world: World = ALONE,
 ) -> WildGHandAvatar:
     """Fit an avatar to a capture and write it.
 
@@ -78,53 +81,72 @@ def fit_capture(
         seed: of everything random.
         all_frames: fit the validation and test frames too: for an avatar, not for a score.
         overwrite: replace an avatar that is there.
+        world: the processes that fit together; its leader alone writes.
 
     Raises:
-        UsageError: `out` exists.
+        UsageError: `out` exists, or the processes cannot share a batch evenly.
         BadInput: no training frame can be used, or the saved state is of another fit.
         DidNotConverge: the fit diverged at once.
-        HwpError: another fit is writing to `out`, or nobody can.
+        HwpError: another fit is writing to `out`, or nobody can, or another process has ended.
     """
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
     chosen = read_settings(settings)
+    world.part(chosen.batch)
     capture = open_capture(source)
     split = every_frame(capture) if all_frames else _split(capture)
     work = out.with_name(out.name + ".fit")
     run = RunSettings(dict(settings), seed, budget)
-    with sole_use(work):
-        avatar = _fit_in(work, capture, split, run, chosen)
-        save_avatar(avatar, out, overwrite=overwrite)
-        shutil.rmtree(work, ignore_errors=True)
+    with sole_use(work) if world.leads else contextlib.nullcontext():
+        if world.leads:
+            write_request(work / "request", capture, split, run)
+        world.wait_for_leader()
+        avatar = _fit_in(work, capture, run, chosen, world)
+        if world.leads:
+            save_avatar(avatar, out, overwrite=overwrite)
+            shutil.rmtree(work, ignore_errors=True)
+        world.wait_for_leader()
     return avatar
 
 
 def _fit_in(
-    work: Path, capture: Capture, split: Split, run: RunSettings, chosen: WildGHandSettings
+    work: Path, capture: Capture, run: RunSettings, chosen: WildGHandSettings, world: World
 ) -> WildGHandAvatar:
     """Fit, from the state that is saved in the work folder if there is one."""
-    training = open_request(write_request(work / "request", capture, split, run))
+    training = open_request(work / "request")
     digest = sha256_json(
         [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
     )
-    fit = Fit(training, chosen, run.seed, choose_device(chosen.device))
+    fit = Fit(training, chosen, run.seed, choose_device(chosen.device), world)
     watchers, start, before = Watchers(chosen.plateau_steps), 0, 0.0
     state = work / STATE
     if state.is_file():
         start, before = load_state(state, fit, watchers, digest)
-        notice(f"Going on after {start} steps.")
+        if world.leads:
+            notice(f"Going on after {start} steps.")
+    fit.require_same(start)
     steps = chosen.steps if run.budget.steps is None else run.budget.steps
-    with progress(f"Fitting {capture.info.id}", steps) as show:
+    with _shown(capture, steps, world) as show:
         clock = _Clock(before, show)
         saved = time.perf_counter()
 
         def save(step: int, watched: Watchers) -> None:
             nonlocal saved
-            if time.perf_counter() - saved >= SAVE_EVERY:
+            if world.leads and time.perf_counter() - saved >= SAVE_EVERY:
                 save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
                 saved = time.perf_counter()
 
         return optimise(fit, run.budget, clock, start=start, watchers=watchers, after_step=save)
+
+
+@contextlib.contextmanager
+def _shown(capture: Capture, steps: int, world: World) -> Iterator[Callable[[int], None]]:
+    """The progress bar, which the leader alone has."""
+    if not world.leads:
+        yield lambda done: None
+        return
+    with progress(f"Fitting {capture.info.id}", steps) as show:
+        yield show
 
 
 def _split(capture: Capture) -> Split:

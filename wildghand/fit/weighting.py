@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hwp_bench.methods.request import TrainingCapture
 from wildghand.fit.frames import TrainingFrames
+from wildghand.fit.parallel import ALONE, World
 from wildghand.model import Drawing
 from wildghand.pao import PerturbationAwareWeights
 from wildghand.prepass import Judgement, PrepassInput, judge_frames
@@ -92,32 +93,40 @@ class Weighting:
             return None
         return self._frame_weights[rows]
 
-    def __call__(self, rows: Tensor, drawing: Drawing, fraction: float) -> Target:
-        """Say what a batch is compared with.
+    def __call__(
+        self, rows: Tensor, drawing: Drawing, fraction: float, world: World = ALONE
+    ) -> Target:
+        """Say what a batch, or this process's part of it, is compared with.
+
+        Where weights compare the frames of a batch, all processes weigh all of it.
 
         Args:
-            rows: (B,) int64, which of the R frames.
-            drawing: of these frames.
+            rows: (B,) int64, which of the R frames are in the batch.
+            drawing: of this process's part of them.
             fraction: share of the budget that is used up.
+            world: the processes.
         """
         settings = self.settings
-        hand = self.frames.masks[rows].to(self.device).float() / 255.0
-        image = self.frames.images[rows].to(self.device).float() / 255.0 * hand[..., None]
+        part = world.part(len(rows))
+        whole = self.frames.masks[rows].to(self.device).float() / 255.0
+        hand, mine = whole[part], rows[part]
+        image = self.frames.images[mine].to(self.device).float() / 255.0 * hand[..., None]
         outside = settings.outside_weight
         plain = outside + (1.0 - outside) * hand
         if not settings.pao or settings.binary_mask:
             return Target(image, hand, (hand > 0.5).float() if settings.binary_mask else plain)
         error = (drawing.image.detach() - image).abs().mean(dim=-1)
         if not settings.additions:
-            found = self.pao(error, self._batch_regions(rows), hand, drawing.omega)
-            return Target(image, hand, found.weights)
+            omega = world.gather(drawing.omega)
+            found = self.pao(world.gather(error), self._batch_regions(rows), whole, omega)
+            return Target(image, hand, found.weights[part])
         weights = plain
         if settings.robust and fraction >= settings.robust_start:
-            residual = blended_residual(error, self._batch_regions(rows), hand)
-            self.median = running_median(self.median, residual, hand)
-            weights = weights * residual_weights(residual, self.median)
+            residual = blended_residual(world.gather(error), self._batch_regions(rows), whole)
+            self.median = running_median(self.median, residual, whole)
+            weights = weights * residual_weights(residual[part], self.median)
         elif self._initial is not None:
-            weights = weights * self._initial[rows].to(self.device).float() / 255.0
+            weights = weights * self._initial[mine].to(self.device).float() / 255.0
         return Target(image, hand, weights)
 
     def _batch_regions(self, rows: Tensor) -> Regions:
