@@ -113,8 +113,11 @@ class WildGHandSettings:
     weights: PaoSettings = field(default_factory=PaoSettings)
     #: Weights of the regularisers.
     terms: TermWeights = field(default_factory=TermWeights)
-    #: The judge of the frames.
-    judge: PrepassSettings = field(default_factory=lambda: PrepassSettings(weight_floor=0.02))
+    #: The judge of the frames. It leaves the biases out of every clean frame, not out of three in
+    #: ten: what little they took from these, the avatar lacked (docs/wildghand.md).
+    judge: PrepassSettings = field(
+        default_factory=lambda: PrepassSettings(weight_floor=0.02, omega_dropout=1.0)
+    )
 
     @property
     def additions(self) -> bool:
