@@ -190,6 +190,7 @@ class Fit:
                 frames=self.frames.indices.tolist(),
                 temporal=self._temporal() if final else {},
                 clean=self.weighting.clean.tolist(),
+                frame_weights=self.weighting.frame_weights.tolist(),
                 steps=steps,
                 seconds=seconds,
                 source=dict(self.source),
@@ -199,15 +200,15 @@ class Fit:
 
     @torch.no_grad()
     def _weight_masks(self) -> dict[int, np.ndarray]:
-        """The weights of every training frame as pictures, 255 = the largest of the frame."""
+        """The weights of pixels within every training frame as pictures, 255 = full weight.
+
+        In the mode `paper`, whose weights have no bound, 255 is the largest of the frame.
+        """
         masks = {}
         if self.settings.pao:
             for row, frame in enumerate(self.frames.indices.tolist()):
                 rows = torch.tensor([row])
                 weights = self.weighting(rows, self.draw(rows), 1.0).weights[0]
-                shares = self.weighting.shares(rows)
-                if shares is not None:
-                    weights = weights * shares
                 largest = weights.max().clamp(min=1.0 if self.settings.additions else 1e-12)
                 masks[frame] = (255.0 * weights / largest).byte().cpu().numpy()
         return masks

@@ -51,6 +51,8 @@ class Weighting:
         judgement: of the pre-pass; None without it.
         clean: (R,) probability that a frame is clean; ones without the pre-pass.
         drop_probability: (R,) chance that a frame's biases are left out.
+        frame_weights: (R,) how much the canonical hand learns from each frame; ones without the
+            pre-pass or without PAO.
         pao: the paper's weights, whose thresholds are learnt.
     """
 
@@ -67,7 +69,7 @@ class Weighting:
         self.clean = torch.ones(count)
         self.drop_probability = torch.full((count,), settings.omega_dropout)
         self._move = torch.zeros(count, dtype=torch.bool)
-        self._frame_weights = torch.ones(count, device=device)
+        self.frame_weights = torch.ones(count, device=device)
         self._initial: Tensor | None = None
         if self.judgement is not None:
             self.clean = torch.from_numpy(self.judgement.clean).float()
@@ -75,7 +77,7 @@ class Weighting:
             self._move = torch.from_numpy(self.judgement.refine_pose)
             if settings.weighs_frames:
                 weights = torch.from_numpy(self.judgement.frame_weights).float()
-                self._frame_weights = weights.to(device)
+                self.frame_weights = weights.to(device)
                 self._initial = torch.from_numpy(self.judgement.pixel_weights)
         self.pao = PerturbationAwareWeights(settings.weights_of(len(training.sides))).to(device)
         self._regions: list[FrameRegions] | None = None
@@ -91,7 +93,7 @@ class Weighting:
         """How much the canonical hand learns from each frame of a batch, (B,); None: all."""
         if self.judgement is None or not self.settings.weighs_frames:
             return None
-        return self._frame_weights[rows]
+        return self.frame_weights[rows]
 
     def __call__(
         self, rows: Tensor, drawing: Drawing, fraction: float, world: World = ALONE

@@ -1,0 +1,98 @@
+"""Do temporal weights follow the severity, and weight masks what is covered?
+
+Run from the repository, after `hwp-bench evaluate wildghand` or `hwp-bench ablate`:
+`python -m benchmarks.disentanglement RESULTS... --captures FOLDER...`, with results folders and the
+simulated captures that they are of. The truth is read here and never by the method.
+
+For every capture: Spearman correlation over the training frames of |omega|, the largest among the
+hands, with the true severity, the largest among the perturbations; mean |omega| of unperturbed
+frames and of those of severity 3 to 5; and, in frames with objects, the area under the ROC curve
+of the weight masks for visible against covered pixels of the hand, beside the estimated mask's.
+Numbers are means over the results given, such as the seeds of a variant.
+"""
+
+from __future__ import annotations
+
+import argparse
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import spearmanr
+
+from benchmarks.prepass import area_under_curve, severities
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.files import read_json
+from hwp_bench.images import read_gray
+
+
+def temporal(folder: Path) -> tuple[np.ndarray, np.ndarray] | None:
+    """Training frames (R,) and the largest |omega| among the hands (R,); None without them."""
+    files = sorted(folder.glob("*-temporal.json"))
+    if not files:
+        return None
+    read = [read_json(path) for path in files]
+    weights = np.abs([record["weights"] for record in read]).max(axis=0)
+    return np.array(read[0]["frames"]), weights
+
+
+def covered(folder: Path, capture: Capture, frames: np.ndarray) -> tuple[float, float]:
+    """Area under the curve of the weight masks and of the estimated masks."""
+    found, masks, visible = [], [], []
+    for frame in frames.tolist():
+        picture = folder / "weights" / f"{frame:06d}.png"
+        known_clean = capture.root / "truth" / "clean_masks" / f"{frame:06d}.png"
+        if not picture.is_file() or not known_clean.is_file():
+            continue
+        truth = capture.true_mask(frame)
+        known = (capture.clean_mask(frame) > 250) & ((truth > 250) | (truth < 5))
+        found.append(read_gray(picture)[known])
+        masks.append(capture.mask(frame)[known])
+        visible.append(truth[known] > 250)
+    if not found:
+        return float("nan"), float("nan")
+    shown = np.concatenate(visible)
+    return (
+        area_under_curve(np.concatenate(found), shown),
+        area_under_curve(np.concatenate(masks), shown),
+    )
+
+
+def measure(folder: Path, capture: Capture) -> list[float]:
+    """Correlation, mean |omega| of clean and of strong frames, both areas; nan where unknown."""
+    course = temporal(folder)
+    if course is None:
+        return [float("nan")] * 5
+    frames, weights = course
+    severity = severities(capture, frames)
+    worst = np.max(list(severity.values()), axis=0)
+    objects = severity.get("hand_object_interaction", np.zeros_like(worst))
+    return [
+        float(spearmanr(weights, worst).statistic),
+        float(weights[worst == 0].mean()),
+        float(weights[worst >= 3].mean()),
+        *covered(folder, capture, frames[objects > 0]),
+    ]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("results", nargs="+", type=Path, help="results folders")
+    parser.add_argument("--captures", nargs="+", type=Path, required=True, help="capture folders")
+    args = parser.parse_args()
+    print(
+        "| capture | Spearman | omega clean | omega severity 3-5 | pixel AUC | mask alone |\n"
+        "| --- |" + " ---: |" * 5
+    )
+    for path in args.captures:
+        capture = open_capture(path)
+        rows = [
+            measure(result / "captures" / capture.info.id / "diagnostics", capture)
+            for result in args.results
+        ]
+        means = np.mean(rows, axis=0)
+        cells = ["" if np.isnan(value) else f"{value:.2f}" for value in means]
+        print(f"| {capture.info.id} | {' | '.join(cells)} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
