@@ -93,7 +93,9 @@ def run_method(
     output.mkdir(parents=True)
     limits = Limits(time_limit, wanted.memory_bytes)
     started = time.perf_counter()
-    outcome, isolation = _run(manifest, request, output, wanted, limits, on_progress)
+    # Behind walls the working folder is another one, and a relative path would lead nowhere.
+    places = request.absolute(), output.absolute()
+    outcome, isolation = _run(manifest, *places, wanted, limits, on_progress)
     wall = time.perf_counter() - started
     remove_odd_files(output)
     log = output / LOG
