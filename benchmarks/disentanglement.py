@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from scipy.stats import spearmanr
 
-from benchmarks.prepass import area_under_curve, severities
+from benchmarks.prepass import covered_pixels, severities
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.files import read_json
 from hwp_bench.images import read_gray
@@ -35,26 +35,10 @@ def temporal(folder: Path) -> tuple[np.ndarray, np.ndarray] | None:
     return np.array(read[0]["frames"]), weights
 
 
-def covered(folder: Path, capture: Capture, frames: np.ndarray) -> tuple[float, float]:
-    """Area under the curve of the weight masks and of the estimated masks."""
-    found, masks, visible = [], [], []
-    for frame in frames.tolist():
-        picture = folder / "weights" / f"{frame:06d}.png"
-        known_clean = capture.root / "truth" / "clean_masks" / f"{frame:06d}.png"
-        if not picture.is_file() or not known_clean.is_file():
-            continue
-        truth = capture.true_mask(frame)
-        known = (capture.clean_mask(frame) > 250) & ((truth > 250) | (truth < 5))
-        found.append(read_gray(picture)[known])
-        masks.append(capture.mask(frame)[known])
-        visible.append(truth[known] > 250)
-    if not found:
-        return float("nan"), float("nan")
-    shown = np.concatenate(visible)
-    return (
-        area_under_curve(np.concatenate(found), shown),
-        area_under_curve(np.concatenate(masks), shown),
-    )
+def stored_weights(folder: Path, frames: np.ndarray) -> dict[int, np.ndarray]:
+    """The weight masks that a method left, by frame."""
+    paths = {frame: folder / "weights" / f"{frame:06d}.png" for frame in frames.tolist()}
+    return {frame: read_gray(path) for frame, path in paths.items() if path.is_file()}
 
 
 def measure(folder: Path, capture: Capture) -> list[float]:
@@ -70,7 +54,7 @@ def measure(folder: Path, capture: Capture) -> list[float]:
         float(spearmanr(weights, worst).statistic),
         float(weights[worst == 0].mean()),
         float(weights[worst >= 3].mean()),
-        *covered(folder, capture, frames[objects > 0]),
+        *covered_pixels(capture, stored_weights(folder, frames[objects > 0])),
     ]
 
 

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Mapping
 from pathlib import Path
 
 import cv2
@@ -72,41 +73,47 @@ def gain_error(capture: Capture, judgement: Judgement) -> tuple[float, float]:
     return float(np.median(errors)), float(np.quantile(errors, 0.9))
 
 
-def covered_pixels(capture: Capture, judgement: Judgement) -> tuple[float, float]:
-    """Area under the curve of the weights and of the mask alone, visible against covered."""
-    severity = severities(capture, judgement.indices).get("hand_object_interaction")
-    weights, masks, visible = [], [], []
-    for row, frame in enumerate(judgement.indices.tolist()):
-        if severity is None or not severity[row] or not _has_clean_mask(capture, frame):
+def covered_pixels(capture: Capture, weights: Mapping[int, np.ndarray]) -> tuple[float, float]:
+    """Area under the curve of weights and of the estimated mask alone, visible against covered.
+
+    Args:
+        capture: with the truth.
+        weights: (H, W) of each frame that counts; frames whose clean mask is unknown do not.
+    """
+    found, masks, visible = [], [], []
+    for frame, weight in weights.items():
+        if not (capture.root / "truth" / "clean_masks" / f"{frame:06d}.png").is_file():
             continue
-        hand = capture.clean_mask(frame) > 250
         truth = capture.true_mask(frame)
-        known = hand & ((truth > 250) | (truth < 5))
-        weights.append(judgement.pixel_weights[row][known])
+        known = (capture.clean_mask(frame) > 250) & ((truth > 250) | (truth < 5))
+        found.append(weight[known])
         masks.append(capture.mask(frame)[known])
         visible.append(truth[known] > 250)
-    if not weights:
+    if not found:
         return float("nan"), float("nan")
     shown = np.concatenate(visible)
     return (
-        area_under_curve(np.concatenate(weights), shown),
+        area_under_curve(np.concatenate(found), shown),
         area_under_curve(np.concatenate(masks), shown),
     )
 
 
+def judged_weights(judgement: Judgement, objects: np.ndarray | None) -> dict[int, np.ndarray]:
+    """Pixel weights of the frames in which objects act."""
+    acting = np.zeros(len(judgement)) if objects is None else objects
+    rows = np.flatnonzero(acting)
+    return {int(judgement.indices[row]): judgement.pixel_weights[row] for row in rows}
+
+
 def level_rows(name: str, judgement: Judgement, truth: dict[str, np.ndarray]) -> list[str]:
     """Rows of the second table: estimated against true levels of what the capture carries."""
-    rows = []
+    rows, levels = [], estimated_severity(judgement)
     for kind, true in truth.items():
-        found = estimated_severity(judgement)[kind]
+        found = levels[kind]
         correlation = spearmanr(found, true).statistic
         error = np.abs(found - true).mean()
         rows.append(f"| {name} | {kind.replace('_', ' ')} | {correlation:.2f} | {error:.1f} |")
     return rows
-
-
-def _has_clean_mask(capture: Capture, frame: int) -> bool:
-    return (capture.root / "truth" / "clean_masks" / f"{frame:06d}.png").is_file()
 
 
 def draw(capture: Capture, given: PrepassInput, judgement: Judgement, folder: Path) -> None:
@@ -192,7 +199,8 @@ def main() -> None:
             worst = np.max(list(truth.values()), axis=0)
             levels += level_rows(capture.info.id, judgement, truth)
             error = gain_error(capture, judgement)
-            pixels = covered_pixels(capture, judgement)
+            objects = truth.get("hand_object_interaction")
+            pixels = covered_pixels(capture, judged_weights(judgement, objects))
             row += [
                 str(int((worst > 0).sum())),
                 f"{seconds:.2f}",

@@ -6,12 +6,12 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Self, TypeVar
 
 from hwp_bench.text import shown
 
 if TYPE_CHECKING:
-    from rich.progress import Progress
+    from rich.progress import Progress, ProgressColumn
 
 Item = TypeVar("Item")
 
@@ -21,27 +21,48 @@ def notice(text: str) -> None:
     print(shown(text), file=sys.stderr, flush=True)
 
 
-def _bar() -> Progress:
+def _bar(*more: ProgressColumn) -> Progress:
     from rich.console import Console
-    from rich.progress import (
-        BarColumn,
-        MofNCompleteColumn,
-        Progress,
-        TextColumn,
-        TimeElapsedColumn,
-        TimeRemainingColumn,
-    )
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
+        *more,
+        console=Console(stderr=True),
+    )
+
+
+def _times() -> list[ProgressColumn]:
+    from rich.progress import TextColumn, TimeElapsedColumn, TimeRemainingColumn
+
+    return [
         TimeElapsedColumn(),
         TextColumn("elapsed,"),
         TimeRemainingColumn(),
         TextColumn("left"),
-        console=Console(stderr=True),
-    )
+    ]
+
+
+class TerminalBar:
+    """A bar that only a terminal gets; a context manager.
+
+    Args:
+        columns: makes the columns behind the count; called, and rich imported, on a terminal only.
+    """
+
+    def __init__(self, columns: Callable[[], Iterable[ProgressColumn]]) -> None:
+        self._bar = _bar(*columns()) if sys.stderr.isatty() else None
+
+    def __enter__(self) -> Self:
+        if self._bar is not None:
+            self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self._bar is not None:
+            self._bar.stop()
 
 
 @contextlib.contextmanager
@@ -62,28 +83,19 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
         yield lambda done: None
         notice(f"{description}: {total} in {time.perf_counter() - start:.1f} s")
         return
-    with _bar() as bar:
+    with _bar(*_times()) as bar:
         task = bar.add_task(description, total=total)
         yield lambda done: bar.update(task, completed=done)
 
 
-class JobProgress:
+class JobProgress(TerminalBar):
     """Shows a list of jobs, one bar each, with elapsed and remaining time.
 
     A context manager; elsewhere than on a terminal it prints one line as each job starts.
     """
 
     def __init__(self) -> None:
-        self._bar = _bar() if sys.stderr.isatty() else None
-
-    def __enter__(self) -> JobProgress:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
+        super().__init__(_times)
 
     def start(self, index: int, count: int, name: str) -> Callable[[int, int], None]:
         """Begin job `index` of `count`; returns what takes (done, total) steps of it."""

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING
 
-from hwp_bench.progress import notice
+from hwp_bench.progress import TerminalBar, notice
+
+if TYPE_CHECKING:
+    from rich.progress import ProgressColumn
 
 #: Jobs that took less than this share of the longest were found finished; they tell nothing.
 FOUND = 0.1
@@ -33,35 +36,22 @@ def clock(seconds: float) -> str:
     return f"{hours}:{minutes:02d}:{rest:02d}" if hours else f"{minutes}:{rest:02d}"
 
 
-class AblationView:
+def _own_times() -> list[ProgressColumn]:
+    from rich.progress import TextColumn
+
+    return [TextColumn("{task.fields[times]}", markup=False)]
+
+
+class AblationView(TerminalBar):
     """A bar on a terminal, a line a job elsewhere; a context manager."""
 
     def __init__(self) -> None:
+        super().__init__(_own_times)
         self._began = time.perf_counter()
         self._job_began: float | None = None
         self._durations: list[float] = []
-        self._bar = None
-        if sys.stderr.isatty():
-            from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
-            self._bar = Progress(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(),
-                MofNCompleteColumn(),
-                TextColumn("{task.fields[times]}", markup=False),
-                console=Console(stderr=True),
-            )
+        if self._bar is not None:
             self._task = self._bar.add_task("", total=None, times="")
-
-    def __enter__(self) -> AblationView:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
 
     def start(self, index: int, count: int, text: str) -> Callable[[int, int], None]:
         """Begin job `index` of `count`; returns what takes (done, total) steps of it."""

@@ -1,7 +1,10 @@
-"""The failures of jobs that run side by side: all are tried, then the first is raised."""
+"""The failures of jobs: all are tried, then the first is raised; how one is sent and read."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
+from hwp_bench import errors
 from hwp_bench.errors import HwpError
 
 
@@ -35,4 +38,28 @@ def lost(text: str, retries: int, reason: str) -> HwpError:
     return HwpError(
         f"the worker of the job {text!r} was lost {retries + 1} times ({reason})",
         remedy="Is the memory enough? Start again with the same arguments: finished jobs stay.",
+    )
+
+
+def error_record(error: HwpError) -> dict[str, str | None]:
+    """Return what `parse_error` takes: an error on its way to another process or node."""
+    return {
+        "kind": type(error).__name__,
+        "problem": error.problem,
+        "where": error.where,
+        "field": error.field,
+        "remedy": error.remedy,
+    }
+
+
+def parse_error(value: Mapping[str, str | None]) -> HwpError:
+    """Make an error of the toolkit out of an `error_record`."""
+    kind = getattr(errors, str(value["kind"]), HwpError)
+    if not (isinstance(kind, type) and issubclass(kind, HwpError)):
+        kind = HwpError
+    return kind(
+        str(value["problem"]),
+        where=value["where"],
+        field=value["field"],
+        remedy=value["remedy"],
     )

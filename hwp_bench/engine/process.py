@@ -14,7 +14,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hwp_bench import errors
+from hwp_bench.engine.failures import parse_error
 from hwp_bench.engine.job import Needs, Report, Work
 from hwp_bench.engine.worker import FAILURE, GRACE_SECONDS, INTERRUPTED, PROGRESS
 from hwp_bench.errors import BadInput, HwpError
@@ -152,16 +152,3 @@ def _raise_failure(status: int, messages: Path) -> None:
         raise WorkerLost("interrupted")
     lines = (messages / "log.txt").read_text(errors="replace").strip().splitlines()
     raise HwpError(f"a job broke: {lines[-1][:500] if lines else f'exit status {status}'}")
-
-
-def parse_error(value: Mapping[str, str | None]) -> HwpError:
-    """Make an error of the toolkit out of what `worker` wrote."""
-    kind = getattr(errors, str(value["kind"]), HwpError)
-    if not (isinstance(kind, type) and issubclass(kind, HwpError)):
-        kind = HwpError
-    return kind(
-        str(value["problem"]),
-        where=value["where"],
-        field=value["field"],
-        remedy=value["remedy"],
-    )

@@ -6,10 +6,10 @@ import contextlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hwp_bench.engine.failures import Failures, lost
+from hwp_bench.engine.failures import Failures, lost, parse_error
 from hwp_bench.engine.job import RETRIES, Folder, Job, Needs, OnDone, OnStart
 from hwp_bench.engine.parcel import folder_digest, pack, unpack
-from hwp_bench.engine.process import parse_error, thread_environment
+from hwp_bench.engine.process import thread_environment
 from hwp_bench.engine.ray_connect import connected, head_address
 from hwp_bench.engine.ray_task import Board, Input, Order, Reply, run_order, toolkit_digest
 from hwp_bench.engine.view import JobsView, NoView

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import socket
 import tempfile
 from collections.abc import Mapping
@@ -13,14 +12,18 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.engine.devices import VISIBLE
+from hwp_bench.engine.failures import error_record
 from hwp_bench.engine.job import RETRIES, Work
 from hwp_bench.engine.parcel import Parcel, folder_digest, pack, unpack
 from hwp_bench.engine.process import Errand, WorkerLost, run_errand
 from hwp_bench.errors import BadInput, HwpError
 from hwp_bench.files import cache_root
+from hwp_bench.results.environment import source_digest
 
 #: Packages beside each other whose source decides what a job does.
 SOURCES = ("hwp_bench", "wildghand", "baselines")
+#: Endings of that source: programs, settings, and the free hand.
+SUFFIXES = {".py", ".toml", ".npz"}
 
 
 @dataclass(frozen=True)
@@ -68,13 +71,10 @@ class Reply:
 def toolkit_digest() -> str:
     """Return the SHA-256 (hex) of the toolkit's source: what decides results besides inputs."""
     root = Path(__file__).resolve().parents[2]
-    total = hashlib.sha256()
-    for package in SOURCES:
-        for path in sorted((root / package).rglob("*")):
-            if path.suffix in {".py", ".toml", ".npz"} and path.is_file():
-                content = hashlib.sha256(path.read_bytes()).hexdigest()
-                total.update(f"{path.relative_to(root).as_posix()}\0{content}\0".encode())
-    return total.hexdigest()
+    files = (path for package in SOURCES for path in (root / package).rglob("*"))
+    return source_digest(
+        root, (path for path in files if path.suffix in SUFFIXES and path.is_file())
+    )
 
 
 def run_order(order: Order, sent: Mapping[str, list[Any]], board: Any) -> Reply:
@@ -106,14 +106,7 @@ def run_order(order: Order, sent: Mapping[str, list[Any]], board: Any) -> Reply:
             return Reply(missing=missing)
         return Reply(result=_run(order, inputs, tell))
     except HwpError as error:
-        failure = {
-            "kind": type(error).__name__,
-            "problem": error.problem,
-            "where": error.where,
-            "field": error.field,
-            "remedy": error.remedy,
-        }
-        return Reply(failure=failure)
+        return Reply(failure=error_record(error))
 
 
 def _find_inputs(

@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import datetime
-import sys
 import time
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hwp_bench.progress import notice
+from hwp_bench.progress import TerminalBar, notice
 
 if TYPE_CHECKING:
-    from rich.progress import TaskID
+    from rich.progress import ProgressColumn, TaskID
 
 
 @dataclass
@@ -23,7 +22,7 @@ class _Line:
     task: TaskID | None = None
 
 
-class JobsView:
+class JobsView(TerminalBar):
     """A bar for all jobs and one for each that runs; elsewhere than on a terminal, lines.
 
     A context manager. `begin` says how many jobs there are; then every job is told of by its
@@ -31,32 +30,11 @@ class JobsView:
     """
 
     def __init__(self) -> None:
+        super().__init__(_elapsed)
         self._lines: dict[int, _Line] = {}
         self._ended = 0
         self._count = 0
         self._began = time.perf_counter()
-        self._bar = None
-        if sys.stderr.isatty():
-            from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-            from rich.progress import TimeElapsedColumn as Elapsed
-
-            self._bar = Progress(
-                TextColumn("{task.description}", markup=False),
-                BarColumn(),
-                MofNCompleteColumn(),
-                Elapsed(),
-                console=Console(stderr=True),
-            )
-
-    def __enter__(self) -> JobsView:
-        if self._bar is not None:
-            self._bar.start()
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        if self._bar is not None:
-            self._bar.stop()
 
     def begin(self, count: int) -> None:
         """Say how many jobs there are."""
@@ -127,6 +105,12 @@ class NoView(JobsView):
 
     def _say(self, text: str) -> None:
         pass
+
+
+def _elapsed() -> list[ProgressColumn]:
+    from rich.progress import TimeElapsedColumn
+
+    return [TimeElapsedColumn()]
 
 
 def _clock(seconds: float) -> str:

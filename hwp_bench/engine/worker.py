@@ -16,6 +16,7 @@ import time
 from collections.abc import Sequence
 from pathlib import Path
 
+from hwp_bench.engine.failures import error_record
 from hwp_bench.errors import HwpError
 from hwp_bench.files import write_json
 
@@ -40,14 +41,7 @@ def main() -> int:
     try:
         work(inputs, output, _Note(messages / PROGRESS))
     except HwpError as error:
-        failure = {
-            "kind": type(error).__name__,
-            "problem": error.problem,
-            "where": error.where,
-            "field": error.field,
-            "remedy": error.remedy,
-        }
-        write_json(messages / FAILURE, failure)
+        write_json(messages / FAILURE, error_record(error))
         return 1
     except KeyboardInterrupt:
         return INTERRUPTED
