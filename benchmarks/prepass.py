@@ -25,25 +25,17 @@ import torch
 from scipy.stats import rankdata, spearmanr
 
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.hands import load_template
 from hwp_bench.splits import contiguous_split
 from wildghand.prepass import Judgement, PrepassInput, judge_frames
 from wildghand.prepass.intensity import log_light_table
+from wildghand.prepass.judge import capture_input
 from wildghand.prepass.severity import estimated_severity
 
 
 def load(capture: Capture) -> PrepassInput:
     """What the pre-pass may see of a capture's training frames."""
     train = contiguous_split(capture.info.id, len(capture)).train
-    source = capture.info.hand_model.source
-    return PrepassInput(
-        indices=train,
-        images=np.stack([capture.frame(frame) for frame in train.tolist()]),
-        masks=np.stack([capture.mask(frame) for frame in train.tolist()]),
-        hands=capture.hands,
-        cameras=capture.cameras,
-        templates={side: load_template(source, side) for side in capture.info.sides},
-    )
+    return capture_input(capture, train)
 
 
 def severities(capture: Capture, frames: np.ndarray) -> dict[str, np.ndarray]:

@@ -57,25 +57,12 @@ def run(args: argparse.Namespace) -> int:
 def _judge(capture: Capture) -> tuple[Judgement, dict[str, np.ndarray]]:
     import numpy as np
 
-    from hwp_bench.hands import load_template
     from hwp_bench.progress import track
-    from wildghand.prepass import PrepassInput, judge_frames
+    from wildghand.prepass.judge import capture_input, judge_frames
     from wildghand.prepass.severity import estimated_severity
 
-    frames = range(len(capture))
-    model = capture.info.hand_model.source
-    read = [(capture.frame(k), capture.mask(k)) for k in track(frames, "Reading")]
-    images, masks = zip(*read, strict=True)
-    judgement = judge_frames(
-        PrepassInput(
-            indices=np.arange(len(capture)),
-            images=np.stack(images),
-            masks=np.stack(masks),
-            hands=capture.hands,
-            cameras=capture.cameras,
-            templates={side: load_template(model, side) for side in capture.info.sides},
-        )
-    )
+    every = np.arange(len(capture))
+    judgement = judge_frames(capture_input(capture, every, track(every.tolist(), "Reading")))
     levels = estimated_severity(judgement)
     listed = capture.info.perturbations
     return judgement, {kind: level for kind, level in levels.items() if kind in (listed or levels)}

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
 
-from hwp_bench.capture import Cameras
+from hwp_bench.capture import Cameras, Capture
 from hwp_bench.errors import BadInput, ShapeMismatch
-from hwp_bench.hands import HandParameters, HandTemplate
+from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.methods.request import TrainingCapture
 from wildghand.prepass.conclusion import Look, conclude
 from wildghand.prepass.cues import LEAST_PIXELS, explain
@@ -81,6 +81,32 @@ class PrepassInput:
             masks=small(self.masks),
             cameras=Cameras(self.cameras.Ks * scale, self.cameras.viewmats),
         )
+
+
+def capture_input(
+    capture: Capture, indices: np.ndarray, frames: Iterable[int] | None = None
+) -> PrepassInput:
+    """Read frames of a capture; its truth is not looked at.
+
+    Args:
+        capture: the capture.
+        indices: (R,) ascending, which frames.
+        frames: the same numbers, where reading them is to be watched.
+
+    Raises:
+        BadImage: an image is missing or damaged.
+    """
+    numbers = indices.tolist() if frames is None else frames
+    images, masks = zip(*((capture.frame(k), capture.mask(k)) for k in numbers), strict=True)
+    source = capture.info.hand_model.source
+    return PrepassInput(
+        indices=indices,
+        images=np.stack(images),
+        masks=np.stack(masks),
+        hands=capture.hands,
+        cameras=capture.cameras,
+        templates={side: load_template(source, side) for side in capture.info.sides},
+    )
 
 
 def judge_capture(training: TrainingCapture, settings: PrepassSettings | None = None) -> Judgement:
