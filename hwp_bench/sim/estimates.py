@@ -102,6 +102,8 @@ def estimate_mask(
     if rng.uniform() < (0.10 if plan.strength else 0.02) and coverage.sum() > 10:
         soft = soft * _missed_part(coverage, rng)
     taken_from = TAKEN_FROM["shutter" in plan.passes]
+    # Borders wander, background stays background: the threshold moves only where there is hand.
+    wobble *= np.clip(soft / taken_from, 0.0, 1.0)
     mask = np.clip((soft - taken_from + wobble) / 0.35 + 0.5, 0.0, 1.0)
     return np.round(255.0 * mask).astype(np.uint8)
 

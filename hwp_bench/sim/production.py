@@ -41,7 +41,7 @@ from hwp_bench.sim.subject import scene_hands
 from hwp_bench.sim.worker import exr_file, frame_file, read_frame, render_frames
 
 #: Version of the renderer's look; part of every render key.
-RENDERER = 8
+RENDERER = 9
 #: Smallest and largest edge of a picture.
 SIZES = (32, 1024)
 #: Edge of a picture where nobody says otherwise.
