@@ -57,7 +57,9 @@ class Curve:
             return float(self.seconds[0])
         share = gains[index - 1] / (gains[index - 1] - gains[index])
         low, high = np.log(self.seconds[index - 1 : index + 1])
-        return float(np.exp(low + share * (high - low)))
+        between = np.exp(low + share * (high - low))
+        # Logarithm and exponential do not undo each other to the last digit.
+        return float(np.clip(between, *self.seconds[index - 1 : index + 1]))
 
     def log_area(self, start: float, stop: float) -> float:
         """Return the mean score over the log of the time from `start` to `stop`, seconds.
