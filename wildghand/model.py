@@ -15,7 +15,7 @@ from wildghand.network import Prediction, PredictionNetwork
 from wildghand.quaternions import quat_multiply, quat_rotate, quat_third_axis
 from wildghand.rig import AnchorPoses, HandRig
 from wildghand.splat import rasterize
-from wildghand.teaching import Shares, taught
+from wildghand.teaching import taught
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +124,7 @@ class WildGHandModel(nn.Module):
         height: int,
         *,
         kept: Mapping[str, Tensor] | None = None,
-        shares: Shares | None = None,
+        shares: Tensor | None = None,
         move: bool = False,
         refine: bool = False,
     ) -> Drawing:
@@ -135,7 +135,7 @@ class WildGHandModel(nn.Module):
             rows: (B,) int64 positions among the training frames.
             width, height: px.
             kept: (B,) bool by side: False leaves a frame's biases out; None: never.
-            shares: how much the canonical hand learns from each frame; None: all.
+            shares: (B,) how much the canonical hand learns from each frame, 0-1; None: all.
             move: add `pose_steps` and `transl_steps` to the given parameters.
             refine: apply the network's refinement of the parameters (head iv).
         """
@@ -148,9 +148,7 @@ class WildGHandModel(nn.Module):
                 pose = pose + self.pose_steps[index, rows]
                 transl = transl + self.transl_steps[index, rows]
             prediction = self._predict(side, anchors, pose.detach())
-            learning = prediction
-            if shares is not None:
-                learning = taught(prediction, shares.frames, shares.places[side])
+            learning = prediction if shares is None else taught(prediction, shares)
             if refine:
                 step = learning.refinement
                 pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl

@@ -83,9 +83,6 @@ class WildGHandSettings:
     omega_dropout: float = number(0.3, 0.0, 1.0)
     #: Weight of the square of the temporal weights, for a frame that is surely clean.
     omega_weight: float = number(0.3)
-    #: Addition to PAO: frames' worth of views that every place of the hand learns from; where
-    #: clean frames show it less often, perturbed ones that do count more. 0: frame weights alone.
-    least_views: float = number(0.0)
     #: Share of D-SSIM in the reconstruction loss; the rest is L1.
     dssim_weight: float = number(0.2, 0.0, 1.0)
     #: Weight of a pixel outside the visible-hand mask, beside 1 inside.

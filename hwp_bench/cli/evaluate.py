@@ -228,7 +228,7 @@ def _override(text: str) -> tuple[str, Any]:
     from hwp_bench.errors import UsageError
 
     name, equals, value = text.partition("=")
-    if not equals or not name.isidentifier():
+    if not equals or not all(part.isidentifier() for part in name.split(".")):
         raise UsageError(f"{text!r} is not NAME=VALUE", field="--set")
     try:
         return name, tomllib.loads(f"value = {value}")["value"]

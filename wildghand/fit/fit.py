@@ -64,7 +64,7 @@ class Fit:
             prior.initialise(self.model.network)
             self.source["prior"] = prior.record.weights
         self.clip = TrainingClip(training, self.frames.indices, rigs, device)
-        self.weighting = Weighting(training, self.frames, settings, device, rigs)
+        self.weighting = Weighting(training, self.frames, settings, device)
         self.objective = Objective(settings, rigs)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
         self.generator = torch.Generator().manual_seed(seed)

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.hands.anchors import anchor_positions
 from hwp_bench.methods.request import TrainingCapture
 from wildghand.fit.frames import TrainingFrames
 from wildghand.fit.parallel import ALONE, World
@@ -19,10 +17,8 @@ from wildghand.prepass import Judgement, PrepassInput, judge_frames
 from wildghand.regions import FrameRegions, Regions, stack_regions
 from wildghand.regions.cache import RegionCache
 from wildghand.regions.superpixels import Superpixels
-from wildghand.rig import HandRig
 from wildghand.robust import blended_residual, residual_weights, running_median
 from wildghand.settings import WildGHandSettings
-from wildghand.teaching import Shares, place_shares
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +46,6 @@ class Weighting:
         frames: the R frames that are fitted.
         settings: which components are on.
         device: where the tensors live.
-        rigs: by side; they carry the Gaussians.
 
     Attributes:
         judgement: of the pre-pass; None without it.
@@ -67,7 +62,6 @@ class Weighting:
         frames: TrainingFrames,
         settings: WildGHandSettings,
         device: torch.device,
-        rigs: Mapping[str, HandRig],
     ) -> None:
         count = len(frames)
         self.frames, self.settings, self.device = frames, settings, device
@@ -77,7 +71,6 @@ class Weighting:
         self._move = torch.zeros(count, dtype=torch.bool)
         self.frame_weights = torch.ones(count, device=device)
         self._initial: Tensor | None = None
-        self._views: dict[str, Tensor] = {}
         if self.judgement is not None:
             self.clean = torch.from_numpy(self.judgement.clean).float()
             self.drop_probability = torch.from_numpy(self.judgement.omega_dropout).float()
@@ -85,10 +78,6 @@ class Weighting:
             if settings.weighs_frames:
                 weights = torch.from_numpy(self.judgement.frame_weights).float()
                 self.frame_weights = weights.to(device)
-                self._views = {
-                    side: views_of_gaussians(self.judgement.views[side], rig)
-                    for side, rig in rigs.items()
-                }
                 self._initial = torch.from_numpy(self.judgement.pixel_weights)
         self.pao = PerturbationAwareWeights(settings.weights_of(len(training.sides))).to(device)
         self._regions: list[FrameRegions] | None = None
@@ -100,14 +89,11 @@ class Weighting:
         """Whether the pose of any frame of a batch is refined."""
         return self.settings.moves_poses and bool(self._move[rows].any())
 
-    def shares(self, rows: Tensor) -> Shares | None:
-        """How much the canonical hand learns from each frame of a batch; None: all."""
-        if not self._views:
+    def shares(self, rows: Tensor) -> Tensor | None:
+        """How much the canonical hand learns from each frame of a batch, (B,); None: all."""
+        if self.judgement is None or not self.settings.weighs_frames:
             return None
-        weights = self.frame_weights[rows]
-        least = self.settings.least_views
-        places = {side: place_shares(weights, views, least) for side, views in self._views.items()}
-        return Shares(weights, places)
+        return self.frame_weights[rows]
 
     def __call__(
         self, rows: Tensor, drawing: Drawing, fraction: float, world: World = ALONE
@@ -148,12 +134,6 @@ class Weighting:
     def _batch_regions(self, rows: Tensor) -> Regions:
         assert self._regions is not None
         return stack_regions([self._regions[row] for row in rows.tolist()], self.device)
-
-
-def views_of_gaussians(views: np.ndarray, rig: HandRig) -> Tensor:
-    """(V,) values of a template's vertices at the Gaussians on it, (N,)."""
-    values = torch.as_tensor(views, dtype=torch.float32, device=rig.template.faces.device)
-    return anchor_positions(values[:, None], rig.template.faces, rig.anchors)[:, 0]
 
 
 def judge(

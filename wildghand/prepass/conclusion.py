@@ -12,7 +12,6 @@ from wildghand.prepass.judgement import Judgement
 from wildghand.prepass.mode import densest, excess, normal_value
 from wildghand.prepass.settings import PrepassSettings
 from wildghand.prepass.verdict import clean_probability, evidence
-from wildghand.prepass.views import views_of_vertices
 from wildghand.prepass.weights import normal_residuals, pixel_weights
 
 
@@ -34,27 +33,13 @@ class Look:
     border: float
     #: Way of the hand since the frame before, px.
     motion: float
-    #: `wildghand.prepass.views.seen_cells`.
-    seen: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class Surface:
-    """The hands' surfaces and the cells that they are cut into."""
-
-    #: By side (V,) the cell of every vertex.
-    vertex_cells: Mapping[str, np.ndarray]
-    #: By side (F, 3) vertices of every face.
-    faces: Mapping[str, np.ndarray]
-    #: Number of cells.
-    cell_count: int
 
 
 def conclude(
     indices: np.ndarray,
     masks: np.ndarray,
     looks: Mapping[int, Look],
-    surface: Surface,
+    cell_count: int,
     settings: PrepassSettings,
 ) -> Judgement:
     """Compare the frames with each other and judge them.
@@ -63,7 +48,7 @@ def conclude(
         indices: (R,) ascending frame numbers.
         masks: (R, H, W) uint8.
         looks: by row; rows that are missing cannot be used. Not empty.
-        surface: what the cells belong to.
+        cell_count: number of cells of the surface.
         settings: floors and thresholds.
     """
     count, share = len(indices), settings.clean_share
@@ -105,7 +90,7 @@ def conclude(
         [look.explained.residual for look in found],
         [look.cells for look in found],
         clean[rows].tolist(),
-        surface.cell_count,
+        cell_count,
         normal_value(level, share)[0],
         settings.residual_prior,
     )
@@ -118,12 +103,11 @@ def conclude(
             normal[look.cells],
             settings.residual_scale,
         )
-    weights = settings.weight_floor + (1.0 - settings.weight_floor) * clean
     return Judgement(
         indices=indices,
         usable=usable,
         clean=clean,
-        frame_weights=weights,
+        frame_weights=settings.weight_floor + (1.0 - settings.weight_floor) * clean,
         omega_dropout=np.where(clean >= settings.clean_threshold, settings.omega_dropout, 0.0),
         refine_pose=spread(refine.astype(np.float64)) > 0.5,
         log_gains=spread(gains),
@@ -139,11 +123,4 @@ def conclude(
         hidden_deviation=spread(off_hidden),
         motion=spread(gathered([look.motion for look in found])),
         pixel_weights=pixels,
-        views=views_of_vertices(
-            [look.seen for look in found],
-            weights[rows].tolist(),
-            surface.vertex_cells,
-            surface.faces,
-            surface.cell_count,
-        ),
     )

@@ -39,10 +39,8 @@ class HandSurfaces:
     def __init__(self, templates: Mapping[str, HandTemplate], patch_size: float) -> None:
         self._tensors = {side: template.to_torch() for side, template in templates.items()}
         faces, keys, start = [], [], 0
-        self._spans: dict[str, slice] = {}
-        for number, (side, template) in enumerate(templates.items()):
+        for number, template in enumerate(templates.values()):
             faces.append(template.faces + start)
-            self._spans[side] = slice(start, start + len(template.vertices))
             start += len(template.vertices)
             rest = (template.vertices - template.vertices.min(axis=0)) / patch_size
             # Hands lie far apart in this grid, so that they share no cell.
@@ -53,11 +51,6 @@ class HandSurfaces:
         #: (C, 3) float32 mean outward normal of every cell on the rest hand, length 1; zeros
         #: where the cell holds no face. Most cells hold none.
         self.cell_normals = self._rest_normals(templates)
-
-    def vertex_cells(self) -> dict[str, np.ndarray]:
-        """The cell of every vertex, (V,) int64 by side."""
-        cells = self._cells(self._places)
-        return {side: cells[span] for side, span in self._spans.items()}
 
     def _rest_normals(self, templates: Mapping[str, HandTemplate]) -> np.ndarray:
         normals = np.concatenate(

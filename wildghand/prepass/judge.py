@@ -13,7 +13,7 @@ from hwp_bench.capture import Cameras, Capture
 from hwp_bench.errors import BadInput, ShapeMismatch
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.methods.request import TrainingCapture
-from wildghand.prepass.conclusion import Look, Surface, conclude
+from wildghand.prepass.conclusion import Look, conclude
 from wildghand.prepass.cues import LEAST_PIXELS, explain
 from wildghand.prepass.edges import border_width
 from wildghand.prepass.footprint import Footprint, HandSurfaces
@@ -28,7 +28,6 @@ from wildghand.prepass.intensity import (
 from wildghand.prepass.judgement import Judgement, enlarged, neutral_judgement
 from wildghand.prepass.outlines import ShownCells, interior, misplacement
 from wildghand.prepass.settings import PrepassSettings
-from wildghand.prepass.views import seen_cells
 
 # Margin inside mask and silhouette that is left out, px.
 _MARGIN = 2
@@ -163,13 +162,7 @@ def _judge(given: PrepassInput, settings: PrepassSettings) -> Judgement:
             remedy="Check the capture with `hwp-bench data show`.",
         )
     if usable.sum() < settings.least_frames:
-        return neutral_judgement(
-            given.indices,
-            usable,
-            given.size,
-            settings.omega_dropout,
-            {side: len(template.vertices) for side, template in given.templates.items()},
-        )
+        return neutral_judgement(given.indices, usable, given.size, settings.omega_dropout)
     model = fit_intensity(survey.samples, surfaces.cell_normals, settings)
     looks = {}
     table = log_light_table()
@@ -185,17 +178,8 @@ def _judge(given: PrepassInput, settings: PrepassSettings) -> Judgement:
             misplacement=float(survey.misplacement[row]),
             border=float(survey.border[row]),
             motion=float(survey.motion[row]),
-            seen=seen_cells(
-                footprint.cells,
-                masked.reshape(-1)[footprint.pixels] & (footprint.facing > _FACING),
-            ),
         )
-    surface = Surface(
-        surfaces.vertex_cells(),
-        {side: template.faces for side, template in given.templates.items()},
-        len(surfaces.cell_normals),
-    )
-    return conclude(given.indices, given.masks, looks, surface, settings)
+    return conclude(given.indices, given.masks, looks, len(surfaces.cell_normals), settings)
 
 
 @dataclass(frozen=True, eq=False)

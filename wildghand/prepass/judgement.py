@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
 import cv2
@@ -60,8 +59,6 @@ class Judgement:
     motion: np.ndarray
     #: (R, H, W) uint8, 255 = full weight: initial weights of the pixels.
     pixel_weights: np.ndarray
-    #: By side (V,): sum of the weights of the frames that show each vertex of the template.
-    views: Mapping[str, np.ndarray]
 
     def __len__(self) -> int:
         return len(self.indices)
@@ -73,11 +70,7 @@ class Judgement:
 
 
 def neutral_judgement(
-    indices: np.ndarray,
-    usable: np.ndarray,
-    size: tuple[int, int],
-    omega_dropout: float,
-    vertex_counts: Mapping[str, int],
+    indices: np.ndarray, usable: np.ndarray, size: tuple[int, int], omega_dropout: float
 ) -> Judgement:
     """Everything that can be used is clean: where there is too little to compare.
 
@@ -86,7 +79,6 @@ def neutral_judgement(
         usable: (R,) bool.
         size: height and width.
         omega_dropout: chance for clean frames.
-        vertex_counts: V by side.
     """
     count = len(indices)
     good = usable.astype(np.float64)
@@ -111,7 +103,6 @@ def neutral_judgement(
         hidden_deviation=zeros,
         motion=zeros,
         pixel_weights=np.full((count, *size), 255, dtype=np.uint8),
-        views={side: np.full(vertices, float(count)) for side, vertices in vertex_counts.items()},
     )
 
 
