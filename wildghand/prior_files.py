@@ -33,7 +33,39 @@ WEIGHTS = "weights.safetensors"
 #: Largest file of weights that is read, bytes; the `paper` network has about 150 MB of them.
 MAX_BYTES = 512 << 20
 
+#: The value of the setting that stands for the prior of this package, and where that lies.
+SHIPPED = "shipped"
+_SHIPPED_FOLDER = "priors/compact"
+
 _SIDES = ("right", "left")
+
+
+def choose_prior(settings: WildGHandSettings, hand_model: HandModelId) -> Prior | None:
+    """Return the prior that a fit starts from, or None for random weights.
+
+    A prior that a person names has to be of the fit's kind. The one that ships is taken where it
+    is: nobody asked for it who chose another network or hand model.
+
+    Args:
+        settings: of the fit.
+        hand_model: of the capture.
+
+    Raises:
+        BadInput: the prior that is named is missing, damaged, or of another kind.
+    """
+    if not settings.prior:
+        return None
+    if settings.prior != SHIPPED:
+        return load_prior(find_prior(settings.prior), settings.network, hand_model)
+    if not settings.additions:
+        return None
+    root = find_prior(_SHIPPED_FOLDER)
+    record = _read_record(root)
+    try:
+        _check_fit(record, settings.network, hand_model, str(root))
+    except BadInput:
+        return None
+    return Prior(record, _read_weights(root / WEIGHTS, record, settings.network))
 
 
 def find_prior(text: str) -> Path:
@@ -131,6 +163,12 @@ def load_prior(
         BadInput: no prior, damaged, or of another network or hand model.
     """
     root = Path(path)
+    record = _read_record(root)
+    _check_fit(record, network, hand_model, str(root / DESCRIPTION))
+    return Prior(record, _read_weights(root / WEIGHTS, record, network))
+
+
+def _read_record(root: Path) -> PriorRecord:
     where = str(root / DESCRIPTION)
     try:
         record = parse_record(PriorRecord, read_json(root / DESCRIPTION), where=where)
@@ -140,8 +178,7 @@ def load_prior(
         _check_record(record)
     except HwpError as error:
         raise BadInput(str(error), where=where) from error
-    _check_fit(record, network, hand_model, where)
-    return Prior(record, _read_weights(root / WEIGHTS, record, network))
+    return record
 
 
 def _check_record(record: PriorRecord) -> None:

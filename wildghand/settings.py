@@ -51,9 +51,11 @@ class WildGHandSettings:
     #: `default`: what measurements keep. `paper`: the formulas as printed, made well-posed; the
     #: additions below are then off whatever they say.
     mode: str = choice("default", "paper")
-    #: A prior over subjects that the network starts from, in either mode: a folder made by
-    #: `wildghand pretrain`. A relative path is one within this package; empty: random weights.
-    prior: str = ""
+    #: The prior over subjects that the network starts from. `shipped`: that of this package, where
+    #: it is of the fit's network and hand model, and in the mode `default` alone. Empty: random
+    #: weights. Else a folder made by `wildghand pretrain`, in either mode: a relative path is one
+    #: within this package.
+    prior: str = "shipped"
     #: Gaussians on each hand.
     gaussians: int = number(12_337, 1, 1_000_000)
     #: Optimiser steps unless the budget says otherwise.

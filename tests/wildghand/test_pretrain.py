@@ -32,7 +32,7 @@ from wildghand.fit.saved import load_state, save_state
 from wildghand.network import network_settings
 from wildghand.pretrain.joint import JointFit
 from wildghand.pretrain.loop import take_steps
-from wildghand.prior_files import DESCRIPTION, WEIGHTS, find_prior, load_prior
+from wildghand.prior_files import DESCRIPTION, WEIGHTS, choose_prior, find_prior, load_prior
 from wildghand.settings import read_settings
 
 QUICK: dict[str, Any] = {
@@ -268,6 +268,47 @@ def test_priors_are_found_in_the_package_or_by_an_absolute_path(name: str) -> No
 
 def test_an_absolute_path_is_taken(prior: Path) -> None:
     assert find_prior(str(prior)) == prior
+
+
+def test_the_prior_that_ships_is_taken_where_it_fits(subjects: dict[str, Path]) -> None:
+    hand_model = open_capture(subjects["anna"]).info.hand_model
+    shipped = choose_prior(read_settings({}), hand_model)
+    assert shipped is not None
+    assert shipped.record.sides == ["right", "left"]
+    assert len(shipped.record.captures) >= 8
+    # Where the kind is another one nobody asked for it; where it is named, that is an error.
+    assert choose_prior(read_settings(QUICK), hand_model) is None
+    assert choose_prior(read_settings({}), HandModelId("mano", "0" * 64)) is None
+    assert choose_prior(read_settings({"mode": "paper"}), hand_model) is None
+    assert choose_prior(read_settings({"prior": ""}), hand_model) is None
+    with pytest.raises(BadInput, match="hand model anny"):
+        choose_prior(read_settings({"prior": "priors/compact"}), HandModelId("mano", "0" * 64))
+
+
+def test_the_prior_that_ships_saw_no_subject_and_no_scene_of_a_suite(
+    subjects: dict[str, Path],
+) -> None:
+    from hwp_bench.sim.scene import load_scene, scene_names
+
+    shipped = choose_prior(read_settings({}), open_capture(subjects["anna"]).info.hand_model)
+    assert shipped is not None
+    scenes = [load_scene(name) for name in scene_names()]
+    sources = [capture["source"] for capture in shipped.record.captures]
+    assert {source["scene"] for source in sources}.isdisjoint(scene.id for scene in scenes)
+    assert {source["seed"] for source in sources}.isdisjoint(scene.seed for scene in scenes)
+
+
+def test_a_default_fit_starts_from_the_prior_that_ships(make_training: Callable[..., Any]) -> None:
+    training = make_training("right")
+    fit = Fit(training, read_settings({"gaussians": 200}), 0, CPU)
+    shipped = choose_prior(fit.settings, training.hand_model)
+    assert shipped is not None
+    assert fit.source["prior"] == shipped.record.weights
+    found = fit.model.network.identity("right")
+    torch.testing.assert_close(found, shipped.tensors[MAP], rtol=0, atol=0)
+    bare = Fit(training, read_settings({"gaussians": 200, "prior": ""}), 0, CPU)
+    assert "prior" not in bare.source
+    assert mean_loss(fit) < mean_loss(bare)
 
 
 def test_captures_of_different_hand_models_are_refused(

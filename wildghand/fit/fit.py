@@ -20,7 +20,7 @@ from wildghand.fit.parallel import ALONE, World, average_gradients, digest_of
 from wildghand.fit.rates import make_optimizer, set_rates
 from wildghand.fit.weighting import Weighting
 from wildghand.model import Drawing
-from wildghand.prior_files import find_prior, load_prior
+from wildghand.prior_files import choose_prior
 from wildghand.settings import WildGHandSettings
 
 
@@ -59,8 +59,8 @@ class Fit:
             templates, rigs, settings, self.mean_color, len(self.frames), seed
         ).to(device)
         self.source = {"capture": training.id}
-        if settings.prior:
-            prior = load_prior(find_prior(settings.prior), settings.network, training.hand_model)
+        prior = choose_prior(settings, training.hand_model)
+        if prior is not None:
             prior.initialise(self.model.network)
             self.source["prior"] = prior.record.weights
         self.clip = TrainingClip(training, self.frames.indices, rigs, device)

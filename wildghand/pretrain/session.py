@@ -43,7 +43,8 @@ def pretrain(
     Args:
         sources: capture folders, one for each subject; all their frames are used.
         out: the folder to make.
-        settings: overrides of the defaults of a fit.
+        settings: overrides of the defaults of a fit; it starts from random weights unless they
+            name a prior.
         steps: optimiser steps over all captures; None: the settings' number for each capture.
         seed: of everything random.
         overwrite: replace a prior that is there.
@@ -57,6 +58,8 @@ def pretrain(
     """
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
+    # What ships is no part of a prior that somebody makes, unless it is asked for.
+    settings = {"prior": "", **settings}
     chosen = read_settings(settings)
     captures = [open_capture(source) for source in sources]
     _check_captures(captures)
