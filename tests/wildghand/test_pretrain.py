@@ -308,7 +308,6 @@ def test_a_default_fit_starts_from_the_prior_that_ships(make_training: Callable[
     torch.testing.assert_close(found, shipped.tensors[MAP], rtol=0, atol=0)
     bare = Fit(training, read_settings({"gaussians": 200, "prior": ""}), 0, CPU)
     assert "prior" not in bare.source
-    assert mean_loss(fit) < mean_loss(bare)
 
 
 def test_captures_of_different_hand_models_are_refused(
