@@ -20,6 +20,7 @@ from hwp_bench.evaluate.scoring import (
     score_predictions,
 )
 from hwp_bench.files import read_json, sha256_json, write_json
+from hwp_bench.methods.contents import exposed_digest
 from hwp_bench.methods.facts import RunFacts
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.methods.predictions import Prediction, read_predictions
@@ -63,6 +64,7 @@ class Job:
     @property
     def key(self) -> str:
         """Digest (hex) of everything that decides the scores."""
+        exposed = self.confinement.exposed
         return sha256_json(
             {
                 "recipe": RECIPE,
@@ -75,6 +77,7 @@ class Job:
                 "frames": self.run.frames,
                 "protocols": [protocol.as_dict() for protocol in PROTOCOLS],
                 "networks": sorted(self.networks),
+                **({"exposed": exposed_digest(exposed)} if exposed else {}),
             }
         )
 

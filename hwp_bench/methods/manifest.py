@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import difflib
-import hashlib
 import os
 import re
 import tomllib
@@ -14,6 +13,7 @@ from typing import Any
 
 from hwp_bench.errors import BadMethod
 from hwp_bench.files import inside
+from hwp_bench.methods.contents import method_digest
 from hwp_bench.methods.plain import check_plain
 from hwp_bench.methods.switches import Switch, read_switches
 from hwp_bench.text import has_odd_characters
@@ -90,14 +90,8 @@ class MethodManifest:
 
     @property
     def digest(self) -> str:
-        """SHA-256 (hex) of the method's own text files: what was run."""
-        total = hashlib.sha256()
-        for path in sorted(self.root.rglob("*")):
-            relative = path.relative_to(self.root)
-            if path.suffix in {".py", ".toml"} and path.is_file() and not path.is_symlink():
-                total.update(f"{relative.as_posix()}\0{path.stat().st_size}\0".encode())
-                total.update(path.read_bytes())
-        return total.hexdigest()
+        """SHA-256 (hex) of the method's own code, settings and weights: what was run."""
+        return method_digest(self.root)
 
 
 def find_method(text: str) -> Path:

@@ -17,6 +17,7 @@ import torch
 from painted import FRAMES, SIZE, cameras, hand_parameters
 from safetensors.torch import load_file, save_file
 
+import wildghand
 from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, HandModelId, open_capture
 from hwp_bench.errors import BadInput, UsageError
 from hwp_bench.files import sha256_file
@@ -293,9 +294,17 @@ def test_the_prior_that_ships_saw_no_subject_and_no_scene_of_a_suite(
     shipped = choose_prior(read_settings({}), open_capture(subjects["anna"]).info.hand_model)
     assert shipped is not None
     scenes = [load_scene(name) for name in scene_names()]
+    made = Path(wildghand.__file__).parent / "priors" / "scenes"
+    quiet = [load_scene(str(path)) for path in sorted(made.glob("*.toml"))]
+    assert not any(scene.effects for scene in quiet)
     sources = [capture["source"] for capture in shipped.record.captures]
-    assert {source["scene"] for source in sources}.isdisjoint(scene.id for scene in scenes)
-    assert {source["seed"] for source in sources}.isdisjoint(scene.seed for scene in scenes)
+    assert {source["scene"] for source in sources} == {scene.id for scene in quiet}
+    assert {scene.id for scene in quiet}.isdisjoint(scene.id for scene in scenes)
+    # A source's seed is that of its subject too (docs/prior.md).
+    seeds = {source["seed"] for source in sources}
+    assert len(seeds) == len(sources)
+    assert seeds.isdisjoint(scene.seed for scene in scenes)
+    assert seeds.isdisjoint(scene.subject.seed for scene in scenes)
 
 
 def test_a_default_fit_starts_from_the_prior_that_ships(make_training: Callable[..., Any]) -> None:

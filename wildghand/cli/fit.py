@@ -49,7 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="a setting (wildghand/settings.py); may be given again",
     )
     parser.add_argument(
-        "--prior", type=Path, metavar="PRIOR", help="start from it (made by `wildghand pretrain`)"
+        "--prior",
+        type=Path,
+        metavar="PRIOR",
+        help="start from it (made by `wildghand pretrain`; default: the one that ships)",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing avatar")
     parser.add_argument("--json", action="store_true", help="print JSON")
