@@ -62,6 +62,8 @@ def test_no_command_and_unknown_commands_are_usage_errors(capsys) -> None:
         (["evaluate", "baselines/plain", "--capture", "nowhere"], 1, "nowhere: is no capture"),
         (["evaluate", "plain", "--capture", "x", "--budget", "-3"], 2, "--budget: -3.0"),
         (["evaluate", "plain", "--capture", "x", "--set", "a b=1"], 2, "is not NAME=VALUE"),
+        (["evaluate", "plain", "--capture", "x", "--set", "a.=1"], 2, "is not NAME=VALUE"),
+        (["evaluate", "plain", "--capture", "x", "--set", "rates.pose=1"], 1, "is no capture"),
         (["table", "nowhere"], 1, "does not exist"),
         (["data", "show", "nowhere"], 1, "is no capture"),
         (["data", "audit", "x", "--guard", "-1"], 2, "--guard"),

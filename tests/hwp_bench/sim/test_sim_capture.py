@@ -211,3 +211,19 @@ def test_masks_err_at_borders_and_occluders(make_scene: SceneMaker) -> None:
         assert ((mask > 0.02) & (mask < 0.98)).any()
     taken = float(mask[covered].mean())
     assert OCCLUDER_TAKEN[0] - 0.15 < taken < OCCLUDER_TAKEN[1] + 0.1
+
+
+def test_background_away_from_a_blurred_hand_is_trusted_nowhere(make_scene: SceneMaker) -> None:
+    from scipy.ndimage import distance_transform_edt
+    from tiny_scene import BLUR
+
+    from hwp_bench.sim.estimates import estimate_mask
+    from hwp_bench.sim.frame import render_frame
+
+    scene = make_scene()
+    result = render_frame(scene, BLUR, 40, 96)
+    assert "shutter" in result.plan.passes
+    mask = estimate_mask(scene, result.plan, result.coverage, result.clean_coverage)
+    away = distance_transform_edt(result.coverage == 0.0) > 4.0
+    assert away.mean() > 0.2
+    assert mask[away].max() == 0
