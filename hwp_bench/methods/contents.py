@@ -34,9 +34,7 @@ def exposed_digest(paths: Iterable[Path]) -> str:
         paths: files and folders, in the order in which they were named. One that is missing
             counts as empty.
     """
-    parts = [
-        sha256_of(path) if path.is_file() else _digest(path, _files(path)) for path in paths
-    ]
+    parts = [sha256_of(path) if path.is_file() else _digest(path, _files(path)) for path in paths]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 

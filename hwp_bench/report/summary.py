@@ -12,6 +12,7 @@ from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
 from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
 from hwp_bench.report.table import FORMATS, Cell, Column, Table, spell
 from hwp_bench.results import Results
+from hwp_bench.results.differences import differing_settings
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
@@ -193,9 +194,11 @@ def labels(results: Sequence[Results]) -> list[str]:
     told = []
     for result in results:
         twins = [other for other in results if other.method.title == result.method.title]
-        parts = [text(result) for text in _TELLING if len({text(twin) for twin in twins}) > 1] or [
-            text(result) for text in _TELLING if len(twins) > 1
-        ]
+        parts = [text(result) for text in _TELLING if len({text(twin) for twin in twins}) > 1]
+        settings = dict(zip(map(id, twins), differing_settings(twins), strict=True))[id(result)]
+        parts += [settings] if settings else []
+        if not parts and len(twins) > 1:
+            parts = [text(result) for text in _TELLING]
         told.append(result.method.title + (f" ({', '.join(parts)})" if parts else ""))
     return told
 

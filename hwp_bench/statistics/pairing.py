@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from hwp_bench.errors import UsageError
 from hwp_bench.files import sha256_json
 from hwp_bench.results import CaptureResult, Results
+from hwp_bench.results.differences import differing_settings
 from hwp_bench.taxonomy import PERTURBATIONS
 
 #: Scope of the headline: every perturbation counts the same, as the macro mean of the tables.
@@ -72,16 +72,37 @@ def group_runs(results: Sequence[Results]) -> list[MethodRuns]:
 
 def _labels(results: Sequence[Results]) -> list[str]:
     """Return titles, told apart by what differs, and by a number where nothing readable does."""
-    tellings: tuple[Callable[[Results], Any], ...] = (
-        lambda result: result.method.title,
-        lambda result: f"{result.method.title} ({_state(result)})",
-        lambda result: f"{result.method.title} ({_state(result)}, {result.method.digest[:8]})",
-    )
-    for telling in tellings:
-        labels = [telling(result) for result in results]
+    titles = [result.method.title for result in results]
+    states = [_state(result) for result in results]
+    differences = _differences(results)
+    digests = [result.method.digest[:8] for result in results]
+    for tellings in (
+        [],
+        [differences],
+        [states],
+        [states, differences],
+        [states, differences, digests],
+    ):
+        labels = [_label(title, *parts) for title, *parts in zip(titles, *tellings, strict=True)]
         if len(set(labels)) == len(labels):
             return labels
     return [f"{index + 1}: {label}" for index, label in enumerate(labels)]
+
+
+def _label(title: str, *parts: str) -> str:
+    told = ", ".join(part for part in parts if part)
+    return f"{title} ({told})" if told else title
+
+
+def _differences(results: Sequence[Results]) -> list[str]:
+    """Settings in which results of the same title differ."""
+    told = [""] * len(results)
+    for title in {result.method.title for result in results}:
+        twins = [index for index, other in enumerate(results) if other.method.title == title]
+        found = differing_settings([results[index] for index in twins])
+        for index, text in zip(twins, found, strict=True):
+            told[index] = text
+    return told
 
 
 def _state(result: Results) -> str:

@@ -127,7 +127,10 @@ def test_labels_are_told_apart() -> None:
     labels = [run.label for run in group_runs([base, replace(base, budget=budget)])]
     assert labels == ["Mine (default)", "Mine (default, 60 s)"]
     other = replace(base, method=replace(base.method, settings={"steps": 11}))
-    assert [run.label[:3] for run in group_runs([base, other])] == ["1: ", "2: "]
+    labels = [run.label for run in group_runs([base, other])]
+    assert labels == ["Mine (steps = 10)", "Mine (steps = 11)"]
+    code = replace(base, method=replace(base.method, digest="d" * 64))
+    assert [run.label for run in group_runs([base, code])][1] == "Mine (default, dddddddd)"
 
 
 def test_the_command_prints_tables_and_json_and_refuses(tmp_path: Path, capsys) -> None:
