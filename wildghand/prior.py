@@ -86,20 +86,33 @@ def mean_weights(networks: Iterable[PredictionNetwork]) -> dict[str, Tensor]:
     return {**shared, **{name: torch.stack(values).mean(dim=0) for name, values in maps.items()}}
 
 
+def shapes_of(network: PredictionNetwork) -> dict[str, torch.Size]:
+    """Shapes of all weights of a network, and of the identity maps of both hands."""
+    shapes = {name: value.shape for name, value in network.state_dict().items()}
+    of_map = next(shape for name, shape in shapes.items() if name.startswith(MAPS))
+    return shapes | {f"{MAPS}{side}": of_map for side in ("right", "left")}
+
+
+def shapes_of_settings(settings: NetworkSettings) -> dict[str, torch.Size]:
+    """The same where there is no network yet; the first time takes a second."""
+    return shapes_of(blank_network(settings))
+
+
 def check_tensors(
-    tensors: Mapping[str, Tensor], sides: Iterable[str], settings: NetworkSettings
+    tensors: Mapping[str, Tensor], sides: Iterable[str], shapes: Mapping[str, torch.Size]
 ) -> None:
-    """Refuse tensors that are not those of a network of these settings.
+    """Refuse tensors that are not the weights of a network.
+
+    Args:
+        tensors: by name.
+        sides: hands that should have an identity map.
+        shapes: of the network's weights, with the maps of both hands.
 
     Raises:
         BadInput: one is missing, too many, of another shape, no float, or not finite; it is named.
     """
     absent = {f"{MAPS}{side}" for side in ("right", "left") if side not in sides}
-    wanted = {
-        name: value.shape
-        for name, value in blank_network(settings).state_dict().items()
-        if name not in absent
-    }
+    wanted = {name: shape for name, shape in shapes.items() if name not in absent}
     for name in sorted(wanted.keys() ^ tensors.keys()):
         raise BadInput("is missing" if name in wanted else "is not known", field=name[:100])
     for name, value in tensors.items():

@@ -21,8 +21,15 @@ from hwp_bench.capture.schema import HandModelId
 from hwp_bench.errors import BadInput, BadResult, HwpError
 from hwp_bench.files import atomic_folder, inside, read_json, write_json
 from hwp_bench.records import parse_record
-from wildghand.network import NetworkSettings, network_settings
-from wildghand.prior import MAPS, Prior, PriorRecord, check_tensors
+from wildghand.network import NetworkSettings, PredictionNetwork, network_settings
+from wildghand.prior import (
+    MAPS,
+    Prior,
+    PriorRecord,
+    check_tensors,
+    shapes_of,
+    shapes_of_settings,
+)
 from wildghand.settings import WildGHandSettings
 
 #: Version of the folder.
@@ -40,7 +47,9 @@ _SHIPPED_FOLDER = "priors/compact"
 _SIDES = ("right", "left")
 
 
-def choose_prior(settings: WildGHandSettings, hand_model: HandModelId) -> Prior | None:
+def choose_prior(
+    settings: WildGHandSettings, hand_model: HandModelId, network: PredictionNetwork | None = None
+) -> Prior | None:
     """Return the prior that a fit starts from, or None for random weights.
 
     A prior that a person names has to be of the fit's kind. The one that ships is taken where it
@@ -49,6 +58,7 @@ def choose_prior(settings: WildGHandSettings, hand_model: HandModelId) -> Prior 
     Args:
         settings: of the fit.
         hand_model: of the capture.
+        network: of the fit, where it is made already; saves a second.
 
     Raises:
         BadInput: the prior that is named is missing, damaged, or of another kind.
@@ -56,7 +66,8 @@ def choose_prior(settings: WildGHandSettings, hand_model: HandModelId) -> Prior 
     if not settings.prior:
         return None
     if settings.prior != SHIPPED:
-        return load_prior(find_prior(settings.prior), settings.network, hand_model)
+        path = find_prior(settings.prior)
+        return load_prior(path, settings.network, hand_model, network)
     if not settings.additions:
         return None
     root = find_prior(_SHIPPED_FOLDER)
@@ -65,7 +76,7 @@ def choose_prior(settings: WildGHandSettings, hand_model: HandModelId) -> Prior 
         _check_fit(record, settings.network, hand_model, str(root))
     except BadInput:
         return None
-    return Prior(record, _read_weights(root / WEIGHTS, record, settings.network))
+    return _read_prior(root, record, settings.network, network)
 
 
 def find_prior(text: str) -> Path:
@@ -130,7 +141,7 @@ def save_prior(
 
     halves = {name: value.detach().half().contiguous() for name, value in tensors.items()}
     sides = [side for side in _SIDES if f"{MAPS}{side}" in tensors]
-    check_tensors(halves, sides, settings.network)
+    check_tensors(halves, sides, shapes_of_settings(settings.network))
     data = save(halves)
     record = PriorRecord(
         schema=SCHEMA,
@@ -150,22 +161,26 @@ def save_prior(
 
 
 def load_prior(
-    path: str | os.PathLike[str], network: NetworkSettings, hand_model: HandModelId
+    path: str | os.PathLike[str],
+    settings: NetworkSettings,
+    hand_model: HandModelId,
+    network: PredictionNetwork | None = None,
 ) -> Prior:
     """Read a prior; nothing in it is executed.
 
     Args:
         path: the folder.
-        network: of the fit that will start from it.
+        settings: of the network of the fit that will start from it.
         hand_model: of the capture.
+        network: that network, where it is made already; saves a second.
 
     Raises:
         BadInput: no prior, damaged, or of another network or hand model.
     """
     root = Path(path)
     record = _read_record(root)
-    _check_fit(record, network, hand_model, str(root / DESCRIPTION))
-    return Prior(record, _read_weights(root / WEIGHTS, record, network))
+    _check_fit(record, settings, hand_model, str(root / DESCRIPTION))
+    return _read_prior(root, record, settings, network)
 
 
 def _read_record(root: Path) -> PriorRecord:
@@ -212,8 +227,15 @@ def _check_fit(
         )
 
 
+def _read_prior(
+    root: Path, record: PriorRecord, settings: NetworkSettings, network: PredictionNetwork | None
+) -> Prior:
+    shapes = shapes_of_settings(settings) if network is None else shapes_of(network)
+    return Prior(record, _read_weights(root / WEIGHTS, record, shapes))
+
+
 def _read_weights(
-    file: Path, record: PriorRecord, network: NetworkSettings
+    file: Path, record: PriorRecord, shapes: Mapping[str, torch.Size]
 ) -> dict[str, torch.Tensor]:
     from safetensors import SafetensorError
     from safetensors.torch import load
@@ -229,7 +251,7 @@ def _read_weights(
         problem = str(error).splitlines()[0][:300] if str(error) else type(error).__name__
         raise BadInput(f"holds no weights ({problem})", where=file) from error
     try:
-        check_tensors(tensors, record.sides, network)
+        check_tensors(tensors, record.sides, shapes)
     except BadInput as error:
         raise BadInput(f"does not hold this prior's weights: {error}", where=file) from error
     return {name: value.float() for name, value in tensors.items()}

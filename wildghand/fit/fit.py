@@ -59,7 +59,7 @@ class Fit:
             templates, rigs, settings, self.mean_color, len(self.frames), seed
         ).to(device)
         self.source = {"capture": training.id}
-        prior = choose_prior(settings, training.hand_model)
+        prior = choose_prior(settings, training.hand_model, self.model.network)
         if prior is not None:
             prior.initialise(self.model.network)
             self.source["prior"] = prior.record.weights
