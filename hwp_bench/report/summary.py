@@ -192,10 +192,9 @@ def _of_protocol(protocol: Protocol) -> tuple[str, ...]:
 def labels(results: Sequence[Results]) -> list[str]:
     """Return a title for each evaluation, told apart by what differs where titles repeat."""
     told = []
-    for result in results:
+    for result, settings in zip(results, differing_settings(results), strict=True):
         twins = [other for other in results if other.method.title == result.method.title]
         parts = [text(result) for text in _TELLING if len({text(twin) for twin in twins}) > 1]
-        settings = dict(zip(map(id, twins), differing_settings(twins), strict=True))[id(result)]
         parts += [settings] if settings else []
         if not parts and len(twins) > 1:
             parts = [text(result) for text in _TELLING]

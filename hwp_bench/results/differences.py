@@ -12,23 +12,29 @@ _SHOWN = 40
 
 
 def differing_settings(results: Sequence[Results]) -> list[str]:
-    """Return for each result those of its settings in which the results differ.
-
-    Args:
-        results: of one method.
+    """Return for each result those of its settings in which results of its title differ.
 
     Returns:
         Texts such as `prior = "", steps = 300`, with `default` where a result says nothing; empty
         where all settings are the same.
     """
-    tables = [result.method.settings for result in results]
-    spelled = [{name: canonical_json(value) for name, value in table.items()} for table in tables]
-    names = sorted({name for table in spelled for name in table})
-    telling = [name for name in names if len({table.get(name) for table in spelled}) > 1]
-    return [
-        ", ".join(
-            f"{name} = {table[name][:_SHOWN]}" if name in table else f"{name} default"
-            for name in telling
-        )
-        for table in spelled
+    spelled = [
+        {name: canonical_json(value) for name, value in result.method.settings.items()}
+        for result in results
     ]
+    told = []
+    for result, mine in zip(results, spelled, strict=True):
+        twins = [
+            table
+            for other, table in zip(results, spelled, strict=True)
+            if other.method.title == result.method.title
+        ]
+        names = sorted({name for table in twins for name in table})
+        told.append(
+            ", ".join(
+                f"{name} = {mine[name][:_SHOWN]}" if name in mine else f"{name} default"
+                for name in names
+                if len({table.get(name) for table in twins}) > 1
+            )
+        )
+    return told

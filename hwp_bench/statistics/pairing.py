@@ -74,7 +74,7 @@ def _labels(results: Sequence[Results]) -> list[str]:
     """Return titles, told apart by what differs, and by a number where nothing readable does."""
     titles = [result.method.title for result in results]
     states = [_state(result) for result in results]
-    differences = _differences(results)
+    differences = differing_settings(results)
     digests = [result.method.digest[:8] for result in results]
     for tellings in (
         [],
@@ -92,17 +92,6 @@ def _labels(results: Sequence[Results]) -> list[str]:
 def _label(title: str, *parts: str) -> str:
     told = ", ".join(part for part in parts if part)
     return f"{title} ({told})" if told else title
-
-
-def _differences(results: Sequence[Results]) -> list[str]:
-    """Settings in which results of the same title differ."""
-    told = [""] * len(results)
-    for title in {result.method.title for result in results}:
-        twins = [index for index, other in enumerate(results) if other.method.title == title]
-        found = differing_settings([results[index] for index in twins])
-        for index, text in zip(twins, found, strict=True):
-            told[index] = text
-    return told
 
 
 def _state(result: Results) -> str:
