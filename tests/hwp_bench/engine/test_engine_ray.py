@@ -98,7 +98,8 @@ def test_a_node_is_killed_in_the_middle_and_the_results_are_those_without_ray(
 
     names = ("one", "two")
     captures = [make_capture(name, frames=20, size=32, perturbations={}).root for name in names]
-    manifest = read_manifest(write_gray_method(tmp_path / "gray", seconds=2.0))
+    # Long enough that a busy machine kills the node before the fit on it ends.
+    manifest = read_manifest(write_gray_method(tmp_path / "gray", seconds=5.0))
     design = make_design(manifest, [], [])
     settings = EvaluationSettings()
     killed: list[int] = []
