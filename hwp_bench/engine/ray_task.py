@@ -17,8 +17,7 @@ from hwp_bench.engine.job import RETRIES, Work
 from hwp_bench.engine.parcel import Parcel, folder_digest, pack, unpack
 from hwp_bench.engine.process import Errand, WorkerLost, run_errand
 from hwp_bench.errors import BadInput, HwpError
-from hwp_bench.files import cache_root
-from hwp_bench.results.environment import source_digest
+from hwp_bench.files import cache_root, files_digest
 
 #: Packages beside each other whose source decides what a job does.
 SOURCES = ("hwp_bench", "wildghand", "baselines")
@@ -72,7 +71,7 @@ def toolkit_digest() -> str:
     """Return the SHA-256 (hex) of the toolkit's source: what decides results besides inputs."""
     root = Path(__file__).resolve().parents[2]
     files = (path for package in SOURCES for path in (root / package).rglob("*"))
-    return source_digest(
+    return files_digest(
         root, (path for path in files if path.suffix in SUFFIXES and path.is_file())
     )
 

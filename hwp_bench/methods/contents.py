@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Iterable
-from functools import lru_cache
 from pathlib import Path
 
-from hwp_bench.files import sha256_file
+from hwp_bench.files import files_digest, sha256_of
 
 #: Names of files that decide what a method does end in one of these; logs and pictures do not.
 CONTENT = frozenset(
@@ -22,7 +21,7 @@ def method_digest(root: Path) -> str:
     Args:
         root: the method's folder; links and hidden folders in it are left out.
     """
-    return _digest(root, (path for path in _files(root) if path.suffix in CONTENT))
+    return files_digest(root, (path for path in _files(root) if path.suffix in CONTENT))
 
 
 def exposed_digest(paths: Iterable[Path]) -> str:
@@ -34,32 +33,16 @@ def exposed_digest(paths: Iterable[Path]) -> str:
         paths: files and folders, in the order in which they were named. One that is missing
             counts as empty.
     """
-    parts = [sha256_of(path) if path.is_file() else _digest(path, _files(path)) for path in paths]
+    parts = [
+        sha256_of(path) if path.is_file() else files_digest(path, _files(path)) for path in paths
+    ]
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
-
-
-def sha256_of(path: Path) -> str:
-    """SHA-256 (hex) of a file, read again only when its size or date has changed."""
-    facts = path.stat()
-    return _sha256(path, facts.st_size, facts.st_mtime_ns)
-
-
-@lru_cache(maxsize=4096)
-def _sha256(path: Path, size: int, modified: int) -> str:
-    return sha256_file(path)
 
 
 def _files(root: Path) -> Iterable[Path]:
     """Regular files below a folder that no hidden folder and no cache holds."""
-    for path in sorted(root.rglob("*")):
+    for path in root.rglob("*"):
         parents = path.relative_to(root).parts[:-1]
         odd = any(name.startswith(".") or name == "__pycache__" for name in parents)
         if not odd and path.is_file() and not path.is_symlink():
             yield path
-
-
-def _digest(root: Path, files: Iterable[Path]) -> str:
-    total = hashlib.sha256()
-    for path in files:
-        total.update(f"{path.relative_to(root).as_posix()}\0{sha256_of(path)}\0".encode())
-    return total.hexdigest()

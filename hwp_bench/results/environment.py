@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import hashlib
 import os
 import platform
-from collections.abc import Iterable
 from importlib import metadata
 from pathlib import Path
 from typing import Any
+
+from hwp_bench.files import files_digest
 
 #: Packages whose version can move a number.
 PACKAGES = (
@@ -53,16 +53,7 @@ def environment() -> dict[str, Any]:
 def code_digest() -> str:
     """Return the SHA-256 (hex) of the toolkit's own modules: names and contents."""
     root = Path(__file__).resolve().parents[1]
-    return source_digest(root, root.rglob("*.py"))
-
-
-def source_digest(root: Path, paths: Iterable[Path]) -> str:
-    """Return the SHA-256 (hex) of files: their names below `root`, and their contents."""
-    total = hashlib.sha256()
-    for path in sorted(paths):
-        total.update(f"{path.relative_to(root).as_posix()}\0".encode())
-        total.update(hashlib.sha256(path.read_bytes()).digest())
-    return total.hexdigest()
+    return files_digest(root, root.rglob("*.py"))
 
 
 def _processor() -> str:
