@@ -110,6 +110,11 @@ class WildGHandModel(nn.Module):
         """A copy of the state that the fit no longer changes."""
         return {name: value.detach().clone() for name, value in self.state_dict().items()}
 
+    @property
+    def biases(self) -> list[DynamicPerturbation]:
+        """The perturbation modules of the hands; none while perturbations are not modelled."""
+        return [self.biases_of(side) for side in self.perturbation]
+
     def biases_of(self, side: str) -> DynamicPerturbation:
         """The perturbation module of one hand."""
         module = self.perturbation[side]

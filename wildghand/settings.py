@@ -83,8 +83,11 @@ class WildGHandSettings:
     frame_poses: bool = True
     #: Chance that a frame's biases are left out of a step (of a clean frame's, with `prepass`).
     omega_dropout: float = number(0.3, 0.0, 1.0)
-    #: Weight of the square of the temporal weights, for a frame that is surely clean.
-    omega_weight: float = number(0.3)
+    #: Addition to DPD: temporal weight that a frame which the pre-pass finds perturbed starts at
+    #: and is held near. 0: all start at 0, and only those of clean frames are held there.
+    omega_scale: float = number(0.05, 0.0, 0.9)
+    #: Weight of the squared distance of the temporal weights from what the pre-pass says.
+    omega_weight: float = number(1.0)
     #: Share of D-SSIM in the reconstruction loss; the rest is L1.
     dssim_weight: float = number(0.2, 0.0, 1.0)
     #: Weight of a pixel outside the visible-hand mask, beside 1 inside.
@@ -145,6 +148,11 @@ class WildGHandSettings:
     def uses_gains(self) -> bool:
         """Whether each frame has a gain of its colours."""
         return self.additions and self.dpd and self.gains
+
+    @property
+    def holds_omega(self) -> bool:
+        """Whether temporal weights are held near what the pre-pass says."""
+        return self.judges and self.dpd
 
     @property
     def moves_poses(self) -> bool:

@@ -18,6 +18,7 @@ from wildghand.fit.frames import load_frames
 from wildghand.fit.objective import Objective
 from wildghand.fit.parallel import ALONE, World, average_gradients, digest_of
 from wildghand.fit.rates import make_optimizer, set_rates
+from wildghand.fit.temporal import TemporalTarget
 from wildghand.fit.weighting import Weighting
 from wildghand.model import Drawing
 from wildghand.prior_files import choose_prior
@@ -65,7 +66,12 @@ class Fit:
             self.source["prior"] = prior.record.weights
         self.clip = TrainingClip(training, self.frames.indices, rigs, device)
         self.weighting = Weighting(training, self.frames, settings, device)
-        self.objective = Objective(settings, rigs)
+        temporal = None
+        if settings.holds_omega:
+            clean = self.weighting.clean.to(device)
+            temporal = TemporalTarget.judged(clean, settings.omega_scale)
+            temporal.begin(self.model.biases)
+        self.objective = Objective(settings, rigs, temporal)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
         self.generator = torch.Generator().manual_seed(seed)
 

@@ -8,6 +8,7 @@ from torch import Tensor
 
 from wildghand import terms
 from wildghand.attributes import RawAttributes
+from wildghand.fit.temporal import TemporalTarget
 from wildghand.fit.weighting import Target
 from wildghand.laplacian import surface_laplacian
 from wildghand.model import Drawing, WildGHandModel
@@ -22,10 +23,17 @@ class Objective:
     Args:
         settings: weights of the terms.
         rigs: by side.
+        temporal: what holds the temporal weights; None: nothing.
     """
 
-    def __init__(self, settings: WildGHandSettings, rigs: Mapping[str, HandRig]) -> None:
+    def __init__(
+        self,
+        settings: WildGHandSettings,
+        rigs: Mapping[str, HandRig],
+        temporal: TemporalTarget | None = None,
+    ) -> None:
         self.settings = settings
+        self.temporal = temporal
         self.weights = settings.term_weights
         smooth = (
             self.weights.laplacian_offsets,
@@ -74,11 +82,9 @@ class Objective:
         if weights.cross_hand and len(drawing.hands) == 2:
             left, right = (drawing.hands[side].prediction.texture for side in ("left", "right"))
             total = total + weights.cross_hand * terms.cross_hand(left, right)
-        if settings.judges and settings.omega_weight:
-            for hand in drawing.hands.values():
-                # What has no perturbation needs no bias: the pre-pass tells the weights where.
-                size = hand.omega.square()
-                total = total + settings.omega_weight * (clean.to(size) * size).mean()
+        if self.temporal is not None and settings.omega_weight:
+            strayed = self.temporal.strayed(model.biases, int(rows[0]))
+            total = total + settings.omega_weight * strayed
         if settings.uses_gains:
             # Clean frames have no gain: without this prior gain and colours could trade places.
             size = model.log_gains[rows].square().mean(dim=-1)

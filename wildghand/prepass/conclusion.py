@@ -3,36 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 
 import numpy as np
 
-from wildghand.prepass.cues import Explained
 from wildghand.prepass.judgement import Judgement
+from wildghand.prepass.look import Look
 from wildghand.prepass.mode import densest, excess, normal_value
 from wildghand.prepass.settings import PrepassSettings
 from wildghand.prepass.verdict import clean_probability, evidence
-from wildghand.prepass.weights import normal_residuals, pixel_weights
-
-
-@dataclass(frozen=True, eq=False)
-class Look:
-    """Everything that was measured in one usable frame."""
-
-    #: The frame under the intensity model.
-    explained: Explained
-    #: (P,) int32 row-major numbers of the silhouette's pixels.
-    pixels: np.ndarray
-    #: (P,) int32 cells that they show.
-    cells: np.ndarray
-    #: Share of the hand that the mask lacks.
-    hidden: float
-    #: `wildghand.prepass.outlines.misplacement`.
-    misplacement: float
-    #: `wildghand.prepass.edges.border_width`, px; not a number where it cannot be read.
-    border: float
-    #: Way of the hand since the frame before, px.
-    motion: float
+from wildghand.prepass.weights import weigh_pixels
 
 
 def conclude(
@@ -86,23 +65,6 @@ def conclude(
     sharp_border = float(np.exp(normal_value(np.log(border), share)[0]))
     extent = np.sqrt(np.maximum(np.nan_to_num(border) ** 2 - sharp_border**2, 0.0))
     refine = (off_place > settings.clear_deviation) & (off_border < settings.clear_deviation)
-    normal = normal_residuals(
-        [look.explained.residual for look in found],
-        [look.cells for look in found],
-        clean[rows].tolist(),
-        cell_count,
-        normal_value(level, share)[0],
-        settings.residual_prior,
-    )
-    pixels = np.full(masks.shape, 255, dtype=np.uint8)
-    for row, look in looks.items():
-        pixels[row] = pixel_weights(
-            look.explained.residual,
-            look.pixels,
-            masks[row],
-            normal[look.cells],
-            settings.residual_scale,
-        )
     return Judgement(
         indices=indices,
         usable=usable,
@@ -122,5 +84,5 @@ def conclude(
         hidden=spread(hidden),
         hidden_deviation=spread(off_hidden),
         motion=spread(gathered([look.motion for look in found])),
-        pixel_weights=pixels,
+        pixel_weights=weigh_pixels(masks, looks, clean, cell_count, settings),
     )

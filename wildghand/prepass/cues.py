@@ -25,6 +25,10 @@ class Explained:
 
     #: (P,) float32 mean absolute residual of the channels, log.
     residual: np.ndarray
+    #: (P,) float32 how far the pixel's tint is from the skin's, log: its brightness is left out.
+    tint: np.ndarray
+    #: (B,) float32 the same of pixels that the mask has and the silhouette lacks.
+    tint_beyond: np.ndarray
     #: (3,) gain that most pixels agree on, log of linear light.
     gain: np.ndarray
     #: Median residual of the inner pixels.
@@ -35,7 +39,11 @@ class Explained:
 
 
 def explain(
-    model: IntensityModel, footprint: Footprint, light: np.ndarray, inner: np.ndarray
+    model: IntensityModel,
+    footprint: Footprint,
+    light: np.ndarray,
+    inner: np.ndarray,
+    beyond: np.ndarray,
 ) -> Explained:
     """Compare a frame with the intensity model.
 
@@ -45,13 +53,17 @@ def explain(
         light: (P, 3) log light.
         inner: (P,) bool, at least one: the pixels that lie well inside hand and mask and are
             neither dark nor clipped.
+        beyond: (B, 3) log light of pixels that the mask has and the silhouette lacks.
     """
     expected = model.predict(footprint.cells, footprint.normals)
     rest = light - expected
     gain = _agreed_gain(rest[inner], 2.5 * model.scale)
     residual = channel_mean(np.abs(rest - gain.astype(np.float32)))
+    skin = model.skin[footprint.cells]
     return Explained(
         residual=residual,
+        tint=_tint(light - skin - gain),
+        tint_beyond=_tint(beyond - np.median(skin, axis=0) - gain),
         gain=gain,
         level=float(np.median(residual[inner])),
         texture=_texture(
@@ -66,6 +78,11 @@ def explain(
 def channel_mean(values: np.ndarray) -> np.ndarray:
     """(P,) mean of the three channels of (P, 3); several times faster than over an axis."""
     return (values[:, 0] + values[:, 1] + values[:, 2]) / 3.0
+
+
+def _tint(values: np.ndarray) -> np.ndarray:
+    """(P,) length of what (P, 3) log values have besides their mean."""
+    return np.linalg.norm(values - channel_mean(values)[:, None], axis=1).astype(np.float32)
 
 
 def _agreed_gain(rest: np.ndarray, reach: float) -> np.ndarray:

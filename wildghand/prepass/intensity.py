@@ -56,6 +56,9 @@ class IntensityModel:
 
     #: (C, 3) float32 log albedo of every cell.
     albedo: np.ndarray
+    #: (C, 3) float32 log skin colour of every cell's side of the hand: smooth, whatever the cell
+    #: itself showed.
+    skin: np.ndarray
     #: (8, 3) float32 coefficients of `shading_basis`.
     shading: np.ndarray
     #: (R, 3) log gain of every frame, linear light.
@@ -110,9 +113,10 @@ def fit_intensity(
         scale = max(float(np.median(residual[part[rows]])), 0.01)
         weights = 1.0 / (1.0 + (residual / (2.5 * scale)) ** 4)
     everywhere = np.column_stack([np.ones(cell_count), shading_basis(cell_normals)])
-    full = everywhere @ skin + centre
+    smooth = (everywhere @ skin + centre).astype(np.float32)
+    full = smooth.copy()
     full[used] = albedo + centre
-    return IntensityModel(full.astype(np.float32), shading.astype(np.float32), gains, scale)
+    return IntensityModel(full, smooth, shading.astype(np.float32), gains, scale)
 
 
 def _albedo(

@@ -13,7 +13,7 @@ from hwp_bench.capture import Cameras, Capture
 from hwp_bench.errors import BadInput, ShapeMismatch
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.methods.request import TrainingCapture
-from wildghand.prepass.conclusion import Look, conclude
+from wildghand.prepass.conclusion import conclude
 from wildghand.prepass.cues import LEAST_PIXELS, explain
 from wildghand.prepass.edges import border_width
 from wildghand.prepass.footprint import Footprint, HandSurfaces
@@ -26,6 +26,7 @@ from wildghand.prepass.intensity import (
     shading_basis,
 )
 from wildghand.prepass.judgement import Judgement, enlarged, neutral_judgement
+from wildghand.prepass.look import Look
 from wildghand.prepass.outlines import ShownCells, interior, misplacement
 from wildghand.prepass.settings import PrepassSettings
 
@@ -170,9 +171,12 @@ def _judge(given: PrepassInput, settings: PrepassSettings) -> Judgement:
         values = given.images[row].reshape(-1, 3)[footprint.pixels]
         masked = given.masks[row] > 127
         inner = _inner(footprint, masked, values)
+        beyond = np.flatnonzero((given.masks[row] > 0) & ~footprint.silhouette)
+        outer = table[given.images[row].reshape(-1, 3)[beyond]]
         looks[row] = Look(
-            explained=explain(model, footprint, table[values], inner),
+            explained=explain(model, footprint, table[values], inner, outer),
             pixels=footprint.pixels,
+            beyond=beyond.astype(np.int32),
             cells=footprint.cells,
             hidden=survey.shown.hidden_share(footprint.cells, masked.reshape(-1)[footprint.pixels]),
             misplacement=float(survey.misplacement[row]),

@@ -47,7 +47,10 @@ class PrepassSettings:
     #: Residual, in those of the clean frames at the same place, at which a pixel's weight has
     #: halved.
     residual_scale: float = 2.5
-    #: Pixels that the median of all residuals is worth in the residual of a place.
+    #: Distance of a pixel's tint from the skin's, in those of the clean frames at the same place,
+    #: at which its weight has halved.
+    tint_scale: float = 4.0
+    #: Pixels that what is normal in the clean frames is worth in what is normal at a place.
     residual_prior: float = 20.0
     #: Fewer usable frames than this cannot be compared: all are judged clean.
     least_frames: int = 4

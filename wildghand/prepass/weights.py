@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import cv2
 import numpy as np
+
+from wildghand.prepass.look import Look
+from wildghand.prepass.mode import normal_value
+from wildghand.prepass.settings import PrepassSettings
 
 # Edge of the window over which residuals are shared out, px.
 _WINDOW = 5
@@ -13,6 +17,59 @@ _WINDOW = 5
 _LEAST_LEVEL = 0.03
 # What is left of a pixel's weight where the mask sees no hand.
 _UNMASKED = 0.3
+
+
+def weigh_pixels(
+    masks: np.ndarray,
+    looks: Mapping[int, Look],
+    clean: np.ndarray,
+    cell_count: int,
+    settings: PrepassSettings,
+) -> np.ndarray:
+    """Weigh the pixels of all frames.
+
+    Two doubts, multiplied. The residual under the intensity model asks whether the place looks as
+    it does in other frames. Where only perturbed frames show a place the model has learnt what
+    covers it; the tint asks, whatever the place, whether this is skin at all.
+
+    Args:
+        masks: (R, H, W) uint8, 255 = visible hand.
+        looks: by row; rows that are missing cannot be used. Not empty.
+        clean: (R,) probability that nothing perturbs a frame.
+        cell_count: number of cells of the surface.
+        settings: how far off halves a weight.
+
+    Returns:
+        (R, H, W) uint8, 255 = full weight; 255 also outside silhouette and mask, where there is
+        nothing to judge by.
+    """
+    found = list(looks.values())
+    cells = [look.cells for look in found]
+    trusts = clean[list(looks)].tolist()
+    residuals = [look.explained.residual for look in found]
+    tints = [look.explained.tint for look in found]
+    levels = np.array([look.explained.level for look in found])
+    tint_levels = np.array([np.median(tint) for tint in tints])
+    level, tint_level = (
+        max(normal_value(values, settings.clean_share)[0], _LEAST_LEVEL)
+        for values in (levels, tint_levels)
+    )
+    prior = settings.residual_prior
+    normal = normal_residuals(residuals, cells, trusts, cell_count, level, prior)
+    normal_tint = normal_residuals(tints, cells, trusts, cell_count, tint_level, prior)
+    weights = np.full(masks.shape, 255, dtype=np.uint8)
+    for row, look in looks.items():
+        seen = masks[row].reshape(-1) / 255.0
+        weight = np.ones(seen.size)
+        shared = _shared(look.explained.residual, look.pixels, masks[row].shape)
+        weight[look.pixels] = (
+            _fit(shared, settings.residual_scale * normal[look.cells])
+            * _fit(look.explained.tint, settings.tint_scale * normal_tint[look.cells])
+            * (_UNMASKED + (1.0 - _UNMASKED) * seen[look.pixels])
+        )
+        weight[look.beyond] = _fit(look.explained.tint_beyond, settings.tint_scale * tint_level)
+        weights[row] = np.round(255.0 * weight).reshape(masks[row].shape)
+    return weights
 
 
 def normal_residuals(
@@ -25,22 +82,21 @@ def normal_residuals(
 ) -> np.ndarray:
     """What residual each cell of the surface has in clean frames.
 
-    Nails, creases and places in shadow fit worse than the rest in every frame; that says nothing
-    against them. Residuals are clipped at five times the level, so that one frame with an
-    object does not make a place look unruly.
+    Nails, creases and places in shadow fit worse than the rest in every frame, and varnish is
+    never the skin's colour; that says nothing against them. Residuals are clipped at five times
+    the level, so that one frame with an object does not make a place look unruly.
 
     Args:
         residuals: for each frame (P,) residuals.
         cells: for each frame (P,) cells.
         trusts: for each frame how much it counts, in [0, 1].
         cell_count: number of cells.
-        level: median residual of the clean frames.
+        level: median residual of the clean frames, positive.
         prior: pixels that the level is worth.
 
     Returns:
-        (C,) float32, at least the level, positive.
+        (C,) float32, at least the level.
     """
-    level = max(level, _LEAST_LEVEL)
     sums, mass = np.zeros(cell_count), np.zeros(cell_count)
     for residual, cell, trust in zip(residuals, cells, trusts, strict=True):
         clipped = np.minimum(residual, 5.0 * level)
@@ -49,37 +105,17 @@ def normal_residuals(
     return np.maximum((sums + prior * level) / (mass + prior), level).astype(np.float32)
 
 
-def pixel_weights(
-    residual: np.ndarray,
-    pixels: np.ndarray,
-    mask: np.ndarray,
-    normal: np.ndarray,
-    residual_scale: float,
-) -> np.ndarray:
-    """Turn the residuals of the silhouette's pixels into weights.
-
-    Half a pixel's own residual and half the mean of its surroundings go into
-    1 / (1 + (r / (residual_scale * normal))^4). Outside the mask the weight is lowered, not
-    zero: masks miss parts.
-
-    Args:
-        residual: (P,) not negative.
-        pixels: (P,) row-major numbers of the pixels in the silhouette.
-        mask: (H, W) uint8, 255 = visible hand.
-        normal: (P,) positive, what the residual of the place is in clean frames.
-        residual_scale: residual, in those, at which the weight is halved.
-
-    Returns:
-        (H, W) uint8, 255 = full weight; 255 also outside the silhouette, where there is nothing
-        to judge by.
-    """
-    planes = np.zeros((mask.size, 2), dtype=np.float32)
+def _shared(residual: np.ndarray, pixels: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """(P,) half of each pixel's own residual and half the mean of its surroundings."""
+    planes = np.zeros((size[0] * size[1], 2), dtype=np.float32)
     planes[pixels, 0] = residual
     planes[pixels, 1] = 1.0
-    around = cv2.blur(planes.reshape(*mask.shape, 2), (_WINDOW, _WINDOW)).reshape(-1, 2)[pixels]
-    shared = 0.5 * residual + 0.5 * around[:, 0] / np.maximum(around[:, 1], 1e-6)
-    fit = 1.0 / (1.0 + (shared / (residual_scale * normal)) ** 4)
-    seen = mask.reshape(-1)[pixels] / 255.0
-    weights = np.full(mask.size, 255, dtype=np.uint8)
-    weights[pixels] = np.round(255.0 * fit * (_UNMASKED + (1.0 - _UNMASKED) * seen))
-    return weights.reshape(mask.shape)
+    around = cv2.blur(planes.reshape(*size, 2), (_WINDOW, _WINDOW)).reshape(-1, 2)[pixels]
+    mean: np.ndarray = around[:, 0] / np.maximum(around[:, 1], 1e-6)
+    return 0.5 * residual + 0.5 * mean
+
+
+def _fit(distance: np.ndarray, half: np.ndarray | float) -> np.ndarray:
+    """1 where nothing is off, a half where the distance is `half`, soon 0 beyond."""
+    result: np.ndarray = 1.0 / (1.0 + (distance / half) ** 4)
+    return result
