@@ -56,7 +56,7 @@ def weigh_pixels(
     )
     prior = settings.residual_prior
     normal = normal_residuals(residuals, cells, trusts, cell_count, level, prior)
-    normal_tint = normal_residuals(tints, cells, trusts, cell_count, tint_level, prior)
+    normal_tint = normal_tints(tints, cells, trusts, cell_count, tint_level, prior)
     weights = np.full(masks.shape, 255, dtype=np.uint8)
     for row, look in looks.items():
         seen = masks[row].reshape(-1) / 255.0
@@ -82,9 +82,9 @@ def normal_residuals(
 ) -> np.ndarray:
     """What residual each cell of the surface has in clean frames.
 
-    Nails, creases and places in shadow fit worse than the rest in every frame, and varnish is
-    never the skin's colour; that says nothing against them. Residuals are clipped at five times
-    the level, so that one frame with an object does not make a place look unruly.
+    Nails, creases and places in shadow fit worse than the rest in every frame; that says nothing
+    against them. Residuals are clipped at five times the level, so that one frame with an object
+    does not make a place look unruly.
 
     Args:
         residuals: for each frame (P,) residuals.
@@ -103,6 +103,38 @@ def normal_residuals(
         sums += trust * np.bincount(cell, clipped, minlength=cell_count)
         mass += trust * np.bincount(cell, minlength=cell_count)
     return np.maximum((sums + prior * level) / (mass + prior), level).astype(np.float32)
+
+
+def normal_tints(
+    tints: Sequence[np.ndarray],
+    cells: Sequence[np.ndarray],
+    trusts: Sequence[float],
+    cell_count: int,
+    level: float,
+    prior: float,
+) -> np.ndarray:
+    """How far from the skin's tint each cell of the surface is in clean frames.
+
+    Nails and tattoos are far from it in every frame, a place under an object in some. The mean
+    is geometric: the first it follows all the way, the second hardly moves it.
+
+    Args:
+        tints: for each frame (P,) distances.
+        cells: for each frame (P,) cells.
+        trusts: for each frame how much it counts, in [0, 1].
+        cell_count: number of cells.
+        level: median distance of the clean frames, positive.
+        prior: pixels that the level is worth.
+
+    Returns:
+        (C,) float32, at least the level.
+    """
+    sums, mass = np.zeros(cell_count), np.full(cell_count, prior)
+    for tint, cell, trust in zip(tints, cells, trusts, strict=True):
+        above = np.log(np.maximum(tint, level) / level)
+        sums += trust * np.bincount(cell, above, minlength=cell_count)
+        mass += trust * np.bincount(cell, minlength=cell_count)
+    return (level * np.exp(sums / mass)).astype(np.float32)
 
 
 def _shared(residual: np.ndarray, pixels: np.ndarray, size: tuple[int, ...]) -> np.ndarray:

@@ -17,6 +17,7 @@ from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.request import RunSettings, open_request, write_request
 from hwp_bench.splits import contiguous_split
 from wildghand.prepass import Judgement, PrepassInput, PrepassSettings, judge_capture, judge_frames
+from wildghand.prepass.footprint import HandSurfaces
 
 Lit = tuple[np.ndarray, np.ndarray]
 #: Frames that the tests perturb.
@@ -97,6 +98,83 @@ def test_covered_pixels_lose_their_weight(lit_frames: Lit) -> None:
     assert (judgement.hidden_deviation[HIT] > 3).all()
     assert (judgement.misplacement_deviation[HIT] < 3).all()
     assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
+
+
+def test_an_object_where_no_clean_frame_shows_the_hand_is_not_learnt_as_skin(
+    lit_frames: Lit,
+) -> None:
+    """The lower third of the hand shows in perturbed frames alone, and there under wood."""
+    linear, masks = lit_frames[0].copy(), lit_frames[1].copy()
+    covered = np.zeros_like(masks)
+    for frame in range(FRAMES):
+        start = int(np.quantile(np.nonzero(masks[frame])[0], 0.7))
+        if frame in HIT:
+            covered[frame, start:] = masks[frame, start:]
+            linear[frame][covered[frame]] = [0.5, 0.45, 0.2]
+        else:
+            masks[frame, start:] = False
+    given = as_input(developed(linear), masks)
+    weights = judge_frames(given).pixel_weights[HIT]
+    assert weights[covered[HIT]].mean() < 0.03 * 255
+    assert weights[lit_frames[1][HIT] & ~covered[HIT]].mean() > 0.7 * 255
+    # What the test is about: a model that has learnt the object finds less wrong with it.
+    blind = judge_frames(given, PrepassSettings(tint_scale=1e6)).pixel_weights[HIT]
+    assert blind[covered[HIT]].mean() > 5.0 * weights[covered[HIT]].mean()
+
+
+def test_tints_that_every_frame_shows_are_not_held_against_a_place(lit_frames: Lit) -> None:
+    linear, masks = lit_frames[0].copy(), lit_frames[1]
+    surfaces = HandSurfaces({"right": load_template("anny", "right")}, 0.004)
+    clip = cameras()
+    footprints = list(
+        surfaces.footprints(
+            {"right": hand_parameters()}, clip.Ks, clip.viewmats, np.arange(FRAMES), (SIZE, SIZE)
+        )
+    )
+    # A twentieth of the places that all frames show, as red as nails may be.
+    often = np.bincount(np.concatenate([np.unique(drawn.cells) for drawn in footprints]))
+    chosen = np.flatnonzero(often == FRAMES)[::20]
+    painted = np.zeros_like(masks)
+    for frame, drawn in enumerate(footprints):
+        painted[frame].reshape(-1)[drawn.pixels[np.isin(drawn.cells, chosen)]] = True
+    linear[painted] *= [1.0, 0.6, 0.6]
+    given = as_input(developed(linear), masks)
+    tinted, untinted = (
+        judge_frames(given, PrepassSettings(tint_scale=scale)).pixel_weights[painted]
+        for scale in (4.0, 1e6)
+    )
+    assert painted.sum() > 500
+    # Measured against the skin alone they would keep a hundredth.
+    assert tinted.astype(float).mean() > 0.8 * untinted.astype(float).mean()
+
+
+def test_beyond_the_silhouette_skin_keeps_its_weight_and_leaves_lose_it(lit_frames: Lit) -> None:
+    linear, masks = lit_frames[0].copy(), lit_frames[1].copy()
+    skin, leaf = np.zeros_like(masks), np.zeros_like(masks)
+    skin[HIT, 2:8, 2:8] = leaf[HIT, 2:8, 12:18] = True
+    assert not (masks & (skin | leaf)).any()
+    linear[skin] = linear[masks].mean(axis=0)
+    linear[leaf] = [0.1, 0.3, 0.05]
+    given = as_input(developed(linear), masks | skin | leaf)
+    weights = judge_frames(given).pixel_weights
+    assert weights[skin].mean() > 0.8 * 255
+    assert weights[leaf].mean() < 0.05 * 255
+    assert (weights[~(masks | skin | leaf)] == 255).all()
+
+
+@pytest.mark.parametrize("brightness", [0.5, 0.8])
+def test_shade_is_no_tint(lit_frames: Lit, brightness: float) -> None:
+    linear = lit_frames[0].copy()
+    linear[HIT, :, : SIZE // 2] *= brightness
+    given = as_input(developed(linear), lit_frames[1])
+    tinted, untinted = (
+        judge_frames(given, PrepassSettings(tint_scale=scale)).pixel_weights[HIT][
+            lit_frames[1][HIT]
+        ]
+        for scale in (4.0, 1e6)
+    )
+    # Half the light leaves a sensor's noise a larger share of the colour, hence not 1.
+    assert tinted.astype(float).mean() > 0.9 * untinted.astype(float).mean()
 
 
 def test_misplaced_hands_ask_for_refinement(lit_frames: Lit) -> None:
