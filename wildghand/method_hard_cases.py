@@ -19,6 +19,7 @@ from hwp_bench.stability.registry import Case, Context, Measured
 from wildghand import terms
 from wildghand.attributes import CHANNELS, RawAttributes
 from wildghand.dpd import DynamicPerturbation, drop
+from wildghand.fit.temporal import TemporalTarget
 from wildghand.pao import PaoSettings, PerturbationAwareWeights, Weights
 from wildghand.perceptual import FilterBank
 from wildghand.regions.frame_regions import FrameRegions, overlapping, partition, stack_regions
@@ -52,6 +53,16 @@ def _perturbation() -> Iterator[_Entry]:
         )
     yield "DPD of one frame (L = 1)", "biases and gradients finite", _run_one_frame
     yield "DPD with every omega dropped", "every bias and every gradient is 0", _run_dropped
+    for name, clean in (
+        ("one perturbed frame (L = 1)", [0.0]),
+        ("no clean frame", [0.0, 0.0, 0.0]),
+        ("clean frames alone", [1.0, 1.0, 1.0]),
+    ):
+        yield (
+            f"DPD begun at the judgement of {name}",
+            "every bias is 0; omega within a fifth of its scale from its target; gradients finite",
+            functools.partial(_run_begun, clean),
+        )
 
 
 def _weights() -> Iterator[_Entry]:
@@ -170,6 +181,19 @@ def _run_one_frame(context: Context) -> Measured:
     return Measured(
         _finite(biases, *(p.grad for p in module.parameters())), f"{biases.numel()} biases"
     )
+
+
+def _run_begun(clean: list[float], context: Context) -> Measured:
+    module, scale = _module(len(clean)), 0.05
+    target = TemporalTarget.judged(torch.tensor(clean), scale)
+    target.begin([module])
+    biases = _biases(module, len(clean))
+    (biases.square().sum() + target.strayed([module], 0)).backward()
+    omega = module.temporal(torch.arange(len(clean))).omega.detach()
+    off = float((omega - target.omega).abs().max())
+    finite = _finite(*(p.grad for p in module.parameters()))
+    sound = finite and bool((biases == 0.0).all()) and off <= 0.2 * scale
+    return Measured(sound, f"omega off by {off:.0e}")
 
 
 def _run_dropped(context: Context) -> Measured:

@@ -69,8 +69,8 @@ class TemporalTarget:
 
         Args:
             modules: of the hands, at least one.
-            first: a frame of this step's batch. In long clips every k-th frame from there on is
-                looked at, so that a step costs no more than in short ones.
+            first: a frame of this step's batch. In long clips it and every k-th frame before and
+                after it is looked at, so that a step costs no more than in short ones.
         """
         stride = math.ceil(len(self.omega) / _LOOKED_AT)
         part = slice(first % stride, None, stride)
