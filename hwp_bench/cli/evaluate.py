@@ -7,7 +7,7 @@ import json
 import sys
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from hwp_bench.engine.options import add_engine_arguments
 
@@ -197,6 +197,7 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     Raises:
         UsageError: a limit is not above 0, or an override is not NAME=VALUE.
     """
+    from hwp_bench.cli.overrides import overrides
     from hwp_bench.errors import UsageError
     from hwp_bench.evaluate.evaluation import EvaluationSettings
     from hwp_bench.methods.contract import Budget
@@ -209,7 +210,7 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     return EvaluationSettings(
         suite="captures" if args.capture else args.suite,
         preset=args.preset,
-        overrides=dict(_override(text) for text in args.set),
+        overrides=overrides(args.set),
         seed=args.seed,
         budget=Budget(args.budget, args.steps),
         frames=args.frames,
@@ -220,20 +221,6 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
             exposed=tuple(Path(path) for path in args.expose),
         ),
     )
-
-
-def _override(text: str) -> tuple[str, Any]:
-    import tomllib
-
-    from hwp_bench.errors import UsageError
-
-    name, equals, value = text.partition("=")
-    if not equals or not all(part.isidentifier() for part in name.split(".")):
-        raise UsageError(f"{text!r} is not NAME=VALUE", field="--set")
-    try:
-        return name, tomllib.loads(f"value = {value}")["value"]
-    except tomllib.TOMLDecodeError:
-        return name, value
 
 
 def chosen_captures(args: argparse.Namespace, engine: Engine) -> list[Path]:

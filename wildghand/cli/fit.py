@@ -108,7 +108,9 @@ def _run(args: argparse.Namespace, world: World) -> int:
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
     """The overrides; a prior's path is the caller's, not the method's."""
-    settings = dict(setting(text) for text in args.set)
+    from hwp_bench.cli.overrides import overrides
+
+    settings = overrides(args.set)
     if args.prior is not None:
         settings["prior"] = str(args.prior.resolve())
     return settings
@@ -149,16 +151,3 @@ def _capture(args: argparse.Namespace) -> Path:
             VideoImport(hand=args.side, hand_model=args.hand),
         )
     return folder
-
-
-def setting(text: str) -> tuple[str, Any]:
-    """Take `NAME=VALUE` apart; a value that is no JSON is a text."""
-    from hwp_bench.errors import UsageError
-
-    name, found, value = text.partition("=")
-    if not found or not name:
-        raise UsageError(f"{text!r} is not NAME=VALUE", field="--set")
-    try:
-        return name, json.loads(value)
-    except json.JSONDecodeError:
-        return name, value

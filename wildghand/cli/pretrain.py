@@ -42,8 +42,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.cli.overrides import overrides
     from hwp_bench.errors import UsageError
-    from wildghand.cli.fit import setting
     from wildghand.pretrain.session import pretrain
     from wildghand.prior_files import WEIGHTS
 
@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     record = pretrain(
         args.captures,
         args.out,
-        settings=dict(setting(text) for text in args.set),
+        settings=overrides(args.set),
         steps=args.steps,
         seed=args.seed,
         overwrite=args.overwrite,

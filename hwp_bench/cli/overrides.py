@@ -1,0 +1,31 @@
+"""`--set NAME=VALUE`, wherever a command takes settings."""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable
+from typing import Any
+
+from hwp_bench.errors import UsageError
+
+
+def overrides(texts: Iterable[str]) -> dict[str, Any]:
+    """Take `NAME=VALUE` apart.
+
+    Args:
+        texts: a name, or `name.field` for a field of a table, and a value as TOML writes it; what
+            is no TOML is a text, so that words need no quotation marks. The last of a name holds.
+
+    Raises:
+        UsageError: a text is not of this form.
+    """
+    found = {}
+    for text in texts:
+        name, equals, value = text.partition("=")
+        if not equals or not all(part.isidentifier() for part in name.split(".")):
+            raise UsageError(f"{text!r} is not NAME=VALUE", field="--set")
+        try:
+            found[name] = tomllib.loads(f"value = {value}")["value"]
+        except tomllib.TOMLDecodeError:
+            found[name] = value
+    return found
