@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from wildghand.dpd import DynamicPerturbation
 
 #: Steps of Adam, and the size of the first, that bring temporal weights to their start.
-_STEPS, _RATE = 200, 3e-3
+_STEPS, _RATE = 50, 3e-3
 #: Frames that one step of the fit looks at, at most.
 _LOOKED_AT = 64
 
