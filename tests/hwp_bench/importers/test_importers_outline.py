@@ -30,11 +30,16 @@ def disc_mask(centre: np.ndarray, radius: float, size: int = FIELD_SIZE) -> np.n
 
 @settings(deadline=None)  # the first call compiles
 @given(st.floats(60, 100), st.floats(60, 100), st.floats(8, 50))
-def test_the_silhouette_of_a_disc_has_its_area(x: float, y: float, radius: float) -> None:
-    # Half a pixel too thick would be an error of 0.5 times the circumference.
+def test_the_silhouette_of_a_disc_is_the_pixels_whose_centres_it_holds(
+    x: float, y: float, radius: float
+) -> None:
     vertices, faces = disc(np.array([x, y]), radius)
-    area = np.count_nonzero(draw_silhouette(vertices, faces, 160))
-    assert abs(area - np.pi * radius**2) < 0.15 * 2 * np.pi * radius + 3
+    drawn = draw_silhouette(vertices, faces, 160) > 0
+    rows, columns = np.mgrid[:160, :160] + 0.5
+    distance = np.hypot(columns - x, rows - y)
+    # The disc has 120 corners: between the circles within and around it either is right.
+    assert drawn[distance < radius * np.cos(np.pi / 120) - 1e-9].all()
+    assert not drawn[distance > radius + 1e-9].any()
 
 
 def test_silhouettes_bear_anything() -> None:
