@@ -22,9 +22,9 @@ import numpy as np
 from scipy.stats import spearmanr
 
 from benchmarks.prepass import covered_pixels, severities
+from hwp_bench.base.files import read_json
+from hwp_bench.base.images import read_gray
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.files import read_json
-from hwp_bench.images import read_gray
 
 
 def temporal(folder: Path) -> tuple[np.ndarray, np.ndarray] | None:

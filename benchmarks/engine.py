@@ -25,9 +25,9 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.engine_work import INPUT_BYTES, Wait
-from hwp_bench.engine import Engine, Folder, Job, LocalEngine
-from hwp_bench.engine.job import Report
-from hwp_bench.engine.parallel import ParallelEngine
+from hwp_bench.run.engine import Engine, Folder, Job, LocalEngine
+from hwp_bench.run.engine.job import Report
+from hwp_bench.run.engine.parallel import ParallelEngine
 
 #: Captures, variants and seeds of the modelled study.
 STUDY = (11, 4, 3)
@@ -115,7 +115,7 @@ def measure_ray(
 ) -> dict[int, list[float]]:
     from ray.cluster_utils import Cluster
 
-    from hwp_bench.engine.ray_engine import RayEngine
+    from hwp_bench.run.engine.ray_engine import RayEngine
 
     times: dict[int, list[float]] = {}
     with ExitStack() as stack:

@@ -24,23 +24,23 @@ import torch
 from baselines.plain.model import make_model
 from baselines.plain.optimise import learning_rates
 from baselines.plain.settings import PlainSettings
+from hwp_bench.base.tables import Column, Table, print_table
 from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.splits import split_for
 from hwp_bench.hands import load_template
 from hwp_bench.methods.request import RunSettings, TrainingCapture, open_request, write_request
-from hwp_bench.report.table import Column, Table, print_table
-from hwp_bench.splits import split_for
-from wildghand.fit.clip import TrainingClip
-from wildghand.fit.frames import TrainingFrames, load_frames
-from wildghand.fit.schedule import batches
-from wildghand.losses import photometric_loss
+from wildghand.gaussians.clip import TrainingClip
+from wildghand.gaussians.frames import TrainingFrames, load_frames
+from wildghand.gaussians.losses import photometric_loss
+from wildghand.gaussians.quaternions import quat_multiply, quat_rotate, quat_third_axis
+from wildghand.gaussians.rig import make_rig
+from wildghand.gaussians.schedule import batches
 from wildghand.network import (
     PredictionNetwork,
     network_settings,
     parameter_groups,
     surface_points,
 )
-from wildghand.quaternions import quat_multiply, quat_rotate, quat_third_axis
-from wildghand.rig import make_rig
 from wildghand.splat import rasterize
 
 #: Gaussians of the stated cost.

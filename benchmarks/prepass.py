@@ -25,7 +25,7 @@ import torch
 from scipy.stats import rankdata, spearmanr
 
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.splits import contiguous_split
+from hwp_bench.capture.splits import contiguous_split
 from wildghand.prepass import Judgement, PrepassInput, judge_frames
 from wildghand.prepass.intensity import log_light_table
 from wildghand.prepass.judge import capture_input

@@ -26,7 +26,7 @@ import numpy as np
 import torch
 
 from benchmarks.splat_workloads import SIZES, Workload, make
-from hwp_bench.report.table import Column, Table, print_table, to_markdown
+from hwp_bench.base.tables import Column, Table, print_table, to_markdown
 from wildghand.splat import rasterize
 
 #: Multiplications and additions of one channel-less pair and its three colours, both passes: as the

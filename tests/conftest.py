@@ -90,9 +90,9 @@ def make_training(make_painted: Callable[..., Capture], tmp_path: Path) -> Calla
     """Return a function that opens what a method is given of a painted capture."""
     from painted import FRAMES, QUICK
 
+    from hwp_bench.capture.splits import contiguous_split
     from hwp_bench.methods.contract import Budget
     from hwp_bench.methods.request import RunSettings, open_request, write_request
-    from hwp_bench.splits import contiguous_split
 
     def make(hands: str = "right", **settings: object) -> Any:
         capture = make_painted(hands)

@@ -9,10 +9,10 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hwp_bench.engine import Folder, Job, Needs
-from hwp_bench.engine.job import Report
-from hwp_bench.engine.view import NoView
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
+from hwp_bench.run.engine import Folder, Job, Needs
+from hwp_bench.run.engine.job import Report
+from hwp_bench.run.engine.view import NoView
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.files import sha256_file
+from hwp_bench.base.files import sha256_file
 
 #: Fields that tell how long something took, how much memory it had, and when.
 TIMINGS = ("seconds", "peak_memory", "started", "environment", "isolation")

@@ -15,10 +15,10 @@ from interhand_release import write_interhand
 from official_release import write_release
 from synthetic_mano import write_mirrored_mano
 
+from hwp_bench.base.images import write_image
 from hwp_bench.capture import open_capture
 from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template
-from hwp_bench.images import write_image
 
 ROOT = Path(__file__).resolve().parents[1]
 #: Commands that are proven elsewhere: the tracker needs MediaPipe.

@@ -10,7 +10,7 @@ import pytest
 from small_captures import CaptureMaker
 
 from hwp_bench.evaluate.evaluation import EvaluationSettings, evaluate
-from hwp_bench.sandbox.confinement import Confinement
+from hwp_bench.run.sandbox.confinement import Confinement
 
 TESTS = Path(__file__).parent
 PAGE = TESTS.parent / "docs" / "threat-model.md"

@@ -15,9 +15,9 @@ from baselines.plain.optimise import fit_model
 from baselines.plain.settings import read_settings
 from hwp_bench.methods.contract import Budget, Report
 from hwp_bench.methods.request import TrainingCapture
-from wildghand.device import choose_device
-from wildghand.fit.frames import load_frames
-from wildghand.photometric_cpu import warm_up as warm_up_loss
+from wildghand.gaussians.device import choose_device
+from wildghand.gaussians.frames import load_frames
+from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
 from wildghand.splat.warmup import warm_up
 
 

@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import HandTemplate
 from hwp_bench.methods.contract import Camera, HandPose
-from wildghand.anchored import AnchoredGaussians, flat_gaussians
-from wildghand.fit.clip import join_hands
-from wildghand.quaternions import quat_third_axis
-from wildghand.rig import AnchorPoses, HandRig, make_rig
-from wildghand.shading import sh_basis, sh_count
+from wildghand.gaussians.anchored import AnchoredGaussians, flat_gaussians
+from wildghand.gaussians.clip import join_hands
+from wildghand.gaussians.quaternions import quat_third_axis
+from wildghand.gaussians.rig import AnchorPoses, HandRig, make_rig
+from wildghand.gaussians.shading import sh_basis, sh_count
 from wildghand.splat import rasterize
 
 

@@ -8,14 +8,14 @@ import torch
 
 from baselines.plain.model import PlainAvatar, PlainModel
 from baselines.plain.settings import PlainSettings
+from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Budget, Report
 from hwp_bench.methods.request import TrainingCapture
-from hwp_bench.progress import notice
-from wildghand.fit.clip import TrainingClip
-from wildghand.fit.frames import TrainingFrames
-from wildghand.fit.guard import Guard
-from wildghand.fit.schedule import batches, spent
-from wildghand.losses import photometric_loss
+from wildghand.gaussians.clip import TrainingClip
+from wildghand.gaussians.frames import TrainingFrames
+from wildghand.gaussians.guard import Guard
+from wildghand.gaussians.losses import photometric_loss
+from wildghand.gaussians.schedule import batches, spent
 
 # Standard deviations stay within these, m: thinner than paper or wider than a finger explains
 # nothing of a hand.

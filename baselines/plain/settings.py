@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from hwp_bench.methods.settings import choice, number, settings_from
-from wildghand.shading import MAX_DEGREE
+from wildghand.gaussians.shading import MAX_DEGREE
 
 
 @dataclass(frozen=True)

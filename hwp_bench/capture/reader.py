@@ -8,6 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.errors import BadCapture, UsageError
+from hwp_bench.base.files import read_json, sha256_json
+from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.capture.layout import (
     CAMERAS,
     HANDS,
@@ -18,10 +21,7 @@ from hwp_bench.capture.layout import (
 )
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands
-from hwp_bench.errors import BadCapture, UsageError
-from hwp_bench.files import read_json, sha256_json
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.images import read_gray, read_rgb
 
 
 class Capture:

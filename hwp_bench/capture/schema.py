@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from hwp_bench.errors import BadCapture
+from hwp_bench.base.errors import BadCapture
+from hwp_bench.base.text import has_odd_characters
 from hwp_bench.taxonomy import check_severity, perturbation
-from hwp_bench.text import has_odd_characters
 
 #: Version of the capture format; a reader refuses every other.
 SCHEMA = "hwp-capture/1"

@@ -7,8 +7,8 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
+from hwp_bench.base.drawing import fitted, labelled, outlined, sheet
 from hwp_bench.capture.reader import Capture
-from hwp_bench.report.drawing import fitted, labelled, outlined, sheet
 
 #: Colour of the projected hand, by side.
 COLOURS = {"right": (255, 160, 0), "left": (0, 170, 255)}

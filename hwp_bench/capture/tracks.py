@@ -9,8 +9,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.arrays import read_npz, take, write_npz
-from hwp_bench.errors import BadInput
+from hwp_bench.base.arrays import read_npz, take, write_npz
+from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.parameters import HandParameters
 
 

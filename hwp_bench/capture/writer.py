@@ -12,6 +12,9 @@ from types import TracebackType
 
 import numpy as np
 
+from hwp_bench.base.errors import BadCapture, ShapeMismatch
+from hwp_bench.base.files import atomic_folder, atomic_write, inside, write_json
+from hwp_bench.base.images import pixel_digest, write_image
 from hwp_bench.capture.layout import CAMERAS, EXTRA, HANDS, METADATA, TRUE_HANDS, image_path
 from hwp_bench.capture.schema import CaptureInfo, check_id
 from hwp_bench.capture.tracks import (
@@ -21,10 +24,7 @@ from hwp_bench.capture.tracks import (
     write_cameras,
     write_hands,
 )
-from hwp_bench.errors import BadCapture, ShapeMismatch
-from hwp_bench.files import atomic_folder, atomic_write, inside, write_json
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.images import pixel_digest, write_image
 
 
 class CaptureWriter:

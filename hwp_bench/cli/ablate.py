@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from hwp_bench.cli.evaluate import add_evaluation_arguments
 
 if TYPE_CHECKING:
-    from hwp_bench.ablate.run import AblationRuns
+    from hwp_bench.evaluate.ablate.run import AblationRuns
 
 _EXAMPLES = """examples:
   hwp-bench ablate --suite mini                          # 2 x 2 of DPD and PAO, three seeds
@@ -79,15 +79,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.ablate.design import make_design
-    from hwp_bench.ablate.run import run_ablation
-    from hwp_bench.ablate.view import AblationView
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.progress import notice
+    from hwp_bench.capture.splits import read_splits
     from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings
-    from hwp_bench.engine.options import engine_for, needs_of
-    from hwp_bench.errors import UsageError
+    from hwp_bench.evaluate.ablate.design import make_design
+    from hwp_bench.evaluate.ablate.run import run_ablation
+    from hwp_bench.evaluate.ablate.view import AblationView
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.progress import notice
-    from hwp_bench.splits import read_splits
+    from hwp_bench.run.engine.options import engine_for, needs_of
 
     if not 1 <= args.seeds <= 100:
         raise UsageError(f"{args.seeds} is not between 1 and 100", field="--seeds")
@@ -119,13 +119,13 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
-    from hwp_bench.ablate.effects import cost_effects, score_effects
-    from hwp_bench.ablate.record import ablation_record, write_record
-    from hwp_bench.ablate.tables import ablation_tables
-    from hwp_bench.progress import notice
+    from hwp_bench.analysis.statistics.pairing import common_metrics
+    from hwp_bench.base.progress import notice
+    from hwp_bench.base.tables import print_table
+    from hwp_bench.evaluate.ablate.effects import cost_effects, score_effects
+    from hwp_bench.evaluate.ablate.record import ablation_record, write_record
+    from hwp_bench.evaluate.ablate.tables import ablation_tables
     from hwp_bench.report.summary import HEADLINE, write_tables
-    from hwp_bench.report.table import print_table
-    from hwp_bench.statistics.pairing import common_metrics
 
     metrics = common_metrics(list(ablation.runs.values()), HEADLINE)
     effects = score_effects(ablation, metrics)
@@ -156,9 +156,9 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
 
 
 def _draw(ablation: AblationRuns, out: Path) -> None:
-    from hwp_bench.cost.analysis import analyse_cost, write_cost
-    from hwp_bench.errors import UsageError
-    from hwp_bench.progress import notice
+    from hwp_bench.analysis.cost.analysis import analyse_cost, write_cost
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.progress import notice
 
     try:
         analysis = analyse_cost(list(ablation.runs.values()), "psnr")

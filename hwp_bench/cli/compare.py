@@ -50,14 +50,14 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from dataclasses import asdict
 
-    from hwp_bench.errors import UsageError
+    from hwp_bench.analysis.statistics.compare import compare, standings
+    from hwp_bench.analysis.statistics.pairing import common_metrics, group_runs, refuse_unlike
+    from hwp_bench.analysis.statistics.tables import differences_table, standings_table
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.tables import print_table, spell
     from hwp_bench.metrics import metric
     from hwp_bench.report.summary import HEADLINE
-    from hwp_bench.report.table import print_table, spell
     from hwp_bench.results import read_all
-    from hwp_bench.statistics.compare import compare, standings
-    from hwp_bench.statistics.pairing import common_metrics, group_runs, refuse_unlike
-    from hwp_bench.statistics.tables import differences_table, standings_table
 
     if not 100 <= args.resamples <= 1_000_000:
         raise UsageError(f"{args.resamples} is not between 100 and 1000000", field="--resamples")

@@ -50,13 +50,13 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from pathlib import Path
 
-    from hwp_bench.cost.analysis import analyse_cost, write_cost
-    from hwp_bench.errors import UsageError
+    from hwp_bench.analysis.cost.analysis import analyse_cost, write_cost
+    from hwp_bench.analysis.statistics.pairing import group_runs
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.progress import notice
+    from hwp_bench.base.tables import print_table
     from hwp_bench.metrics import metric
-    from hwp_bench.progress import notice
-    from hwp_bench.report.table import print_table
     from hwp_bench.results import read_all
-    from hwp_bench.statistics.pairing import group_runs
 
     metric(args.metric)
     for budget in args.budgets:

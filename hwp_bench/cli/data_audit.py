@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hwp_bench.splits.audit import AuditReport
+    from hwp_bench.capture.splits.audit import AuditReport
 
 _EXAMPLES = """examples:
   hwp-bench data audit my_capture
@@ -34,10 +34,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.progress import track
     from hwp_bench.capture import open_capture
-    from hwp_bench.errors import UsageError
-    from hwp_bench.progress import track
-    from hwp_bench.splits import audit_split, contiguous_split, read_splits, split_for
+    from hwp_bench.capture.splits import audit_split, contiguous_split, read_splits, split_for
 
     if args.guard < 0 or (args.guard and args.splits):
         raise UsageError("a guard gap is at least 0, and not for a split file", field="--guard")
@@ -60,7 +60,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print(report: AuditReport) -> None:
-    from hwp_bench.report.table import Column, Table, print_table
+    from hwp_bench.base.tables import Column, Table, print_table
 
     closest = min(report.near_duplicates, key=lambda pair: pair[2], default=None)
     near = "none"

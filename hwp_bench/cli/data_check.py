@@ -28,8 +28,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.progress import track
     from hwp_bench.capture.check import check_capture
-    from hwp_bench.progress import track
 
     reports = [check_capture(path) for path in track(args.captures, "checking captures")]
     if args.json:
@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _print(report: CheckReport) -> None:
-    from hwp_bench.report.table import Column, Table, print_table
+    from hwp_bench.base.tables import Column, Table, print_table
 
     verdict = "sound" if report.ok else "NOT SOUND"
     rows = tuple((name, _fact(value)) for name, value in report.facts.items())

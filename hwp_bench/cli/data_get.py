@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.progress import JobProgress, notice
     from hwp_bench.importers.official.download import HuggingFaceHub, download_release
-    from hwp_bench.progress import JobProgress, notice
 
     with JobProgress() as jobs:
         update = jobs.start(0, 1, f"downloading to {args.out}")

@@ -33,8 +33,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.capture.splits import read_splits
     from hwp_bench.publish import publish
-    from hwp_bench.splits import read_splits
 
     splits = read_splits(args.splits) if args.splits else None
     made = publish(args.captures, args.out, splits=splits)

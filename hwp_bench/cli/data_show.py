@@ -28,10 +28,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.sheet import contact_sheet
-    from hwp_bench.errors import UsageError
-    from hwp_bench.images import write_image
 
     if args.count < 1 or not 16 <= args.edge <= 2048:
         raise UsageError("at least one frame, of 16 to 2048 px, is drawn", field="--count, --edge")

@@ -9,13 +9,13 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hwp_bench.engine.options import add_engine_arguments
+from hwp_bench.run.engine.options import add_engine_arguments
 
 if TYPE_CHECKING:
-    from hwp_bench.engine import Engine
     from hwp_bench.evaluate.evaluation import EvaluationSettings
     from hwp_bench.publish import SealedPart
     from hwp_bench.results import Results
+    from hwp_bench.run.engine import Engine
 
 _EXAMPLES = """examples:
   hwp-bench evaluate baselines/plain --suite smoke
@@ -113,13 +113,13 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from dataclasses import asdict, replace
 
-    from hwp_bench.engine.options import engine_for, needs_of
+    from hwp_bench.base.progress import JobProgress
+    from hwp_bench.base.tables import print_table
+    from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluate.evaluation import evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.progress import JobProgress
     from hwp_bench.report.summary import all_tables, write_tables
-    from hwp_bench.report.table import print_table
-    from hwp_bench.splits import read_splits
+    from hwp_bench.run.engine.options import engine_for, needs_of
 
     settings = evaluation_settings(args)
     sealed = _sealed_part(args)
@@ -161,8 +161,8 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
     """Open the sealed part that is asked for, and tell its commitment."""
     if args.sealed is None:
         return None
-    from hwp_bench.errors import UsageError
-    from hwp_bench.progress import notice
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.progress import notice
     from hwp_bench.publish import open_sealed
 
     if args.capture or args.splits:
@@ -174,7 +174,7 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
 
 def report_outcome(out: Path, results: Results) -> int:
     """Tell a person where the results lie and what failed; returns the exit status."""
-    from hwp_bench.progress import notice
+    from hwp_bench.base.progress import notice
 
     failed = [capture for capture in results.captures if capture.failed_frames]
     for capture in failed:
@@ -197,11 +197,11 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     Raises:
         UsageError: a limit is not above 0, or an override is not NAME=VALUE.
     """
+    from hwp_bench.base.errors import UsageError
     from hwp_bench.cli.overrides import overrides
-    from hwp_bench.errors import UsageError
     from hwp_bench.evaluate.evaluation import EvaluationSettings
     from hwp_bench.methods.contract import Budget
-    from hwp_bench.sandbox.confinement import Confinement
+    from hwp_bench.run.sandbox.confinement import Confinement
 
     for name in ("budget", "steps", "time_limit", "memory_limit"):
         value = getattr(args, name)
@@ -227,7 +227,7 @@ def chosen_captures(args: argparse.Namespace, engine: Engine) -> list[Path]:
     """Return the capture folders that were named, or those of the suite, rendered if need be."""
     if args.capture:
         return [Path(path) for path in args.capture]
-    from hwp_bench.engine.options import needs_of
+    from hwp_bench.run.engine.options import needs_of
     from hwp_bench.sim import ensure_suite
 
     return ensure_suite(args.suite, engine=engine, needs=needs_of(args))

@@ -32,7 +32,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.capture import open_capture
-    from hwp_bench.hands.convert import convert_capture
+    from hwp_bench.capture.convert import convert_capture
 
     errors = convert_capture(open_capture(args.capture), args.out, args.hand, overwrite=args.force)
     if args.json:

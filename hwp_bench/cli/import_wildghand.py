@@ -53,9 +53,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.progress import notice
     from hwp_bench.importers.official import OfficialImport, import_official
     from hwp_bench.importers.official.folders import find_folders
-    from hwp_bench.progress import notice
 
     options = OfficialImport(
         mano=args.mano,

@@ -42,11 +42,11 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from pathlib import Path
 
+    from hwp_bench.base.packages import data_folder
+    from hwp_bench.base.progress import notice
     from hwp_bench.leaderboard.entries import add_entry, check_entries, read_entries
-    from hwp_bench.leaderboard.place import leaderboard_folder
-    from hwp_bench.progress import notice
 
-    folder = Path(args.entries) if args.entries else leaderboard_folder() / "entries"
+    folder = Path(args.entries) if args.entries else data_folder("leaderboard") / "entries"
     if args.action == "add":
         from hwp_bench.results import read_all
 

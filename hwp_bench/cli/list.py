@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hwp_bench.report.table import Table
+    from hwp_bench.base.tables import Table
 
 _TOPICS = ("captures", "perturbations", "suites", "methods", "metrics")
 
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.report.table import print_table, to_object
+    from hwp_bench.base.tables import print_table, to_object
 
     makers = {
         "captures": _captures,
@@ -51,7 +51,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _captures() -> Table:
-    from hwp_bench.report.table import Column, Table
+    from hwp_bench.base.tables import Column, Table
     from hwp_bench.taxonomy import catalogue
 
     columns = ("capture", "hands", "action", "device", "frames", "perturbations")
@@ -70,7 +70,7 @@ def _captures() -> Table:
 
 
 def _perturbations() -> Table:
-    from hwp_bench.report.table import Column, Table
+    from hwp_bench.base.tables import Column, Table
     from hwp_bench.taxonomy import PERTURBATIONS, catalogue, perturbation
 
     rows = tuple(
@@ -86,7 +86,7 @@ def _perturbations() -> Table:
 
 
 def _suites() -> Table:
-    from hwp_bench.report.table import Column, Table
+    from hwp_bench.base.tables import Column, Table
     from hwp_bench.sim import suite
 
     rows = []
@@ -106,8 +106,8 @@ def _suites() -> Table:
 
 
 def _methods() -> Table:
+    from hwp_bench.base.tables import Column, Table
     from hwp_bench.methods.manifest import shipped_methods
-    from hwp_bench.report.table import Column, Table
 
     rows = tuple(
         (
@@ -124,8 +124,8 @@ def _methods() -> Table:
 
 
 def _metrics() -> Table:
+    from hwp_bench.base.tables import Column, Table
     from hwp_bench.metrics import METRICS
-    from hwp_bench.report.table import Column, Table
 
     rows = tuple(
         (

@@ -6,7 +6,7 @@ import tomllib
 from collections.abc import Iterable
 from typing import Any
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 
 
 def overrides(texts: Iterable[str]) -> dict[str, Any]:

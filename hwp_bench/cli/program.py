@@ -13,7 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from hwp_bench import __version__
-from hwp_bench.errors import HwpError
+from hwp_bench.base.errors import HwpError
 
 
 @dataclass(frozen=True)

@@ -42,7 +42,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from pathlib import Path
 
-    from hwp_bench.progress import notice
+    from hwp_bench.base.progress import notice
     from hwp_bench.report.page.render import write_report
     from hwp_bench.report.sources import read_sources
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from hwp_bench.engine.options import add_engine_arguments
+from hwp_bench.run.engine.options import add_engine_arguments
 
 _EXAMPLES = """examples:
   hwp-bench sim list

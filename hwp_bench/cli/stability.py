@@ -64,7 +64,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _check_backends(cases: list[Case], wanted: list[str]) -> None:
-    from hwp_bench.errors import UsageError
+    from hwp_bench.base.errors import UsageError
 
     known = sorted({name for case in cases for name in case.backends if name})
     for name in wanted:
@@ -89,7 +89,7 @@ def _as_object(outcome: Outcome) -> dict[str, Any]:
 
 
 def _print(outcomes: list[Outcome]) -> None:
-    from hwp_bench.report.table import Column, Table, print_table
+    from hwp_bench.base.tables import Column, Table, print_table
 
     titles = ("case", "backend", "what must hold", "measured", "pass")
     rows = tuple(

@@ -67,8 +67,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.tables import print_table, spell
     from hwp_bench.report.choose import TableRequest, make_table
-    from hwp_bench.report.table import print_table, spell
 
     table = make_table(
         TableRequest(

@@ -46,10 +46,10 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from dataclasses import asdict
 
+    from hwp_bench.base.progress import track
+    from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluate.verify import verify_results
-    from hwp_bench.progress import track
     from hwp_bench.results import result_files
-    from hwp_bench.splits import read_splits
 
     splits = read_splits(args.splits) if args.splits else None
     files = [file for path in args.results for file in result_files(path)]
@@ -66,7 +66,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _captures(args: argparse.Namespace, file: Path) -> list[Path]:
-    from hwp_bench.errors import UsageError
+    from hwp_bench.base.errors import UsageError
     from hwp_bench.evaluate.verify import capture_folders
     from hwp_bench.results import read_results
     from hwp_bench.sim import ensure_suite
@@ -89,7 +89,7 @@ def _captures(args: argparse.Namespace, file: Path) -> list[Path]:
 
 
 def _print(outcome: Verification) -> None:
-    from hwp_bench.report.table import Column, Table, print_table
+    from hwp_bench.base.tables import Column, Table, print_table
 
     shown = outcome.discrepancies[:_SHOWN]
     if shown:

@@ -9,8 +9,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
+from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
+from hwp_bench.base.files import read_json, sha256_json, write_json
+from hwp_bench.base.records import parse_record
 from hwp_bench.capture import Capture
-from hwp_bench.errors import BadMethod, HwpError, MethodFailed
+from hwp_bench.capture.splits import Split
 from hwp_bench.evaluate.pictures import write_pictures
 from hwp_bench.evaluate.scoring import (
     keep_predictions,
@@ -19,21 +22,18 @@ from hwp_bench.evaluate.scoring import (
     read_targets,
     score_predictions,
 )
-from hwp_bench.files import read_json, sha256_json, write_json
 from hwp_bench.methods.contents import exposed_digest
-from hwp_bench.methods.facts import RunFacts
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.methods.predictions import Prediction, read_predictions
 from hwp_bench.methods.request import RunSettings, write_request
-from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
-from hwp_bench.methods.surroundings import hand_model_files
-from hwp_bench.methods.worker import CHECKPOINTS, DIAGNOSTICS
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.score import Network
-from hwp_bench.records import parse_record
 from hwp_bench.results import CaptureResult, CurvePoint
-from hwp_bench.sandbox.confinement import Confinement
-from hwp_bench.splits import Split
+from hwp_bench.run.facts import RunFacts
+from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
+from hwp_bench.run.sandbox.confinement import Confinement
+from hwp_bench.run.surroundings import hand_model_files
+from hwp_bench.run.worker import CHECKPOINTS, DIAGNOSTICS
 
 #: Most bytes of temporal weights and weight masks that are kept of a capture.
 MAX_DIAGNOSTICS = 64 << 20

@@ -9,24 +9,24 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench import __version__
+from hwp_bench.base.errors import BadCapture
+from hwp_bench.base.locks import sole_use
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.engine import Engine, LocalEngine, Needs
-from hwp_bench.errors import BadCapture
+from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluate.capture_run import Job, read_result
 from hwp_bench.evaluate.jobs import evaluation_job
 from hwp_bench.methods.contract import Budget
+from hwp_bench.methods.json_values import check_plain
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
-from hwp_bench.methods.plain import check_plain
 from hwp_bench.methods.request import RunSettings
-from hwp_bench.methods.runner import DEFAULT_TIME_LIMIT
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results, write_results
 from hwp_bench.results.environment import environment
-from hwp_bench.sandbox.confinement import Confinement
-from hwp_bench.sole import sole_use
-from hwp_bench.splits import Split, split_for
+from hwp_bench.run.engine import Engine, LocalEngine, Needs
+from hwp_bench.run.runner import DEFAULT_TIME_LIMIT
+from hwp_bench.run.sandbox.confinement import Confinement
 
 #: Called when a capture's work begins, with (index, count, capture id); returns what is to be
 #: called with (done, total) steps meanwhile.

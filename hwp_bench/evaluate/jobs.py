@@ -6,18 +6,16 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from hwp_bench.base.errors import HwpError
+from hwp_bench.base.packages import PACKAGES
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.layout import EXTRA
-from hwp_bench.engine import Folder, Needs
-from hwp_bench.engine import Job as EngineJob
-from hwp_bench.engine.job import Report
-from hwp_bench.errors import HwpError
 from hwp_bench.evaluate.capture_run import Job, evaluate_capture, stored_result
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.metrics.lpips_weights import load_available
-
-#: Folder that holds the toolkit's packages, and the methods that ship with it.
-PACKAGES = Path(__file__).resolve().parents[2]
+from hwp_bench.run.engine import Folder, Needs
+from hwp_bench.run.engine import Job as EngineJob
+from hwp_bench.run.engine.job import Report
 
 
 @dataclass(frozen=True)
@@ -34,7 +32,7 @@ class EvaluateCapture:
     networks: tuple[str, ...]
 
     def __call__(self, inputs: Mapping[str, Path], output: Path, report: Report) -> None:
-        """Evaluate; see `hwp_bench.engine.job.Work`.
+        """Evaluate; see `hwp_bench.run.engine.job.Work`.
 
         Raises:
             HwpError: method, capture, weights or protocols are others here.

@@ -10,10 +10,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.errors import BadCapture, BadPrediction
+from hwp_bench.base.images import pixel_digest
 from hwp_bench.capture import Capture
 from hwp_bench.capture.layout import frame_name
-from hwp_bench.errors import BadCapture, BadPrediction
-from hwp_bench.images import pixel_digest
 from hwp_bench.methods.predictions import Prediction
 from hwp_bench.metrics.batch import Frame, score_frames
 from hwp_bench.metrics.protocol import HWP_V1

@@ -8,18 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench import __version__
+from hwp_bench.base.errors import BadSplit, HwpError
+from hwp_bench.base.files import inside, sha256_json
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
-from hwp_bench.errors import BadSplit, HwpError
+from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluate.scoring import predictions_digest, read_targets, score_predictions
-from hwp_bench.files import inside, sha256_json
 from hwp_bench.methods.predictions import read_predictions
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, FrameResult, Results, read_results
 from hwp_bench.results.environment import environment
-from hwp_bench.splits import Split, split_for
 
 #: Largest difference of a score that rounding on another processor may make.
 TOLERANCE = 1e-6

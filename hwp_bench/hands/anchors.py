@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hwp_bench.errors import BadHandModel, UsageError
+from hwp_bench.base.errors import BadHandModel, UsageError
 from hwp_bench.hands.surface import unit_or, vertex_normals
 from hwp_bench.hands.template import HandTemplate
 

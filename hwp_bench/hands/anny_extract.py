@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.arrays import write_npz
+from hwp_bench.base.arrays import write_npz
 from hwp_bench.hands.landmarks import FINGERS, finger_joints
 from hwp_bench.hands.shape_space import align_hands, shape_components, stretch_fingers
 

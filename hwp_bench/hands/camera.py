@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from hwp_bench.errors import ShapeMismatch
+from hwp_bench.base.errors import ShapeMismatch
 
 
 def project(

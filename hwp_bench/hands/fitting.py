@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
-from hwp_bench.errors import BadInput, DidNotConverge
+from hwp_bench.base.errors import BadInput, DidNotConverge
 from hwp_bench.hands.joint_limits import anatomical_limits, joint_limit_penalty
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.hands.skinning import PosedHand, TemplateTensors, pose_hand

@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.errors import BadHandModel
+from hwp_bench.base.errors import BadHandModel
+from hwp_bench.base.unpickle import StandIn, load_pickle
 from hwp_bench.hands.landmarks import PARENTS
 from hwp_bench.hands.template import (
     JOINT_COUNT,
@@ -19,7 +20,6 @@ from hwp_bench.hands.template import (
     make_template,
 )
 from hwp_bench.hands.uv_charts import two_chart_uv
-from hwp_bench.unpickle import StandIn, load_pickle
 
 #: Size of the MANO mesh.
 VERTEX_COUNT = 778

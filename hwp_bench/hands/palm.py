@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.errors import BadHandModel
+from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands.landmarks import JOINT_NAMES
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT
 
 

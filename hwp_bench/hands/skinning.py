@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from hwp_bench.errors import ShapeMismatch
+from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.hands.landmarks import landmark_order
 from hwp_bench.hands.rotations import axis_angle_to_matrix
 from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, HandTemplate

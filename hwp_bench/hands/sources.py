@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.arrays import read_npz, take
-from hwp_bench.errors import BadHandModel, UsageError
+from hwp_bench.base.arrays import read_npz, take
+from hwp_bench.base.errors import BadHandModel, UsageError
 from hwp_bench.hands.landmarks import SIDES
 from hwp_bench.hands.subdivision import MANO_HD_NAME, mano_hd
 from hwp_bench.hands.template import (

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.hands.template import HandTemplate, rebuilt
 
 #: More would exceed the memory that a template may take: each time is four times the faces.

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.errors import BadHandModel
+from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands.landmarks import PARENTS, SIDES
 
 if TYPE_CHECKING:

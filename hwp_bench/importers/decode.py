@@ -11,8 +11,8 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.errors import BadInput, UsageError
-from hwp_bench.images import MAX_PIXELS
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.images import MAX_PIXELS
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from dataclasses import fields
 
 import torch
 
-from hwp_bench.errors import DidNotConverge
+from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.importers.clip_model import ClipModel, PosedClip
 
 #: First step of each variable, in its own unit; constants move slower than poses.

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.arrays import read_npz
-from hwp_bench.errors import BadInput
+from hwp_bench.base.arrays import read_npz
+from hwp_bench.base.errors import BadInput
 
 #: MediaPipe (= OpenPose) order, the order of every landmark array in this package.
 LANDMARK_NAMES = (

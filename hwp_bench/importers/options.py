@@ -6,7 +6,7 @@ import os
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.importers.decode import FrameRange
 from hwp_bench.importers.fit_settings import FitSettings
 

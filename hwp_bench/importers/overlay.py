@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hwp_bench.base.drawing import labelled, outlined, sheet
 from hwp_bench.importers.landmarks import LANDMARK_EDGES
-from hwp_bench.report.drawing import labelled, outlined, sheet
 
 #: Colour of the mesh where it faces the camera; it darkens towards its outline.
 MESH = (120, 150, 255)

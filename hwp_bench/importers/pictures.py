@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.errors import BadInput, UsageError
-from hwp_bench.images import read_gray
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.images import read_gray
 from hwp_bench.importers.crop import CropWindows, cut, resample
 from hwp_bench.importers.decode import FrameRange, VideoInfo, read_frames
 from hwp_bench.importers.outline import FIELD_SIZE

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hwp_bench.base.files import sha256_file
+from hwp_bench.base.images import write_image
+from hwp_bench.base.progress import progress
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, HandModelId
-from hwp_bench.files import sha256_file
-from hwp_bench.images import write_image
 from hwp_bench.importers.options import VideoImport
 from hwp_bench.importers.overlay import OverlayFrame, overlay_sheet
-from hwp_bench.progress import progress
 
 if TYPE_CHECKING:
     from hwp_bench.importers.video import ImportedClip

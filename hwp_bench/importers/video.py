@@ -8,8 +8,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.progress import progress
 from hwp_bench.capture.schema import MAX_FRAMES, check_id
-from hwp_bench.errors import UsageError
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.importers.contour import ContourEnergy
 from hwp_bench.importers.crop import CropWindows, follow_hand
@@ -29,7 +30,6 @@ from hwp_bench.importers.options import VideoImport
 from hwp_bench.importers.pictures import Pictures, check_memory, read_masks, read_pictures
 from hwp_bench.importers.projected import ProjectedClip, project_clip
 from hwp_bench.importers.segment import NARROW, WIDE
-from hwp_bench.progress import progress
 from hwp_bench.taxonomy import perturbation
 
 #: A frame whose landmarks are missed by more than this share of the hand's size is not valid.

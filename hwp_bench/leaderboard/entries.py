@@ -10,11 +10,11 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.errors import BadResult, UsageError
-from hwp_bench.files import atomic_write, read_json, sha256_json
+from hwp_bench.base.errors import BadResult, UsageError
+from hwp_bench.base.files import atomic_write, read_json, sha256_json
+from hwp_bench.base.records import parse_record
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.aggregate import aggregate
-from hwp_bench.records import parse_record
 from hwp_bench.results import Results
 from hwp_bench.results.schema import score_rows
 

@@ -10,14 +10,14 @@ from typing import Any
 
 from markupsafe import Markup
 
-from hwp_bench.errors import UsageError
-from hwp_bench.files import atomic_folder, canonical_json
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import atomic_folder, canonical_json
 from hwp_bench.leaderboard.entries import SUITES, Entry, check_entries, digest
-from hwp_bench.leaderboard.published import NOTE, read_published
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import aggregate
 from hwp_bench.report.page.render import render_template, style_sheet, write_report
 from hwp_bench.report.sources import Source
+from hwp_bench.results.published import NOTE, read_published
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 

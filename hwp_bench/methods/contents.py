@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Iterable
 from pathlib import Path
 
-from hwp_bench.files import files_digest, sha256_of
+from hwp_bench.base.files import files_digest, sha256_of
 
 #: Names of files that decide what a method does end in one of these; logs and pictures do not.
 CONTENT = frozenset(

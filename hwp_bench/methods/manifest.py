@@ -11,12 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.errors import BadMethod
-from hwp_bench.files import inside
+from hwp_bench.base.errors import BadMethod
+from hwp_bench.base.files import inside
+from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.text import has_odd_characters
 from hwp_bench.methods.contents import method_digest
-from hwp_bench.methods.plain import check_plain
+from hwp_bench.methods.json_values import check_plain
 from hwp_bench.methods.switches import Switch, read_switches
-from hwp_bench.text import has_odd_characters
 
 #: Version of the method contract.
 SCHEMA = "hwp-method/1"
@@ -105,7 +106,7 @@ def find_method(text: str) -> Path:
     """
     if (Path(text) / MANIFEST).is_file():
         return Path(text)
-    package = Path(__file__).resolve().parents[2]
+    package = PACKAGES
     for relative in (text.rstrip("/"), f"baselines/{text}"):
         candidate = package / relative
         if candidate.is_relative_to(package) and (candidate / MANIFEST).is_file():
@@ -206,6 +207,6 @@ def _presets(value: Any, where: Path) -> dict[str, dict[str, Any]]:
 
 def shipped_methods() -> list[MethodManifest]:
     """Return the methods that ship with the toolkit: the reference entry and the baselines."""
-    package = Path(__file__).resolve().parents[2]
+    package = PACKAGES
     folders = [package / "wildghand", *sorted((package / "baselines").iterdir())]
     return [read_manifest(folder) for folder in folders if (folder / MANIFEST).is_file()]

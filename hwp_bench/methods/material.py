@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hwp_bench.base.errors import UsageError
 from hwp_bench.capture.layout import IMAGE_FOLDERS
-from hwp_bench.errors import UsageError
+from hwp_bench.capture.splits import Split
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.splits import Split
 
 if TYPE_CHECKING:
     from hwp_bench.capture import Capture

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.errors import BadImage
+from hwp_bench.base.images import read_rgb
 from hwp_bench.capture.layout import frame_name
-from hwp_bench.errors import BadImage
-from hwp_bench.images import read_rgb
 
 
 @dataclass(frozen=True, eq=False)

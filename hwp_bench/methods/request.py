@@ -16,16 +16,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.files import atomic_folder, read_json, write_json
+from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.capture.layout import CAMERAS, HANDS, image_path
 from hwp_bench.capture.schema import SIDES, HandModelId
+from hwp_bench.capture.splits import Split
 from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands, write_cameras, write_hands
-from hwp_bench.errors import BadInput, UsageError
-from hwp_bench.files import atomic_folder, read_json, write_json
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.images import read_gray, read_rgb
 from hwp_bench.methods.contract import Budget, Camera, HandPose
 from hwp_bench.methods.material import FRAME_CHOICES, training_material
-from hwp_bench.splits import Split
 
 if TYPE_CHECKING:
     from hwp_bench.capture import Capture
@@ -126,7 +126,7 @@ class TrainingCapture:
         Raises:
             BadInput: the template that is installed here is another than the capture's.
         """
-        from hwp_bench.hands.matching import load_matching_template
+        from hwp_bench.capture.hand_model import load_matching_template
 
         if side not in self.sides:
             raise UsageError(f"this capture has no {side} hand", where=self.root)

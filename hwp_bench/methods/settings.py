@@ -14,7 +14,7 @@ import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
-from hwp_bench.errors import BadMethod, HwpError
+from hwp_bench.base.errors import BadMethod, HwpError
 
 Settings = TypeVar("Settings")
 

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.errors import BadMethod
-from hwp_bench.methods.plain import check_plain
-from hwp_bench.text import has_odd_characters
+from hwp_bench.base.errors import BadMethod
+from hwp_bench.base.text import has_odd_characters
+from hwp_bench.methods.json_values import check_plain
 
 #: Kinds of switch by the key that holds its settings.
 KINDS = ("settings_off", "settings_on")

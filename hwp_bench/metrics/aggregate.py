@@ -11,7 +11,7 @@ from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
-from hwp_bench.errors import BadResult
+from hwp_bench.base.errors import BadResult
 
 Scores = dict[str, float]
 

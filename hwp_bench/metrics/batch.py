@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.errors import EmptyMask, HwpError
+from hwp_bench.base.errors import EmptyMask, HwpError
 from hwp_bench.metrics.pixels import check_prediction, check_truth
 from hwp_bench.metrics.protocol import PROTOCOLS, Protocol
 from hwp_bench.metrics.score import Network, score_frame

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.errors import BadInput, ShapeMismatch
+from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.metrics.pixels import check_same_shape
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hwp_bench.errors import BadInput, MissingDependency, UsageError
+from hwp_bench.base.errors import BadInput, MissingDependency, UsageError
 
 if TYPE_CHECKING:
     from hwp_bench.metrics.lpips import Lpips

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.errors import BadImage, BadPrediction, ShapeMismatch
+from hwp_bench.base.errors import BadImage, BadPrediction, ShapeMismatch
 
 
 def quantize(image: np.ndarray) -> np.ndarray:

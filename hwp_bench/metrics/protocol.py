@@ -10,7 +10,7 @@ import difflib
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 
 #: Score of identical images, in dB; keeps means finite.
 PSNR_CAP = 100.0

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.errors import EmptyMask
+from hwp_bench.base.errors import EmptyMask
 from hwp_bench.metrics.pixels import check_same_shape
 from hwp_bench.metrics.protocol import HWP_V1, PSNR_CAP
 from hwp_bench.metrics.region import bounding_box

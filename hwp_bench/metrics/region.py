@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hwp_bench.errors import EmptyMask
+from hwp_bench.base.errors import EmptyMask
 
 #: A mask value above this means "hand".
 MASK_THRESHOLD = 127

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.errors import ShapeMismatch
+from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.metrics.perceptual import oriented_distance
 from hwp_bench.metrics.pixels import check_prediction, check_truth
 from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, Protocol

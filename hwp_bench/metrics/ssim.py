@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from hwp_bench.errors import ShapeMismatch
+from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.metrics.pixels import check_same_shape
 from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, SsimSettings
 from hwp_bench.metrics.region import bounding_box, composite, crop

@@ -6,7 +6,7 @@ import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, PSNR_CAP, Protocol
 
 

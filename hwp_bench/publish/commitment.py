@@ -11,10 +11,10 @@ import hashlib
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from hwp_bench.base.files import canonical_json
+from hwp_bench.base.images import pixel_digest
 from hwp_bench.capture import Capture
-from hwp_bench.files import canonical_json
-from hwp_bench.images import pixel_digest
-from hwp_bench.splits import Split
+from hwp_bench.capture.splits import Split
 
 #: Version of what is committed to.
 SCHEME = "hwp-commitment/1"

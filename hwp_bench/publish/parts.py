@@ -11,13 +11,13 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hwp_bench import __version__
+from hwp_bench.base.errors import BadCapture, UsageError
+from hwp_bench.base.files import atomic_folder, write_json
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.layout import CAMERAS, HANDS, IMAGE_FOLDERS, METADATA, TRUE_HANDS
-from hwp_bench.errors import BadCapture, UsageError
-from hwp_bench.files import atomic_folder, write_json
+from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.methods.request import RunSettings, write_request
 from hwp_bench.publish.commitment import SALT_BYTES, commitment, joint_commitment, target_content
-from hwp_bench.splits import Split, split_for
 
 #: Version of the public manifest.
 PUBLIC_SCHEMA = "hwp-public/1"

@@ -8,13 +8,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.files import read_json
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.schema import check_id
-from hwp_bench.errors import BadInput
-from hwp_bench.files import read_json
+from hwp_bench.capture.splits import Split
 from hwp_bench.publish.commitment import SALT_BYTES, commitment, joint_commitment, target_content
 from hwp_bench.publish.parts import KEY, MANIFEST, PUBLIC_SCHEMA, SEALED_SCHEMA
-from hwp_bench.splits import Split
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.errors import BadResult, HwpError
+from hwp_bench.base.files import cache_root, inside, read_json, sha256_json
+from hwp_bench.base.records import parse_record
 from hwp_bench.capture.schema import CaptureInfo
-from hwp_bench.errors import BadResult, HwpError
-from hwp_bench.files import cache_root, inside, read_json, sha256_json
-from hwp_bench.records import parse_record
 from hwp_bench.results import Results, read_results, result_files
 
 #: Largest file of temporal weights that is read, bytes.

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.analysis.statistics.compare import macro_by_seed
+from hwp_bench.analysis.statistics.pairing import MethodRuns, common_metrics, group_runs
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture.schema import CaptureInfo
-from hwp_bench.errors import UsageError
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import aggregate
 from hwp_bench.report.sources import Source, mean_severity, mean_temporal_weight
 from hwp_bench.report.summary import HEADLINE, labels, score_column
-from hwp_bench.report.table import Cell, Column, Table
 from hwp_bench.results.schema import score_rows
-from hwp_bench.statistics.compare import macro_by_seed
-from hwp_bench.statistics.pairing import MethodRuns, common_metrics, group_runs
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: Metrics of the robustness table.

@@ -6,11 +6,11 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 
-from hwp_bench.errors import UsageError
-from hwp_bench.files import atomic_write
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import atomic_write
+from hwp_bench.base.tables import FORMATS, Cell, Column, Table, spell
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
 from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
-from hwp_bench.report.table import FORMATS, Cell, Column, Table, spell
 from hwp_bench.results import Results
 from hwp_bench.results.differences import differing_settings
 from hwp_bench.results.schema import score_rows

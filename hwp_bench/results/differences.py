@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hwp_bench.files import canonical_json
+from hwp_bench.base.files import canonical_json
 from hwp_bench.results import Results
 
 # Longest text of a value.

@@ -5,10 +5,10 @@ from __future__ import annotations
 import os
 import platform
 from importlib import metadata
-from pathlib import Path
 from typing import Any
 
-from hwp_bench.files import files_digest
+from hwp_bench.base import packages
+from hwp_bench.base.files import files_digest
 
 #: Packages whose version can move a number.
 PACKAGES = (
@@ -52,7 +52,7 @@ def environment() -> dict[str, Any]:
 
 def code_digest() -> str:
     """Return the SHA-256 (hex) of the toolkit's own modules: names and contents."""
-    root = Path(__file__).resolve().parents[1]
+    root = packages.PACKAGES / "hwp_bench"
     return files_digest(root, root.rglob("*.py"))
 
 

@@ -6,8 +6,8 @@ import os
 from collections.abc import Iterable
 from pathlib import Path
 
-from hwp_bench.errors import BadResult
-from hwp_bench.files import inside, read_json
+from hwp_bench.base.errors import BadResult
+from hwp_bench.base.files import inside, read_json
 from hwp_bench.results.schema import Results, read_results
 
 #: Name of the file that makes a folder an ablation.

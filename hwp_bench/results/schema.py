@@ -7,10 +7,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.errors import BadResult
-from hwp_bench.files import read_json, write_json
+from hwp_bench.base.errors import BadResult
+from hwp_bench.base.files import read_json, write_json
+from hwp_bench.base.records import parse_record
 from hwp_bench.metrics.aggregate import CaptureScores
-from hwp_bench.records import parse_record
 
 #: Version of the result file.
 SCHEMA = "hwp-results/1"

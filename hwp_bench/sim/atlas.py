@@ -10,9 +10,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.arrays import read_npz
-from hwp_bench.errors import BadInput
-from hwp_bench.files import atomic_write, cache_root, sha256_json
+from hwp_bench.base.arrays import read_npz
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.files import atomic_write, cache_root, sha256_json
 from hwp_bench.sim.mesh import unit, vertex_normals
 from hwp_bench.sim.raycast import Tracer
 from hwp_bench.sim.scene import Subject

@@ -9,8 +9,8 @@ from types import MappingProxyType
 
 import numpy as np
 
-from hwp_bench.errors import BadInput
-from hwp_bench.sim.colors import srgb_to_linear
+from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.noise import fractal_noise
 from hwp_bench.sim.seeds import generator
 

@@ -17,11 +17,11 @@ from types import MappingProxyType
 
 import numpy as np
 
-from hwp_bench.errors import BadInput, UsageError
-from hwp_bench.files import atomic_write
-from hwp_bench.progress import track
+from hwp_bench.base.colors import linear_to_srgb
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.files import atomic_write
+from hwp_bench.base.progress import track
 from hwp_bench.sim.camera import intrinsics, viewmat
-from hwp_bench.sim.colors import linear_to_srgb
 from hwp_bench.sim.effects import registered
 from hwp_bench.sim.frame import carry_out
 from hwp_bench.sim.ledger import Ledger

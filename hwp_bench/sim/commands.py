@@ -8,11 +8,11 @@ from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.sim.scene import Scene, load_scene, scene_names
 
 if TYPE_CHECKING:
-    from hwp_bench.engine import Engine
+    from hwp_bench.run.engine import Engine
 
 
 def list_scenes(args: argparse.Namespace) -> int:
@@ -78,7 +78,7 @@ def print_plan(args: argparse.Namespace) -> int:
 
 def render(args: argparse.Namespace) -> int:
     """Render captures and print their folders."""
-    from hwp_bench.engine.options import engine_for, needs_of
+    from hwp_bench.run.engine.options import engine_for, needs_of
     from hwp_bench.sim.suites import ensure_suite
 
     if (args.suite is None) == (args.scene is None):
@@ -105,7 +105,7 @@ def render(args: argparse.Namespace) -> int:
 
 
 def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine) -> list[Path]:
-    from hwp_bench.engine.options import needs_of
+    from hwp_bench.run.engine.options import needs_of
     from hwp_bench.sim.jobs import RenderCapture, render_job, workers_each
 
     needs = needs_of(args)

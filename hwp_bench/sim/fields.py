@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 
 
 class Fields:

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hwp_bench.base.colors import eight_bit_srgb
 from hwp_bench.sim.camera import intrinsics, viewmat
-from hwp_bench.sim.colors import eight_bit_srgb
 from hwp_bench.sim.effects import SENSOR, registered
 from hwp_bench.sim.exposure import Rows, Window, exposed
 from hwp_bench.sim.ledger import Ledger

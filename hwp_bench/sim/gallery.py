@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.files import atomic_write
-from hwp_bench.progress import track
+from hwp_bench.base.files import atomic_write
+from hwp_bench.base.progress import track
 from hwp_bench.sim.camera import intrinsics
 from hwp_bench.sim.effects import registered
 from hwp_bench.sim.frame import FrameResult, render_frame

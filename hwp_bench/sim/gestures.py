@@ -10,7 +10,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 
 #: Order of the fingers in an articulation.
 FINGERS = ("thumb", "index", "middle", "ring", "little")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.errors import BadHandModel
+from hwp_bench.base.errors import BadHandModel
 
 #: Largest file that is read, in bytes.
 MAX_BYTES = 256 * 1024 * 1024
@@ -103,7 +103,7 @@ class Gltf:
                 return base64.b64decode(uri.split(",", 1)[1])
             except (IndexError, binascii.Error) as error:
                 raise self._wrong("holds damaged data") from error
-        from hwp_bench.files import inside
+        from hwp_bench.base.files import inside
 
         return inside(self._path.parent, uri).read_bytes()
 
@@ -145,7 +145,7 @@ class Gltf:
         elif (image.uri or "").startswith("data:"):
             raw = base64.b64decode(image.uri.split(",", 1)[1])
         else:
-            from hwp_bench.files import inside
+            from hwp_bench.base.files import inside
 
             raw = inside(self._path.parent, image.uri).read_bytes()
         pixels = cv2.imdecode(np.frombuffer(raw, dtype=np.uint8), cv2.IMREAD_COLOR)

@@ -7,9 +7,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hwp_bench.engine import Engine, Job, Needs
-from hwp_bench.engine.job import Report
-from hwp_bench.errors import HwpError
+from hwp_bench.base.errors import HwpError
+from hwp_bench.run.engine import Engine, Job, Needs
+from hwp_bench.run.engine.job import Report
 from hwp_bench.sim.scene import Scene
 
 #: Seconds between two counts of the frames that wait.
@@ -38,7 +38,7 @@ class RenderCapture:
     overwrite: bool = False
 
     def __call__(self, inputs: Mapping[str, Path], output: Path, report: Report) -> None:
-        """Render; see `hwp_bench.engine.job.Work`."""
+        """Render; see `hwp_bench.run.engine.job.Work`."""
         ended = threading.Event()
         watch = threading.Thread(target=self._count, args=(output, report, ended), daemon=True)
         watch.start()

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.errors import HwpError
+from hwp_bench.base.errors import HwpError
 from hwp_bench.sim.camera import intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.frame import FrameResult
 from hwp_bench.sim.ledger import Ledger

@@ -6,8 +6,8 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from hwp_bench.errors import HwpError
-from hwp_bench.progress import notice
+from hwp_bench.base.errors import HwpError
+from hwp_bench.base.progress import notice
 
 
 @contextlib.contextmanager

@@ -7,10 +7,10 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.errors import UsageError
-from hwp_bench.files import atomic_write
-from hwp_bench.images import write_image
-from hwp_bench.progress import track
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import atomic_write
+from hwp_bench.base.images import write_image
+from hwp_bench.base.progress import track
 from hwp_bench.sim.frame import FrameResult, render_frame
 from hwp_bench.sim.scene import Scene
 

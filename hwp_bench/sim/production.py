@@ -18,6 +18,10 @@ from typing import IO, Any
 
 import numpy as np
 
+from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.files import canonical_json, sha256_json
+from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.progress import progress
 from hwp_bench.capture import (
     Cameras,
     Capture,
@@ -26,10 +30,7 @@ from hwp_bench.capture import (
     HandModelId,
     open_capture,
 )
-from hwp_bench.errors import HwpError, UsageError
-from hwp_bench.files import canonical_json, sha256_json
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.progress import progress
 from hwp_bench.sim.atlas import skin_atlas
 from hwp_bench.sim.camera import focus_point, intrinsics, viewmat
 from hwp_bench.sim.estimates import estimate_hands, estimate_mask
@@ -157,7 +158,7 @@ def _render_missing(
 
 
 def _start(job: tuple[Any, ...], log: IO[bytes]) -> subprocess.Popen[bytes]:
-    root = os.fspath(Path(__file__).resolve().parents[2])
+    root = os.fspath(PACKAGES)
     known = os.environ.get("PYTHONPATH")
     environment = {
         **os.environ,

@@ -13,7 +13,7 @@ from types import MappingProxyType
 
 import numpy as np
 
-from hwp_bench.errors import BadHandModel, MissingDependency
+from hwp_bench.base.errors import BadHandModel, MissingDependency
 from hwp_bench.hands import HandTemplate, mirror_template
 from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, make_template
 from hwp_bench.sim.gltf import Gltf

@@ -15,8 +15,8 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.errors import BadInput, UsageError
-from hwp_bench.files import sha256_json
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.files import sha256_json
 from hwp_bench.sim.fields import Fields
 from hwp_bench.taxonomy import MAX_SEVERITY, PERTURBATIONS
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.sim.colors import lamp_color
+from hwp_bench.base.colors import lamp_color
 from hwp_bench.sim.mesh import unit
 from hwp_bench.sim.raycast import Hits
 from hwp_bench.sim.scene import Light

@@ -10,8 +10,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.sim.anatomy import Anatomy
-from hwp_bench.sim.colors import srgb_to_linear
 from hwp_bench.sim.noise import fractal_noise
 from hwp_bench.sim.scene import Subject
 from hwp_bench.sim.seeds import generator

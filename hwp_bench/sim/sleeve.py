@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.sim.colors import srgb_to_linear
+from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.sim.mesh import boundary_loop, normal_operator, unit, vertex_normals
 from hwp_bench.sim.noise import fractal_noise
 from hwp_bench.sim.seeds import generator

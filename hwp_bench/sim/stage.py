@@ -7,9 +7,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.sim.atlas import skin_atlas
 from hwp_bench.sim.camera import focus_point
-from hwp_bench.sim.colors import srgb_to_linear
 from hwp_bench.sim.effects.base import Placement
 from hwp_bench.sim.ledger import Ledger
 from hwp_bench.sim.mesh import unit

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.errors import MissingDependency
+from hwp_bench.base.errors import MissingDependency
 from hwp_bench.sim.camera import focus_point, viewmat
 from hwp_bench.sim.ledger import Ledger
 from hwp_bench.sim.plan import hands_at, lights_at, objects_at, plan

@@ -8,9 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from hwp_bench.engine import Engine, LocalEngine, Needs
-from hwp_bench.errors import UsageError
-from hwp_bench.files import cache_root
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import cache_root
+from hwp_bench.run.engine import Engine, LocalEngine, Needs
 from hwp_bench.sim.scene import Scene, load_scene, scene_names
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import replace
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.sim.scene import Scene, Subject
 from hwp_bench.sim.seeds import generator
 from hwp_bench.taxonomy import MAX_SEVERITY

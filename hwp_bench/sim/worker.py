@@ -15,9 +15,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.arrays import read_npz
-from hwp_bench.errors import BadInput
-from hwp_bench.files import atomic_write
+from hwp_bench.base.arrays import read_npz
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.files import atomic_write
 from hwp_bench.sim.scene import Scene
 
 

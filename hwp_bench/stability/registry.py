@@ -19,7 +19,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib import metadata
 
-from hwp_bench.errors import HwpError, MissingDependency, UsageError
+from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 
 #: Entry-point group of functions that return cases.
 ENTRY_POINTS = "hwp_bench.stability"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 
 #: Severity runs from 0 (absent) to this.
 MAX_SEVERITY = 5

@@ -10,7 +10,7 @@ import pytest
 
 from baselines.plain.method import PlainMethod
 from baselines.plain.settings import PlainSettings, read_settings
-from hwp_bench.errors import BadMethod
+from hwp_bench.base.errors import BadMethod
 from hwp_bench.methods import find_method, read_manifest
 
 

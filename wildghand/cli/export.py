@@ -26,12 +26,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.errors import UsageError
     from hwp_bench.capture import open_capture
-    from hwp_bench.errors import UsageError
     from hwp_bench.methods.contract import HandPose
-    from wildghand.avatar_files import load_avatar
-    from wildghand.playback import rest_poses
-    from wildghand.ply import write_ply
+    from wildghand.avatar.files import load_avatar
+    from wildghand.avatar.playback import rest_poses
+    from wildghand.avatar.ply import write_ply
 
     avatar = load_avatar(args.avatar, hand=args.hand)
     hands = rest_poses(avatar)

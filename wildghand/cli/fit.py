@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="a setting (wildghand/settings.py); may be given again",
+        help="a setting (wildghand/model/settings.py); may be given again",
     )
     parser.add_argument(
         "--prior",
@@ -60,9 +60,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command, alone or with the processes that torchrun started."""
-    from wildghand.device import choose_device
     from wildghand.fit.parallel import run_in_world
-    from wildghand.settings import read_settings
+    from wildghand.gaussians.device import choose_device
+    from wildghand.model.settings import read_settings
 
     return run_in_world(
         lambda: choose_device(read_settings(_settings(args)).device),
@@ -71,7 +71,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _run(args: argparse.Namespace, world: World) -> int:
-    from hwp_bench.errors import UsageError
+    from hwp_bench.base.errors import UsageError
     from hwp_bench.methods.contract import Budget
     from wildghand.fit.session import fit_capture
 
@@ -128,7 +128,7 @@ def _shared_capture(args: argparse.Namespace, world: World) -> Path:
 
 def _capture(args: argparse.Namespace) -> Path:
     """The capture folder; made of a video where the source is one."""
-    from hwp_bench.errors import UsageError
+    from hwp_bench.base.errors import UsageError
 
     if args.source.is_dir() or not args.source.exists():
         return args.source

@@ -36,7 +36,7 @@ def run(args: argparse.Namespace) -> int:
     if args.network:
         _print_network(args.network, args.json)
         return 0
-    from hwp_bench.report.table import Column, Table, print_table
+    from hwp_bench.base.tables import Column, Table, print_table
     from hwp_bench.results.environment import environment
 
     facts = environment()
@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _print_network(size: str, as_json: bool) -> None:
     """List the parameters of one size of the network."""
-    from hwp_bench.report.table import Column, Table, print_table
+    from hwp_bench.base.tables import Column, Table, print_table
     from wildghand.network.settings import network_settings
     from wildghand.network.table import blank_network, parameter_table
 
@@ -94,7 +94,7 @@ def _check(backend: str) -> dict[str, Any]:
     """Draw a seeded scene and compare it with the reference."""
     import torch
 
-    from hwp_bench.errors import HwpError
+    from hwp_bench.base.errors import HwpError
     from wildghand.splat import rasterize
 
     generator = torch.Generator().manual_seed(0)

@@ -36,8 +36,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.files import write_json
     from hwp_bench.capture import open_capture
-    from hwp_bench.files import write_json
 
     capture = open_capture(args.capture)
     judgement, levels = _judge(capture)
@@ -57,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
 def _judge(capture: Capture) -> tuple[Judgement, dict[str, np.ndarray]]:
     import numpy as np
 
-    from hwp_bench.progress import track
+    from hwp_bench.base.progress import track
     from wildghand.prepass.judge import capture_input, judge_frames
     from wildghand.prepass.severity import estimated_severity
 
@@ -81,7 +81,7 @@ def _record(
 
 
 def _print(capture: Capture, judgement: Judgement, levels: dict[str, np.ndarray]) -> None:
-    from hwp_bench.report.table import Column, Table, print_table
+    from hwp_bench.base.tables import Column, Table, print_table
 
     count = len(judgement)
     rows: list[tuple[str, int, float | None]] = [
@@ -102,7 +102,7 @@ def _draw(judgement: Judgement, levels: dict[str, np.ndarray], path: Path) -> No
 
     from matplotlib.figure import Figure
 
-    from hwp_bench.files import atomic_write
+    from hwp_bench.base.files import atomic_write
 
     figure = Figure(figsize=(9.0, 3.6), layout="constrained")
     clean, severity = figure.subplots(2, 1, sharex=True)

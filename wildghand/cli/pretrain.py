@@ -34,7 +34,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="a setting of the fit (wildghand/settings.py); may be given again",
+        help="a setting of the fit (wildghand/model/settings.py); may be given again",
     )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing prior")
     parser.add_argument("--json", action="store_true", help="print JSON")
@@ -42,10 +42,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.errors import UsageError
     from hwp_bench.cli.overrides import overrides
-    from hwp_bench.errors import UsageError
     from wildghand.pretrain.session import pretrain
-    from wildghand.prior_files import WEIGHTS
+    from wildghand.prior.files import WEIGHTS
 
     if args.steps is not None and args.steps < 1:
         raise UsageError(f"is {args.steps}", field="--steps", remedy="Use 1 or more.")

@@ -35,10 +35,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.errors import UsageError
     from hwp_bench.capture import open_capture
-    from hwp_bench.errors import UsageError
-    from wildghand.avatar_files import load_avatar
-    from wildghand.playback import render_clip
+    from wildghand.avatar.files import load_avatar
+    from wildghand.avatar.playback import render_clip
 
     if not 0 <= args.background <= 255:
         raise UsageError(f"is {args.background}", field="--background", remedy="Use 0 to 255.")
@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _frames(text: str | None, count: int) -> range:
-    from hwp_bench.errors import UsageError
+    from hwp_bench.base.errors import UsageError
 
     if text is None:
         return range(count)

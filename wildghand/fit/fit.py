@@ -10,19 +10,19 @@ import numpy as np
 import torch
 
 from hwp_bench.methods.request import TrainingCapture
-from wildghand.assemble import assemble, make_rigs
-from wildghand.avatar import FitRecord, WildGHandAvatar
-from wildghand.dpd import drop
-from wildghand.fit.clip import TrainingClip
-from wildghand.fit.frames import load_frames
+from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
+from wildghand.dpd.dpd import drop
+from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fit.objective import Objective
 from wildghand.fit.parallel import ALONE, World, average_gradients, digest_of
 from wildghand.fit.rates import make_optimizer, set_rates
-from wildghand.fit.temporal import TemporalTarget
 from wildghand.fit.weighting import Weighting
-from wildghand.model import Drawing
-from wildghand.prior_files import choose_prior
-from wildghand.settings import WildGHandSettings
+from wildghand.gaussians.clip import TrainingClip
+from wildghand.gaussians.frames import load_frames
+from wildghand.model.assemble import assemble, make_rigs
+from wildghand.model.model import Drawing
+from wildghand.model.settings import WildGHandSettings
+from wildghand.prior.files import choose_prior
 
 
 class Fit:

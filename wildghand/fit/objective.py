@@ -6,15 +6,15 @@ from collections.abc import Mapping
 
 from torch import Tensor
 
-from wildghand import terms
-from wildghand.attributes import RawAttributes
-from wildghand.fit.temporal import TemporalTarget
+from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fit.weighting import Target
-from wildghand.laplacian import surface_laplacian
-from wildghand.model import Drawing, WildGHandModel
-from wildghand.perceptual import FilterBank
-from wildghand.rig import HandRig
-from wildghand.settings import WildGHandSettings
+from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.laplacian import surface_laplacian
+from wildghand.gaussians.perceptual import FilterBank
+from wildghand.gaussians.rig import HandRig
+from wildghand.model import terms
+from wildghand.model.model import Drawing, WildGHandModel
+from wildghand.model.settings import WildGHandSettings
 
 
 class Objective:

@@ -7,14 +7,14 @@ from typing import Any
 
 import torch
 
+from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Budget, Report
-from hwp_bench.progress import notice
-from wildghand.avatar import WildGHandAvatar
+from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fit.fit import Fit
-from wildghand.fit.guard import Guard
 from wildghand.fit.parallel import World
 from wildghand.fit.plateau import Plateau
-from wildghand.fit.schedule import batches, spent
+from wildghand.gaussians.guard import Guard
+from wildghand.gaussians.schedule import batches, spent
 
 
 class Watchers:

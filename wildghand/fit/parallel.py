@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hwp_bench.errors import HwpError, MissingDependency, UsageError
+from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 
 #: Longest that a process waits for the others; the leader alone imports videos and writes.
 TIMEOUT = datetime.timedelta(hours=1)

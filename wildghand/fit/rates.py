@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import torch
 
-from wildghand.model import WildGHandModel
+from wildghand.model.model import WildGHandModel
+from wildghand.model.settings import WildGHandSettings
 from wildghand.network import parameter_groups
-from wildghand.pao import PerturbationAwareWeights
-from wildghand.settings import WildGHandSettings
+from wildghand.pao.pao import PerturbationAwareWeights
 
 # Gradients of a mean over all pixels are small beside Adam's usual 1e-8.
 _EPSILON = 1e-15

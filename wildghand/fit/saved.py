@@ -11,8 +11,8 @@ from typing import Any, Protocol
 
 import torch
 
-from hwp_bench.errors import BadInput
-from hwp_bench.files import atomic_write
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.files import atomic_write
 from wildghand.fit.optimise import Watchers
 
 #: Version of the file.

@@ -9,22 +9,22 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.files import sha256_file, sha256_json
+from hwp_bench.base.locks import sole_use
+from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.errors import HwpError, UsageError
-from hwp_bench.files import sha256_file, sha256_json
+from hwp_bench.capture.splits import Split, contiguous_split
 from hwp_bench.methods.contract import Avatar, Budget
 from hwp_bench.methods.request import REQUEST, RunSettings, open_request, write_request
-from hwp_bench.progress import notice, progress
-from hwp_bench.sole import sole_use
-from hwp_bench.splits import Split, contiguous_split
-from wildghand.avatar import WildGHandAvatar
-from wildghand.avatar_files import save_avatar
-from wildghand.device import choose_device
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.avatar.files import save_avatar
 from wildghand.fit.fit import Fit
 from wildghand.fit.optimise import Watchers, optimise
 from wildghand.fit.parallel import ALONE, World
 from wildghand.fit.saved import load_state, save_state
-from wildghand.settings import WildGHandSettings, read_settings
+from wildghand.gaussians.device import choose_device
+from wildghand.model.settings import WildGHandSettings, read_settings
 
 #: Seconds between two saved states.
 SAVE_EVERY = 20.0

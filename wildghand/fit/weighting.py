@@ -9,16 +9,16 @@ import torch
 from torch import Tensor
 
 from hwp_bench.methods.request import TrainingCapture
-from wildghand.fit.frames import TrainingFrames
 from wildghand.fit.parallel import ALONE, World
-from wildghand.model import Drawing
-from wildghand.pao import PerturbationAwareWeights
+from wildghand.gaussians.frames import TrainingFrames
+from wildghand.model.model import Drawing
+from wildghand.model.settings import WildGHandSettings
+from wildghand.pao.pao import PerturbationAwareWeights
+from wildghand.pao.regions import FrameRegions, Regions, stack_regions
+from wildghand.pao.regions.cache import RegionCache
+from wildghand.pao.regions.superpixels import Superpixels
+from wildghand.pao.robust import blended_residual, residual_weights, running_median
 from wildghand.prepass import Judgement, PrepassInput, judge_frames
-from wildghand.regions import FrameRegions, Regions, stack_regions
-from wildghand.regions.cache import RegionCache
-from wildghand.regions.superpixels import Superpixels
-from wildghand.robust import blended_residual, residual_weights, running_median
-from wildghand.settings import WildGHandSettings
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from wildghand.attributes import CHANNELS, RawAttributes
+from wildghand.gaussians.attributes import CHANNELS, RawAttributes
 from wildghand.network.encoding import POSITION_CHANNELS
 from wildghand.network.initial import DIRECT_GAINS
 from wildghand.network.settings import NetworkSettings

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 import torch
 from torch import Tensor, nn
 
-from wildghand.attributes import CHANNELS
+from wildghand.gaussians.attributes import CHANNELS
 from wildghand.network.settings import NetworkSettings
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from wildghand.anchored import flat_gaussians
-from wildghand.attributes import SIZES, RawAttributes
+from wildghand.gaussians.anchored import flat_gaussians
+from wildghand.gaussians.attributes import SIZES, RawAttributes
 from wildghand.network.settings import NetworkSettings
 from wildghand.network.surface import SurfacePoints
 

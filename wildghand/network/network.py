@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from hwp_bench.errors import ShapeMismatch, UsageError
-from wildghand.attributes import Activation, RawAttributes
+from hwp_bench.base.errors import ShapeMismatch, UsageError
+from wildghand.gaussians.attributes import Activation, RawAttributes
 from wildghand.network.chart import Chart
 from wildghand.network.compact import CompactGeometry, CompactTexture
 from wildghand.network.encoding import POSITION_CHANNELS

@@ -8,12 +8,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import silu
 
+from wildghand.gaussians.shading import sh_basis, sh_count
 from wildghand.network.chart import COORDINATES, Chart
 from wildghand.network.encoding import encode_pose
 from wildghand.network.identity import IdentityMap
 from wildghand.network.pointnet import LocalPointNet
 from wildghand.network.settings import NetworkSettings
-from wildghand.shading import sh_basis, sh_count
 
 #: Hidden width of a transformer layer in units of its token width.
 EXPANSION = 4

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 
 
 class FixedGather(nn.Module):

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Any
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.hands.landmarks import SIDES
 from hwp_bench.methods.settings import choice, number
-from wildghand.attributes import CHANNELS
+from wildghand.gaussians.attributes import CHANNELS
 
 #: The sizes by name.
 SIZES = ("compact", "paper")

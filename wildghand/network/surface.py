@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.errors import BadInput, ShapeMismatch
+from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.hands import HandTemplate, SurfaceAnchors, anchor_uv
 
 

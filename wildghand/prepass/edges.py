@@ -5,7 +5,7 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from hwp_bench.sim.colors import srgb_to_linear
+from hwp_bench.base.colors import srgb_to_linear
 
 # Reach of a profile to either side of the border, share of the picture's edge.
 _REACH = 0.1

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from wildghand.gaussians.shading import sh_basis
 from wildghand.prepass.mode import densest
 from wildghand.prepass.settings import PrepassSettings
-from wildghand.shading import sh_basis
 
 #: 8-bit values outside this range say nothing about the light: noise, or clipped.
 LOWEST, HIGHEST = 4, 250

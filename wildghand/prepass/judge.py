@@ -9,8 +9,8 @@ from dataclasses import dataclass, replace
 import cv2
 import numpy as np
 
+from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.capture import Cameras, Capture
-from hwp_bench.errors import BadInput, ShapeMismatch
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.methods.request import TrainingCapture
 from wildghand.prepass.conclusion import conclude

@@ -11,10 +11,10 @@ from torch import Tensor
 from hwp_bench.methods.request import TrainingCapture
 from wildghand.fit.fit import Fit
 from wildghand.fit.rates import make_optimizer
-from wildghand.fit.schedule import batches
+from wildghand.gaussians.schedule import batches
+from wildghand.model.settings import WildGHandSettings
 from wildghand.network import PredictionNetwork
-from wildghand.prior import MAPS, mean_weights
-from wildghand.settings import WildGHandSettings
+from wildghand.prior.prior import MAPS, mean_weights
 
 # Children of a network that belong to its subject.
 _OWN = ("identity", "charts")

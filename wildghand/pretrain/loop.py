@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from hwp_bench.progress import notice
+from hwp_bench.base.progress import notice
 from wildghand.fit.optimise import Watchers
 from wildghand.pretrain.joint import JointFit
 

@@ -8,22 +8,22 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import sha256_file, sha256_json
+from hwp_bench.base.locks import sole_use
+from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.errors import UsageError
-from hwp_bench.files import sha256_file, sha256_json
 from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.request import REQUEST, RunSettings, open_request, write_request
-from hwp_bench.progress import notice, progress
-from hwp_bench.sole import sole_use
-from wildghand.device import choose_device
 from wildghand.fit.optimise import Watchers
 from wildghand.fit.saved import load_state, save_state
 from wildghand.fit.session import SAVE_EVERY, STATE, every_frame
+from wildghand.gaussians.device import choose_device
+from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.pretrain.joint import JointFit
 from wildghand.pretrain.loop import take_steps
-from wildghand.prior import Prior
-from wildghand.prior_files import save_prior
-from wildghand.settings import WildGHandSettings, read_settings
+from wildghand.prior.files import save_prior
+from wildghand.prior.prior import Prior
 
 
 def pretrain(

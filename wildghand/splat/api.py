@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from wildghand.splat.conventions import MAX_COLOR
 from wildghand.splat.layout import check_options, flatten
 from wildghand.splat.scene import Options, Scene, unflattened

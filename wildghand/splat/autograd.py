@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from hwp_bench.errors import HwpError
+from hwp_bench.base.errors import HwpError
 from wildghand.splat.backward_stages import (
     BlendGradients,
     ProjectGradients,

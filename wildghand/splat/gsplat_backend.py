@@ -14,7 +14,7 @@ from typing import Any
 
 import torch
 
-from hwp_bench.errors import MissingDependency
+from hwp_bench.base.errors import MissingDependency
 from wildghand.splat import conventions as rules
 from wildghand.splat.scene import Scene, channels_with_depth
 

@@ -6,7 +6,7 @@ import math
 
 import torch
 
-from hwp_bench.errors import ShapeMismatch, UsageError
+from hwp_bench.base.errors import ShapeMismatch, UsageError
 from wildghand.splat.conventions import RASTERIZE_MODES, RENDER_MODES
 from wildghand.splat.scene import Options, Scene
 

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 import psutil
 
-from hwp_bench.errors import HwpError
+from hwp_bench.base.errors import HwpError
 from wildghand.splat.kernels import geometry
 from wildghand.splat.kernels.bins import count_tiles, fill_tiles, place_tiles
 from wildghand.splat.kernels.blend import blend

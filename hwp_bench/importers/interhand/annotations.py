@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.files import inside, read_json
 from hwp_bench.capture.schema import MAX_FRAMES
-from hwp_bench.errors import BadInput
-from hwp_bench.files import inside, read_json
 from hwp_bench.importers.interhand.sequences import SPLITS, Sequence
 
 #: Largest annotation file; the training part's `data` file has about 1 GB.

@@ -16,19 +16,19 @@ from typing import Any
 import numpy as np
 import torch
 
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.images import read_rgb
+from hwp_bench.base.progress import progress
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, HandModelId
-from hwp_bench.errors import BadInput, UsageError
+from hwp_bench.capture.convert import with_one_shape
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
-from hwp_bench.hands.convert import with_one_shape
 from hwp_bench.hands.fitting import FitTargets, fit_hand
-from hwp_bench.images import read_rgb
 from hwp_bench.importers.crop import CropWindows, cut, follow_hand, resample
 from hwp_bench.importers.interhand.annotations import InterHandRecords, Mano, read_annotations
 from hwp_bench.importers.interhand.sequences import Sequence
 from hwp_bench.importers.landmarks import Landmarks
 from hwp_bench.importers.posed import PosedClip, pose_clip, posed_sheet, sheet_frames
 from hwp_bench.importers.silhouette import draw_silhouette
-from hwp_bench.progress import progress
 
 #: Terms of the data set.
 LICENCE = "CC BY-NC 4.0 (InterHand2.6M)"

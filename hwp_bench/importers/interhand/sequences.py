@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 
 #: Parts of the data set.
 SPLITS = ("train", "val", "test")

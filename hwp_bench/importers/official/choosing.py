@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.errors import BadInput
-from hwp_bench.images import read_gray
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.images import read_gray
 from hwp_bench.importers.official.crop import MASK_THRESHOLD
 from hwp_bench.importers.official.folders import OfficialFolder
 from hwp_bench.importers.official.records import OfficialRecords

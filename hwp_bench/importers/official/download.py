@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
 
-from hwp_bench.errors import BadInput, HwpError, MissingDependency, UsageError
-from hwp_bench.files import cache_root, inside, read_json, sha256_file, write_json
+from hwp_bench.base.errors import BadInput, HwpError, MissingDependency, UsageError
+from hwp_bench.base.files import cache_root, inside, read_json, sha256_file, write_json
 
 #: The release, a data set on the hub.
 REPOSITORY = "XuanHuang0/WildGHand"

@@ -7,7 +7,7 @@ import re
 from dataclasses import dataclass
 from pathlib import Path
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 from hwp_bench.taxonomy import catalogue
 
 _NAME = re.compile(r"(capture\d+)(?:_subsample(\d+))?(_single)?")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
 from hwp_bench.hands.fitting import FitTargets, FittingSettings, fit_hand
 from hwp_bench.hands.mano import FINGERTIPS

@@ -12,12 +12,13 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.files import sha256_file
+from hwp_bench.base.images import read_gray, read_rgb
+from hwp_bench.base.progress import progress
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter, HandModelId
 from hwp_bench.capture.schema import check_id
-from hwp_bench.errors import BadInput, UsageError
-from hwp_bench.files import sha256_file
 from hwp_bench.hands import load_template
-from hwp_bench.images import read_gray, read_rgb
 from hwp_bench.importers.official.choosing import choose_sides, unexpected
 from hwp_bench.importers.official.crop import (
     CroppedFrame,
@@ -30,7 +31,6 @@ from hwp_bench.importers.official.hands import ImportedHand, free_hand, mano_han
 from hwp_bench.importers.official.records import OfficialRecords, SideRecords, read_records
 from hwp_bench.importers.official.report import import_facts
 from hwp_bench.importers.posed import PosedClip, pose_clip, posed_sheet, sheet_frames
-from hwp_bench.progress import progress
 from hwp_bench.taxonomy import catalogue
 
 #: Terms of the release; the capture made of it may not be passed on under others.

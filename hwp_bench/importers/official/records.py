@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.unpickle import load_pickle
 from hwp_bench.capture.schema import MAX_FRAMES
-from hwp_bench.errors import BadInput
 from hwp_bench.importers.official.folders import OfficialFolder, find_file
-from hwp_bench.unpickle import load_pickle
 
 #: Largest pickle that is read, bytes: each record holds a mask of the whole frame.
 MAX_PICKLE_BYTES = 4 * 1024 * 1024 * 1024

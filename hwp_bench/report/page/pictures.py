@@ -9,9 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hwp_bench.errors import HwpError
-from hwp_bench.images import read_rgb
-from hwp_bench.report.drawing import fitted, labelled, sheet
+from hwp_bench.base.drawing import fitted, labelled, sheet
+from hwp_bench.base.errors import HwpError
+from hwp_bench.base.images import read_rgb
 from hwp_bench.report.sources import Source
 
 #: Bytes of pictures that a page holds at most, as they stand in it.

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from hwp_bench.cost.front import FrontPart, MeanCurve
+from hwp_bench.analysis.cost.front import FrontPart, MeanCurve
+from hwp_bench.analysis.statistics.bootstrap import Estimate
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.page.svg import (
     WIDTH,
@@ -21,7 +22,6 @@ from hwp_bench.report.page.svg import (
     tag,
     ticks,
 )
-from hwp_bench.statistics.bootstrap import Estimate
 
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44.0, WIDTH - 18.0, 14.0, 232.0
 #: Height of one bar, and of the gap under a group.

@@ -10,7 +10,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from hwp_bench.files import atomic_write
+from hwp_bench.base.files import atomic_write
 from hwp_bench.report.page.content import Report, gather
 from hwp_bench.report.sources import Source
 

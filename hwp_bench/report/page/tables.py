@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from markupsafe import Markup
 
+from hwp_bench.base.tables import Table
 from hwp_bench.report.page.svg import join, tag
-from hwp_bench.report.table import Table
 
 _RANKS = {0: "b", 1: "u"}
 

@@ -11,7 +11,7 @@ import importlib
 from functools import cache
 from typing import TYPE_CHECKING
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 
 if TYPE_CHECKING:
     from hwp_bench.sim.effects.base import Effect

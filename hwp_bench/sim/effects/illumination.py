@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hwp_bench.sim.colors import lamp_color
+from hwp_bench.base.colors import lamp_color
 from hwp_bench.sim.effects.base import Effect
 from hwp_bench.sim.fields import Fields
 from hwp_bench.sim.mesh import unit

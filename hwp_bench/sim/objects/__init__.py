@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from types import MappingProxyType
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.surface import Surface
 
 # Name of each object and the module that builds it.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.sim.colors import srgb_to_linear
+from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.sim.objects.shapes import box, turned
 from hwp_bench.sim.surface import Surface, join, plain, transformed
 

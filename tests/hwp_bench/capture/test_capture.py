@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 from small_captures import CaptureMaker, cameras, hand_parameters, hand_picture
 
+from hwp_bench.base.errors import BadCapture, BadInput, HwpError, ShapeMismatch, UsageError
 from hwp_bench.capture import Cameras, CaptureWriter, open_capture
 from hwp_bench.capture.check import check_capture
-from hwp_bench.errors import BadCapture, BadInput, HwpError, ShapeMismatch, UsageError
 
 
 @pytest.mark.parametrize("hands", ["right", "left", "both"])
@@ -40,7 +40,7 @@ def test_equal_content_has_equal_digest_and_a_changed_pixel_another(
     first = make_capture(folder=tmp_path / "a")
     second = make_capture(folder=tmp_path / "b")
     assert first.digest == second.digest
-    from hwp_bench.images import write_image
+    from hwp_bench.base.images import write_image
 
     picture = second.frame(3)
     picture[0, 0, 0] ^= 1

@@ -110,7 +110,7 @@ def test_lists_speak_json(capsys) -> None:
 def test_evaluate_prints_the_table_and_says_where_things_are(
     make_capture: CaptureMaker, tmp_path: Path, capsys
 ) -> None:
-    from hwp_bench.images import write_image
+    from hwp_bench.base.images import write_image
 
     capture = make_capture(frames=20, size=48)
     entry = tmp_path / "entry"

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
+from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.overrides import overrides
-from hwp_bench.errors import UsageError
 
 
 @pytest.mark.parametrize(

@@ -10,14 +10,14 @@ import numpy as np
 import pytest
 from small_captures import CaptureMaker
 
+from hwp_bench.base.errors import BadCapture, BadImage, BadSplit
+from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
-from hwp_bench.errors import BadCapture, BadImage, BadSplit
+from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.evaluate.evaluation import EvaluationSettings, evaluate
-from hwp_bench.images import write_image
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric, penalty
 from hwp_bench.results import Results, read_results
-from hwp_bench.sandbox.confinement import Confinement
-from hwp_bench.splits import contiguous_split
+from hwp_bench.run.sandbox.confinement import Confinement
 
 # Some methods here note their fits beside themselves, which no sandbox would let them.
 SETTINGS = EvaluationSettings(confinement=Confinement("none"))

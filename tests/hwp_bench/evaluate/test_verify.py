@@ -11,9 +11,9 @@ import pytest
 from small_captures import CaptureMaker
 from toy_method import write_toy_method
 
+from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.cli.main import main
-from hwp_bench.images import write_image
 
 
 @pytest.fixture

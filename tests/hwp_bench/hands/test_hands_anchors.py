@@ -8,7 +8,7 @@ import torch
 from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
-from hwp_bench.errors import BadHandModel, UsageError
+from hwp_bench.base.errors import BadHandModel, UsageError
 from hwp_bench.hands import (
     HandTemplate,
     SurfaceAnchors,

@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hwp_bench.arrays import read_npz, write_npz
-from hwp_bench.errors import BadHandModel, BadInput, UsageError
+from hwp_bench.base.arrays import read_npz, write_npz
+from hwp_bench.base.errors import BadHandModel, BadInput, UsageError
 from hwp_bench.hands import HandTemplate, load_template, sources, to_trimesh
 from hwp_bench.hands.landmarks import FINGERS, finger_joints
 from hwp_bench.hands.shape_space import align_hands, shape_components, stretch_fingers

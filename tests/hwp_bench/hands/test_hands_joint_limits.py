@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from hwp_bench.errors import BadHandModel
+from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands import (
     HandTemplate,
     anatomical_limits,

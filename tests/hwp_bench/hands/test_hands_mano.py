@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from synthetic_mano import as_published, mano_content, write_mano_folder
 
-from hwp_bench.errors import BadHandModel, BadInput, HwpError, UnsafePickle
+from hwp_bench.base.errors import BadHandModel, BadInput, HwpError, UnsafePickle
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.hands.landmarks import PARENTS
 from hwp_bench.hands.mano import load_mano

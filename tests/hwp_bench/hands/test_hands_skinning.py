@@ -7,7 +7,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from hwp_bench.errors import ShapeMismatch
+from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.hands import HandTemplate, landmark_order, mirror_template, pose_hand
 
 

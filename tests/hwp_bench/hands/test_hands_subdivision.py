@@ -7,7 +7,7 @@ import pytest
 import torch
 import trimesh
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import HandTemplate, load_template, pose_hand, subdivide
 from hwp_bench.hands.subdivision import MAX_TIMES, mano_hd
 

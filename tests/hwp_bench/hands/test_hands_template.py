@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import hwp_bench.hands
-from hwp_bench.errors import BadHandModel, BadInput
+from hwp_bench.base.errors import BadHandModel, BadInput
 from hwp_bench.hands import HandParameters, HandTemplate, mirror_template
 from hwp_bench.hands.template import make_template, rebuilt
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from synthetic_clip import write_video
 
-from hwp_bench.errors import BadInput, UsageError
+from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.importers.decode import FrameRange, parse_frame_range, probe, read_frames
 
 COUNT = 12

@@ -11,8 +11,8 @@ from typing import Any
 
 import pytest
 
+from hwp_bench.base.errors import BadInput, HwpError, MissingDependency, UsageError
 from hwp_bench.cli.main import main
-from hwp_bench.errors import BadInput, HwpError, MissingDependency, UsageError
 from hwp_bench.importers.official.download import (
     RECORD,
     HuggingFaceHub,

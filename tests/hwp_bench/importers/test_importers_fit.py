@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 from synthetic_clip import FOCAL, FPS, HEIGHT, WIDTH, SyntheticClip, make_clip
 
-from hwp_bench.errors import DidNotConverge
+from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.hands import pose_hand
 from hwp_bench.hands.template import rebuilt
 from hwp_bench.importers.clip_model import continuous_rotation_vectors

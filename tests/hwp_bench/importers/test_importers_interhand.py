@@ -12,10 +12,10 @@ import torch
 from interhand_release import FRAMES, project, write_interhand
 from synthetic_mano import write_mirrored_mano
 
+from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
-from hwp_bench.errors import BadInput, UsageError
 from hwp_bench.hands import load_template, pose_hand
 from hwp_bench.importers.interhand import (
     PAPER_SEQUENCES,

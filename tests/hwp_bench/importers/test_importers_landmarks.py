@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 from synthetic_clip import write_landmarks
 
-from hwp_bench.errors import BadInput, HwpError
+from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.importers.landmarks import Landmarks, check_against_video, read_landmarks
 
 

@@ -24,18 +24,18 @@ from official_release import (
 )
 from synthetic_mano import write_mirrored_mano
 
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
+from hwp_bench.capture.splits import contiguous_split, split_for
 from hwp_bench.cli.main import main
-from hwp_bench.errors import BadInput, UsageError
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
-from hwp_bench.images import read_rgb
 from hwp_bench.importers.official import OfficialImport, import_official
 from hwp_bench.importers.official.crop import box_of_landmarks, correct_crop, official_crop
 from hwp_bench.importers.official.folders import find_folders
 from hwp_bench.importers.official.records import read_records
 from hwp_bench.importers.posed import pose_clip
-from hwp_bench.splits import contiguous_split, split_for
 
 FRAMES = 12
 

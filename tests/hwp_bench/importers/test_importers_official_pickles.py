@@ -12,8 +12,8 @@ from typing import Any
 import pytest
 import torch
 
+from hwp_bench.base.errors import BadInput, UnsafePickle
 from hwp_bench.cli.main import main
-from hwp_bench.errors import BadInput, UnsafePickle
 from hwp_bench.importers.official.folders import find_file, find_folders
 from hwp_bench.importers.official.records import read_records
 

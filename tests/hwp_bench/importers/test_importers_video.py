@@ -12,12 +12,12 @@ import pytest
 import torch
 from synthetic_clip import FOCAL, SyntheticClip, make_clip, write_landmarks, write_video
 
+from hwp_bench.base.errors import BadInput, HwpError, UsageError
+from hwp_bench.base.images import read_rgb, write_image
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
-from hwp_bench.errors import BadInput, HwpError, UsageError
 from hwp_bench.hands import load_template, pose_hand, project
-from hwp_bench.images import read_rgb, write_image
 from hwp_bench.importers.decode import FrameRange
 from hwp_bench.importers.fit_settings import FitSettings
 from hwp_bench.importers.options import VideoImport

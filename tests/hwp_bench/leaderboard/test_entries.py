@@ -8,10 +8,10 @@ from pathlib import Path
 
 import pytest
 
+from hwp_bench.base.errors import BadResult, UsageError
+from hwp_bench.base.packages import data_folder
 from hwp_bench.cli.main import main
-from hwp_bench.errors import BadResult, UsageError
 from hwp_bench.leaderboard.entries import add_entry, check_entries, entry_name, read_entries
-from hwp_bench.leaderboard.place import leaderboard_folder
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult, Results, write_results
 
@@ -102,7 +102,7 @@ def test_a_result_without_the_headline_metrics_is_refused(
 
 
 def test_the_entries_that_ship_are_sound() -> None:
-    check_entries(read_entries(leaderboard_folder() / "entries"))
+    check_entries(read_entries(data_folder("leaderboard") / "entries"))
 
 
 def test_the_command(make_entry, tmp_path, capsys) -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.errors import BadMethod, HwpError
+from hwp_bench.base.errors import BadMethod, HwpError
 from hwp_bench.methods.manifest import find_method, read_manifest, shipped_methods
 
 GOOD = """

@@ -7,7 +7,7 @@ from typing import Literal
 
 import pytest
 
-from hwp_bench.errors import BadMethod, UsageError
+from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.methods.settings import choice, number, settings_from
 
 

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from small_captures import CaptureMaker
 
-from hwp_bench.errors import BadImage, BadInput, HwpError, UsageError
+from hwp_bench.base.errors import BadImage, BadInput, HwpError, UsageError
+from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.request import RunSettings, open_request, write_request
-from hwp_bench.splits import contiguous_split
 
 RUN = RunSettings({"steps": 3}, seed=7, budget=Budget(seconds=5.0))
 
@@ -81,7 +81,7 @@ def test_the_oracles_choose_what_they_say(make_capture: CaptureMaker, tmp_path: 
     assert sorted([*training.train, *perturbed]) == list(range(16))
     for frame in perturbed:
         assert not (training.root / "frames" / f"{frame:06d}.png").exists()
-    from hwp_bench.images import write_image
+    from hwp_bench.base.images import write_image
 
     marked = np.full((32, 32, 3), 7, np.uint8)
     write_image(capture.root / "truth" / "clean" / f"{perturbed[0]:06d}.png", marked)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hwp_bench.errors import BadResult
+from hwp_bench.base.errors import BadResult
 from hwp_bench.metrics.aggregate import CaptureScores, aggregate, mean_scores
 
 

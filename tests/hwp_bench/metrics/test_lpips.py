@@ -9,7 +9,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from hwp_bench.errors import BadInput, ShapeMismatch
+from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.metrics.lpips import Lpips
 
 torch = pytest.importorskip("torch")

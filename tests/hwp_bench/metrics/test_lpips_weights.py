@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hwp_bench.errors import BadInput, MissingDependency, UsageError
+from hwp_bench.base.errors import BadInput, MissingDependency, UsageError
 from hwp_bench.metrics import lpips_weights
 from hwp_bench.metrics.lpips_weights import (
     BACKBONE_FILES,

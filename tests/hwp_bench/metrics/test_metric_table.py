@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.metrics import (
     HWP_V1,
     METRICS,

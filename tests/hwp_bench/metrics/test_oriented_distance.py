@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.errors import EmptyMask, ShapeMismatch
+from hwp_bench.base.errors import EmptyMask, ShapeMismatch
 from hwp_bench.metrics.filter_bank import ORIENTATIONS, filter_bank, oriented_energies
 from hwp_bench.metrics.perceptual import oriented_distance
 

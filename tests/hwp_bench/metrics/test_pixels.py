@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hwp_bench.errors import BadImage, BadPrediction, ShapeMismatch
+from hwp_bench.base.errors import BadImage, BadPrediction, ShapeMismatch
 from hwp_bench.metrics.pixels import check_prediction, check_truth, quantize
 
 

@@ -8,7 +8,7 @@ import numpy as np
 import OpenImageIO as oiio
 import pytest
 
-from hwp_bench.errors import EmptyMask, ShapeMismatch
+from hwp_bench.base.errors import EmptyMask, ShapeMismatch
 from hwp_bench.metrics.protocol import PSNR_CAP
 from hwp_bench.metrics.psnr import decibels, psnr, psnr_box, psnr_full
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.errors import BadImage, BadPrediction, EmptyMask, ShapeMismatch
+from hwp_bench.base.errors import BadImage, BadPrediction, EmptyMask, ShapeMismatch
 from hwp_bench.metrics import HWP_V1, PAPER_WILDGHAND, metric, metric_names
 from hwp_bench.metrics.perceptual import oriented_distance
 from hwp_bench.metrics.psnr import psnr, psnr_box, psnr_full

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from hwp_bench.errors import BadPrediction, ShapeMismatch
+from hwp_bench.base.errors import BadPrediction, ShapeMismatch
 from hwp_bench.metrics import HWP_V1, penalty
 from hwp_bench.metrics.batch import Frame, score_frames
 from hwp_bench.metrics.score import score_frame

@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import ndimage
 
-from hwp_bench.errors import EmptyMask
+from hwp_bench.base.errors import EmptyMask
 from hwp_bench.metrics.region import (
     Box,
     bounding_box,

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from hwp_bench.errors import EmptyMask, ShapeMismatch
+from hwp_bench.base.errors import EmptyMask, ShapeMismatch
 from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND
 from hwp_bench.metrics.region import bounding_box
 from hwp_bench.metrics.ssim import ssim, ssim_box, ssim_full, ssim_map

@@ -10,15 +10,15 @@ import numpy as np
 import pytest
 from small_captures import CaptureMaker
 
+from hwp_bench.base.errors import BadCapture, BadInput, UsageError
+from hwp_bench.base.files import canonical_json
+from hwp_bench.base.images import pixel_digest, read_rgb, write_image
 from hwp_bench.capture import Capture
+from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.main import main
-from hwp_bench.errors import BadCapture, BadInput, UsageError
-from hwp_bench.files import canonical_json
-from hwp_bench.images import pixel_digest, read_rgb, write_image
 from hwp_bench.methods.request import open_request
 from hwp_bench.publish import Publication, open_sealed, publish
 from hwp_bench.publish.commitment import commitment, target_content
-from hwp_bench.splits import contiguous_split
 
 SALT = "5a" * 32
 

@@ -11,10 +11,10 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.errors import UsageError
-from hwp_bench.files import write_json
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import write_json
+from hwp_bench.base.tables import spell
 from hwp_bench.report.choose import TableRequest, make_table
-from hwp_bench.report.table import spell
 from hwp_bench.results import FrameResult, Results, write_results
 
 GOLDEN = Path(__file__).with_name("golden")

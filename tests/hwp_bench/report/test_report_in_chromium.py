@@ -11,7 +11,7 @@ import pytest
 from browser import DESK, PHONE, least_contrast, open_page, overflow, show
 from made_results import made_results
 
-from hwp_bench.images import write_image
+from hwp_bench.base.images import write_image
 from hwp_bench.report.page.render import write_report
 from hwp_bench.report.sources import Source
 

@@ -10,18 +10,18 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hwp_bench.errors import UsageError
-from hwp_bench.files import write_json
-from hwp_bench.images import write_image
+from hwp_bench.analysis.statistics.pairing import group_runs
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import write_json
+from hwp_bench.base.images import write_image
+from hwp_bench.base.tables import Column, Table
 from hwp_bench.report.page.content import gather, summary_sentence
 from hwp_bench.report.page.pictures import Album
 from hwp_bench.report.page.render import write_report
 from hwp_bench.report.page.svg import log_ticks, tag, ticks
 from hwp_bench.report.page.tables import to_html
 from hwp_bench.report.sources import Source
-from hwp_bench.report.table import Column, Table
 from hwp_bench.results import CurvePoint
-from hwp_bench.statistics.pairing import group_runs
 
 EVIL = '<script>alert("x")</script>'
 VOID = {"meta", "img", "br", "line", "rect", "circle", "polyline", "polygon"}

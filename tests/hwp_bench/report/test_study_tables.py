@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import pytest
 
+from hwp_bench.base.errors import BadResult, UsageError
+from hwp_bench.base.files import write_json
 from hwp_bench.capture import Capture
-from hwp_bench.errors import BadResult, UsageError
-from hwp_bench.files import write_json
 from hwp_bench.report.choose import TableRequest, make_table
 from hwp_bench.report.sources import Source, find_captures, mean_severity, temporal_weights
 from hwp_bench.report.study_tables import robustness_table

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.errors import BadInput, BadResult
+from hwp_bench.base.errors import BadInput, BadResult
 from hwp_bench.results import read_results, write_results
 from hwp_bench.results.environment import environment
 

@@ -19,9 +19,9 @@ import psutil
 import pytest
 from tiny_scene import SINGLE, scene_maker
 
+from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.capture import open_capture
 from hwp_bench.cli.main import main
-from hwp_bench.errors import BadInput, HwpError
 from hwp_bench.sim.production import render_capture
 from hwp_bench.sim.scene import Scene
 

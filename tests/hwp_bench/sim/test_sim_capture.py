@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from tiny_scene import scene_maker
 
+from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.errors import UsageError
 from hwp_bench.sim.estimates import EASY_ERROR, estimate_hands
 from hwp_bench.sim.plan import plan
 from hwp_bench.sim.production import render_capture, render_key, true_hands

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hwp_bench.sim.colors import lamp_color, linear_to_srgb, srgb_to_linear
+from hwp_bench.base.colors import lamp_color, linear_to_srgb, srgb_to_linear
 
 
 @pytest.mark.parametrize(

@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from tiny_scene import scene_maker
 
+from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.capture import open_capture
-from hwp_bench.errors import BadInput, HwpError
 from hwp_bench.sim.production import render_capture
 from hwp_bench.sim.scene import Scene
 

@@ -125,7 +125,7 @@ def test_an_object_covers_what_the_mask_loses(render: Callable[[int], FrameResul
 
 
 def test_dimming_is_a_factor_on_linear_light(make_scene: SceneMaker) -> None:
-    from hwp_bench.sim.colors import srgb_to_linear
+    from hwp_bench.base.colors import srgb_to_linear
 
     scene = replace(make_scene(), sensor=Sensor(noise=0.0))
     result = render_frame(scene, LIGHT, COUNT, SIZE)

@@ -16,8 +16,8 @@ import torch
 from synthetic_mano import write_mirrored_mano
 from tiny_scene import scene_maker
 
+from hwp_bench.base.errors import BadHandModel
 from hwp_bench.capture import Capture
-from hwp_bench.errors import BadHandModel
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.sim.production import render_capture
 from hwp_bench.sim.scene import Scene

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from tiny_scene import SINGLE, scene_maker
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
 from hwp_bench.sim.camera import focus_point, intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.gestures import LIMITS, finger_pose, gesture, gestures, within_limits

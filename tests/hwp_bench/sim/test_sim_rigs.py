@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import scene_maker
 
-from hwp_bench.errors import BadHandModel
+from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.sim.frame import render_frame
 from hwp_bench.sim.rigs import OPENXR, WEBXR, load_rig

@@ -9,7 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import SINGLE, scene_maker
 
-from hwp_bench.errors import BadInput, UsageError
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.sim.episodes import clean_share, level, moments, severity
 from hwp_bench.sim.scene import (
     CLEAN_FROM,
@@ -21,7 +22,6 @@ from hwp_bench.sim.scene import (
 )
 from hwp_bench.sim.suites import suite, suite_names
 from hwp_bench.sim.variants import with_effects, with_severity, with_subject
-from hwp_bench.splits import contiguous_split
 from hwp_bench.taxonomy import catalogue
 
 SceneMaker = Callable[..., Scene]

@@ -14,7 +14,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, scene_maker
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects import ORDER, SENSOR, registered
 from hwp_bench.sim.frame import FrameResult, render_frame
 from hwp_bench.sim.ledger import Ledger

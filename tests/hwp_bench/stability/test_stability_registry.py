@@ -8,8 +8,8 @@ import types
 
 import pytest
 
+from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.cli.main import main
-from hwp_bench.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.stability import registry
 from hwp_bench.stability.registry import Case, Context, Measured, find_cases, run_cases
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.errors import BadInput
+from hwp_bench.base.errors import BadInput
 from hwp_bench.taxonomy import PERTURBATIONS, catalogue, check_severity, perturbation
 
 PAPER = Path(__file__).resolve().parents[4] / "shared" / "paper" / "wildghand.tex"

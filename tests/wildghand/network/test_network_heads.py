@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from wildghand.attributes import CHANNELS, RawAttributes
+from wildghand.gaussians.attributes import CHANNELS, RawAttributes
 from wildghand.network.encoding import POSITION_CHANNELS
 from wildghand.network.heads import AttributeHead, RefinementHead, ShadowHead, TemplateHead
 from wildghand.network.settings import network_settings

@@ -10,9 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.errors import ShapeMismatch, UsageError
+from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.hands import load_template
-from wildghand.anchored import flat_gaussians
+from wildghand.gaussians.anchored import flat_gaussians
+from wildghand.gaussians.rig import make_rig
 from wildghand.network import (
     NetworkSettings,
     Prediction,
@@ -23,7 +24,6 @@ from wildghand.network import (
     parameter_groups,
     surface_points,
 )
-from wildghand.rig import make_rig
 
 COLOR = torch.tensor([0.6, 0.45, 0.4])
 SMALL: dict[str, dict[str, Any]] = {

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.errors import UsageError
+from hwp_bench.base.errors import UsageError
 from wildghand.network.sampling import CellPooling, PlaneSampler, bilinear_taps
 
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from hwp_bench.errors import BadMethod, UsageError
+from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.methods.settings import settings_from
 from wildghand.network import NetworkSettings, network_settings
 

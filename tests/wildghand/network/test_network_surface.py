@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from hwp_bench.errors import BadInput, ShapeMismatch
+from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.hands import (
     HandTemplate,
     SurfaceAnchors,

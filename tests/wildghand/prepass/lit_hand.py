@@ -6,10 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import load_template
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.sim.colors import linear_to_srgb
 from wildghand.prepass import PrepassInput
 from wildghand.prepass.footprint import HandSurfaces
 

@@ -10,12 +10,12 @@ import numpy as np
 import pytest
 from lit_hand import FRAMES, SIZE, as_input, cameras, developed, hand_parameters, only
 
+from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.capture import CaptureInfo, CaptureWriter, HandModelId, open_capture
-from hwp_bench.errors import BadInput, ShapeMismatch
+from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import Budget
 from hwp_bench.methods.request import RunSettings, open_request, write_request
-from hwp_bench.splits import contiguous_split
 from wildghand.prepass import Judgement, PrepassInput, PrepassSettings, judge_capture, judge_frames
 from wildghand.prepass.footprint import HandSurfaces
 

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.importers.silhouette import draw_silhouette
-from hwp_bench.sim.colors import linear_to_srgb
 from wildghand.prepass.edges import border_width
 from wildghand.prepass.mode import densest, excess, normal_value
 from wildghand.prepass.outlines import misplacement

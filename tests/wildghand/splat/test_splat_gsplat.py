@@ -16,7 +16,7 @@ from typing import Any
 import pytest
 import torch
 
-from hwp_bench.errors import MissingDependency
+from hwp_bench.base.errors import MissingDependency
 from wildghand.splat import gsplat_backend, rasterize
 from wildghand.splat.hard_scenes import difference, draw, hand_scene
 from wildghand.splat.layout import flatten

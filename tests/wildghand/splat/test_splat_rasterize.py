@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from hwp_bench.errors import HwpError, ShapeMismatch, UsageError
+from hwp_bench.base.errors import HwpError, ShapeMismatch, UsageError
 from wildghand.splat import rasterize
 from wildghand.splat.hard_scenes import hand_scene
 

@@ -1,0 +1,1 @@
+"""Shared foundations: errors, files, locks, records, images, tables, drawing, progress."""

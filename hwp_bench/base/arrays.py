@@ -1,0 +1,120 @@
+"""Named arrays on disk (`.npz`) from others: no pickles, sizes bounded, shapes checked."""
+
+from __future__ import annotations
+
+import io
+import math
+import os
+import zipfile
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.files import atomic_write
+from hwp_bench.base.text import shown
+
+#: Largest array file that is read, unpacked, in bytes (a zip can unpack to a thousand times).
+MAX_NPZ_BYTES = 1024 * 1024 * 1024
+
+
+def read_npz(
+    path: str | os.PathLike[str], *, max_bytes: int = MAX_NPZ_BYTES
+) -> dict[str, np.ndarray]:
+    """Read every array of an `.npz` file.
+
+    Raises:
+        BadInput: missing, damaged, larger than `max_bytes` when unpacked, or holding objects.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise BadInput("does not exist", where=path)
+    try:
+        with zipfile.ZipFile(path) as archive:
+            members = archive.infolist()
+            unpacked = sum(item.file_size for item in members)
+            if unpacked > max_bytes:
+                raise BadInput(
+                    f"unpacks to {unpacked} bytes, more than the {max_bytes} that are read",
+                    where=path,
+                )
+            return {item.filename.removesuffix(".npy"): _member(archive, item) for item in members}
+    except BadInput:
+        raise
+    # A damaged archive can raise whatever a decompressor or numpy's parser of headers raises.
+    except Exception as error:
+        raise BadInput(
+            f"is no readable array file ({shown(str(error))[:200]})",
+            where=path,
+            remedy="It must be an .npz of plain arrays.",
+        ) from error
+
+
+def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> np.ndarray:
+    """Read one array, after a look at how large its header says that it is."""
+    with archive.open(item) as stream:
+        version = np.lib.format.read_magic(stream)
+        readers = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }
+        if version not in readers:
+            raise ValueError(f"{item.filename} is an array of version {version}")
+        shape, _, dtype = readers[version](stream)
+        claimed = math.prod(shape) * dtype.itemsize
+        if claimed > item.file_size:
+            raise ValueError(f"{item.filename} claims {claimed} bytes and has {item.file_size}")
+    with archive.open(item) as stream:
+        return np.lib.format.read_array(stream, allow_pickle=False)
+
+
+def write_npz(path: str | os.PathLike[str], arrays: Mapping[str, np.ndarray]) -> Path:
+    """Write arrays to an `.npz` file atomically."""
+    buffer = io.BytesIO()
+    np.savez_compressed(buffer, allow_pickle=False, **dict(arrays))
+    return atomic_write(path, buffer.getvalue())
+
+
+def take(
+    arrays: Mapping[str, np.ndarray],
+    name: str,
+    shape: tuple[int | None, ...],
+    *,
+    where: str | os.PathLike[str],
+    dtype: type = np.float64,
+) -> np.ndarray:
+    """Take one array out of a file and check it.
+
+    Args:
+        arrays: what the file holds.
+        name: which array.
+        shape: expected shape; None admits any length.
+        where: the file, for the message.
+        dtype: wanted type; floats must be finite.
+
+    Returns:
+        The array as `dtype`.
+
+    Raises:
+        BadInput: absent, of another shape or kind, or not finite; the first bad row is named.
+    """
+    if name not in arrays:
+        raise BadInput("is missing", where=where, field=name)
+    array = arrays[name]
+    if len(array.shape) != len(shape) or any(
+        wanted is not None and got != wanted for got, wanted in zip(array.shape, shape, strict=True)
+    ):
+        wanted_text = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        raise BadInput(
+            f"has shape {array.shape} where {wanted_text} is expected", where=where, field=name
+        )
+    kinds = "b" if dtype is bool else "fiu"
+    if array.dtype.kind not in kinds:
+        raise BadInput(f"has type {array.dtype}, not {dtype.__name__}", where=where, field=name)
+    array = np.ascontiguousarray(array, dtype=dtype)
+    if dtype is not bool and not np.isfinite(array).all():
+        rows = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1) if array.ndim else []
+        first = int(np.argmax(rows)) if array.ndim else 0
+        raise BadInput(f"holds NaN or infinity (first in row {first})", where=where, field=name)
+    return array

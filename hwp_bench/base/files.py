@@ -1,0 +1,242 @@
+"""Files that are whole or absent: atomic writing, bounded reading, digests, the cache folder."""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import json
+import math
+import os
+import shutil
+import stat
+import tempfile
+from collections.abc import Iterable, Iterator
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+from hwp_bench.base.errors import BadInput, HwpError, UsageError
+
+#: Largest JSON file that is read, in bytes; a result of 10,000 frames stays far below it.
+MAX_JSON_BYTES = 256 * 1024 * 1024
+#: Deepest nesting of JSON that is read: no format here needs ten levels.
+MAX_JSON_DEPTH = 100
+#: Largest whole number that is read; above it other programs would round.
+MAX_JSON_INTEGER = 2**63
+
+
+def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
+    """Write a file so that a reader sees the old content or the new one, never a part.
+
+    Args:
+        path: the file; its folder is made.
+        data: bytes, or text that is stored as UTF-8.
+
+    Returns:
+        The path.
+
+    Raises:
+        HwpError: the place cannot be written (no space, no permission).
+    """
+    path = Path(path)
+    raw = data.encode() if isinstance(data, str) else data
+    temporary: str | None = None
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(raw)
+        # mkstemp makes private files; results are meant to be read by others.
+        os.chmod(temporary, 0o644)
+        os.replace(temporary, path)
+    except OSError as error:
+        if temporary is not None:
+            with contextlib.suppress(OSError):
+                os.unlink(temporary)
+        raise HwpError(
+            f"cannot be written ({error.strerror})",
+            where=path,
+            remedy="Check the free space and the permissions of the folder.",
+        ) from error
+    return path
+
+
+@contextlib.contextmanager
+def atomic_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+    """Fill a folder under a temporary name; it takes its own name only when the block ends well.
+
+    Args:
+        path: the folder to make.
+        overwrite: replace an existing folder; without it an existing non-empty one is refused.
+
+    Yields:
+        The temporary folder, a sibling of `path`.
+
+    Raises:
+        UsageError: `path` exists and holds something, or is a file.
+        HwpError: the place cannot be written.
+    """
+    path = Path(path).absolute()
+    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
+        raise UsageError(
+            "exists already", where=path, remedy="Choose another place, or allow overwriting it."
+        )
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
+        os.chmod(temporary, 0o755)
+    except OSError as error:
+        raise HwpError(f"cannot be made ({error.strerror})", where=path) from error
+    try:
+        yield temporary
+        retired = temporary.with_name(temporary.name + ".old")
+        if path.exists():
+            os.replace(path, retired)
+        os.replace(temporary, path)
+        shutil.rmtree(retired, ignore_errors=True)
+    except OSError as error:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise HwpError(f"cannot be written ({error.strerror})", where=path) from error
+    except BaseException:
+        shutil.rmtree(temporary, ignore_errors=True)
+        raise
+
+
+def canonical_json(value: Any) -> str:
+    """Return one spelling of a JSON value: sorted keys, no spaces, NaN refused."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def sha256_json(value: Any) -> str:
+    """Return the SHA-256 (hex) of a JSON value's canonical spelling."""
+    return hashlib.sha256(canonical_json(value).encode()).hexdigest()
+
+
+def sha256_file(path: str | os.PathLike[str]) -> str:
+    """Return the SHA-256 (hex) of a file's bytes."""
+    with open(path, "rb") as stream:
+        return hashlib.file_digest(stream, "sha256").hexdigest()
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 (hex) of a file, read again only when its size or date has changed."""
+    facts = path.stat()
+    return _sha256(path, facts.st_size, facts.st_mtime_ns)
+
+
+@lru_cache(maxsize=4096)
+def _sha256(path: Path, size: int, modified: int) -> str:
+    return sha256_file(path)
+
+
+def files_digest(root: Path, paths: Iterable[Path]) -> str:
+    """Return the SHA-256 (hex) of files: their names below `root`, and their contents."""
+    total = hashlib.sha256()
+    for path in sorted(paths):
+        total.update(f"{path.relative_to(root).as_posix()}\0".encode())
+        total.update(bytes.fromhex(sha256_of(path)))
+    return total.hexdigest()
+
+
+def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) -> Any:
+    """Read a JSON file from outside.
+
+    Raises:
+        BadInput: the file is missing, no regular file, larger than `max_bytes`, not UTF-8, not
+            JSON, nested too deeply, or holds a number that is infinite or absurdly large.
+    """
+    path = Path(path)
+    try:
+        text = _read_bounded(path, max_bytes).decode()
+        value = json.loads(
+            text, parse_constant=_refuse_constant, parse_float=_finite, parse_int=_whole
+        )
+    except FileNotFoundError as error:
+        raise BadInput("does not exist", where=path) from error
+    except OSError as error:
+        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+    except UnicodeDecodeError as error:
+        raise BadInput("is not UTF-8 text", where=path) from error
+    except RecursionError as error:
+        raise BadInput("is nested too deeply", where=path) from error
+    except ValueError as error:
+        raise BadInput(f"is not valid JSON ({error})", where=path) from error
+    if _deeper_than(value, MAX_JSON_DEPTH):
+        raise BadInput("is nested too deeply", where=path)
+    return value
+
+
+def _read_bounded(path: Path, max_bytes: int) -> bytes:
+    # Not blocking: a named pipe would keep its reader waiting for ever. And what a device or a
+    # growing file holds is not known from its size.
+    handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
+    with os.fdopen(handle, "rb") as stream:
+        if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
+            raise BadInput("is no regular file", where=path)
+        data = stream.read(max_bytes + 1)
+    if len(data) > max_bytes:
+        raise BadInput(f"holds more than the {max_bytes} bytes that are read", where=path)
+    return data
+
+
+def _deeper_than(value: Any, limit: int) -> bool:
+    level = [value]
+    for _ in range(limit):
+        level = [
+            item
+            for holder in level
+            if isinstance(holder, dict | list)
+            for item in (holder.values() if isinstance(holder, dict) else holder)
+            if isinstance(item, dict | list)
+        ]
+        if not level:
+            return False
+    return True
+
+
+def _refuse_constant(name: str) -> float:
+    raise ValueError(f"{name} is no JSON number")
+
+
+def _finite(text: str) -> float:
+    number = float(text)
+    if not math.isfinite(number):
+        raise ValueError(f"{text[:20]} is too large a number")
+    return number
+
+
+def _whole(text: str) -> int:
+    # Long ones are told from their length: turning them into numbers takes long.
+    if len(text) > 20 or abs(int(text)) > MAX_JSON_INTEGER:
+        raise ValueError(f"{text[:20]}... is too large a number")
+    return int(text)
+
+
+def write_json(path: str | os.PathLike[str], value: Any) -> Path:
+    """Write a JSON file atomically, indented, keys in the order given, NaN refused."""
+    return atomic_write(path, json.dumps(value, indent=1, allow_nan=False) + "\n")
+
+
+def inside(root: str | os.PathLike[str], relative: str) -> Path:
+    """Join a path from outside to a folder, refusing whatever leads out of the folder.
+
+    Raises:
+        BadInput: `relative` is absolute, climbs with `..`, or passes a link that leaves `root`.
+    """
+    base = Path(root).resolve()
+    target = (base / relative).resolve()
+    if Path(relative).is_absolute() or not target.is_relative_to(base):
+        raise BadInput(
+            f"the path {relative!r} leads out of the folder",
+            where=root,
+            remedy="Use a path inside it.",
+        )
+    return target
+
+
+def cache_root() -> Path:
+    """Return the folder for what can be made again: HWP_CACHE, else the user's cache folder."""
+    if "HWP_CACHE" in os.environ:
+        return Path(os.environ["HWP_CACHE"]).expanduser()
+    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    return Path(base) / "hwp-bench"

@@ -1,0 +1,135 @@
+"""Images in and out through OpenImageIO: 8-bit sRGB, sizes checked, damage named."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from pathlib import Path
+
+import numpy as np
+import OpenImageIO as oiio
+
+from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch
+from hwp_bench.base.image_kinds import check_kind
+
+#: Largest image that is decoded, in pixels: a 300 byte PNG can ask for gigabytes.
+MAX_PIXELS = 64 * 1024 * 1024
+#: zlib level of written PNG files: within 10 % of the smallest at a third of the time.
+PNG_LEVEL = 3
+
+
+def read_rgb(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read a colour image.
+
+    Args:
+        path: a PNG, JPEG or BMP file, whatever its name. Gray becomes RGB; an alpha channel is
+            dropped, not composited.
+        size: expected (height, width) in pixels.
+
+    Returns:
+        (H, W, 3) uint8, sRGB.
+
+    Raises:
+        BadImage: missing, empty, of another format, animated, damaged, not 8-bit, too large, not
+            of `size`, or to be turned before it is shown (EXIF).
+    """
+    pixels = _read(Path(path), size)
+    if pixels.shape[2] < 3:
+        return np.ascontiguousarray(np.repeat(pixels[:, :, :1], 3, axis=2))
+    return np.ascontiguousarray(pixels[:, :, :3])
+
+
+def read_gray(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
+    """Read a one-channel image (a mask); of a colour image the first channel is taken.
+
+    Returns:
+        (H, W) uint8.
+
+    Raises:
+        BadImage: as `read_rgb`.
+    """
+    return np.ascontiguousarray(_read(Path(path), size)[:, :, 0])
+
+
+def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
+    check_kind(path)
+    config = oiio.ImageSpec()
+    # Otherwise colours come multiplied by alpha, and a submission's alpha would act as a mask.
+    config.attribute("oiio:UnassociatedAlpha", 1)
+    source = oiio.ImageInput.open(os.fspath(path), config)
+    if source is None:
+        raise BadImage(f"is no image that can be read ({oiio.geterror().strip()})", where=path)
+    try:
+        spec = source.spec()
+        height, width = spec.height, spec.width
+        if height * width > MAX_PIXELS:
+            raise BadImage(f"is {width}x{height}, above the limit of {MAX_PIXELS} px", where=path)
+        if size is not None and (height, width) != tuple(size):
+            raise BadImage(
+                f"is {width}x{height} pixels where {size[1]}x{size[0]} is expected", where=path
+            )
+        if spec.format.basetype != oiio.UINT8:
+            raise BadImage(f"holds {spec.format} samples where 8-bit is expected", where=path)
+        turned = spec.get_int_attribute("Orientation", 1)
+        if turned != 1:
+            raise BadImage(
+                f"asks to be turned when it is shown (EXIF orientation {turned})",
+                where=path,
+                remedy="Store its pixels upright, without that mark.",
+            )
+        pixels = source.read_image(format=oiio.UINT8)
+        # OpenImageIO fills what a truncated file lacks with zeros and only sets an error.
+        problem = source.geterror().strip()
+        if pixels is None or problem:
+            reason = problem.splitlines()[0] if problem else "no pixels"
+            raise BadImage(f"is damaged or truncated ({reason})", where=path)
+    finally:
+        source.close()
+    return np.asarray(pixels, dtype=np.uint8).reshape(height, width, -1)
+
+
+def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
+    """Write an 8-bit image, whole or not at all.
+
+    Args:
+        path: the file; the ending chooses the format (`.png` for everything the toolkit keeps).
+        pixels: (H, W) or (H, W, 1 | 3 | 4) uint8.
+
+    Raises:
+        ShapeMismatch: the array is no such image.
+        HwpError: the place cannot be written.
+    """
+    path = Path(path)
+    array = pixels[:, :, None] if pixels.ndim == 2 else pixels
+    if array.dtype != np.uint8 or array.ndim != 3 or array.shape[2] not in (1, 3, 4):
+        raise ShapeMismatch(
+            f"cannot store an array of shape {pixels.shape} and type {pixels.dtype} as an image",
+            where=path,
+        )
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    output = oiio.ImageOutput.create(os.fspath(temporary))
+    if output is None:
+        raise HwpError(f"has an ending that is no image format ({oiio.geterror()})", where=path)
+    spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], oiio.UINT8)
+    spec.attribute("oiio:ColorSpace", "sRGB")
+    spec.attribute("png:compressionLevel", PNG_LEVEL)
+    spec.attribute("oiio:UnassociatedAlpha", 1)
+    written = output.open(os.fspath(temporary), spec) and output.write_image(
+        np.ascontiguousarray(array)
+    )
+    problem = output.geterror().strip()
+    if not (output.close() and written):
+        temporary.unlink(missing_ok=True)
+        raise HwpError(f"cannot be written ({problem or 'no space or permission'})", where=path)
+    os.replace(temporary, path)
+    return path
+
+
+def pixel_digest(pixels: np.ndarray) -> str:
+    """Return the SHA-256 (hex) of decoded pixels: shape, type and samples, not the file's bytes.
+
+    Two PNG files of different compression level agree.
+    """
+    head = f"{pixels.shape}{pixels.dtype.str}".encode()
+    return hashlib.sha256(head + np.ascontiguousarray(pixels).tobytes()).hexdigest()

@@ -1,0 +1,272 @@
+"""Read pickles from outside without running what they ask for.
+
+Hand models and the official HWP release come as pickles, and a pickle can name any function and
+have it called. Here it can name numpy arrays and builtin containers; what the caller lists as
+stand-ins becomes an inert object that only keeps its state; everything else is refused by name.
+Not even numpy's own types are given out: array and element type are rebuilt by the functions
+below, because a crafted `numpy.dtype` state can make numpy take bytes for pointers.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import pickletools
+from collections import OrderedDict
+from collections.abc import Callable, Collection
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.base.errors import BadInput, HwpError, UnsafePickle
+
+#: Largest pickle that is read, in bytes; MANO has 4 MB, a released HWP capture some 100 MB.
+MAX_PICKLE_BYTES = 1024 * 1024 * 1024
+
+_BYTE_ORDERS = "<>|="
+_KINDS = "biufcSU"
+
+
+class StandIn:
+    """What is left of an object whose class is not admitted: the name and the state."""
+
+    #: The class that the pickle names, "module.name".
+    origin: str = ""
+    #: Positional arguments of the constructor.
+    arguments: tuple[Any, ...] = ()
+    #: The state: mostly the object's attributes as a dict.
+    state: Any = None
+
+    def __new__(cls, *arguments: Any) -> StandIn:
+        """Keep the arguments; no code of the named class exists here."""
+        made = super().__new__(cls)
+        made.arguments = arguments
+        return made
+
+    def __init__(self, *arguments: Any) -> None:
+        pass
+
+    def __setstate__(self, state: Any) -> None:
+        self.state = state
+
+
+def load_pickle(
+    path: str | os.PathLike[str],
+    *,
+    stand_ins: Collection[str] = (),
+    max_bytes: int = MAX_PICKLE_BYTES,
+) -> Any:
+    """Read one object from a pickle file, whatever the file asks for.
+
+    Python 2 pickles are read too, their strings as Latin-1.
+
+    Args:
+        path: the file.
+        stand_ins: names that become `StandIn` objects: "module.name" for one class, "package.*"
+            for every class of a package.
+        max_bytes: larger files are refused.
+
+    Returns:
+        Builtin containers, numbers, strings, stand-ins and numpy arrays of plain numbers. The
+        arrays are of a subclass; `numpy.asarray` makes them plain.
+
+    Raises:
+        UnsafePickle: the file names anything else; the error's field is that name.
+        BadInput: the file is missing, too large, truncated or damaged.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise BadInput("does not exist", where=path)
+    size = path.stat().st_size
+    if size > max_bytes:
+        raise BadInput(f"holds {size} bytes, more than the {max_bytes} that are read", where=path)
+    try:
+        with path.open("rb") as stream:
+            _check_memo(stream)
+            stream.seek(0)
+            return _Unpickler(stream, path, stand_ins).load()
+    except HwpError:
+        raise
+    # A damaged pickle can raise anything that its opcodes can be made to do.
+    except Exception as error:
+        raise BadInput(f"is no readable pickle ({error})", where=path) from error
+
+
+def _check_memo(stream: Any) -> None:
+    """Refuse memo numbers that no pickler writes: the reader makes room for the largest one."""
+    for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
+        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > count + 1:
+            raise ValueError(f"memo number {argument} after {count} steps")
+
+
+class _Unpickler(pickle.Unpickler):
+    def __init__(self, stream: Any, path: Path, stand_ins: Collection[str]) -> None:
+        super().__init__(stream, encoding="latin1")
+        self._path = path
+        self._stand_ins = frozenset(stand_ins)
+        self._classes: dict[str, type[StandIn]] = {}
+
+    def find_class(self, module: str, name: str) -> Any:
+        full = f"{module}.{name}"
+        if full in _ADMITTED:
+            return _ADMITTED[full]
+        if self._is_stand_in(module, full):
+            if full not in self._classes:
+                self._classes[full] = type("StandIn", (StandIn,), {"origin": full})
+            return self._classes[full]
+        raise UnsafePickle(
+            "this pickle asks for something that is not plain data",
+            where=self._path,
+            field=full,
+            remedy="Do not open this file with ordinary tools: it may run code.",
+        )
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise UnsafePickle(
+            "this pickle refers to objects outside itself", where=self._path, field="persistent id"
+        )
+
+    def _is_stand_in(self, module: str, full: str) -> bool:
+        parents = module.split(".")
+        packages = {".".join(parents[: i + 1]) + ".*" for i in range(len(parents))}
+        return full in self._stand_ins or not packages.isdisjoint(self._stand_ins)
+
+
+class _Function:
+    """A function that a pickle may call but not change (a pickle can set attributes)."""
+
+    __slots__ = ("_function",)
+    _function: Callable[..., Any]
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        object.__setattr__(self, "_function", function)
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self._function(*arguments)
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        raise TypeError("a pickle may not change what it calls")
+
+    def __setstate__(self, state: Any) -> None:
+        raise TypeError("a pickle may not change what it calls")
+
+
+class _Dtype:
+    """An element type as a pickle describes it, checked before numpy sees it."""
+
+    def __init__(self, name: Any, align: Any = False, copy: Any = False) -> None:
+        dtype = np.dtype(str(name))
+        # An element of no bytes would make an array of any shape out of nothing.
+        if dtype.kind not in _KINDS or dtype.itemsize == 0:
+            raise ValueError(f"array elements of type {name!r} are not plain numbers or text")
+        self.dtype = dtype
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        # (version, byte order, subtype, names, fields, element size, alignment, flags[, metadata])
+        order, structure, size = state[1], state[2:5], state[5]
+        if order not in tuple(_BYTE_ORDERS) or any(part is not None for part in structure):
+            raise ValueError("an array's element type is structured")
+        if size not in (-1, self.dtype.itemsize):
+            raise ValueError("an array's element size contradicts its type")
+        self.dtype = self.dtype.newbyteorder(order)
+
+
+class _Array(np.ndarray):
+    """An array that takes its content only from bytes of the right length."""
+
+    def __setstate__(self, state: Any) -> None:
+        _, shape, dtype, fortran, raw = state
+        plain = _plain_dtype(dtype)
+        data = raw.encode("latin1") if isinstance(raw, str) else _bytes_of(raw)
+        expected = plain.itemsize
+        for length in shape:
+            if not isinstance(length, int) or length < 0:
+                raise ValueError("an array's shape is not made of whole numbers")
+            expected *= length
+        if expected != len(data):
+            raise ValueError(f"an array of shape {shape} holds {len(data)} bytes, not {expected}")
+        whole = (1, tuple(shape), plain, bool(fortran), data)
+        super().__setstate__(whole)  # type: ignore[arg-type]
+
+
+def _bytes_of(raw: Any) -> bytes:
+    # Nothing but bytes: an integer would make that many zeros.
+    if not isinstance(raw, (bytes, bytearray)):
+        raise TypeError(f"{type(raw).__name__} where bytes are expected")
+    return bytes(raw)
+
+
+def _plain_dtype(holder: Any) -> np.dtype[Any]:
+    if not isinstance(holder, _Dtype):
+        raise TypeError("an array without an element type")
+    return holder.dtype
+
+
+def _refuse_call(*arguments: Any) -> Any:
+    raise TypeError("this class is only named in pickles, never called")
+
+
+def _reconstruct(subtype: Any, shape: Any, typecode: Any) -> np.ndarray:
+    if subtype is not _NDARRAY:
+        raise TypeError("an array of a foreign class")
+    return np.ndarray.__new__(_Array, (0,), np.int8)
+
+
+def _scalar(dtype: Any, raw: Any = b"") -> Any:
+    data = raw.encode("latin1") if isinstance(raw, str) else _bytes_of(raw)
+    (value,) = np.frombuffer(data, dtype=_plain_dtype(dtype))
+    return value
+
+
+def _from_buffer(buffer: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:
+    flat = np.frombuffer(bytearray(_bytes_of(buffer)), dtype=_plain_dtype(dtype))
+    return flat.reshape(shape, order="F" if order == "F" else "C")
+
+
+def _encode(text: Any, codec: Any = "latin1") -> bytes:
+    if not isinstance(text, str) or codec not in ("latin1", "latin-1", "iso-8859-1"):
+        raise TypeError("only Latin-1 text becomes bytes")
+    return text.encode("latin1")
+
+
+def _bytes(raw: Any = b"") -> bytes:
+    return _bytes_of(raw)
+
+
+def _bytearray(raw: Any = b"", codec: Any = "latin1") -> bytearray:
+    return bytearray(_encode(raw, codec) if isinstance(raw, str) else _bytes_of(raw))
+
+
+def _object_reconstructor(made: Any, base: Any, state: Any) -> Any:
+    if not (isinstance(made, type) and issubclass(made, StandIn) and base is _OBJECT):
+        raise TypeError("an object of a class that is not admitted")
+    return made()
+
+
+_NDARRAY = _Function(_refuse_call)
+_OBJECT = _Function(_refuse_call)
+
+
+def _admitted() -> dict[str, Any]:
+    names: dict[str, Any] = {
+        "numpy.ndarray": _NDARRAY,
+        "numpy.dtype": _Dtype,
+        "_codecs.encode": _Function(_encode),
+        "collections.OrderedDict": OrderedDict,
+    }
+    for core in ("numpy.core", "numpy._core"):  # the name changed in numpy 2
+        names[f"{core}.multiarray._reconstruct"] = _Function(_reconstruct)
+        names[f"{core}.multiarray.scalar"] = _Function(_scalar)
+        names[f"{core}.numeric._frombuffer"] = _Function(_from_buffer)
+    for builtins in ("builtins", "__builtin__"):  # Python 3 and 2
+        names |= {f"{builtins}.{made.__name__}": made for made in (set, frozenset, complex)}
+        names[f"{builtins}.bytes"] = _Function(_bytes)
+        names[f"{builtins}.bytearray"] = _Function(_bytearray)
+        names[f"{builtins}.object"] = _OBJECT
+    for copyreg in ("copyreg", "copy_reg"):
+        names[f"{copyreg}._reconstructor"] = _Function(_object_reconstructor)
+    return names
+
+
+_ADMITTED = _admitted()

@@ -1,0 +1,174 @@
+"""The design of an ablation: its variants, and the effects that they make known."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import combinations, product
+from typing import Any
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.methods.manifest import MANIFEST, MethodManifest
+from hwp_bench.methods.switches import Switch
+
+#: Components that are crossed when nothing is asked for.
+DEFAULT_FACTORS = 2
+#: Most components that are crossed: 2^4 variants.
+MAX_FACTORS = 4
+#: Name of the variant with no switch thrown.
+FULL = "full"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The method with some switches thrown."""
+
+    #: `full`, `no-dpd`, `no-dpd+no-pao`, `binary-mask`.
+    name: str
+    #: What it is called in tables, without the method's name; empty for the full method.
+    title: str
+    #: Names of the switches that are thrown.
+    thrown: tuple[str, ...]
+    #: What overrides the preset.
+    settings: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class Effect:
+    """A difference between variants that answers one question."""
+
+    #: In tables: `DPD`, `DPD x PAO`.
+    title: str
+    #: `main` (mean over the other components in and out), `interaction`, `out` (of the full
+    #: method), or `alternative` (the full method less the one with the alternative).
+    kind: str
+    #: Coefficient of each variant by name. All add up to 0; the positive ones to 1, or in an
+    #: interaction to 2.
+    contrast: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Design:
+    """What an ablation runs and answers."""
+
+    #: Components that are taken out.
+    components: tuple[Switch, ...]
+    #: Alternatives that are put in.
+    alternatives: tuple[Switch, ...]
+    #: Variants, the barest first, the full method last before the alternatives.
+    variants: tuple[Variant, ...]
+    #: Effects.
+    effects: tuple[Effect, ...]
+
+
+def make_design(
+    manifest: MethodManifest, thrown: Sequence[str] = (), crossed: Sequence[str] = ()
+) -> Design:
+    """Choose the variants.
+
+    Without names the first two components that the method declares are crossed: 2 x 2 variants.
+    `crossed` crosses the named components instead: 2^k variants. `thrown` asks what each named
+    switch does to the full method: the full method, the method with each of them thrown alone,
+    and, of two components or more, with all of them out. (With two that is the 2 x 2 again.)
+
+    Args:
+        manifest: the method.
+        thrown: names of switches.
+        crossed: names of components, at most 4.
+
+    Raises:
+        UsageError: both are given; the method has no such switch, or nothing to take out; an
+            alternative is to be crossed; too many are.
+    """
+    if thrown and crossed:
+        raise UsageError(
+            "components are either crossed or taken out one by one", remedy="Leave one out."
+        )
+    switches = [_switch(manifest, name) for name in dict.fromkeys([*thrown, *crossed])]
+    if not switches:
+        declared = [item for item in manifest.switches.values() if not item.alternative]
+        switches = declared[:DEFAULT_FACTORS]
+        if not switches:
+            raise UsageError(
+                "declares no component that could be taken out",
+                where=manifest.root / MANIFEST,
+                field="switches",
+                remedy="docs/methods.md shows how a method declares its switches.",
+            )
+    components = tuple(item for item in switches if not item.alternative)
+    alternatives = tuple(item for item in switches if item.alternative)
+    if crossed and (alternatives or len(components) > MAX_FACTORS):
+        raise UsageError(f"at most {MAX_FACTORS} components, no alternatives, can be crossed")
+    factorial = bool(crossed) or len(components) <= DEFAULT_FACTORS
+    outs = _all_subsets(components) if factorial else _one_by_one(components)
+    variants = [_variant(out) for out in sorted(outs, key=len, reverse=True)]
+    effects = _factorial_effects(components) if factorial else _out_effects(components)
+    for alternative in alternatives:
+        variants.append(_variant((alternative,)))
+        contrast = {FULL: 1.0, alternative.thrown: -1.0}
+        effects.append(Effect(f"not {alternative.title}", "alternative", contrast))
+    return Design(components, alternatives, tuple(variants), tuple(effects))
+
+
+def _switch(manifest: MethodManifest, name: str) -> Switch:
+    if name in manifest.switches:
+        return manifest.switches[name]
+    near = difflib.get_close_matches(name, manifest.switches, n=1)
+    known = ", ".join(manifest.switches) or "none"
+    raise UsageError(
+        f"{manifest.name} has no switch {name!r}",
+        where=manifest.root / MANIFEST,
+        field="switches",
+        remedy=f"Did you mean {near[0]!r}?" if near else f"It declares: {known}.",
+    )
+
+
+def _all_subsets(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
+    counts = range(len(components) + 1)
+    return [subset for count in counts for subset in combinations(components, count)]
+
+
+def _one_by_one(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
+    return [(), *((item,) for item in components), tuple(components)]
+
+
+def _variant(thrown: tuple[Switch, ...]) -> Variant:
+    out = [item.title for item in thrown if not item.alternative]
+    alternatives = [item.title for item in thrown if item.alternative]
+    titles = ([f"without {', '.join(out)}"] if out else []) + [f"with {t}" for t in alternatives]
+    settings: dict[str, Any] = {}
+    for item in thrown:
+        settings |= item.settings
+    return Variant(name_of(thrown), ", ".join(titles), tuple(i.name for i in thrown), settings)
+
+
+def name_of(thrown: Sequence[Switch]) -> str:
+    """Return the name of the variant with these switches thrown."""
+    return "+".join(item.thrown for item in thrown) or FULL
+
+
+def _factorial_effects(components: Sequence[Switch]) -> list[Effect]:
+    """Main effects and interactions of two; each a mean over the other components in and out."""
+    effects = []
+    count = len(components)
+    for order in (1, 2):
+        for chosen in combinations(range(count), order):
+            contrast = {}
+            for present in product((True, False), repeat=count):
+                sign = 1
+                for index in chosen:
+                    sign *= 1 if present[index] else -1
+                out = [c for c, there in zip(components, present, strict=True) if not there]
+                contrast[name_of(out)] = sign / 2.0 ** (count - order)
+            title = " x ".join(components[index].title for index in chosen)
+            effects.append(Effect(title, "main" if order == 1 else "interaction", contrast))
+    return effects
+
+
+def _out_effects(components: Sequence[Switch]) -> list[Effect]:
+    effects = [
+        Effect(item.title, "out", {FULL: 1.0, name_of((item,)): -1.0}) for item in components
+    ]
+    together = {FULL: 1.0, name_of(components): -1.0}
+    return [*effects, Effect("all of them", "out", together)]

@@ -1,0 +1,110 @@
+"""The numbers of the paper's tables, as data: always of other data than what is measured here."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+from pathlib import Path
+
+from hwp_bench.base.errors import BadResult
+from hwp_bench.base.files import read_json
+from hwp_bench.base.packages import data_folder
+from hwp_bench.base.records import parse_record
+
+#: Version of the file.
+SCHEMA = "hwp-published/1"
+#: What stands behind the name of a method wherever a published number is shown.
+MARK = "published, other data"
+#: What stands under every table that shows published numbers.
+NOTE = (
+    "Published rows are the paper's own numbers, on other captures, masks and weights; they show "
+    "a table's scale and cannot be compared with measured rows."
+)
+
+
+@dataclass(frozen=True)
+class Measurement:
+    """Published scores of one method in one scope."""
+
+    #: Name of the method.
+    method: str
+    #: What of the method, or how strong the perturbation: a variant, a level; empty if neither.
+    detail: str
+    #: Which data: `single` and `interacting` (the paper's captures), `interhand2.6m`,
+    #: `anchorcrafter`, a perturbation, `captureN`, or `all`.
+    scope: str
+    #: `psnr` [dB], `ssim`, `lpips`; `temporal_weight_e3` is a mean weight times 1000.
+    scores: dict[str, float]
+    #: Standard deviation of some of the scores.
+    deviations: dict[str, float]
+
+
+@dataclass(frozen=True)
+class PublishedTable:
+    """One table of the paper."""
+
+    #: Its number in the paper, in Arabic digits.
+    number: int
+    #: Its label in the paper's source.
+    label: str
+    #: Its page in the paper, where known; the source file does not tell.
+    page: int | None
+    #: What it shows.
+    caption: str
+    #: Its numbers, row by row, from left to right.
+    measurements: list[Measurement]
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """One row of the paper's comparison of data sets."""
+
+    #: Name of the data set.
+    name: str
+    #: `Lab` or `Wild`.
+    environment: str
+    #: What it has: `clean_test`, `single`, `interacting`, and perturbations.
+    has: list[str]
+
+
+@dataclass(frozen=True)
+class Published:
+    """All published numbers."""
+
+    #: Title of the paper.
+    title: str
+    #: Where it says its code and data are.
+    url: str
+    #: Tables of measurements.
+    tables: list[PublishedTable]
+    #: The comparison of data sets (table 1).
+    datasets: list[Dataset]
+
+    def table(self, number: int) -> PublishedTable:
+        """Return the table of that number.
+
+        Raises:
+            BadResult: it holds no measurements.
+        """
+        for table in self.tables:
+            if table.number == number:
+                return table
+        raise BadResult(f"table {number} holds no published measurements", field="number")
+
+
+def read_published(path: str | os.PathLike[str] | None = None) -> Published:
+    """Read published numbers.
+
+    Args:
+        path: the file; None takes the one that ships.
+
+    Raises:
+        BadInput: missing or no JSON.
+        BadResult: a field is missing, unknown or of the wrong type; it is named.
+    """
+    file = Path(path) if path is not None else data_folder("leaderboard") / "published.json"
+    value = read_json(file)
+    if not isinstance(value, dict) or value.get("schema") != SCHEMA:
+        raise BadResult(f"holds no published numbers of schema {SCHEMA}", where=file)
+    value = {key: item for key, item in value.items() if key != "schema"}
+    return parse_record(Published, value, where=os.fspath(file))

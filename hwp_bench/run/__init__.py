@@ -1,0 +1,1 @@
+"""Runs a method: its process, its walls (`sandbox`), and where jobs run (`engine`)."""

@@ -1,0 +1,114 @@
+"""Several jobs at once on this machine, each in a process of its own."""
+
+from __future__ import annotations
+
+import queue
+import threading
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+
+from hwp_bench.base.errors import HwpError
+from hwp_bench.run.engine.devices import shares, visible_gpus
+from hwp_bench.run.engine.failures import Failures, lost
+from hwp_bench.run.engine.job import RETRIES, Job, Needs, OnDone, OnStart
+from hwp_bench.run.engine.process import Errand, WorkerLost, run_errand, thread_environment
+from hwp_bench.run.engine.view import JobsView, NoView
+
+
+class ParallelEngine:
+    """Runs up to `at_once` jobs at once; a job whose process is killed is begun anew.
+
+    Args:
+        at_once: how many jobs run at once.
+        view: shows the jobs; nothing if None.
+        retries: times that a job is begun anew.
+    """
+
+    in_turn = False
+
+    def __init__(
+        self, at_once: int, view: JobsView | None = None, *, retries: int = RETRIES
+    ) -> None:
+        self._at_once = at_once
+        self._view = view or NoView()
+        self._retries = retries
+
+    def __enter__(self) -> ParallelEngine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
+        """Run jobs; see `Engine.run`."""
+        # Asked for before anything runs: whoever wants too many GPUs is told at once.
+        visible = visible_gpus()
+        needs = max((job.needs for job in jobs), key=lambda item: item.gpus, default=Needs())
+        places: queue.SimpleQueue[tuple[int, dict[str, str]]] = queue.SimpleQueue()
+        for place in enumerate(shares(self._at_once, needs, visible), start=1):
+            places.put(place)
+        ended: queue.SimpleQueue[tuple[int, BaseException | None]] = queue.SimpleQueue()
+        stop = threading.Event()
+        failures = Failures()
+
+        def run_one(index: int) -> None:
+            place, environment = places.get()
+            try:
+                if not stop.is_set():
+                    self._run(index, jobs[index], place, environment, stop)
+                ended.put((index, None))
+            except BaseException as error:
+                ended.put((index, error))
+            finally:
+                places.put((place, environment))
+
+        with self._view as view, ThreadPoolExecutor(self._at_once) as pool:
+            try:
+                view.begin(len(jobs))
+                for index in range(len(jobs)):
+                    pool.submit(run_one, index)
+                for _ in jobs:
+                    index, error = _next(ended)
+                    if error is not None and not isinstance(error, HwpError):
+                        raise error
+                    view.end(index, jobs[index].text, None if error is None else str(error))
+                    if error is None:
+                        on_done(index)
+                    else:
+                        failures.add(error)
+            finally:
+                stop.set()
+        failures.raise_first(len(jobs))
+
+    def _run(
+        self, index: int, job: Job, place: int, gpus: dict[str, str], stop: threading.Event
+    ) -> None:
+        if job.finished():
+            return
+        errand = Errand(
+            job.work,
+            {name: folder.path.absolute() for name, folder in job.inputs.items()},
+            job.output.absolute(),
+            {**thread_environment(job.needs), **gpus},
+        )
+        for attempt in range(self._retries + 1):
+            self._view.start(index, job.text, f"place {place}")
+            try:
+                run_errand(
+                    errand, lambda done, total: self._view.steps(index, done, total), stop.is_set
+                )
+                return
+            except WorkerLost as error:
+                if attempt == self._retries:
+                    raise lost(job.text, self._retries, str(error)) from error
+
+
+def _next(
+    ended: queue.SimpleQueue[tuple[int, BaseException | None]],
+) -> tuple[int, BaseException | None]:
+    # A wait without end would not let Ctrl-C through on every system.
+    while True:
+        try:
+            return ended.get(timeout=1.0)
+        except queue.Empty:
+            continue

@@ -1,0 +1,58 @@
+"""What a run says of itself in `run.json`; the worker writes it, and a command may."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from hwp_bench.base.files import read_json
+from hwp_bench.base.records import parse_record
+
+#: Largest `run.json` that is read, bytes.
+MAX_BYTES = 10 * 1024 * 1024
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One moment of a fit that was put on record."""
+
+    #: Optimiser steps done.
+    step: int
+    #: Seconds on the method's clock.
+    seconds: float
+    #: Peak memory of the process until then, bytes.
+    peak_memory: int
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """What a run took; None where the method does not say."""
+
+    #: Seconds on the method's clock.
+    fit_seconds: float | None = None
+    #: Seconds to render the test frames.
+    render_seconds: float | None = None
+    #: Seconds spent on checkpoints, outside the method's clock.
+    curve_seconds: float | None = None
+    #: Optimiser steps.
+    steps: int | None = None
+    #: Peak memory of the process, bytes.
+    peak_memory: int | None = None
+    #: Device that the method ran on.
+    device: str | None = None
+    #: Validation frames that were rendered for every checkpoint.
+    checkpoint_frames: list[int] = field(default_factory=list)
+    #: The checkpoints, in time order; the last is the finished fit.
+    checkpoints: list[Checkpoint] = field(default_factory=list)
+
+
+def read_facts(path: Path) -> RunFacts:
+    """Read `run.json`; a run that wrote none said nothing.
+
+    Raises:
+        BadInput: it is damaged.
+        BadResult: a field is unknown or of the wrong type.
+    """
+    if not path.is_file():
+        return RunFacts()
+    return parse_record(RunFacts, read_json(path, max_bytes=MAX_BYTES), where=str(path))

@@ -1,0 +1,206 @@
+"""Run a method on one capture in a process of its own, away from the test frames."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+import signal
+import sys
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed
+from hwp_bench.base.files import inside, read_json
+from hwp_bench.base.text import shown
+from hwp_bench.methods.manifest import MethodManifest
+from hwp_bench.run.facts import RunFacts, read_facts
+from hwp_bench.run.sandbox.confinement import Confinement
+from hwp_bench.run.sandbox.leftovers import remove_odd_files
+from hwp_bench.run.sandbox.supervise import MAX_PROCESSES, Limits, Outcome, Program, run_program
+from hwp_bench.run.surroundings import apart, inherited
+from hwp_bench.run.worker import FAILURE, PREDICTIONS, PROGRESS, RUN
+
+#: Seconds a method may take on one capture unless told otherwise.
+DEFAULT_TIME_LIMIT = 3600.0
+#: What a method printed, inside its output folder.
+LOG = "log.txt"
+
+_REMEDIES = {
+    "time": "Raise --time-limit, or give the method a --budget.",
+    "memory": "Raise --memory-limit, or make the method smaller.",
+    "processes": "A method must do with fewer.",
+}
+
+
+@dataclass(frozen=True)
+class RunRecord:
+    """What a run left behind."""
+
+    #: Folder of the predicted frames.
+    predictions: Path
+    #: What `run.json` says; says nothing for submitted predictions.
+    facts: RunFacts
+    #: Wall time of the whole process, start-up included, seconds.
+    wall_seconds: float
+    #: How the process was kept apart: `namespaces`, or `processes` with the reason why not more;
+    #: None for submitted predictions.
+    isolation: str | None = None
+
+
+def run_method(
+    manifest: MethodManifest,
+    capture_id: str,
+    request: Path,
+    output: Path,
+    *,
+    time_limit: float = DEFAULT_TIME_LIMIT,
+    confinement: Confinement | None = None,
+    on_progress: Callable[[int, int], None] | None = None,
+) -> RunRecord:
+    """Run a method on a request.
+
+    Args:
+        manifest: the method.
+        capture_id: names the folder of a submission's predictions.
+        request: the request folder.
+        output: a folder of the run's own; emptied first.
+        time_limit: seconds after which the process and its children are killed.
+        confinement: how it is kept apart, and its memory limit; None takes the defaults.
+        on_progress: called with (done, total) steps now and then.
+
+    Returns:
+        Where the predictions lie, and what the run took.
+
+    Raises:
+        MethodFailed: it crashed, or ran out of time or memory; the message names the log. Or
+            isolation is required and the system does not allow it.
+        BadMethod: a submission has no predictions for this capture.
+        BadInput: the folder of a submission's predictions leads out of the submission.
+    """
+    if manifest.kind == "predictions":
+        folder = inside(manifest.root, f"{manifest.entry}/{capture_id}")
+        if not folder.is_dir():
+            raise BadMethod(
+                f"has no predictions for {capture_id}",
+                where=folder,
+                remedy=f"Put the frames into {manifest.entry}/{capture_id}/.",
+            )
+        return RunRecord(folder, RunFacts(), 0.0)
+    wanted = confinement or Confinement()
+    shutil.rmtree(output, ignore_errors=True)
+    output.mkdir(parents=True)
+    limits = Limits(time_limit, wanted.memory_bytes)
+    started = time.perf_counter()
+    # Behind walls the working folder is another one, and a relative path would lead nowhere.
+    places = request.absolute(), output.absolute()
+    outcome, isolation = _run(manifest, *places, wanted, limits, on_progress)
+    wall = time.perf_counter() - started
+    remove_odd_files(output)
+    log = output / LOG
+    if outcome.stopped is not None:
+        raise MethodFailed(
+            f"{manifest.name} {_broken(outcome.stopped, capture_id, limits)}",
+            where=log,
+            remedy=_REMEDIES[outcome.stopped],
+        )
+    if outcome.status != 0:
+        raise MethodFailed(
+            f"{manifest.name} failed on {capture_id}: {_reason(output, outcome.status)}",
+            where=log,
+            remedy="The log holds what it printed.",
+        )
+    if manifest.kind == "python" and not (output / RUN).is_file():
+        raise MethodFailed(
+            f"{manifest.name} ended before it had rendered every frame of {capture_id}", where=log
+        )
+    try:
+        facts = read_facts(output / RUN)
+    except BadInput as error:
+        problem = f"{manifest.name} wrote a {RUN} that cannot be read ({error.problem})"
+        raise MethodFailed(problem, where=log, field=error.field) from error
+    return RunRecord(output / PREDICTIONS, facts, wall, isolation)
+
+
+def _run(
+    manifest: MethodManifest,
+    request: Path,
+    output: Path,
+    wanted: Confinement,
+    limits: Limits,
+    on_progress: Callable[[int, int], None] | None,
+) -> tuple[Outcome, str]:
+    """Run behind the best walls that are wanted and to be had; says which they were."""
+    command = _command(manifest, request, output)
+
+    def poll() -> None:
+        if on_progress is not None:
+            _show_progress(output / PROGRESS, on_progress)
+
+    if wanted.mode != "none":
+        environment, places = apart(manifest, command, request, output, wanted)
+        walled = Program(command, output, environment, places, output / LOG)
+        outcome = run_program(walled, limits, poll)
+        if outcome.refused is None:
+            return outcome, "namespaces"
+        if wanted.mode == "required":
+            raise MethodFailed(
+                f"namespaces are required and not to be had ({outcome.refused})",
+                where=manifest.name,
+                field="isolation",
+                remedy="docs/threat-model.md says what they need.",
+            )
+        isolation = f"processes ({outcome.refused})"
+    else:
+        isolation = "processes"
+    plain = Program(command, output, inherited(), None, output / LOG)
+    outcome = run_program(plain, limits, poll)
+    if outcome.refused is not None:
+        raise MethodFailed(f"could not be started ({outcome.refused})", where=manifest.name)
+    return outcome, isolation
+
+
+def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]:
+    if manifest.kind == "python":
+        worker = [sys.executable, "-m", "hwp_bench.run.worker"]
+        method = ["--method", str(manifest.root.resolve()), "--entry", str(manifest.entry)]
+        return [*worker, str(request.resolve()), str(output.resolve()), *method]
+    places = {
+        "{request}": str(request.resolve()),
+        "{output}": str(output.resolve()),
+        "{method}": str(manifest.root.resolve()),
+        "{python}": sys.executable,
+    }
+    words = []
+    for word in manifest.entry:
+        for place, value in places.items():
+            word = word.replace(place, value)
+        words.append(word)
+    return words
+
+
+def _broken(limit: str, capture_id: str, limits: Limits) -> str:
+    return {
+        "time": f"ran out of time on {capture_id} after {limits.seconds:g} s",
+        "memory": f"took more than {limits.memory / 1e9:.3g} GB of memory on {capture_id}",
+        "processes": f"ran more than {MAX_PROCESSES} processes at once on {capture_id}",
+    }[limit]
+
+
+def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
+    # A link may lead to what only the toolkit can read.
+    if path.is_symlink():
+        return
+    with contextlib.suppress(BadInput, KeyError, TypeError, ValueError):
+        value = read_json(path, max_bytes=10_000)
+        on_progress(int(value["done"]), int(value["total"]))
+
+
+def _reason(output: Path, status: int | None) -> str:
+    with contextlib.suppress(BadInput, KeyError, TypeError):
+        return shown(str(read_json(output / FAILURE, max_bytes=100_000)["problem"])[:2000])
+    if status is not None and status < 0:
+        with contextlib.suppress(ValueError):
+            return f"killed by {signal.Signals(-status).name}"
+    return f"exit status {status}"

@@ -1,0 +1,173 @@
+"""The process between the toolkit and a stranger's program: builds its walls, then waits for it.
+
+It is started with a bare interpreter (`-I -S`) for its speed. Its order comes as JSON on standard
+input, so that the program finds nothing of it; its report goes to a descriptor that the program
+does not inherit.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import resource
+import signal
+import sys
+from typing import Any, NoReturn
+
+from hwp_bench.run.sandbox import syscalls
+from hwp_bench.run.sandbox.offspring import end_descendants
+from hwp_bench.run.sandbox.root import enter_root, raise_loopback
+
+_NAMESPACES = (
+    syscalls.CLONE_NEWUSER
+    | syscalls.CLONE_NEWNS
+    | syscalls.CLONE_NEWPID
+    | syscalls.CLONE_NEWNET
+    | syscalls.CLONE_NEWIPC
+)
+
+
+def main(report: int) -> None:
+    """Carry out one order.
+
+    The order holds `command`, `folder`, `environment`, `parent` (process id of whoever waits) and
+    `places` (null for a run without namespaces). The report is one JSON object: `status` (an exit
+    status, or a signal's number below 0), or `problem` with `stage` (`sandbox` or `command`).
+
+    Args:
+        report: descriptor that the report is written to.
+    """
+    order = json.loads(sys.stdin.buffer.read())
+    os.set_inheritable(report, False)
+    silence = os.open(os.devnull, os.O_RDWR)
+    os.dup2(silence, 0)
+    os.close(silence)
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+    _volunteer()
+    try:
+        run = _run_apart if order["places"] is not None else _run_watched
+        answer = run(order)
+    except OSError as error:
+        answer = {"stage": "sandbox", "problem": str(error.args[-1])}
+    os.write(report, json.dumps(answer).encode())
+
+
+def _volunteer() -> None:
+    """Where memory runs out altogether, the kernel should end the method, not the toolkit."""
+    with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as stream:
+        stream.write("1000")
+
+
+def _run_watched(order: dict[str, Any]) -> dict[str, Any]:
+    """Run the command as a plain child; its descendants die with it."""
+    linux = sys.platform == "linux"
+    if linux:
+        syscalls.adopt_orphans()
+        syscalls.die_with_parent(signal.SIGTERM)
+        syscalls.hide_from_peers()
+    # Set before the child exists: its end must never be a question of timing.
+    signal.signal(signal.SIGTERM, _end_all)
+    if os.getppid() != order["parent"]:
+        raise OSError("whoever asked for the run is gone")
+    child, problem = _start(order)
+    if problem:
+        return {"stage": "command", "problem": problem}
+    status = _wait(child)
+    if linux:
+        end_descendants()
+    return {"status": status}
+
+
+def _end_all(*_: object) -> NoReturn:
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)
+    if sys.platform == "linux":
+        end_descendants()
+    os._exit(1)
+
+
+def _run_apart(order: dict[str, Any]) -> dict[str, Any]:
+    """Run the command in namespaces of its own; the kernel ends them with their first process."""
+    user, group = os.getuid(), os.getgid()
+    syscalls.unshare(_NAMESPACES)
+    for name, text in (
+        ("setgroups", "deny"),
+        ("uid_map", f"{user} {user} 1"),
+        ("gid_map", f"{group} {group} 1"),
+    ):
+        with open(f"/proc/self/{name}", "w") as table:
+            table.write(text)
+    syscalls.die_with_parent(signal.SIGKILL)
+    if os.getppid() != order["parent"]:
+        raise OSError("whoever asked for the run is gone")
+    go_read, go_write = os.pipe()
+    answer_read, answer_write = os.pipe()
+    first = os.fork()
+    if first == 0:
+        os.close(go_write)
+        os.close(answer_read)
+        _be_first(order, go_read, answer_write)
+    os.close(go_read)
+    os.close(answer_write)
+    os.write(go_write, b"!")
+    with os.fdopen(answer_read, "rb") as answer:
+        said = answer.read()
+    status = _wait(first)
+    return json.loads(said) if said else {"status": status}
+
+
+def _be_first(order: dict[str, Any], go: int, answer: int) -> NoReturn:
+    """What the first process of the new process namespace does; never returns."""
+    result: dict[str, Any] = {"stage": "sandbox", "problem": "failed"}
+    try:
+        syscalls.die_with_parent(signal.SIGKILL)
+        # Nothing comes where the parent had ended before the line above.
+        if not os.read(go, 1):
+            os._exit(1)
+        os.close(go)
+        enter_root(order["places"])
+        with contextlib.suppress(OSError):
+            raise_loopback()
+        syscalls.give_up_privileges()
+        syscalls.hide_from_peers()
+        child, problem = _start(order)
+        if problem:
+            result = {"stage": "command", "problem": problem}
+        else:
+            result = {"status": _wait(child)}
+    except OSError as error:
+        result = {"stage": "sandbox", "problem": str(error.args[-1])}
+    finally:
+        os.write(answer, json.dumps(result).encode())
+        os._exit(0)
+
+
+def _start(order: dict[str, Any]) -> tuple[int, str]:
+    """Start the command; returns its process id, and what is wrong where it cannot be started."""
+    read, write = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            # Python ignores some signals, and what is ignored stays so in the new program.
+            for name in ("SIGTERM", "SIGPIPE", "SIGXFSZ"):
+                signal.signal(getattr(signal, name), signal.SIG_DFL)
+            os.chdir(order["folder"])
+            os.execvpe(order["command"][0], order["command"], order["environment"])
+        except OSError as error:
+            os.write(write, (error.strerror or "unknown reason").encode())
+        finally:
+            os._exit(127)
+    os.close(write)
+    with os.fdopen(read, "rb") as stream:
+        problem = stream.read().decode()
+    if problem:
+        os.waitpid(child, 0)
+    return child, problem
+
+
+def _wait(child: int) -> int:
+    """Wait for one child, and bury the orphans that end meanwhile."""
+    while True:
+        process, status = os.waitpid(-1, 0)
+        if process == child:
+            return os.waitstatus_to_exitcode(status)

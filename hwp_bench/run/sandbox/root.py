@@ -1,0 +1,113 @@
+"""A root of its own for a program: only what is shown exists, and nothing else can be reached.
+
+The order of steps is bubblewrap's: the new root grows on a tmpfs, the old one is moved below it
+with pivot_root(2) while places are bound out of it, and then detached.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import socket
+import struct
+from collections.abc import Sequence
+
+from hwp_bench.run.sandbox import syscalls
+
+#: Ways in which a place can appear: read-only or writable as it is, empty, as a private scratch
+#: folder, as a symbolic link, or as the process table.
+KINDS = ("read", "write", "hidden", "scratch", "link", "proc")
+#: Size of a scratch folder, bytes; it counts as memory.
+SCRATCH_BYTES = 1 << 30
+
+# Any folder that exists everywhere; what lies in it is bound out of the old root.
+_STAGE = "/tmp"
+_OLD, _NEW = "/old", "/new"
+
+#: One place: kind, path, and the target of a link (empty for the others).
+Place = tuple[str, str, str]
+
+
+def enter_root(places: Sequence[Place]) -> None:
+    """Move this process into a root that shows the given places only.
+
+    It must be in a mount namespace of its own, and the first process of its process namespace.
+
+    Args:
+        places: sorted so that outer ones come first; paths are absolute, and free of symbolic
+            links apart from those that are places themselves.
+
+    Raises:
+        Refused: the system does not allow a step.
+        OSError: a mount point cannot be made.
+    """
+    quiet = syscalls.MS_NOSUID | syscalls.MS_NODEV
+    syscalls.mount("", "/", "", syscalls.MS_REC | syscalls.MS_SLAVE)
+    syscalls.mount("tmpfs", _STAGE, "tmpfs", quiet, "size=16m,mode=755")
+    for name in (_OLD, _NEW):
+        os.mkdir(_STAGE + name)
+    syscalls.mount("tmpfs", _STAGE + _NEW, "tmpfs", quiet, "size=16m,mode=755")
+    syscalls.pivot_root(_STAGE, _STAGE + _OLD)
+    os.chdir("/")
+    # A hidden folder is one only where a place that is shown contains it.
+    masks = [path for place in places if (path := _show(place))]
+    # Not before now: what lies in a hidden folder and is shown all the same needs mount points.
+    for path in masks:
+        _restrict(path)
+    syscalls.unmount(_OLD)
+    os.chdir(_NEW)
+    # The known way to drop the outer root: stack it on the new one, and detach it.
+    syscalls.pivot_root(".", ".")
+    syscalls.unmount(".")
+    os.chdir("/")
+    _restrict("/")
+
+
+def _show(place: Place) -> str | None:
+    """Show one place; returns the folder that was hidden, if one was."""
+    kind, path, target = place
+    here, there = _NEW + path, _OLD + path
+    if kind == "link":
+        if not os.path.lexists(here):
+            os.makedirs(os.path.dirname(here), exist_ok=True)
+            os.symlink(target, here)
+    elif kind in ("read", "write"):
+        _mount_point(here, folder=os.path.isdir(there))
+        syscalls.mount(there, here, "", syscalls.MS_BIND | syscalls.MS_REC)
+        attributes = syscalls.MOUNT_ATTR_NOSUID
+        if kind == "read":
+            attributes |= syscalls.MOUNT_ATTR_RDONLY
+        syscalls.set_attributes(here, attributes)
+    elif kind == "proc":
+        os.makedirs(here, exist_ok=True)
+        syscalls.mount("proc", here, "proc", syscalls.MS_NOSUID | syscalls.MS_NODEV)
+    elif kind == "scratch":
+        os.makedirs(here, exist_ok=True)
+        _tmpfs(here, f"size={SCRATCH_BYTES},mode=1777")
+    elif os.path.isdir(here):
+        _tmpfs(here, "size=1m,mode=755")
+        return here
+    return None
+
+
+def _mount_point(path: str, *, folder: bool) -> None:
+    if folder:
+        os.makedirs(path, exist_ok=True)
+    elif not os.path.lexists(path):
+        os.makedirs(os.path.dirname(path), exist_ok=True)
+        os.close(os.open(path, os.O_CREAT | os.O_WRONLY, 0o644))
+
+
+def _tmpfs(path: str, options: str) -> None:
+    syscalls.mount("tmpfs", path, "tmpfs", syscalls.MS_NOSUID | syscalls.MS_NODEV, options)
+
+
+def _restrict(path: str) -> None:
+    syscalls.set_attributes(path, syscalls.MOUNT_ATTR_RDONLY, recursive=False)
+
+
+def raise_loopback() -> None:
+    """Switch on `lo`, the only interface of a new network namespace: it leads nowhere else."""
+    siocsifflags, up = 0x8914, 0x1
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as handle:
+        fcntl.ioctl(handle, siocsifflags, struct.pack("16sh22x", b"lo", up))

@@ -1,0 +1,185 @@
+"""Start a stranger's program behind its walls, watch its time and memory, and end all of it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import IO, Any
+
+from hwp_bench.base.errors import MethodFailed
+from hwp_bench.base.packages import PACKAGES
+from hwp_bench.run.sandbox.root import Place
+from hwp_bench.run.sandbox.usage import memory_of, processes_of
+
+#: Bytes of a program's output that are kept; the rest is counted and thrown away.
+MAX_LOG_BYTES = 1024 * 1024
+#: Most processes that a program may have at once.
+MAX_PROCESSES = 1024
+
+_POLL_SECONDS = 0.05
+_MEASURE_SECONDS = 0.2
+# A bare interpreter, so that a run starts within a few hundredths of a second.
+_LAUNCH = (
+    "import sys; sys.path.insert(0, {root!r}); from hwp_bench.run.sandbox.launch import main; "
+)
+
+
+@dataclass(frozen=True)
+class Program:
+    """What is run, and where."""
+
+    #: Its words.
+    command: Sequence[str]
+    #: Its working folder.
+    folder: Path
+    #: Everything that it finds in its environment.
+    environment: Mapping[str, str]
+    #: What it sees of the file system; None starts it without namespaces.
+    places: Sequence[Place] | None
+    #: File that takes what it prints.
+    log: Path
+
+
+@dataclass(frozen=True)
+class Limits:
+    """When a program is stopped."""
+
+    #: Wall time, seconds.
+    seconds: float
+    #: Memory of all its processes together, bytes.
+    memory: int
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a program ended."""
+
+    #: Exit status, below 0 a signal's number; None where it was stopped or never started.
+    status: int | None
+    #: Which limit stopped it (`time`, `memory`, `processes`), or None.
+    stopped: str | None = None
+    #: Why there was no sandbox, or None.
+    refused: str | None = None
+
+
+def run_program(
+    program: Program, limits: Limits, on_poll: Callable[[], None] | None = None
+) -> Outcome:
+    """Run a program to its end; whatever ends it, no process of it is left.
+
+    Args:
+        program: what to run.
+        limits: when to stop it.
+        on_poll: called some times a second meanwhile.
+
+    Raises:
+        MethodFailed: there is no such command, or it cannot be executed.
+    """
+    read, write = os.pipe()
+    root = os.fspath(PACKAGES)
+    bare = [sys.executable, "-I", "-S", "-B", "-c", _LAUNCH.format(root=root) + f"main({write})"]
+    process = subprocess.Popen(
+        bare,
+        env=dict(program.environment),
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        start_new_session=True,
+        pass_fds=(write,),
+    )
+    os.close(write)
+    assert process.stdin is not None
+    assert process.stdout is not None
+    drain = threading.Thread(target=_drain, args=(process.stdout, program.log), daemon=True)
+    drain.start()
+    with os.fdopen(read, "rb") as report:
+        try:
+            with contextlib.suppress(BrokenPipeError):
+                process.stdin.write(_order(program))
+                process.stdin.close()
+            stopped = _watch(process, limits, on_poll)
+        finally:
+            _end(process)
+            drain.join(timeout=5)
+        text = report.read()
+    if stopped is not None:
+        return Outcome(None, stopped)
+    answer: dict[str, Any] = json.loads(text) if text else {"status": process.returncode}
+    if answer.get("stage") == "sandbox":
+        return Outcome(None, refused=answer["problem"])
+    if answer.get("stage") == "command":
+        raise MethodFailed(
+            f"cannot be started ({answer['problem']})",
+            where=program.command[0],
+            field="entry.command",
+        )
+    return Outcome(answer["status"])
+
+
+def _order(program: Program) -> bytes:
+    order = {
+        "command": list(program.command),
+        "folder": os.fspath(program.folder),
+        "environment": dict(program.environment),
+        "places": program.places,
+        "parent": os.getpid(),
+    }
+    return json.dumps(order).encode()
+
+
+def _watch(
+    process: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[], None] | None
+) -> str | None:
+    """Wait for the end of a process; returns the limit that it broke, if any."""
+    deadline = time.monotonic() + limits.seconds
+    measure = 0.0
+    while process.poll() is None:
+        now = time.monotonic()
+        if now > deadline:
+            return "time"
+        if now >= measure:
+            measure = now + _MEASURE_SECONDS
+            family = processes_of(process.pid)
+            if len(family) > MAX_PROCESSES:
+                return "processes"
+            if memory_of(family, limits.memory) > limits.memory:
+                return "memory"
+            if on_poll is not None:
+                on_poll()
+        time.sleep(_POLL_SECONDS)
+    return None
+
+
+def _end(process: subprocess.Popen[bytes]) -> None:
+    """End a launcher and everything below it."""
+    if process.poll() is None:
+        # It takes its descendants along, or the kernel does, with their process namespace.
+        process.terminate()
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(timeout=10)
+    # What is left where there are no namespaces and the launcher itself was killed.
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def _drain(stream: IO[bytes], log: Path) -> None:
+    kept = 0
+    dropped = 0
+    with open(log, "wb") as target:
+        while chunk := stream.read(65536):
+            part = chunk[: MAX_LOG_BYTES - kept]
+            target.write(part)
+            kept += len(part)
+            dropped += len(chunk) - len(part)
+        if dropped:
+            target.write(f"\n[{dropped} further bytes were not kept]\n".encode())

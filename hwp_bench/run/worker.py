@@ -1,0 +1,161 @@
+"""The process that a Python method runs in: `python -m hwp_bench.run.worker`.
+
+It is given a request folder and an output folder, and never learns where the capture lies.
+"""
+
+from __future__ import annotations
+
+import argparse
+import importlib
+import sys
+import time
+import traceback
+from dataclasses import asdict
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
+from hwp_bench.base.files import write_json
+from hwp_bench.base.images import write_image
+from hwp_bench.capture.layout import frame_name
+from hwp_bench.methods.contract import Avatar, MethodFactory
+from hwp_bench.methods.request import TrainingCapture, open_request
+from hwp_bench.run.clock import ReportClock, peak_memory
+from hwp_bench.run.facts import RunFacts
+
+#: Folder of the predicted test frames inside the output folder.
+PREDICTIONS = "predictions"
+#: Folder of the validation frames of each checkpoint inside the output folder.
+CHECKPOINTS = "checkpoints"
+#: Folder of what the method says of itself, for pictures and tables; optional.
+DIAGNOSTICS = "diagnostics"
+#: What the run took.
+RUN = "run.json"
+#: How far the fit is.
+PROGRESS = "progress.json"
+#: Why the run failed.
+FAILURE = "failure.json"
+#: Most validation frames that are rendered for a checkpoint.
+CHECKPOINT_FRAMES = 8
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a method on a request; returns the exit status."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("request", type=Path)
+    parser.add_argument("output", type=Path)
+    parser.add_argument("--method", type=Path, required=True)
+    parser.add_argument("--entry", required=True)
+    args = parser.parse_args(arguments)
+    args.output.mkdir(parents=True, exist_ok=True)
+    try:
+        factory = load_entry(args.method, args.entry)
+        run(open_request(args.request), factory, args.output)
+    except HwpError as error:
+        write_json(args.output / FAILURE, {"problem": str(error)})
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except Exception as error:
+        traceback.print_exc()
+        problem = f"{type(error).__name__}: {error}"[:500]
+        write_json(args.output / FAILURE, {"problem": problem})
+        return 1
+    return 0
+
+
+def load_entry(method: Path, entry: str) -> MethodFactory:
+    """Import `module:callable`; modules in the method directory come first.
+
+    Raises:
+        BadMethod: there is no such module or callable.
+    """
+    module_name, _, name = entry.partition(":")
+    sys.path.insert(0, str(method.resolve()))
+    try:
+        module = importlib.import_module(module_name)
+    except ModuleNotFoundError as error:
+        raise BadMethod(
+            f"cannot import {module_name} ({error})", where=method, field="entry.python"
+        ) from error
+    factory = getattr(module, name, None)
+    if not callable(factory):
+        raise BadMethod(f"{module_name} has no {name}", where=method, field="entry.python")
+    return factory
+
+
+def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None:
+    """Fit, render the targets, and write predictions, checkpoints and `run.json`.
+
+    Raises:
+        MethodFailed: the method returned something that is no image.
+    """
+    frames = checkpoint_frames(training.validation)
+
+    def record(index: int, avatar: Avatar) -> None:
+        for frame in frames:
+            folder = output / CHECKPOINTS / f"{index:03d}"
+            write_image(folder / frame_name(frame), render(avatar, training, frame))
+
+    method = factory(training.run.settings, training.run.seed)
+    report = ReportClock(training.run.budget, record, output / PROGRESS)
+    avatar = method.fit(training, training.run.budget, report)
+    fit_seconds = report.elapsed
+    steps = max((checkpoint.step for checkpoint in report.checkpoints), default=0)
+    final_step = int(getattr(avatar, "steps", steps))
+    explain = getattr(avatar, "write_diagnostics", None)
+    if callable(explain):
+        explain(output / DIAGNOSTICS)
+    report.take(final_step, avatar)
+    render_seconds = 0.0
+    for frame in training.targets.tolist():
+        started = time.perf_counter()
+        pixels = render(avatar, training, frame)
+        render_seconds += time.perf_counter() - started
+        write_image(output / PREDICTIONS / frame_name(frame), pixels)
+    facts = RunFacts(
+        fit_seconds=fit_seconds,
+        render_seconds=render_seconds,
+        curve_seconds=report.paused,
+        steps=final_step,
+        peak_memory=peak_memory(),
+        device=device_name(avatar),
+        checkpoint_frames=frames,
+        checkpoints=report.checkpoints,
+    )
+    write_json(output / RUN, asdict(facts))
+
+
+def checkpoint_frames(validation: np.ndarray) -> list[int]:
+    """Return at most eight validation frames, evenly spaced."""
+    count = min(CHECKPOINT_FRAMES, len(validation))
+    picks = np.linspace(0, len(validation) - 1, count).round().astype(int)
+    return validation[picks].tolist()
+
+
+def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
+    """Render one frame and bring it to 8 bits: clipped, rounded half to even.
+
+    Raises:
+        MethodFailed: the result has another shape or is not finite.
+    """
+    rgba = np.asarray(avatar.render(training.hand_poses(frame), training.camera(frame)))
+    if rgba.shape != (training.height, training.width, 4):
+        raise MethodFailed(
+            f"render returned shape {rgba.shape}, not {(training.height, training.width, 4)}",
+            field=f"frame {frame}",
+        )
+    if not np.isfinite(rgba).all():
+        raise MethodFailed("render returned NaN or infinity", field=f"frame {frame}")
+    from hwp_bench.metrics.pixels import quantize
+
+    return quantize(np.asarray(rgba[:, :, :3], dtype=np.float64))
+
+
+def device_name(avatar: Avatar) -> str:
+    """Return what the avatar says it ran on, `cpu` if it says nothing."""
+    return str(getattr(avatar, "device", "cpu"))[:100]
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,125 @@
+"""Atomic files and folders, bounded JSON, paths that stay inside. Oracle: the file system."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from hwp_bench.base.errors import BadInput, HwpError, UsageError
+from hwp_bench.base.files import (
+    atomic_folder,
+    atomic_write,
+    inside,
+    read_json,
+    sha256_json,
+    write_json,
+)
+
+
+def test_a_file_is_replaced_whole_and_leaves_nothing_beside_it(tmp_path: Path) -> None:
+    target = tmp_path / "deep" / "file.txt"
+    atomic_write(target, "first")
+    atomic_write(target, b"second")
+    assert target.read_bytes() == b"second"
+    assert [item.name for item in target.parent.iterdir()] == ["file.txt"]
+
+
+def test_a_write_that_fails_is_one_error_and_leaves_the_old_file(tmp_path: Path) -> None:
+    target = tmp_path / "file.json"
+    write_json(target, {"old": 1})
+    with pytest.raises(ValueError, match="Out of range float"):
+        write_json(target, {"new": float("nan")})
+    assert read_json(target) == {"old": 1}
+    with pytest.raises(HwpError, match="cannot be written"):
+        atomic_write(target / "below a file", "x")
+
+
+def test_a_folder_takes_its_name_only_when_the_block_ends_well(tmp_path: Path) -> None:
+    target = tmp_path / "capture"
+    with pytest.raises(RuntimeError), atomic_folder(target) as folder:
+        (folder / "half").write_text("x")
+        raise RuntimeError
+    assert list(tmp_path.iterdir()) == []
+    with atomic_folder(target) as folder:
+        (folder / "whole").write_text("x")
+        assert not target.exists()
+    assert (target / "whole").is_file()
+    assert [item.name for item in tmp_path.iterdir()] == ["capture"]
+
+
+def test_a_full_folder_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
+    target = tmp_path / "capture"
+    with atomic_folder(target) as folder:
+        (folder / "old").write_text("x")
+    with pytest.raises(UsageError, match="exists already"), atomic_folder(target):
+        pass
+    with atomic_folder(target, overwrite=True) as folder:
+        (folder / "new").write_text("x")
+    assert [item.name for item in target.iterdir()] == ["new"]
+
+
+@pytest.mark.parametrize(
+    ("text", "problem"),
+    [
+        ("{", "is not valid JSON"),
+        ('{"a": NaN}', "NaN is no JSON number"),
+        ("[" * 100_000, "nested too deeply"),
+        ("[" * 200 + "]" * 200, "nested too deeply"),
+        ('{"a":' * 150 + "1" + "}" * 150, "nested too deeply"),
+        ('{"a": 1e999}', "1e999 is too large a number"),
+        ('{"a": -1e999}', "-1e999 is too large"),
+        ('{"a": ' + "9" * 5000 + "}", "is too large a number"),
+        ('{"a": 9223372036854775809}', "is too large a number"),
+        ('"' + "x" * 300 + '"', "more than the 200 bytes"),
+        (b"\xff\xfe{", "is not UTF-8"),
+    ],
+)
+def test_damaged_json_is_named(tmp_path: Path, text: str | bytes, problem: str) -> None:
+    path = tmp_path / "file.json"
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    limit = 200 if "more than" in problem else 10**7
+    with pytest.raises(BadInput, match=problem) as caught:
+        read_json(path, max_bytes=limit)
+    assert str(path) in str(caught.value)
+
+
+def test_missing_json_is_named(tmp_path: Path) -> None:
+    with pytest.raises(BadInput, match="does not exist"):
+        read_json(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize("path", ["/etc/passwd", "../up", "a/../../up", "link/file"])
+def test_paths_out_of_a_folder_are_refused(tmp_path: Path, path: str) -> None:
+    root = tmp_path / "root"
+    root.mkdir()
+    (root / "link").symlink_to(tmp_path)
+    with pytest.raises(BadInput, match="leads out of the folder"):
+        inside(root, path)
+    assert inside(root, "a/../b") == root / "b"
+
+
+def test_json_digest_ignores_the_order_of_keys_only() -> None:
+    assert sha256_json({"a": 1, "b": [1, 2]}) == sha256_json({"b": [1, 2], "a": 1})
+    assert sha256_json({"a": 1, "b": [1, 2]}) != sha256_json({"a": 1, "b": [2, 1]})
+    assert len(sha256_json(json.loads("{}"))) == 64
+
+
+def test_json_of_ordinary_depth_and_size_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "file.json"
+    value = {"a": [[[1.5, -(2**63), None, True]]], "b": "\u202e"}
+    path.write_text(json.dumps(value))
+    assert read_json(path) == value
+
+
+def test_pipes_devices_and_folders_are_not_waited_for(tmp_path: Path) -> None:
+    import os
+
+    os.mkfifo(tmp_path / "pipe")
+    (tmp_path / "zero").symlink_to("/dev/zero")
+    for name in ("pipe", "zero"):
+        with pytest.raises(BadInput, match="is no regular file"):
+            read_json(tmp_path / name)
+    with pytest.raises(BadInput, match="cannot be read"):
+        read_json(tmp_path)

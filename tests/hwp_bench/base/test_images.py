@@ -1,0 +1,169 @@
+"""Images in and out. Oracle: OpenCV's and Pillow's own readers and writers, exact."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch
+from hwp_bench.base.images import pixel_digest, read_gray, read_rgb, write_image
+
+
+@pytest.fixture
+def picture() -> np.ndarray:
+    return np.random.default_rng(0).integers(0, 256, (30, 40, 3), dtype=np.uint8)
+
+
+def test_opencv_reads_what_is_written_and_the_other_way(tmp_path: Path, picture) -> None:
+    path = write_image(tmp_path / "ours.png", picture)
+    np.testing.assert_array_equal(cv2.imread(str(path))[:, :, ::-1], picture)
+    cv2.imwrite(str(tmp_path / "theirs.png"), picture[:, :, ::-1])
+    np.testing.assert_array_equal(read_rgb(tmp_path / "theirs.png", (30, 40)), picture)
+    write_image(tmp_path / "mask.png", picture[:, :, 0])
+    np.testing.assert_array_equal(read_gray(tmp_path / "mask.png"), picture[:, :, 0])
+    assert sorted(item.name for item in tmp_path.iterdir()) == [
+        "mask.png",
+        "ours.png",
+        "theirs.png",
+    ]
+
+
+def test_gray_becomes_rgb_and_alpha_is_dropped(tmp_path: Path, picture) -> None:
+    write_image(tmp_path / "gray.png", picture[:, :, 0])
+    gray = read_rgb(tmp_path / "gray.png")
+    assert all((gray[:, :, c] == picture[:, :, 0]).all() for c in range(3))
+    alpha = np.zeros((30, 40, 1), np.uint8)
+    write_image(tmp_path / "rgba.png", np.concatenate([picture, alpha], axis=2))
+    # Transparent pixels keep their colour: alpha is dropped, not composited.
+    np.testing.assert_array_equal(read_rgb(tmp_path / "rgba.png"), picture)
+
+
+@pytest.mark.parametrize("kind", ["missing", "empty", "text", "truncated", "size", "16-bit"])
+def test_bad_images_are_named(tmp_path: Path, picture, kind: str) -> None:
+    path = tmp_path / "image.png"
+    whole = write_image(tmp_path / "whole.png", picture).read_bytes()
+    problem = {
+        "missing": "does not exist",
+        "empty": "is empty",
+        "text": "is no image",
+        "truncated": "is damaged or truncated",
+        "size": "40x30 pixels where 32x32 is expected",
+        "16-bit": "uint16 samples",
+    }[kind]
+    if kind == "16-bit":
+        cv2.imwrite(str(path), picture.astype(np.uint16) * 256)
+    elif kind != "missing":
+        content = {"empty": b"", "text": b"no image", "truncated": whole[: len(whole) // 2]}
+        path.write_bytes(content.get(kind, whole))
+    with pytest.raises(BadImage, match=problem) as caught:
+        read_rgb(path, (32, 32) if kind == "size" else (30, 40))
+    assert str(path) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_header_that_claims_gigabytes_is_refused_before_decoding(tmp_path: Path) -> None:
+    import struct
+    import zlib
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        body = kind + data
+        return struct.pack(">I", len(data)) + body + struct.pack(">I", zlib.crc32(body))
+
+    header = struct.pack(">IIBBBBB", 60_000, 60_000, 8, 2, 0, 0, 0)
+    path = tmp_path / "bomb.png"
+    path.write_bytes(
+        b"\x89PNG\r\n\x1a\n"
+        + chunk(b"IHDR", header)
+        + chunk(b"IDAT", zlib.compress(b"\0" * 100))
+        + chunk(b"IEND", b"")
+    )
+    with pytest.raises(BadImage, match=r"above the limit|malicious"):
+        read_rgb(path)
+
+
+def test_what_cannot_be_written_is_one_error(tmp_path: Path, picture) -> None:
+    with pytest.raises(ShapeMismatch):
+        write_image(tmp_path / "float.png", picture / 255.0)
+    with pytest.raises(HwpError, match="no image format"):
+        write_image(tmp_path / "file.nothing", picture)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_digest_sees_pixels_and_shape_not_compression(picture) -> None:
+    assert pixel_digest(picture) == pixel_digest(picture.copy())
+    changed = picture.copy()
+    changed[3, 4, 1] ^= 1
+    assert pixel_digest(picture) != pixel_digest(changed)
+    assert pixel_digest(picture) != pixel_digest(picture.reshape(40, 30, 3))
+
+
+def _pillow(path: Path, picture: np.ndarray, form: str, **options: object) -> Path:
+    from PIL import Image
+
+    Image.fromarray(picture).save(path, format=form, **options)
+    return path
+
+
+@pytest.mark.parametrize("orientation", [3, 6, 8])
+@pytest.mark.parametrize("form", ["JPEG", "PNG"])
+def test_a_mark_to_turn_the_picture_is_refused(
+    tmp_path: Path, picture, form: str, orientation: int
+) -> None:
+    from PIL import Image
+
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    path = _pillow(tmp_path / "turned.png", picture, form, exif=exif)
+    with pytest.raises(BadImage, match=f"EXIF orientation {orientation}"):
+        read_rgb(path)
+    exif[0x0112] = 1
+    assert read_rgb(_pillow(path, picture, form, exif=exif)).shape == (30, 40, 3)
+
+
+def test_an_animated_png_is_refused(tmp_path: Path, picture) -> None:
+    from PIL import Image
+
+    frames = [Image.fromarray(255 - picture)]
+    path = _pillow(tmp_path / "moving.png", picture, "PNG", save_all=True, append_images=frames)
+    with pytest.raises(BadImage, match="animated"):
+        read_rgb(path)
+
+
+@pytest.mark.parametrize("form", ["GIF", "TIFF", "WEBP", "TGA", "PPM", "ICO"])
+def test_other_formats_are_refused_whatever_the_name(tmp_path: Path, picture, form: str) -> None:
+    path = _pillow(tmp_path / "000018.png", picture, form)
+    with pytest.raises(BadImage, match="is no image that can be read"):
+        read_rgb(path)
+
+
+@pytest.mark.parametrize("form", ["zip", "tar"])
+def test_an_archive_in_place_of_an_image_is_refused(tmp_path: Path, form: str) -> None:
+    import shutil
+
+    (tmp_path / "content").mkdir()
+    archive = Path(shutil.make_archive(str(tmp_path / "archive"), form, tmp_path / "content"))
+    with pytest.raises(BadImage, match="is no image that can be read"):
+        read_rgb(archive.rename(tmp_path / "000018.png"))
+
+
+def test_palettes_one_bit_and_gray_with_alpha_are_read_as_pillow_does(tmp_path: Path) -> None:
+    from PIL import Image
+
+    rng = np.random.default_rng(1)
+    gray = Image.fromarray(rng.integers(0, 2, (16, 24), dtype=np.uint8) * 255)
+    for mode in ("P", "1", "LA"):
+        path = tmp_path / f"{mode}.png"
+        gray.convert(mode).save(path)
+        np.testing.assert_array_equal(read_rgb(path), np.asarray(gray.convert("RGB")))
+
+
+def test_a_folder_or_a_pipe_is_no_image(tmp_path: Path) -> None:
+    import os
+
+    os.mkfifo(tmp_path / "pipe.png")
+    for name in ("pipe.png", "."):
+        with pytest.raises(BadImage, match="does not exist"):
+            read_rgb(tmp_path / name)

@@ -1,0 +1,232 @@
+"""The restricted unpickler: reads what it must, runs nothing, names what it refuses."""
+
+from __future__ import annotations
+
+import contextlib
+import pickle
+import struct
+from collections import OrderedDict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hwp_bench.base.errors import BadInput, HwpError, UnsafePickle
+from hwp_bench.base.unpickle import StandIn, load_pickle
+
+
+@pytest.fixture
+def file(tmp_path: Path) -> Path:
+    return tmp_path / "object.pkl"
+
+
+class Calls:
+    """Pickles as a call of `function` with `arguments`."""
+
+    def __init__(self, function: Any, *arguments: Any) -> None:
+        self.call = (function, arguments)
+
+    def __reduce__(self) -> Any:
+        return self.call
+
+
+@pytest.mark.parametrize("protocol", range(pickle.HIGHEST_PROTOCOL + 1))
+def test_arrays_and_containers_come_back(file: Path, protocol: int) -> None:
+    random = np.random.default_rng(0)
+    value = {
+        "floats": random.normal(size=(3, 4)),
+        "fortran": np.asfortranarray(random.normal(size=(3, 4)).astype(np.float32)),
+        "big endian": np.arange(5, dtype=">i4"),
+        "bytes": np.zeros((2, 2, 1), dtype=np.uint8),
+        "bools": np.array([True, False]),
+        "text": np.array(["hand", "öre"]),
+        "empty": np.zeros((0, 3)),
+        "zero-dimensional": np.array(3.5),
+        "scalar": np.float32(1.5),
+        "plain": [1, 2.5, None, True, "name", b"raw", (1, 2), {3}, frozenset([4]), 1 + 2j],
+        "ordered": OrderedDict(a=1),
+        "buffer": bytearray(b"xyz"),
+    }
+    file.write_bytes(pickle.dumps(value, protocol=protocol))
+    read = load_pickle(file)
+    assert list(read) == list(value)
+    for key, expected in value.items():
+        if isinstance(expected, np.ndarray):
+            plain = np.asarray(read[key])
+            assert type(plain) is np.ndarray
+            assert plain.dtype.newbyteorder("=") == expected.dtype.newbyteorder("=")
+            np.testing.assert_array_equal(plain, expected)
+        else:
+            assert read[key] == expected
+    assert isinstance(read["scalar"], np.float32)
+
+
+def test_python_2_pickles_are_read(file: Path) -> None:
+    # What Python 2's cPickle wrote for {'a': numpy.arange(3.), 'path': 'x.jpg'}, protocol 2.
+    raw = (
+        b"\x80\x02}q\x01(U\x01aq\x02cnumpy.core.multiarray\n_reconstruct\nq\x03cnumpy\nndarray\n"
+        b"q\x04K\x00\x85U\x01b\x87Rq\x05(K\x01K\x03\x85cnumpy\ndtype\nq\x06U\x02f8K\x00K\x01\x87R"
+        b"q\x07(K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00tb\x89U\x18"
+        + np.arange(3.0).tobytes()
+        + b"tbU\x04pathq\x08U\x05x.jpgq\x09u."
+    )
+    file.write_bytes(raw)
+    read = load_pickle(file)
+    np.testing.assert_array_equal(read["a"], np.arange(3.0))
+    assert read["path"] == "x.jpg"
+
+
+def exploit(function: Any, *arguments: Any) -> bytes:
+    return pickle.dumps({"frames": [1, {"deep": (Calls(function, *arguments),)}]})
+
+
+def test_foreign_calls_are_refused_by_name_and_not_made(file: Path, tmp_path: Path) -> None:
+    import builtins
+    import os
+    import subprocess
+
+    trace = tmp_path / "trace"
+    for name, raw in {
+        "posix.system": exploit(os.system, f"touch {trace}"),
+        "builtins.eval": exploit(builtins.eval, f"open({str(trace)!r}, 'w')"),
+        "builtins.exec": exploit(builtins.exec, f"open({str(trace)!r}, 'w')"),
+        "subprocess.Popen": exploit(subprocess.Popen, ["touch", str(trace)]),
+        "builtins.getattr": exploit(builtins.getattr, {}, "__class__"),
+        "builtins.__import__": exploit(builtins.__import__, "os"),
+        "io.open": exploit(builtins.open, str(trace), "w"),
+        "numpy.fromfile": exploit(np.fromfile, "/etc/hostname"),
+        "numpy.load": exploit(np.load, "x.npy", None, True),
+        "functools.partial": b"cfunctools\npartial\n.",
+        "builtins.bytearray.fromhex": b"\x80\x04\x8c\x08builtins\x8c\x11bytearray.fromhex\x93.",
+        "numpy._core.multiarray._reconstruct.__globals__": (
+            b"\x80\x04\x8c\x16numpy._core.multiarray\x8c\x18_reconstruct.__globals__\x93."
+        ),
+        "hwp_bench.base.unpickle.load_pickle": b"chwp_bench.unpickle\nload_pickle\n.",
+    }.items():
+        file.write_bytes(raw)
+        with pytest.raises(UnsafePickle) as caught:
+            load_pickle(file)
+        assert caught.value.field == name
+        assert str(file) in str(caught.value)
+    assert not trace.exists()
+
+
+def test_persistent_references_are_refused(file: Path) -> None:
+    file.write_bytes(b"Pwhatever\n.")
+    with pytest.raises(UnsafePickle):
+        load_pickle(file)
+
+
+def test_object_arrays_are_refused(file: Path) -> None:
+    file.write_bytes(pickle.dumps(np.array([{}, None], dtype=object)))
+    with pytest.raises(BadInput, match="not plain numbers"):
+        load_pickle(file)
+
+
+def array_pickle(dtype: bytes, state: bytes, shape: bytes, raw: bytes) -> bytes:
+    """An array pickle with chosen type name, type state, shape and bytes (protocol 2)."""
+    return (
+        b"\x80\x02cnumpy.core.multiarray\n_reconstruct\ncnumpy\nndarray\nK\x00\x85U\x01b\x87R"
+        b"(K\x01" + shape + b"cnumpy\ndtype\nU" + bytes([len(dtype)]) + dtype + b"K\x00K\x01\x87R"
+        b"(" + state + b"tb\x89T" + struct.pack("<I", len(raw)) + raw + b"tb."
+    )
+
+
+PLAIN_STATE = b"K\x03U\x01<NNNJ\xff\xff\xff\xffJ\xff\xff\xff\xffK\x00"
+
+
+def test_the_crafted_pickles_below_are_well_formed(file: Path) -> None:
+    file.write_bytes(array_pickle(b"f8", PLAIN_STATE, b"K\x02\x85", bytes(16)))
+    np.testing.assert_array_equal(load_pickle(file), np.zeros(2))
+
+
+@pytest.mark.parametrize(
+    "raw",
+    [
+        # Bytes taken for object pointers: an object type, plain or hidden in a structure.
+        array_pickle(b"O8", PLAIN_STATE, b"K\x02\x85", bytes(16)),
+        array_pickle(b"O", PLAIN_STATE, b"K\x02\x85", bytes(16)),
+        array_pickle(b"V8", PLAIN_STATE, b"K\x02\x85", bytes(16)),
+        array_pickle(b"f8,O", PLAIN_STATE, b"K\x01\x85", bytes(16)),
+        # Structure, subtype or element size slipped in through the type's state.
+        array_pickle(
+            b"f8", b"K\x03U\x01<NU\x01f\x85}J\xff\xff\xff\xffK\x01K\x3f", b"K\x02\x85", b""
+        ),
+        array_pickle(b"f8", b"K\x03U\x01<NNNM\xff\x7fK\x01K\x3f", b"K\x02\x85", bytes(16)),
+        array_pickle(b"f8", b"K\x03U\x01?NNNJ\xff\xff\xff\xffK\x01K\x00", b"K\x02\x85", bytes(16)),
+        # Shapes that promise more or less than there is.
+        array_pickle(b"f8", PLAIN_STATE, b"K\x03\x85", bytes(16)),
+        array_pickle(b"f8", PLAIN_STATE, b"J\xff\xff\xff\xff\x85", bytes(8)),
+        array_pickle(b"f8", PLAIN_STATE, b"J\xff\xff\xff\x7fJ\xff\xff\xff\x7f\x86", bytes(8)),
+        array_pickle(b"S0", PLAIN_STATE, b"J\xff\xff\xff\x7f\x85", b""),
+        # Memory asked for out of nothing.
+        b"c__builtin__\nbytearray\nJ\xff\xff\xff\x7f\x85R.",
+        b"\x80\x02N" + b"r\xff\xff\xff\xff" + b".",
+        b"cnumpy\nndarray\n(J\xff\xff\xff\x7f\x85tR.",
+        b"\x80\x02cnumpy\nndarray\nJ\xff\xff\xff\x7f\x85\x85\x81.",
+        # Admitted functions misused.
+        b"c_codecs\nencode\nX\x01\x00\x00\x00aX\x03\x00\x00\x00bz2\x86R.",
+        b"ccopy_reg\n_reconstructor\n(c__builtin__\nset\nc__builtin__\nobject\nNtR.",
+        b"cnumpy.core.multiarray\nscalar\nNN\x86R.",
+        b"cnumpy.core.multiarray\n_reconstruct\n(c__builtin__\nset\nK\x00\x85U\x01btR.",
+        # Attributes of admitted functions set from a pickle.
+        b"\x80\x02c_codecs\nencode\nN}U\x09_functionNs\x86b.",
+        b"\x80\x02cnumpy\ndtype\n}U\x09__init__Nsb.",
+    ],
+)
+def test_crafted_pickles_are_refused(file: Path, raw: bytes) -> None:
+    file.write_bytes(raw)
+    with pytest.raises(BadInput):
+        load_pickle(file)
+    # Nothing stuck to the reader: an honest file is still read.
+    file.write_bytes(pickle.dumps([np.arange(3), bytearray(b"x"), b"y"], protocol=2))
+    np.testing.assert_array_equal(load_pickle(file)[0], np.arange(3))
+
+
+def test_stand_ins_keep_state_and_run_nothing(file: Path) -> None:
+    raw = b"\x80\x02cchumpy.ch\nCh\n)\x81}U\x01xK\x05sbcfoo\nBar\nK\x01K\x02\x86R\x86."
+    file.write_bytes(raw)
+    inner, called = load_pickle(file, stand_ins=("chumpy.*", "foo.Bar"))
+    assert isinstance(inner, StandIn)
+    assert (inner.origin, inner.state) == ("chumpy.ch.Ch", {"x": 5})
+    assert (called.origin, called.arguments) == ("foo.Bar", (1, 2))
+    with pytest.raises(UnsafePickle) as caught:
+        load_pickle(file, stand_ins=("chumpy.*",))
+    assert caught.value.field == "foo.Bar"
+    with pytest.raises(UnsafePickle):
+        load_pickle(file, stand_ins=("chump.*", "foo.Bar"))
+
+
+def test_old_style_objects_become_stand_ins(file: Path) -> None:
+    file.write_bytes(
+        b"ccopy_reg\n_reconstructor\n(cchumpy.ch\nCh\nc__builtin__\nobject\nNtR(dS'x'\nI7\nsb."
+    )
+    assert load_pickle(file, stand_ins=("chumpy.*",)).state == {"x": 7}
+
+
+def test_absent_and_oversized_files_are_named(file: Path) -> None:
+    with pytest.raises(BadInput, match="does not exist"):
+        load_pickle(file)
+    file.write_bytes(pickle.dumps(bytes(1000)))
+    with pytest.raises(BadInput, match="more than the 500"):
+        load_pickle(file, max_bytes=500)
+
+
+HONEST = pickle.dumps(
+    [{"img_path": "a.jpg", "pose": np.arange(48.0)[None], "n": i} for i in range(3)], protocol=2
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(position=st.integers(0, len(HONEST) - 1), value=st.integers(0, 255), cut=st.booleans())
+def test_damage_is_a_named_error_or_plain_data(
+    tmp_path_factory: pytest.TempPathFactory, position: int, value: int, cut: bool
+) -> None:
+    file = tmp_path_factory.getbasetemp() / "damaged.pkl"
+    damaged = HONEST[:position] + (b"" if cut else bytes([value]) + HONEST[position + 1 :])
+    file.write_bytes(damaged)
+    with contextlib.suppress(HwpError):  # any other exception fails the test
+        load_pickle(file)

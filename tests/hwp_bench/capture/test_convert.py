@@ -1,0 +1,131 @@
+"""Hands between models. Oracles: a model converted to itself, and vertices moved by hand."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from small_captures import CaptureMaker, hand_parameters
+
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.capture import HandModelId, open_capture
+from hwp_bench.capture.check import check_capture
+from hwp_bench.capture.convert import convert_hand, with_one_shape
+from hwp_bench.capture.hand_model import load_matching_template
+from hwp_bench.capture.rewrite import rewrite_capture
+from hwp_bench.cli.main import main
+from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
+
+
+def bent(frames: int = 3) -> HandParameters:
+    """Fingers that bend inside their anatomical range, the wrist turned, half a metre away."""
+    rng = np.random.default_rng(1)
+    pose = 0.03 * rng.normal(size=(frames, 16, 3))
+    pose[:, 1:13, 2] += np.linspace(0.1, 0.5, frames)[:, None]
+    pose[:, 0] = [0.4, -0.3, 0.2]
+    transl = np.array([0.02, -0.01, 0.5]) + 0.01 * rng.normal(size=(frames, 3))
+    valid = np.ones(frames, dtype=bool)
+    valid[1] = False
+    return HandParameters(pose, 0.8 * rng.normal(size=10), transl, valid)
+
+
+def test_a_model_converted_to_itself_keeps_its_skin(free_right: HandTemplate) -> None:
+    hand = bent()
+    made, error = convert_hand(hand, free_right, free_right)
+    # The shape is found from the mean hand: within a millimetre of the skin.
+    assert error.skin_mm < 1.0
+    assert error.landmark_mm < 2.5
+    np.testing.assert_array_equal(made.valid, hand.valid)
+    tensors = free_right.to_torch(torch.float64)
+    before, after = (
+        pose_hand(tensors, *map(torch.from_numpy, (h.pose, h.betas, h.transl))).vertices[hand.valid]
+        for h in (hand, made)
+    )
+    assert (before - after).norm(dim=-1).mean() < 2.5e-3
+
+
+def test_mano_and_the_free_hand_reach_each_other(
+    free_right: HandTemplate, mano_right: HandTemplate
+) -> None:
+    # The synthetic MANO is an ellipsoid with joints: no hand comes closer than some millimetres.
+    for source, target in ((mano_right, free_right), (free_right, mano_right)):
+        made, error = convert_hand(bent(), source, target)
+        assert error.skin_mm < 6.0
+        assert error.landmark_mm < 15.0
+        assert error.worst_skin_mm >= error.skin_mm
+        assert np.isfinite(made.pose).all()
+
+
+def test_sides_are_not_mixed(free_right: HandTemplate, free_left: HandTemplate) -> None:
+    with pytest.raises(UsageError, match="right hand is no left hand"):
+        convert_hand(bent(), free_right, free_left)
+
+
+def test_a_hand_that_is_never_valid_is_refused(free_right: HandTemplate) -> None:
+    hand = hand_parameters(3)
+    nowhere = HandParameters(hand.pose, hand.betas, hand.transl, np.zeros(3, dtype=bool))
+    with pytest.raises(BadInput, match="nothing to fit"):
+        convert_hand(nowhere, free_right, free_right)
+
+
+def test_one_shape_keeps_vertices_in_place(mano_right: HandTemplate) -> None:
+    rng = np.random.default_rng(2)
+    hand = bent()
+    betas = np.tile(hand.betas, (3, 1))
+    exact, error = with_one_shape(mano_right, hand.pose, betas, hand.transl, hand.valid)
+    np.testing.assert_allclose(exact.transl[hand.valid], hand.transl[hand.valid], atol=1e-12)
+    assert np.isnan(error[1])
+    assert np.nanmax(error) < 1e-9
+    spread = betas + 0.1 * rng.normal(size=betas.shape)
+    made, error = with_one_shape(mano_right, hand.pose, spread, hand.transl, hand.valid)
+    tensors = mano_right.to_torch(torch.float64)
+    pose = torch.from_numpy(hand.pose)
+    own = pose_hand(tensors, pose, torch.from_numpy(spread), torch.from_numpy(hand.transl))
+    shared = pose_hand(tensors, pose, torch.from_numpy(made.betas), torch.from_numpy(made.transl))
+    gap = (own.vertices - shared.vertices)[hand.valid]
+    assert gap.mean(dim=1).abs().max() < 1e-12
+    expected = 1000 * gap.norm(dim=-1).mean(dim=1).numpy()
+    np.testing.assert_allclose(error[hand.valid], expected, rtol=1e-9)
+
+
+def test_the_command_rewrites_a_capture(
+    make_capture: CaptureMaker, free_right: HandTemplate, mano_folder: str, tmp_path: Path, capsys
+) -> None:
+    from dataclasses import replace
+
+    plain = make_capture(frames=10, truth=True)
+    info = replace(plain.info, hand_model=HandModelId(free_right.name, free_right.digest))
+    rewrite_capture(plain, tmp_path / "sound", info, {"right": bent(10)})
+    source, out = str(tmp_path / "sound"), str(tmp_path / "as_mano")
+    assert main(["hands", "convert", source, out, "--hand", f"mano:{mano_folder}", "--json"]) == 0
+    error = json.loads(capsys.readouterr().out)["right"]
+    assert 0 < error["skin_mm"] <= error["worst_skin_mm"]
+    made = open_capture(out)
+    assert check_capture(out).ok
+    assert made.info.hand_model.name == "mano"
+    assert made.info.source["converted"]["from"] == "anny-1"
+    assert made.true_hands is None
+    np.testing.assert_array_equal(made.frame(3), plain.frame(3))
+    assert main(["hands", "convert", source, out, "--hand", "anny"]) == 2
+    assert main(["hands", "convert", str(plain.root), str(tmp_path / "x"), "--hand", "anny"]) == 1
+    assert "another edition of hand model anny-1" in capsys.readouterr().err
+
+
+def test_another_hand_model_is_refused_by_name_and_by_content(
+    free_right: HandTemplate, mano_right: HandTemplate, mano_folder: str
+) -> None:
+    sides = ("right", "left")
+    good = HandModelId(free_right.name, free_right.digest)
+    assert load_matching_template(good, sides, "left", where="c").side == "left"
+    for model in (
+        HandModelId("mano", mano_right.digest, "anny"),
+        HandModelId("anny-1", free_right.digest, f"mano:{mano_folder}"),
+        HandModelId("anny-1", "0" * 64),
+        HandModelId("mano", "1" * 64, f"mano:{mano_folder}"),
+    ):
+        with pytest.raises(BadInput, match="hands convert") as caught:
+            load_matching_template(model, sides, "right", where="my_capture")
+        assert "my_capture: hand_model" in str(caught.value)

@@ -1,0 +1,397 @@
+"""Hostile methods: what they try must fail, on any Linux and, where there are namespaces, fully.
+
+Nothing that they try would do harm if it succeeded. Oracle: what they report of themselves in
+their log, and the process table outside.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hwp_bench.base.errors import MethodFailed
+from hwp_bench.methods.manifest import read_manifest
+from hwp_bench.methods.predictions import read_prediction
+from hwp_bench.run.runner import RunRecord, run_method
+from hwp_bench.run.sandbox.confinement import Confinement
+
+MODES = ("required", "none")
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="process control is Linux's")
+
+
+@pytest.fixture
+def attack(tmp_path: Path, namespaces: bool):
+    """Return a function that runs a script as a method and returns its record and what it said."""
+
+    def run(script: str, mode: str = "required", **limits) -> tuple[RunRecord, dict]:
+        if mode == "required" and not namespaces:
+            pytest.skip("no user namespaces on this machine")
+        method = _method(tmp_path / "method", script)
+        time_limit = limits.pop("time_limit", 60.0)
+        confinement = Confinement(mode, **limits)
+        record = run_method(
+            read_manifest(method),
+            "tiny",
+            _folder(tmp_path / "request"),
+            tmp_path / "output",
+            time_limit=time_limit,
+            confinement=confinement,
+        )
+        said = (tmp_path / "output" / "log.txt").read_text()
+        return record, json.loads(said) if said.strip() else {}
+
+    return run
+
+
+def _folder(path: Path) -> Path:
+    path.mkdir(exist_ok=True)
+    return path
+
+
+def _method(folder: Path, script: str) -> Path:
+    _folder(folder)
+    (folder / "run.py").write_text("import json, os, pathlib, subprocess, sys, time\n" + script)
+    (folder / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "hostile"\n[entry]\n'
+        'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n'
+    )
+    return folder
+
+
+@pytest.fixture(scope="module")
+def namespaces(tmp_path_factory: pytest.TempPathFactory) -> bool:
+    """Whether this machine allows them."""
+    root = tmp_path_factory.mktemp("probe")
+    method = read_manifest(_method(root / "method", ""))
+    record = run_method(method, "tiny", _folder(root / "request"), root / "output")
+    return record.isolation == "namespaces"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_no_secret_comes_through_the_environment_or_descriptors(
+    attack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
+) -> None:
+    frame = tmp_path / "capture" / "000018.png"
+    _folder(frame.parent)
+    frame.write_text("a test frame")
+    monkeypatch.setenv("SECRET_TOKEN", "s3cret")
+    monkeypatch.setenv("CAPTURE", str(frame))
+    script = """
+held = [os.readlink(f"/proc/self/fd/{name}") for name in os.listdir("/proc/self/fd")
+        if os.path.lexists(f"/proc/self/fd/{name}")]
+print(json.dumps({"environment": dict(os.environ), "held": held, "input": sys.stdin.read()}))
+"""
+    with frame.open() as stream:
+        os.set_inheritable(stream.fileno(), True)
+        record, said = attack(script, mode)
+    text = json.dumps(said)
+    assert "s3cret" not in text
+    assert "000018" not in text
+    assert said["input"] == ""
+    assert len(said["held"]) <= 4
+    assert record.isolation == ("namespaces" if mode == "required" else "processes")
+
+
+def test_nothing_but_what_is_shown_can_be_seen(attack, tmp_path: Path) -> None:
+    secret = _folder(tmp_path / "capture") / "000018.png"
+    secret.write_text("a test frame")
+    script = f"""
+def sees(path):
+    try:
+        return bool(os.listdir(path)) if os.path.isdir(path) else bool(open(path, "rb").read(1))
+    except OSError:
+        return False
+parents = [pid for pid in os.listdir("/proc") if pid.isdigit()]
+print(json.dumps({{
+    "frame": sees({str(secret)!r}), "tests": sees({str(Path(__file__).parent)!r}),
+    "shadow": sees("/etc/shadow"), "home": sees({str(Path.home() / ".ssh")!r}),
+    "processes": len(parents), "first": sees("/proc/1/environ"), "held": sees("/proc/1/fd/0"),
+    "root": sorted(os.listdir("/")), "request": os.path.isdir(sys.argv[1]),
+    "method": sees(os.path.dirname(__file__)),
+}}))
+"""
+    _, said = attack(script)
+    hidden = ("frame", "tests", "shadow", "home", "first", "held")
+    assert {name: said[name] for name in hidden} == dict.fromkeys(hidden, False)
+    assert said["processes"] == 2
+    assert said["request"]
+    assert said["method"]
+    assert "run" not in said["root"]
+
+
+def test_nothing_outside_the_work_folder_can_be_written(attack, tmp_path: Path) -> None:
+    script = """
+def writes(folder):
+    path = os.path.join(folder, "written-by-a-test")
+    try:
+        open(path, "w").close()
+    except OSError:
+        return False
+    os.unlink(path)
+    return True
+print(json.dumps({name: writes(folder) for name, folder in {
+    "method": os.path.dirname(__file__), "request": sys.argv[1], "usr": "/usr", "root": "/",
+    "packages": os.path.dirname(json.__file__), "prefix": sys.prefix, "output": sys.argv[2],
+    "home": os.environ["HOME"], "scratch": "/tmp", "cache": os.environ["HWP_CACHE"],
+}.items()}))
+"""
+    _, said = attack(script)
+    assert [name for name, written in said.items() if written] == [
+        "output",
+        "home",
+        "scratch",
+        "cache",
+    ]
+    assert not (tmp_path / "method" / "written-by-a-test").exists()
+
+
+def test_there_is_no_network_but_itself(attack) -> None:
+    script = """
+import socket
+def reaches(address):
+    try:
+        socket.create_connection(address, timeout=2).close()
+    except OSError:
+        return False
+    return True
+server = socket.create_server(("127.0.0.1", 0))
+print(json.dumps({"own": reaches(server.getsockname()), "host": reaches(("127.0.0.1", PORT)),
+    "world": reaches(("192.0.2.1", 80)), "interfaces": [n for _, n in socket.if_nameindex()]}))
+"""
+    import socket
+
+    with socket.create_server(("127.0.0.1", 0)) as listener:
+        _, said = attack(script.replace("PORT", str(listener.getsockname()[1])))
+    assert said["own"]
+    assert not said["host"]
+    assert not said["world"]
+    assert said["interfaces"] == ["lo"]
+
+
+def test_the_walls_cannot_be_taken_down(attack) -> None:
+    # Unmounting and remounting are tried in the sandbox only: there it is all that would change.
+    script = """
+import ctypes
+libc = ctypes.CDLL(None, use_errno=True)
+if os.path.exists("/etc/shadow"):
+    raise SystemExit("no sandbox, so nothing is tried")
+def undo():
+    flags = 0x20 | 0x1000  # remount, bind: writable again
+    return [libc.umount2(b"/proc", 2), libc.mount(None, b"/usr", None, flags, None)]
+first = undo()
+made = libc.unshare(0x10000000 | 0x00020000)  # a user namespace inside gives capabilities there
+second = [libc.umount2(b"/usr", 2), libc.mount(None, b"/usr", None, 0x1020, None)]
+caps = [line for line in open("/proc/1/status") if line.startswith(("CapEff", "NoNewPrivs"))]
+print(json.dumps({"first": first, "second": second, "status": "".join(caps).split()}))
+"""
+    _, said = attack(script)
+    assert said["first"] == [-1, -1]
+    assert said["second"] == [-1, -1]
+    assert said["status"] == ["CapEff:", "0" * 16, "NoNewPrivs:", "1"]
+
+
+GRANDCHILD = """
+child = "import os, time, pathlib; os.setsid(); time.sleep(600)"
+if os.fork() == 0:
+    os.setsid()
+    if os.fork() == 0:
+        os.execv(sys.executable, [sys.executable, "-c", child, "TAG"])
+    os._exit(0)
+time.sleep(0.5)
+"""
+
+
+@pytest.mark.parametrize("mode", MODES)
+@pytest.mark.parametrize("ending", ["", "time.sleep(600)", "os.kill(os.getpid(), 9)"])
+def test_grandchildren_in_other_sessions_die_too(
+    attack, tmp_path: Path, mode: str, ending: str
+) -> None:
+    tag = f"tag-{tmp_path.name}"
+    script = GRANDCHILD.replace("TAG", tag) + ending
+    if ending:
+        with pytest.raises(MethodFailed):
+            attack(script, mode, time_limit=2.0)
+    else:
+        attack(script, mode)
+    _assert_gone(tag)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_killed_toolkit_takes_the_method_along(
+    tmp_path: Path, namespaces: bool, mode: str
+) -> None:
+    if mode == "required" and not namespaces:
+        pytest.skip("no user namespaces on this machine")
+    tag = f"tag-{tmp_path.name}"
+    method = _method(tmp_path / "method", GRANDCHILD.replace("TAG", tag) + "time.sleep(600)")
+    program = f"""
+from pathlib import Path
+from hwp_bench.methods.manifest import read_manifest
+from hwp_bench.run.runner import run_method
+from hwp_bench.run.sandbox.confinement import Confinement
+run_method(read_manifest({str(method)!r}), "tiny", Path({str(_folder(tmp_path / "request"))!r}),
+           Path({str(tmp_path / "output")!r}), confinement=Confinement({mode!r}))
+"""
+    toolkit = subprocess.Popen([sys.executable, "-c", program], cwd=Path(__file__).parents[3])
+    deadline = time.monotonic() + 30
+    while not _tagged(tag) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert _tagged(tag)
+    toolkit.send_signal(signal.SIGKILL)
+    toolkit.wait()
+    _assert_gone(tag)
+
+
+def _tagged(tag: str) -> list[str]:
+    found = []
+    for path in Path("/proc").glob("[0-9]*/cmdline"):
+        try:
+            if path.read_bytes().endswith(tag.encode() + b"\0"):
+                found.append(path.parent.name)
+        except OSError:
+            continue
+    return found
+
+
+def _assert_gone(tag: str) -> None:
+    deadline = time.monotonic() + 10
+    while _tagged(tag) and time.monotonic() < deadline:
+        time.sleep(0.05)
+    assert _tagged(tag) == []
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_memory_of_all_processes_is_limited(attack, mode: str) -> None:
+    # Three processes of 80 MB each, where 200 MB together are allowed.
+    script = """
+for _ in range(2):
+    if os.fork() == 0:
+        break
+held = bytearray(os.urandom(1)) * 80_000_000
+time.sleep(60)
+"""
+    problem = r"hostile took more than 0\.2 GB of memory on tiny. Raise --memory-limit"
+    with pytest.raises(MethodFailed, match=problem):
+        attack(script, mode, memory_limit=200_000_000)
+
+
+def test_a_storm_of_processes_is_ended(attack, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hwp_bench.run.sandbox.supervise.MAX_PROCESSES", 20)
+    script = """
+for _ in range(60):
+    if os.fork() == 0:
+        time.sleep(60)
+time.sleep(60)
+"""
+    with pytest.raises(MethodFailed, match="processes at once on tiny"):
+        attack(script)
+
+
+def test_a_system_that_refuses_is_named_and_the_run_goes_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A place of no known source cannot be bound: the same path as a refusing kernel takes.
+    monkeypatch.setattr(
+        "hwp_bench.run.surroundings.visible_places",
+        lambda **_: [("read", "/no/such/place", "")],
+    )
+    method = read_manifest(_method(tmp_path / "method", ""))
+    places = (method, "tiny", _folder(tmp_path / "request"), tmp_path / "output")
+    record = run_method(*places)
+    assert record.isolation is not None
+    assert record.isolation.startswith("processes (")
+    with pytest.raises(MethodFailed, match="namespaces are required and not to be had"):
+        run_method(*places, confinement=Confinement("required"))
+
+
+@pytest.mark.parametrize("mode", ["auto", "none"])
+def test_a_command_that_is_not_there_is_one_message(tmp_path: Path, mode: str) -> None:
+    method = _method(tmp_path / "method", "")
+    manifest = (method / "method.toml").read_text().replace("{python}", "no-such-program")
+    (method / "method.toml").write_text(manifest)
+    with pytest.raises(MethodFailed, match=r"no-such-program: .*cannot be started \(No such file"):
+        run_method(
+            read_manifest(method),
+            "tiny",
+            _folder(tmp_path / "request"),
+            tmp_path / "output",
+            confinement=Confinement(mode),
+        )
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_links_and_pipes_in_the_output_are_not_followed(attack, tmp_path: Path, mode: str) -> None:
+    frame = _folder(tmp_path / "capture") / "000018.png"
+    frame.write_bytes(b"a test frame")
+    script = f"""
+output = pathlib.Path(sys.argv[2])
+(output / "predictions").mkdir()
+(output / "predictions/000018.png").symlink_to({str(frame)!r})
+(output / "checkpoints").symlink_to({str(frame.parent)!r})
+(output / "run.json").symlink_to("/dev/zero")
+os.mkfifo(output / "progress.json")
+time.sleep(0.5)
+"""
+    record, _ = attack(script, mode)
+    assert record.facts.fit_seconds is None
+    left = sorted(path.name for path in (tmp_path / "output").rglob("*"))
+    assert [name for name in left if name != "home"] == ["log.txt", "predictions"]
+    assert frame.read_bytes() == b"a test frame"
+
+
+def test_a_log_that_became_a_link_is_not_passed_on(attack, tmp_path: Path) -> None:
+    secret = _folder(tmp_path / "home") / "secret"
+    secret.write_text("s3cret")
+    script = f"""
+log = pathlib.Path(sys.argv[2]) / "log.txt"
+log.unlink()
+log.symlink_to({str(secret)!r})
+"""
+    with pytest.raises(FileNotFoundError):  # by the test's own look at the log
+        attack(script, "none")
+    assert secret.read_text() == "s3cret"
+
+
+@pytest.mark.parametrize("which", ["frame", "folder"])
+def test_a_submission_of_links_is_refused(tmp_path: Path, which: str) -> None:
+    from hwp_bench.base.errors import BadInput
+    from hwp_bench.base.images import write_image
+
+    sealed = _folder(tmp_path / "sealed")
+    write_image(sealed / "000018.png", np.full((8, 8, 3), 9, np.uint8))
+    method = _folder(tmp_path / "entry")
+    (method / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "links"\n[entry]\npredictions = "predictions"\n'
+    )
+    folder = method / "predictions" / "tiny"
+    folder.parent.mkdir()
+    if which == "folder":
+        folder.symlink_to(sealed)
+        with pytest.raises(BadInput, match="leads out of the folder"):
+            run_method(read_manifest(method), "tiny", tmp_path, tmp_path / "output")
+    else:
+        folder.mkdir()
+        (folder / "000018.png").symlink_to(sealed / "000018.png")
+        record = run_method(read_manifest(method), "tiny", tmp_path, tmp_path / "output")
+        assert read_prediction(record.predictions, 18, (8, 8)).failure == "000018.png: is a link"
+
+
+@pytest.mark.parametrize("form", ["zip", "tar"])
+def test_an_archive_is_no_method(tmp_path: Path, form: str) -> None:
+    import shutil
+
+    from hwp_bench.base.errors import BadMethod
+    from hwp_bench.methods.manifest import find_method
+
+    method = _method(tmp_path / "method", "")
+    archive = shutil.make_archive(str(tmp_path / "archive"), form, method)
+    with pytest.raises(BadMethod, match="is no method directory"):
+        read_manifest(find_method(archive))

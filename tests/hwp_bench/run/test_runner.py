@@ -1,0 +1,185 @@
+"""Methods run apart: crashes, hangs, floods of output end as one error."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_captures import CaptureMaker
+
+from hwp_bench.base.errors import MethodFailed
+from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.methods.contract import Budget
+from hwp_bench.methods.manifest import MethodManifest, read_manifest
+from hwp_bench.methods.predictions import read_prediction
+from hwp_bench.methods.request import RunSettings, write_request
+from hwp_bench.run.clock import ReportClock, schedule
+from hwp_bench.run.runner import run_method
+from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
+
+PYTHON = """
+import numpy as np
+
+class Avatar:
+    def __init__(self, colour): self.colour = colour
+    def render(self, hands, camera):
+        rgba = np.ones((camera.height, camera.width, 4), np.float32)
+        rgba[..., :3] = self.colour
+        return rgba
+
+class Method:
+    def __init__(self, settings, seed): self.settings = settings
+    def fit(self, training, budget, report):
+        total = np.zeros(3)
+        for step, frame in enumerate(training.train):
+            total += training.frame(frame)[training.mask(frame) > 127].mean(0) / 255
+            report(step, Avatar(total / (step + 1)))
+            report.progress(step + 1, len(training.train))
+        BODY
+        return Avatar(total / len(training.train))
+"""
+
+
+def python_method(folder: Path, body: str = "pass") -> MethodManifest:
+    """A method that paints the mean colour of the hand; `body` runs at the end of its fit."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "mean_colour.py").write_text(PYTHON.replace("BODY", body))
+    (folder / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "mean"\n[entry]\npython = "mean_colour:Method"\n'
+    )
+    return read_manifest(folder)
+
+
+def command_method(folder: Path, script: str) -> MethodManifest:
+    """A method that is a Python script outside the contract's classes."""
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / "run.py").write_text(script)
+    (folder / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "command"\n[entry]\n'
+        'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n'
+    )
+    return read_manifest(folder)
+
+
+@pytest.fixture
+def request_folder(make_capture: CaptureMaker, tmp_path: Path) -> Path:
+    split = contiguous_split("tiny", 20)
+    return write_request(tmp_path / "request", make_capture(frames=20), split, RunSettings({}))
+
+
+def _run(manifest: MethodManifest, request: Path, tmp_path: Path, limit: float = 60.0):
+    return run_method(manifest, "tiny", request, tmp_path / "output", time_limit=limit)
+
+
+def test_a_python_method_fits_and_renders(request_folder: Path, tmp_path: Path) -> None:
+    record = _run(python_method(tmp_path / "m"), request_folder, tmp_path)
+    colours = [read_prediction(record.predictions, f, (32, 32)).pixels[0, 0] for f in (18, 19)]
+    np.testing.assert_array_equal(colours[0], colours[1])
+    assert 100 < colours[0][0] < 200
+    facts = record.facts
+    assert facts.fit_seconds > 0
+    assert facts.render_seconds > 0
+    assert facts.peak_memory > 10**7
+    assert facts.steps == 0 or facts.steps < 16
+    assert facts.checkpoints[-1].seconds == pytest.approx(facts.fit_seconds, abs=0.05)
+    assert facts.checkpoint_frames == [16, 17]
+
+
+def test_a_command_fits_and_renders(request_folder: Path, tmp_path: Path) -> None:
+    script = """
+import json, pathlib, shutil, sys
+request, output = map(pathlib.Path, sys.argv[1:])
+split = json.loads((request / "request.json").read_text())["split"]
+(output / "predictions").mkdir()
+for frame in range(*split["test"]):
+    shutil.copy(request / "frames/000000.png", output / f"predictions/{frame:06d}.png")
+"""
+    record = _run(command_method(tmp_path / "m", script), request_folder, tmp_path)
+    assert read_prediction(record.predictions, 19, (32, 32)).failure is None
+    assert record.facts.fit_seconds is None
+    assert record.wall_seconds > 0
+
+
+@pytest.mark.parametrize(
+    ("body", "problem"),
+    [
+        ("raise ValueError('no luck')", "ValueError: no luck"),
+        ("import os; os._exit(3)", "exit status 3"),
+        ("import os; os.kill(os.getpid(), 9)", "killed by SIGKILL"),
+        ("return None", "AttributeError"),
+        ("Avatar.render = lambda *a: np.zeros((5, 5, 4))", r"shape \(5, 5, 4\)"),
+        ("return Avatar(np.nan)", "NaN or infinity"),
+        ("import sys; sys.exit(0)", "ended before"),
+    ],
+)
+def test_crashes_are_named(request_folder: Path, tmp_path: Path, body: str, problem: str) -> None:
+    manifest = python_method(tmp_path / "m", body)
+    with pytest.raises(MethodFailed, match=problem):
+        _run(manifest, request_folder, tmp_path)
+
+
+def test_a_method_that_hangs_is_stopped(request_folder: Path, tmp_path: Path) -> None:
+    method = command_method(tmp_path / "m", "import time; time.sleep(600)")
+    with pytest.raises(MethodFailed, match=r"ran out of time on tiny after 1\.5 s"):
+        _run(method, request_folder, tmp_path, limit=1.5)
+
+
+def test_megabytes_of_output_are_cut(request_folder: Path, tmp_path: Path) -> None:
+    manifest = command_method(tmp_path / "m", "print('x' * 5_000_000)\nraise SystemExit(4)")
+    with pytest.raises(MethodFailed, match="exit status 4"):
+        _run(manifest, request_folder, tmp_path)
+    log = (tmp_path / "output" / "log.txt").read_bytes()
+    assert len(log) < MAX_LOG_BYTES + 100
+    assert b"further bytes were not kept" in log[-60:]
+
+
+def test_a_method_does_not_inherit_the_environment_or_learn_where_the_capture_is(
+    request_folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SECRET_TOKEN", "s3cret")
+    script = "import os, sys\nprint(sorted(os.environ), os.getcwd(), sys.argv)\nraise SystemExit(1)"
+    with pytest.raises(MethodFailed):
+        _run(command_method(tmp_path / "m", script), request_folder, tmp_path)
+    log = (tmp_path / "output" / "log.txt").read_text()
+    assert "SECRET" not in log
+    assert str(tmp_path / "tiny") not in log
+
+
+def test_a_run_file_of_lies_is_refused(request_folder: Path, tmp_path: Path) -> None:
+    script = """
+import pathlib, sys
+pathlib.Path(sys.argv[2], "run.json").write_text('{"fit_seconds": "fast"}')
+"""
+    with pytest.raises(MethodFailed, match="fit_seconds"):
+        _run(command_method(tmp_path / "m", script), request_folder, tmp_path)
+
+
+def test_the_schedule_is_dense_at_the_start_then_every_tenth() -> None:
+    assert schedule(Budget(seconds=10.0)) == [1, 2, 3, 4, 5, 6, 7, 8, 9]
+    assert schedule(Budget())[:5] == [1, 2, 4, 8, 16]
+    assert schedule(Budget(seconds=0.5)) == pytest.approx([0.05 * k for k in range(1, 10)])
+
+
+def test_the_clock_stands_still_while_a_checkpoint_is_taken(tmp_path: Path) -> None:
+    taken = []
+    clock = ReportClock(
+        Budget(), lambda index, avatar: (time.sleep(0.3), taken.append(index)), tmp_path / "p.json"
+    )
+    before = clock.elapsed
+    clock.take(5, None)  # type: ignore[arg-type]
+    assert clock.elapsed - before < 0.2
+    assert clock.paused >= 0.3
+    assert taken == [0]
+    assert clock.checkpoints[0].step == 5
+    clock(6, None)  # type: ignore[arg-type]
+    assert taken == [0]
+
+
+def test_a_budget_in_steps_is_checkpointed_every_tenth(tmp_path: Path) -> None:
+    clock = ReportClock(Budget(steps=40), lambda index, avatar: None, tmp_path / "p.json")
+    # What is offered first is the unfitted avatar: it always is on record.
+    for step in range(41):
+        clock(step, None)  # type: ignore[arg-type]
+    assert [checkpoint.step for checkpoint in clock.checkpoints] == list(range(0, 40, 4))

@@ -1,0 +1,143 @@
+"""Temporal weights and what the pre-pass found. Oracles: the targets, the formula written out."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from wildghand.dpd.dpd import DynamicPerturbation
+from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.gaussians.attributes import RawAttributes
+
+SCALE = 0.05
+
+
+def episodes(count: int = 48) -> torch.Tensor:
+    """Probabilities that frames are clean: three episodes of different strength."""
+    clean = torch.ones(count)
+    for start, worst in ((0.1, 0.7), (0.4, 0.0), (0.75, 0.3)):
+        first = int(start * count)
+        clean[first : first + count // 8] = worst
+    return clean
+
+
+def module(count: int = 48, seed: int = 0) -> DynamicPerturbation:
+    torch.manual_seed(seed)
+    return DynamicPerturbation(count)
+
+
+def attributes(*lead: int) -> RawAttributes:
+    return RawAttributes.split(torch.randn(*lead, 14, generator=torch.Generator().manual_seed(0)))
+
+
+def omega_of(learnt: DynamicPerturbation) -> torch.Tensor:
+    return learnt.temporal(torch.arange(learnt.frame_count)).omega.detach()
+
+
+@pytest.mark.parametrize("count", [48, 560])
+def test_weights_begin_at_what_was_judged(count: int) -> None:
+    clean, learnt = episodes(count), module(count)
+    TemporalTarget.judged(clean, SCALE).begin([learnt])
+    error = (omega_of(learnt) - SCALE * (1.0 - clean)).square().mean().sqrt()
+    # A tenth of the scale; episodes begin abruptly, which the code of a long clip cannot follow
+    # as closely.
+    assert error < (0.1 if count < 100 else 0.2) * SCALE
+
+
+def test_biases_begin_at_zero_and_learn_from_the_first_step() -> None:
+    learnt = module()
+    TemporalTarget.judged(episodes(), SCALE).begin([learnt])
+    frames = torch.arange(48)
+    temporal = learnt.temporal(frames)
+    biases = learnt.biases(attributes(48, 5), temporal.z, temporal.omega).concatenate()
+    assert (biases == 0.0).all()
+    assert all(parameter.grad is None for parameter in learnt.parameters())
+    (biases - 1.0).square().mean().backward()
+    assert all(value.grad.abs().max() > 0.0 for value in learnt.varphi.parameters())
+
+
+def test_without_a_scale_the_start_is_the_papers() -> None:
+    clean, learnt = episodes(), module()
+    before = {name: value.clone() for name, value in learnt.state_dict().items()}
+    target = TemporalTarget.judged(clean, 0.0)
+    target.begin([learnt])
+    assert all(torch.equal(before[name], value) for name, value in learnt.state_dict().items())
+    assert (target.omega == 0.0).all()
+    assert torch.equal(target.hold, clean)
+
+
+def test_where_every_frame_is_clean_the_start_is_the_papers() -> None:
+    learnt = module()
+    TemporalTarget.judged(torch.ones(48), SCALE).begin([learnt])
+    assert (omega_of(learnt) == 0.0).all()
+    assert learnt.varphi["logit_colors"].weight.abs().max() > 0.0
+
+
+def test_the_start_repeats_exactly() -> None:
+    first, second = module(), module()
+    for learnt in (first, second):
+        TemporalTarget.judged(episodes(), SCALE).begin([learnt])
+    assert torch.equal(omega_of(first), omega_of(second))
+
+
+def test_distance_is_the_held_square_summed_over_hands() -> None:
+    left, right = module(10, 1), module(10, 2)
+    for learnt in (left, right):
+        torch.nn.init.normal_(learnt.psi.weight)
+    target = TemporalTarget(torch.linspace(0.0, 0.5, 10), torch.linspace(1.0, 0.0, 10))
+    expected = sum(
+        (target.hold * (omega_of(learnt) - target.omega) ** 2).mean() for learnt in (left, right)
+    )
+    torch.testing.assert_close(target.strayed([left, right], 3).detach(), expected)
+
+
+def test_frames_that_are_not_held_pass_no_gradient() -> None:
+    learnt = module(10)
+    target = TemporalTarget(torch.full((10,), 0.3), torch.zeros(10))
+    target.strayed([learnt], 0).backward()
+    assert all(value.grad.abs().max() == 0.0 for value in learnt.psi.parameters())
+
+
+def test_every_frame_of_a_long_clip_is_looked_at_by_some_step() -> None:
+    count = 300
+    learnt = module(count)
+    for frame in range(0, count, 7):
+        omega = torch.zeros(count)
+        omega[frame] = 0.5
+        target = TemporalTarget(omega, torch.ones(count))
+        # Omega is zero everywhere, so that the one frame is all of the distance.
+        seen = [first for first in range(count) if target.strayed([learnt], first) > 0.0]
+        assert frame in seen
+        assert len(seen) >= count // 64
+
+
+def test_holding_keeps_the_weights_and_letting_go_does_not() -> None:
+    """A pull on all weights, as a fit that explains frames by larger biases would make it."""
+    errors = []
+    target = TemporalTarget.judged(episodes(), SCALE)
+    for weight in (0.0, 100.0):
+        learnt = module()
+        target.begin([learnt])
+        optimizer = torch.optim.Adam(learnt.parameters(), lr=1e-3)
+        for step in range(60):
+            loss = -learnt.temporal(torch.tensor([step % 48])).omega.mean()
+            loss = loss + weight * target.strayed([learnt], step % 48)
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+        errors.append(float((omega_of(learnt) - target.omega).abs().mean()))
+    assert errors[1] < 0.2 * errors[0]
+
+
+@settings(max_examples=15, deadline=None)
+@given(clean=st.lists(st.floats(0.0, 1.0, width=32), min_size=1, max_size=12))
+def test_any_judgement_gives_weights_in_range(clean: list[float]) -> None:
+    learnt = module(len(clean))
+    target = TemporalTarget.judged(torch.tensor(clean), SCALE)
+    target.begin([learnt])
+    omega = omega_of(learnt)
+    assert omega.isfinite().all()
+    assert (omega.abs() < 0.9).all()
+    assert target.strayed([learnt], 0).isfinite()

@@ -1,0 +1,88 @@
+"""Which frames are fitted, what a rendering is compared with, where the hands are."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from painted import FRAMES, SIZE, TrainingMaker
+
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.images import write_image
+from hwp_bench.methods.request import TrainingCapture
+from wildghand.gaussians.clip import TrainingClip
+from wildghand.gaussians.frames import TrainingFrames, load_frames
+from wildghand.gaussians.rig import make_rig
+
+
+def invalidate(training: TrainingCapture, side: str, frames: list[int]) -> None:
+    hand = training.hands[side]
+    valid = hand.valid.copy()
+    valid[frames] = False
+    training.hands[side] = dataclasses.replace(hand, valid=valid)
+
+
+def test_every_training_frame_and_no_other(make_training: TrainingMaker) -> None:
+    training = make_training()
+    frames = load_frames(training)
+    np.testing.assert_array_equal(frames.indices, np.arange(FRAMES * 8 // 10))
+    np.testing.assert_array_equal(frames.images[3], training.frame(3))
+    np.testing.assert_array_equal(frames.masks[3], training.mask(3))
+
+
+def test_frames_without_valid_parameters_are_skipped(make_training: TrainingMaker) -> None:
+    training = make_training("both")
+    invalidate(training, "right", [0, 5])
+    invalidate(training, "left", [5, 6])
+    assert not {0, 5, 6} & set(load_frames(training).indices.tolist())
+
+
+def test_frames_with_an_empty_mask_are_skipped(make_training: TrainingMaker) -> None:
+    training = make_training()
+    write_image(training.root / "masks" / "000002.png", np.zeros((SIZE, SIZE), np.uint8))
+    assert 2 not in load_frames(training).indices
+
+
+def test_a_capture_without_a_usable_frame_is_an_error(make_training: TrainingMaker) -> None:
+    training = make_training()
+    invalidate(training, "right", list(range(FRAMES)))
+    with pytest.raises(BadInput, match="none of 32 training frames"):
+        load_frames(training)
+
+
+def test_targets_are_black_and_light_outside_the_mask() -> None:
+    """By hand: one pixel in the mask, one outside, one half in it."""
+    frames = TrainingFrames(
+        indices=np.array([0]),
+        images=torch.tensor([[[[255, 51, 0], [255, 255, 255], [102, 102, 102]]]]).byte(),
+        masks=torch.tensor([[[255, 0, 51]]]).byte(),
+    )
+    target, weights = frames.targets(torch.tensor([0]), 0.1, torch.device("cpu"))
+    np.testing.assert_allclose(target[0, 0], [[1.0, 0.2, 0.0], [0.0] * 3, [0.08] * 3], rtol=1e-6)
+    np.testing.assert_allclose(weights[0, 0], [1.0, 0.1, 0.28], rtol=1e-6)
+
+
+def test_mean_color_is_over_the_mask_alone() -> None:
+    frames = TrainingFrames(
+        indices=np.array([0]),
+        images=torch.tensor([[[[255, 51, 0], [0, 51, 0], [7, 7, 7]]]]).byte(),
+        masks=torch.tensor([[[255, 255, 0]]]).byte(),
+    )
+    np.testing.assert_allclose(frames.mean_color(), [0.5, 0.2, 0.0], rtol=1e-6)
+
+
+def test_anchors_are_the_same_with_and_without_the_cache(make_training: TrainingMaker) -> None:
+    training = make_training("both")
+    rigs = {side: make_rig(training.template(side), 30) for side in training.sides}
+    indices, cpu = np.array([4, 7, 9]), torch.device("cpu")
+    cached = TrainingClip(training, indices, rigs, cpu)
+    posed = TrainingClip(training, indices, rigs, cpu, cache_bytes=0)
+    rows = torch.tensor([2, 0])
+    assert cached.poses(rows).positions.shape == (2, 60, 3)
+    np.testing.assert_allclose(cached.poses(rows).positions, posed.poses(rows).positions, atol=1e-6)
+    np.testing.assert_allclose(
+        cached.poses(rows).orientations, posed.poses(rows).orientations, atol=1e-5
+    )
+    np.testing.assert_array_equal(cached.Ks[0], torch.from_numpy(training.cameras.Ks[4]).float())

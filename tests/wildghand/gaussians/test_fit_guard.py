@@ -1,0 +1,65 @@
+"""When a fit counts as diverged, and what is kept then: by construction."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+from painted import painted_avatar
+
+from baselines.plain.model import PlainModel
+from hwp_bench.base.errors import DidNotConverge
+from wildghand.gaussians.guard import MAX_RISE, WINDOW, Guard
+
+
+@pytest.fixture(scope="module")
+def model() -> PlainModel:
+    return painted_avatar(("right",)).model
+
+
+def watch_window(guard: Guard, model: PlainModel, start: int, loss: float) -> list[bool]:
+    return [guard.watch(start + i, loss, model) for i in range(WINDOW)]
+
+
+def test_falling_loss_is_fine_and_the_last_window_is_kept(model: PlainModel) -> None:
+    guard = Guard()
+    assert all(watch_window(guard, model, 0, 1.0) + watch_window(guard, model, WINDOW, 0.5))
+    assert guard.step == 2 * WINDOW - 1
+
+
+def test_a_loss_that_rises_far_is_divergence_and_the_best_state_is_kept(model: PlainModel) -> None:
+    guard = Guard()
+    watch_window(guard, model, 0, 1.0)
+    kept = model.light.clone()
+    changed = model.with_parameters({**model.parameters(), "light": model.light + 1.0})
+    assert not all(watch_window(guard, changed, WINDOW, 1.01 * MAX_RISE))
+    assert guard.step == WINDOW - 1
+    assert torch.equal(guard.best().light, kept)
+
+
+def test_the_kept_state_is_a_copy(model: PlainModel) -> None:
+    guard = Guard()
+    live = model.snapshot()
+    watch_window(guard, live, 0, 1.0)
+    live.light.add_(5.0)
+    assert torch.equal(guard.best().light, model.light)
+
+
+@pytest.mark.parametrize("loss", [math.nan, math.inf])
+def test_a_loss_that_is_no_number_is_divergence(model: PlainModel, loss: float) -> None:
+    assert not Guard().watch(0, loss, model)
+
+
+def test_a_parameter_that_is_no_number_is_divergence(model: PlainModel) -> None:
+    guard = Guard()
+    watch_window(guard, model, 0, 1.0)
+    broken = model.snapshot()
+    broken.gaussians.offsets[3, 1] = math.nan
+    assert not all(watch_window(guard, broken, WINDOW, 0.9))
+    assert torch.isfinite(guard.best().gaussians.offsets).all()
+
+
+def test_without_any_good_state_there_is_only_the_error() -> None:
+    with pytest.raises(DidNotConverge, match="first 50 steps"):
+        Guard().best()

@@ -1,0 +1,64 @@
+"""Oracle: `pose_hand` and the surface anchors themselves; float32, 1e-5 m."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.hands import HandTemplate, anchor_normals, anchor_positions, load_template, pose_hand
+from wildghand.gaussians.quaternions import quat_third_axis
+from wildghand.gaussians.rig import CHUNK, make_rig
+
+
+@pytest.fixture(scope="module")
+def template() -> HandTemplate:
+    return load_template()
+
+
+def parameters(frames: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    random = torch.Generator().manual_seed(seed)
+    return (
+        0.3 * torch.randn(frames, 16, 3, generator=random),
+        torch.randn(10, generator=random),
+        torch.randn(frames, 3, generator=random),
+    )
+
+
+def test_anchors_are_on_the_posed_surface_with_its_normals(template: HandTemplate) -> None:
+    rig = make_rig(template, 200, seed=1)
+    pose, betas, transl = parameters(3)
+    posed = rig.pose(pose, betas, transl)
+    tensors = template.to_torch()
+    vertices = pose_hand(tensors, pose, betas, transl).vertices
+    np.testing.assert_allclose(
+        posed.positions, anchor_positions(vertices, tensors.faces, rig.anchors), atol=1e-6
+    )
+    np.testing.assert_allclose(
+        quat_third_axis(posed.orientations),
+        anchor_normals(vertices, tensors.faces, rig.anchors),
+        atol=1e-5,
+    )
+
+
+def test_long_clips_are_posed_in_parts(template: HandTemplate) -> None:
+    rig = make_rig(template, 20)
+    pose, betas, transl = parameters(CHUNK + 2)
+    together = rig.pose(pose, betas, transl)
+    alone = rig.pose(pose[-1:], betas, transl[-1:])
+    assert together.positions.shape == (CHUNK + 2, 20, 3)
+    np.testing.assert_allclose(together.positions[-1], alone.positions[0], atol=1e-6)
+
+
+def test_spacing_is_that_of_a_square_grid_of_equal_area(template: HandTemplate) -> None:
+    corners = template.vertices[template.faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    area = 0.5 * np.linalg.norm(cross, axis=1).sum()
+    rig = make_rig(template, 400)
+    assert rig.spacing**2 * len(rig) == pytest.approx(area, rel=1e-5)
+
+
+def test_no_anchors_is_an_error(template: HandTemplate) -> None:
+    with pytest.raises(UsageError, match="count"):
+        make_rig(template, 0)

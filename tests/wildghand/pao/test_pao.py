@@ -1,0 +1,216 @@
+"""PAO. Oracle: the paper's two equations evaluated mask by mask in numpy, float64."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hwp_bench.base.errors import ShapeMismatch, UsageError
+from wildghand.pao.pao import PaoSettings, PerturbationAwareWeights
+from wildghand.pao.regions import FrameRegions, Regions, overlapping, partition, stack_regions
+
+PRINTED = PaoSettings(normalise_errors=False, share_of="hand")
+SIZE = 12
+
+
+def scene(seed: int = 0, frames: int = 2) -> tuple[torch.Tensor, np.ndarray, torch.Tensor]:
+    """Errors, overlapping masks (B, U, H, W) and hands."""
+    random = np.random.default_rng(seed)
+    error = random.uniform(0.0, 1.0, (frames, SIZE, SIZE))
+    masks = random.uniform(size=(frames, 5, SIZE, SIZE)) < 0.6
+    hand = random.uniform(size=(frames, SIZE, SIZE)) < 0.5
+    return torch.from_numpy(error), masks, torch.from_numpy(hand)
+
+
+def regions_of(masks: np.ndarray) -> Regions:
+    return stack_regions([overlapping(frame) for frame in masks])
+
+
+def printed(
+    error: np.ndarray, masks: np.ndarray, hand: np.ndarray, omega: float, chosen: PaoSettings
+) -> np.ndarray:
+    """W of one frame, as the paper writes it, with |omega|."""
+    total = np.zeros_like(error)
+    for mask in masks:
+        both = mask & hand
+        mu = both.sum() / (hand.sum() if chosen.share_of == "hand" else mask.sum())
+        weight = chosen.alpha * max(chosen.error_threshold - error[both].mean(), 0.0)
+        weight *= max(mu - chosen.share_threshold, 0.0) / (1.0 + chosen.beta * abs(omega))
+        total += weight * mask
+    return total + ~hand * np.maximum(chosen.background_threshold - 3.0 * error, 0.0)
+
+
+@pytest.mark.parametrize("share_of", ["hand", "region"])
+@pytest.mark.parametrize("threshold", [0.3, 0.55])
+def test_weights_are_the_papers(share_of: str, threshold: float) -> None:
+    chosen = replace(
+        PRINTED, share_of=share_of, error_threshold=threshold, background_threshold=1.2
+    )
+    error, masks, hand = scene()
+    omega = torch.tensor([-0.3, 0.001], dtype=torch.float64)
+    made = PerturbationAwareWeights(chosen).double()(error, regions_of(masks), hand, omega)
+    for frame in range(2):
+        expected = printed(
+            error[frame].numpy(), masks[frame], hand[frame].numpy(), float(omega[frame]), chosen
+        )
+        # The thresholds were float32 for a moment.
+        np.testing.assert_allclose(made.weights[frame].detach(), expected, atol=1e-5)
+
+
+def test_a_partition_is_the_same_regions_as_its_masks() -> None:
+    error, _, hand = scene()
+    labels = np.arange(SIZE * SIZE).reshape(SIZE, SIZE) // 30
+    masks = np.stack([labels == u for u in range(labels.max() + 1)])
+    module = PerturbationAwareWeights(replace(PRINTED, share_threshold=0.05))
+    omega = torch.zeros(2)
+    apart = module(error, stack_regions([partition(labels)] * 2), hand, omega)
+    general = module(error, regions_of(np.stack([masks] * 2)), hand, omega)
+    torch.testing.assert_close(apart.lambdas, general.lambdas)
+    torch.testing.assert_close(apart.weights, general.weights)
+
+
+def test_normalised_errors_span_the_batch_and_equal_ones_are_zero() -> None:
+    error, masks, hand = scene()
+    module = PerturbationAwareWeights()
+    made = module(error, regions_of(masks), hand, torch.zeros(2))
+    assert made.errors.min() == 0.0
+    assert made.errors.max() == 1.0
+    # Sums of 0.4 leave rounding, which must not be stretched to 1.
+    for value in (0.4, 0.5, 0.0):
+        flat = torch.full_like(error, value, dtype=torch.float32)
+        assert (module(flat, regions_of(masks), hand, torch.zeros(2)).errors == 0.0).all()
+
+
+def test_only_the_thresholds_get_a_gradient_and_the_right_one() -> None:
+    error, masks, hand = scene()
+    error.requires_grad_(True)
+    omega = torch.tensor([0.01, -0.02], dtype=torch.float64, requires_grad=True)
+    regions = regions_of(masks)
+    module = PerturbationAwareWeights(replace(PRINTED, background_threshold=1.5)).double()
+    parameters = tuple(module.parameters())
+    (module(error, regions, hand, omega).weights * error.detach()).mean().backward()
+    assert error.grad is None
+    assert omega.grad is None
+
+    def loss(*thresholds: torch.Tensor) -> torch.Tensor:
+        named = dict(zip(("T_E", "T_mu", "T_b"), thresholds, strict=True))
+        made = torch.func.functional_call(module, named, (error, regions, hand, omega))
+        return (made.weights * error.detach()).mean()
+
+    assert all(value.grad is not None and value.grad.abs() > 0.0 for value in parameters)
+    assert torch.autograd.gradcheck(loss, parameters, atol=1e-7)
+
+
+def test_the_reward_of_weight_moves_the_thresholds_apart() -> None:
+    error, masks, hand = scene()
+    module = PerturbationAwareWeights(replace(PRINTED, background_threshold=1.5))
+    (-0.5 * module(error, regions_of(masks), hand, torch.zeros(2)).weights.mean()).backward()
+    assert module.T_E.grad < 0.0 < module.T_mu.grad
+    assert module.T_b.grad < 0.0
+
+
+def test_binary_variant_is_the_hand() -> None:
+    error, masks, hand = scene()
+    regions = regions_of(masks)
+    chosen = PaoSettings(variant="binary")
+    made = PerturbationAwareWeights(chosen)(error, regions, hand, torch.ones(2))
+    assert torch.equal(made.weights, hand.to(error))
+    soft = PerturbationAwareWeights(replace(chosen, binary_outside=0.03))
+    weights = soft(error, regions, hand, torch.ones(2)).weights
+    torch.testing.assert_close(weights, torch.where(hand, 1.0, 0.03).to(error))
+
+
+def test_superpixels_qualify_unless_the_formula_is_asked_for() -> None:
+    labels = np.arange(SIZE)[:, None] // 2 * 6 + np.arange(SIZE)[None] // 2
+    error, _, _ = scene(frames=1)
+    hand = torch.zeros(1, SIZE, SIZE, dtype=torch.bool)
+    hand[:, 2:10, 3:10] = True
+    superpixels = stack_regions([partition(labels)])
+    masks = np.stack([labels == u for u in range(36)])
+
+    def share(share_of: str, regions: Regions) -> float:
+        module = PerturbationAwareWeights(PaoSettings(share_of=share_of))
+        weights = module(error, regions, hand, torch.zeros(1)).weights.detach()
+        return float((weights[hand] > 0.0).double().mean())
+
+    # All but the region with the largest error, which is stretched to T_E.
+    assert share("auto", superpixels) == share("region", superpixels) > 0.9
+    assert share("hand", superpixels) == 0.0
+    assert share("auto", stack_regions([overlapping(masks)])) == 0.0
+
+
+def test_a_covered_region_counts_less_than_a_visible_one() -> None:
+    labels = np.zeros((SIZE, SIZE), int)
+    labels[:, SIZE // 2 :] = 1
+    error = torch.full((1, SIZE, SIZE), 0.02)
+    error[:, :, SIZE // 2 :] = 0.6
+    hand = torch.ones(1, SIZE, SIZE)
+    regions = stack_regions([partition(labels)])
+    made = PerturbationAwareWeights(PRINTED)(error, regions, hand, torch.zeros(1))
+    # (1 - 0.6) / (1 - 0.02) at equal shares.
+    ratio = made.weights[0, 0, -1] / made.weights[0, 0, 0]
+    assert float(ratio.detach()) == pytest.approx(0.4 / 0.98, rel=1e-5)
+
+
+@settings(max_examples=30, deadline=None)
+@given(
+    omega=st.one_of(st.floats(-1.0, 1.0), st.sampled_from([-1e-3, 1e-3, -1.0, 1.0])),
+    value=st.sampled_from([0.0, 1.0, 0.5, float("nan"), float("inf")]),
+    hand=st.sampled_from(["none", "all", "one pixel", "half"]),
+    region=st.sampled_from(["whole", "pixels", "none", "empty mask", "whole mask"]),
+    share_of=st.sampled_from(["hand", "region"]),
+    threshold=st.sampled_from([-0.1, 0.0, 0.3, 1.0]),
+)
+def test_weights_are_finite_and_not_negative_everywhere(
+    omega: float, value: float, hand: str, region: str, share_of: str, threshold: float
+) -> None:
+    error = torch.full((1, SIZE, SIZE), value)
+    mask = torch.zeros(1, SIZE, SIZE, dtype=torch.bool)
+    mask.view(-1)[: {"none": 0, "all": SIZE**2, "one pixel": 1, "half": SIZE**2 // 2}[hand]] = True
+    ones = np.ones((1, SIZE, SIZE), bool)
+    regions: FrameRegions = {
+        "whole": partition(np.zeros((SIZE, SIZE), int)),
+        "pixels": partition(np.arange(SIZE**2).reshape(SIZE, SIZE)),
+        "none": overlapping(ones[:0]),
+        "empty mask": overlapping(~ones),
+        "whole mask": overlapping(ones),
+    }[region]
+    module = PerturbationAwareWeights(PaoSettings(share_of=share_of))
+    with torch.no_grad():
+        module.T_mu.fill_(threshold)
+    made = module(error, stack_regions([regions]), mask, torch.tensor([omega]))
+    assert made.weights.isfinite().all()
+    assert (made.weights >= 0.0).all()
+    made.weights.sum().backward()
+    assert all(parameter.grad.isfinite() for parameter in module.parameters())
+    if not np.isfinite(value):
+        assert (made.weights == 0.0).all()
+
+
+def test_one_bad_pixel_spoils_only_itself() -> None:
+    error, masks, hand = scene()
+    regions = regions_of(masks)
+    module = PerturbationAwareWeights(PRINTED)
+    whole = module(error, regions, hand, torch.zeros(2))
+    error[0, 3, 4] = float("nan")
+    made = module(error, regions, hand, torch.zeros(2))
+    assert made.weights[0, 3, 4] == 0.0
+    assert made.weights.isfinite().all()
+    assert torch.equal(made.weights[1], whole.weights[1])
+
+
+def test_bad_arguments_are_named() -> None:
+    error, masks, hand = scene()
+    module = PerturbationAwareWeights()
+    with pytest.raises(ShapeMismatch, match="omega"):
+        module(error, regions_of(masks), hand, torch.zeros(3))
+    with pytest.raises(ShapeMismatch):
+        module(error, regions_of(masks), hand[:, 1:], torch.zeros(2))
+    for bad in ({"alpha": float("nan")}, {"beta": -1.0}, {"variant": "mask"}, {"share_of": "u"}):
+        with pytest.raises(UsageError, match=next(iter(bad))):
+            PaoSettings(**bad)

@@ -1,0 +1,331 @@
+"""A prior over subjects: made of two, it helps a fit of a third, and bad ones are refused.
+
+Oracles: the fit from random weights, the run that was never stopped, the weights as they were
+written. The three subjects have one texture on their skin and tones of their own.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from painted import FRAMES, SIZE, cameras, hand_parameters
+from safetensors.torch import load_file, save_file
+
+import wildghand
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.files import sha256_file
+from hwp_bench.base.images import read_gray, read_rgb
+from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, HandModelId, open_capture
+from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.methods.contract import Budget
+from hwp_bench.methods.request import RunSettings, TrainingCapture, open_request, write_request
+from wildghand.avatar.files import load_avatar
+from wildghand.cli.main import main
+from wildghand.fit.fit import Fit
+from wildghand.fit.optimise import Watchers
+from wildghand.fit.saved import load_state, save_state
+from wildghand.model.settings import read_settings
+from wildghand.network import network_settings
+from wildghand.pretrain.joint import JointFit
+from wildghand.pretrain.loop import take_steps
+from wildghand.prior.files import DESCRIPTION, WEIGHTS, choose_prior, find_prior, load_prior
+
+QUICK: dict[str, Any] = {
+    "gaussians": 400,
+    "steps": 40,
+    "device": "cpu",
+    "network.identity_resolution": 24,
+    "network.plane_resolution": 12,
+}
+NETWORK = network_settings(identity_resolution=24, plane_resolution=12)
+CPU = torch.device("cpu")
+#: Gains of the tones of the subjects; the last one is not pretrained on.
+TONES = {"anna": (1.0, 1.0, 1.0), "ben": (0.7, 0.75, 0.85), "dora": (0.85, 0.8, 0.7)}
+
+
+@pytest.fixture(scope="module")
+def subjects(
+    make_painted: Callable[..., Capture], tmp_path_factory: pytest.TempPathFactory
+) -> dict[str, Path]:
+    """Three people: the painted hand in tones of their own."""
+    painted, root = make_painted(), tmp_path_factory.mktemp("subjects")
+    return {name: _toned(painted, root / name, gains) for name, gains in TONES.items()}
+
+
+def _toned(painted: Capture, path: Path, gains: tuple[float, ...]) -> Path:
+    info = CaptureInfo(
+        id=path.name,
+        hands="right",
+        action="Waving",
+        device="Test",
+        fps=30.0,
+        width=SIZE,
+        height=SIZE,
+        frame_count=FRAMES,
+        hand_model=painted.info.hand_model,
+        perturbations={},
+        source={"kind": "test"},
+        licence="CC0",
+    )
+    with CaptureWriter(path, info, {"right": hand_parameters("right", 0)}, cameras()) as writer:
+        for frame in range(FRAMES):
+            image = read_rgb(painted.root / "frames" / f"{frame:06d}.png")
+            writer.frame(frame, (image * np.array(gains)).astype(np.uint8))
+            writer.mask(frame, read_gray(painted.root / "masks" / f"{frame:06d}.png"))
+    return path
+
+
+def training_of(source: Path, folder: Path) -> TrainingCapture:
+    capture = open_capture(source)
+    split = contiguous_split(capture.info.id, FRAMES)
+    run = RunSettings(dict(QUICK), 0, Budget())
+    return open_request(write_request(folder / capture.info.id, capture, split, run))
+
+
+def make_prior(subjects: dict[str, Path], out: Path, *words: str) -> int:
+    options = [word for name, value in QUICK.items() for word in ("--set", f"{name}={value}")]
+    pair = [str(subjects["anna"]), str(subjects["ben"])]
+    return main(["pretrain", *pair, "-o", str(out), "--steps", "60", *options, *words])
+
+
+@pytest.fixture(scope="module")
+def prior(subjects: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    out = tmp_path_factory.mktemp("prior") / "prior"
+    assert make_prior(subjects, out) == 0
+    return out
+
+
+def mean_loss(fit: Fit) -> float:
+    """L1 + D-SSIM over all training frames, without steps."""
+    with torch.no_grad():
+        losses = []
+        for row in range(len(fit.frames)):
+            rows = torch.tensor([row])
+            drawing = fit.draw(rows)
+            target = fit.weighting(rows, drawing, 0.0)
+            losses.append(
+                fit.objective(fit.model, drawing, target, rows, fit.weighting.clean[rows])
+            )
+        return float(torch.stack(losses).mean())
+
+
+def test_a_prior_of_two_subjects_helps_a_third(
+    subjects: dict[str, Path], prior: Path, tmp_path: Path
+) -> None:
+    training = training_of(subjects["dora"], tmp_path)
+    plain = Fit(training, read_settings(QUICK), 0, CPU)
+    ahead = Fit(training, read_settings({**QUICK, "prior": str(prior)}), 0, CPU)
+    assert mean_loss(ahead) < 0.8 * mean_loss(plain)
+    # And it stays ahead while both are fitted.
+    for fit in (plain, ahead):
+        for step in range(8):
+            fit.step(torch.tensor([4 * step]), step / 8)
+    assert mean_loss(ahead) < mean_loss(plain)
+
+
+def test_a_prior_is_read_as_it_was_written(subjects: dict[str, Path], prior: Path) -> None:
+    hand_model = open_capture(subjects["anna"]).info.hand_model
+    read = load_prior(prior, NETWORK, hand_model)
+    assert read.record.sides == ["right"]
+    assert read.record.steps == 60
+    assert [capture["id"] for capture in read.record.captures] == ["anna", "ben"]
+    assert read.record.weights == sha256_file(prior / WEIGHTS)
+    stored = load_file(prior / WEIGHTS)
+    assert all(value.dtype == torch.float16 for value in stored.values())
+    assert all(torch.equal(stored[name].float(), value) for name, value in read.tensors.items())
+
+
+def test_maps_are_averaged_and_a_hand_not_seen_takes_the_other_ones(
+    subjects: dict[str, Path], prior: Path, tmp_path: Path, make_training: Callable[..., Any]
+) -> None:
+    joint = JointFit(
+        [training_of(subjects[name], tmp_path) for name in ("anna", "ben")],
+        read_settings(QUICK),
+        0,
+        CPU,
+    )
+    take_steps(joint, 4, Watchers(0))
+    first, second = (fit.model.network for fit in joint.fits)
+    assert first.texture_branch is second.texture_branch
+    maps = [network.identity("right").detach() for network in (first, second)]
+    assert not torch.equal(*maps)
+    torch.testing.assert_close(
+        joint.weights()["identity.maps.right"], (maps[0] + maps[1]) / 2, rtol=0, atol=1e-7
+    )
+    both = make_training("both")
+    network = Fit(both, read_settings({**QUICK, "prior": str(prior)}), 0, CPU).model.network
+    assert torch.equal(network.identity("left"), network.identity("right"))
+
+
+def test_the_same_seed_repeats_and_a_stopped_run_goes_on(
+    subjects: dict[str, Path], tmp_path: Path
+) -> None:
+    trainings = [training_of(subjects[name], tmp_path) for name in ("anna", "ben")]
+    settings = read_settings(QUICK)
+    whole, half, rest = (JointFit(trainings, settings, 0, CPU) for _ in range(3))
+    take_steps(whole, 13, Watchers(0))
+    watchers = Watchers(0)
+
+    class Stopped(Exception):
+        pass
+
+    def stop(step: int) -> None:
+        if step == 7:
+            save_state(tmp_path / "state", half, watchers, step=7, seconds=1.0, digest="d")
+            raise Stopped
+
+    with pytest.raises(Stopped):
+        take_steps(half, 13, watchers, after_step=stop)
+    resumed = Watchers(0)
+    assert load_state(tmp_path / "state", rest, resumed, "d") == (7, 1.0)
+    assert take_steps(rest, 13, resumed, start=7) == 13
+    expected, found = whole.snapshot(), rest.snapshot()
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+    assert all(torch.equal(whole.weights()[name], value) for name, value in rest.weights().items())
+
+
+def test_the_commands_use_a_prior(
+    subjects: dict[str, Path], prior: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = [word for name, value in QUICK.items() for word in ("--set", f"{name}={value}")]
+    words = ["fit", str(subjects["dora"]), "-o", str(tmp_path / "avatar"), "--steps", "3"]
+    assert main([*words, "--prior", str(prior), *options]) == 0
+    avatar = load_avatar(tmp_path / "avatar")
+    assert avatar.record.source["prior"] == sha256_file(prior / WEIGHTS)
+    capsys.readouterr()
+    assert make_prior(subjects, prior) == 2
+    assert "exists" in capsys.readouterr().err
+    assert main(["pretrain", str(subjects["anna"]), "-o", str(tmp_path / "one")]) == 2
+    assert "several people" in capsys.readouterr().err
+
+
+def test_a_prior_of_another_kind_is_refused(prior: Path, subjects: dict[str, Path]) -> None:
+    hand_model = open_capture(subjects["anna"]).info.hand_model
+    with pytest.raises(BadInput, match="identity_resolution = 24, and this fit has 160"):
+        load_prior(prior, network_settings(), hand_model)
+    with pytest.raises(BadInput, match="hand model anny"):
+        load_prior(prior, NETWORK, HandModelId("mano", "0" * 64))
+
+
+def _record(folder: Path, **changes: Any) -> None:
+    value = json.loads((folder / DESCRIPTION).read_text())
+    (folder / DESCRIPTION).write_text(json.dumps({**value, **changes}))
+
+
+def _tensors(folder: Path, name: str, value: torch.Tensor | None) -> None:
+    tensors = load_file(folder / WEIGHTS)
+    tensors.pop(name, None)
+    if value is not None:
+        tensors[name] = value
+    save_file(tensors, folder / WEIGHTS)
+    _record(folder, weights=sha256_file(folder / WEIGHTS))
+
+
+MAP = "identity.maps.right"
+HARM: dict[str, tuple[Callable[[Path], Any], str]] = {
+    "no json": (lambda p: (p / DESCRIPTION).write_text("{"), "is not valid JSON"),
+    "deep": (lambda p: (p / DESCRIPTION).write_text("[" * 5000), "prior.json"),
+    "empty": (lambda p: (p / DESCRIPTION).write_text("{}"), "is missing"),
+    "schema": (lambda p: _record(p, schema="wildghand-prior/9"), "wildghand-prior/9"),
+    "sides": (lambda p: _record(p, sides=["third"]), "third"),
+    "size": (lambda p: _record(p, network={"size": "huge"}), "huge"),
+    "no weights": (lambda p: (p / WEIGHTS).unlink(), "is missing or larger"),
+    "other weights": (lambda p: (p / WEIGHTS).write_bytes(b"x" * 99), "another digest"),
+    "no tensor": (lambda p: _tensors(p, MAP, None), "maps.right: is missing"),
+    "a tensor more": (lambda p: _tensors(p, "more", torch.ones(1)), "more: is not known"),
+    "shape": (lambda p: _tensors(p, MAP, torch.ones(3, 3)), r"\(3, 3\), wanted \(576, 33\)"),
+    "whole": (lambda p: _tensors(p, MAP, torch.ones(576, 33).int()), "int32"),
+    "nan": (lambda p: _tensors(p, MAP, torch.full((576, 33), torch.nan)), "NaN"),
+}
+
+
+@pytest.mark.parametrize("harm", HARM)
+def test_damaged_priors_are_one_line(
+    harm: str, prior: Path, subjects: dict[str, Path], tmp_path: Path
+) -> None:
+    import shutil
+
+    hand_model = open_capture(subjects["anna"]).info.hand_model
+    folder = Path(shutil.copytree(prior, tmp_path / "prior"))
+    spoil, message = HARM[harm]
+    spoil(folder)
+    with pytest.raises(BadInput, match=message) as caught:
+        load_prior(folder, NETWORK, hand_model)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", ["../outside", "priors/none", "a\0b", "/nowhere/at/all"])
+def test_priors_are_found_in_the_package_or_by_an_absolute_path(name: str) -> None:
+    with pytest.raises(BadInput, match="is no prior") as caught:
+        find_prior(name)
+    assert "\n" not in str(caught.value)
+
+
+def test_an_absolute_path_is_taken(prior: Path) -> None:
+    assert find_prior(str(prior)) == prior
+
+
+def test_the_prior_that_ships_is_taken_where_it_fits(subjects: dict[str, Path]) -> None:
+    hand_model = open_capture(subjects["anna"]).info.hand_model
+    shipped = choose_prior(read_settings({}), hand_model)
+    assert shipped is not None
+    assert shipped.record.sides == ["right", "left"]
+    assert len(shipped.record.captures) >= 8
+    # Where the kind is another one nobody asked for it; where it is named, that is an error.
+    assert choose_prior(read_settings(QUICK), hand_model) is None
+    assert choose_prior(read_settings({}), HandModelId("mano", "0" * 64)) is None
+    assert choose_prior(read_settings({"mode": "paper"}), hand_model) is None
+    assert choose_prior(read_settings({"prior": ""}), hand_model) is None
+    with pytest.raises(BadInput, match="hand model anny"):
+        choose_prior(read_settings({"prior": "priors/compact"}), HandModelId("mano", "0" * 64))
+
+
+def test_the_prior_that_ships_saw_no_subject_and_no_scene_of_a_suite(
+    subjects: dict[str, Path],
+) -> None:
+    from hwp_bench.sim.scene import load_scene, scene_names
+
+    shipped = choose_prior(read_settings({}), open_capture(subjects["anna"]).info.hand_model)
+    assert shipped is not None
+    scenes = [load_scene(name) for name in scene_names()]
+    made = Path(wildghand.__file__).parent / "priors" / "scenes"
+    quiet = [load_scene(str(path)) for path in sorted(made.glob("*.toml"))]
+    assert not any(scene.effects for scene in quiet)
+    sources = [capture["source"] for capture in shipped.record.captures]
+    assert {source["scene"] for source in sources} == {scene.id for scene in quiet}
+    assert {scene.id for scene in quiet}.isdisjoint(scene.id for scene in scenes)
+    # A source's seed is that of its subject too (docs/prior.md).
+    seeds = {source["seed"] for source in sources}
+    assert len(seeds) == len(sources)
+    assert seeds.isdisjoint(scene.seed for scene in scenes)
+    assert seeds.isdisjoint(scene.subject.seed for scene in scenes)
+
+
+def test_a_default_fit_starts_from_the_prior_that_ships(make_training: Callable[..., Any]) -> None:
+    training = make_training("right")
+    fit = Fit(training, read_settings({"gaussians": 200}), 0, CPU)
+    shipped = choose_prior(fit.settings, training.hand_model)
+    assert shipped is not None
+    assert fit.source["prior"] == shipped.record.weights
+    found = fit.model.network.identity("right")
+    torch.testing.assert_close(found, shipped.tensors[MAP], rtol=0, atol=0)
+    bare = Fit(training, read_settings({"gaussians": 200, "prior": ""}), 0, CPU)
+    assert "prior" not in bare.source
+
+
+def test_captures_of_different_hand_models_are_refused(
+    subjects: dict[str, Path], make_capture: Callable[..., Capture], tmp_path: Path
+) -> None:
+    from wildghand.pretrain.session import pretrain
+
+    other = make_capture("other", frames=20)
+    info = other.root / "capture.json"
+    info.write_text(info.read_text().replace("anny-1", "mano"))
+    with pytest.raises(UsageError, match="captures of one hand model"):
+        pretrain([subjects["anna"], other.root], tmp_path / "p", settings=QUICK)

@@ -1,0 +1,1 @@
+"""The fitted avatar: drawing, files, clips, export."""

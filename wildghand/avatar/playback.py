@@ -1,0 +1,111 @@
+"""Drawing an avatar along the poses of a capture, to pictures and a video."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.files import atomic_folder
+from hwp_bench.base.images import write_image
+from hwp_bench.base.progress import track
+from hwp_bench.capture import Capture
+from hwp_bench.hands import load_template
+from hwp_bench.methods.contract import Camera, HandPose
+from wildghand.avatar.avatar import WildGHandAvatar
+
+
+def render_clip(
+    avatar: WildGHandAvatar,
+    capture: Capture,
+    frames: range,
+    out: Path,
+    *,
+    background: int = 0,
+    video: Path | None = None,
+    overwrite: bool = False,
+) -> dict[str, Any]:
+    """Draw frames into a folder, whole or not at all.
+
+    Args:
+        avatar: what is drawn.
+        capture: whose hand parameters and cameras are used.
+        frames: which of its frames.
+        out: the folder.
+        background: grey level behind the hand, 0 to 255.
+        video: MP4 file to write, too.
+        overwrite: replace what exists.
+
+    Returns:
+        Number of frames, and frames drawn in a second.
+
+    Raises:
+        UsageError: the capture shows no hand that the avatar has, or belongs to another hand
+            model.
+        HwpError: the video cannot be written.
+    """
+    sides = [side for side in capture.info.sides if side in avatar.sides]
+    if not sides:
+        raise UsageError(
+            f"shows the {' and '.join(capture.info.sides)} hand, the avatar is of the "
+            f"{' and '.join(avatar.sides)} hand",
+            where=capture.root,
+        )
+    if capture.info.hand_model.name != avatar.hand_model.name:
+        raise UsageError(
+            f"has parameters of the hand model {capture.info.hand_model.name}, "
+            f"the avatar takes those of {avatar.hand_model.name}",
+            where=capture.root,
+            remedy="Convert them with `hwp-bench hands convert`.",
+        )
+    info, seconds, pictures = capture.info, 0.0, []
+    with atomic_folder(out, overwrite=overwrite) as folder:
+        for frame in track(frames, "Drawing"):
+            camera = Camera(
+                capture.cameras.Ks[frame], capture.cameras.viewmats[frame], info.width, info.height
+            )
+            hands = {}
+            for side in sides:
+                given = capture.hands[side]
+                hands[side] = HandPose(side, given.pose[frame], given.betas, given.transl[frame])
+            started = time.perf_counter()
+            rgba = avatar.render(hands, camera)
+            seconds += time.perf_counter() - started
+            behind = (1.0 - rgba[..., 3:]) * (background / 255.0)
+            picture = np.rint(255.0 * (rgba[..., :3] + behind)).clip(0, 255).astype(np.uint8)
+            write_image(folder / f"{frame:06d}.png", picture)
+            if video is not None:
+                pictures.append(picture)
+    if video is not None:
+        _write_video(video, pictures, info.fps)
+    return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
+
+
+def rest_poses(avatar: WildGHandAvatar) -> dict[str, HandPose]:
+    """Every hand of an avatar at rest, side by side where there are two."""
+    hands = {}
+    for side in avatar.sides:
+        template = load_template(avatar.hand_model.source, side)
+        width = float(np.ptp(template.vertices[:, 2]))
+        shift = np.zeros(3)
+        if len(avatar.sides) > 1:
+            shift[2] = width if side == "right" else -width
+        hands[side] = HandPose(side, np.zeros((16, 3)), avatar.betas[side], shift)
+    return hands
+
+
+def _write_video(path: Path, pictures: list[np.ndarray], fps: float) -> None:
+    import cv2
+
+    height, width = pictures[0].shape[:2]
+    partial = path.with_name(f".{path.stem}.partial.mp4")
+    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
+    if not writer.isOpened():
+        raise HwpError("cannot be written as a video", where=path)
+    for picture in pictures:
+        writer.write(picture[:, :, ::-1])
+    writer.release()
+    partial.replace(path)

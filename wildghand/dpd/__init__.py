@@ -1,0 +1,1 @@
+"""DPD, dynamic perturbation disentanglement: temporally weighted biases of the attributes."""

@@ -1,0 +1,173 @@
+"""Dynamic perturbation disentanglement: temporally weighted biases of Gaussian attributes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from hwp_bench.base.errors import ShapeMismatch, UsageError
+from wildghand.gaussians.attributes import SIZES, RawAttributes
+
+#: K of the paper: the encoding has the octaves 0 to K.
+OCTAVES = 9
+#: Channels of the encoding: a sine and a cosine for each octave, and l / L itself.
+ENCODED = 2 * (OCTAVES + 1) + 1
+
+
+@dataclass(frozen=True, eq=False)
+class Temporal:
+    """What B frames have of their own."""
+
+    #: (B, width) temporal embedding z_l.
+    z: Tensor
+    #: (B,) temporal weight omega_l in (-1, 1).
+    omega: Tensor
+
+    def with_omega(self, omega: Tensor) -> Temporal:
+        """The same embedding under other weights, after `drop`."""
+        return Temporal(self.z, omega)
+
+
+class DynamicPerturbation(nn.Module):
+    """Delta g_l = omega_l * varphi([z_l, g_l]) for every frame of a clip.
+
+    `psi` starts at zero, hence omega, hence every bias. `varphi` does not, so that psi gets a
+    gradient at the first step and the others from the second: learning starts.
+
+    Args:
+        frame_count: L, the frames that have a temporal embedding, at least 1.
+        width: of the embedding; 256 makes the paper's 75,323 parameters.
+
+    Raises:
+        UsageError: `frame_count` or `width` is below 1.
+
+    Source: WildGHand, section "Dynamic Perturbation Disentanglement"; `docs/dpd_pao.md` lists
+    what the paper leaves open. Initial weights are torch's, from its global generator.
+    """
+
+    encoding: Tensor
+
+    def __init__(self, frame_count: int, width: int = 256) -> None:
+        super().__init__()
+        if frame_count < 1:
+            raise UsageError(f"is {frame_count}", field="frame_count", remedy="Use 1 or more.")
+        if width < 1:
+            raise UsageError(f"is {width}", field="width", remedy="Use 1 or more.")
+        self.phi = nn.Sequential(nn.Linear(ENCODED, width), nn.SiLU(), nn.Linear(width, width))
+        self.psi = nn.Linear(width, 1)
+        nn.init.zeros_(self.psi.weight)
+        nn.init.zeros_(self.psi.bias)
+        self.varphi = nn.ModuleDict({name: nn.Linear(width + k, k) for name, k in SIZES.items()})
+        # It follows from the number of frames: no part of a checkpoint.
+        table = encode_frames(torch.arange(frame_count), frame_count)
+        self.register_buffer("encoding", table, persistent=False)
+
+    @property
+    def frame_count(self) -> int:
+        """L."""
+        return len(self.encoding)
+
+    def temporal(self, frames: Tensor) -> Temporal:
+        """Embedding and weight of B frames.
+
+        Args:
+            frames: (B,) int, 0 to L - 1; frame 0 is the paper's l = 1.
+
+        Raises:
+            UsageError: a frame that is not in the clip.
+        """
+        if frames.numel() and not 0 <= int(frames.min()) <= int(frames.max()) < self.frame_count:
+            raise UsageError(
+                f"are {int(frames.min())} to {int(frames.max())}",
+                field="frames",
+                remedy=f"This module knows the frames 0 to {self.frame_count - 1}.",
+            )
+        z = self.phi(self.encoding[frames])
+        return Temporal(z, 2.0 * torch.sigmoid(self.psi(z).squeeze(-1)) - 1.0)
+
+    def biases(self, raw: RawAttributes, z: Tensor, omega: Tensor) -> RawAttributes:
+        """Delta g, to be added to the attributes before their activation.
+
+        The linear layer on [z, g] is split into one on z, once for each frame, and one on g:
+        the same function with the same parameters, at the cost of the second alone.
+
+        Args:
+            raw: g: (B, N, k) each, or (N, k) where all frames share it.
+            z: (B, width).
+            omega: (B,).
+
+        Returns:
+            (B, N, k) each.
+
+        Raises:
+            ShapeMismatch: the three do not describe the same frames.
+        """
+        frames = {len(z), len(omega), *([len(raw.offsets)] if raw.offsets.ndim > 2 else [])}
+        if len(frames) > 1 or raw.offsets.ndim > 3:
+            raise ShapeMismatch(
+                f"are {tuple(raw.offsets.shape)} (offsets), {tuple(z.shape)} and "
+                f"{tuple(omega.shape)}",
+                field="raw, z, omega",
+            )
+        made = {}
+        for name, g in raw.items():
+            layer = cast(nn.Linear, self.varphi[name])
+            of_z, of_g = layer.weight.split([z.shape[-1], g.shape[-1]], dim=1)
+            shift = nn.functional.linear(z, of_z, layer.bias)
+            made[name] = omega[:, None, None] * (g @ of_g.mT + shift[:, None])
+        return RawAttributes(**made)
+
+
+def encode_frames(frames: Tensor, frame_count: int) -> Tensor:
+    """l / L and the sines and cosines of its octaves.
+
+    Args:
+        frames: (B,) int, 0 to L - 1.
+        frame_count: L.
+
+    Returns:
+        (B, 21) float32: sin(2^0 pi l/L), cos(2^0 pi l/L), ..., cos(2^9 pi l/L), l/L with
+        l = frame + 1.
+
+    Source: the paper's gamma(l) with K = 9; the raw value follows the authors' implementation.
+    """
+    # In float64: at the ninth octave float32 would lose four digits.
+    place = (frames.double() + 1.0) / frame_count
+    octaves = 2.0 ** torch.arange(OCTAVES + 1, dtype=torch.float64, device=frames.device)
+    angles = math.pi * place[:, None] * octaves
+    waves = torch.stack([angles.sin(), angles.cos()], dim=-1).flatten(1)
+    return torch.cat([waves, place[:, None]], dim=-1).float()
+
+
+def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator) -> Tensor:
+    """Set temporal weights to 0 at random, so that the canonical attributes stand alone.
+
+    Training only; the paper's probability is 0.3 for every frame.
+
+    Args:
+        omega: (B,).
+        probability: in [0, 1], one for all or (B,): frames that are known to be perturbed may
+            keep their weights, with 0.
+        generator: draws B numbers for each call, whatever the probabilities are.
+
+    Returns:
+        (B,); a dropped frame passes no gradient.
+
+    Raises:
+        UsageError: a probability outside [0, 1].
+        ShapeMismatch: as many probabilities as frames are wanted.
+    """
+    chance = torch.as_tensor(probability, dtype=torch.float32).detach().cpu()
+    if not bool(((chance >= 0.0) & (chance <= 1.0)).all()):
+        raise UsageError("is outside [0, 1]", field="probability")
+    if chance.ndim and chance.shape != omega.shape:
+        raise ShapeMismatch(
+            f"has shape {tuple(chance.shape)}, omega {tuple(omega.shape)}", field="probability"
+        )
+    drawn = torch.rand(omega.shape, generator=generator, device=generator.device)
+    kept = drawn >= chance.to(drawn.device)
+    return torch.where(kept.to(omega.device), omega, torch.zeros_like(omega))

@@ -1,0 +1,58 @@
+"""How much of a frame's gradient the canonical hand takes."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from wildghand.gaussians.attributes import RawAttributes
+from wildghand.network import Prediction
+from wildghand.network.network import Refinement
+
+
+class _Share(torch.autograd.Function):
+    """The tensor itself; its gradient times a factor."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, factor: Tensor) -> Tensor:
+        ctx.save_for_backward(factor)
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        (factor,) = ctx.saved_tensors
+        return gradients[0] * factor, None
+
+
+def taught(prediction: Prediction, shares: Tensor) -> Prediction:
+    """The same prediction, which learns from each of B frames by its share.
+
+    What belongs to a frame alone (biases, gain, pose) still learns from all of its gradient: a
+    perturbed frame is explained by what is particular to it and leaves the hand alone. Weighing
+    the frame's loss instead would silence both.
+
+    Args:
+        prediction: of B frames.
+        shares: (B,) in [0, 1], without gradient.
+    """
+    count = len(shares)
+
+    def by_frame(values: Tensor) -> Tensor:
+        factor = shares.reshape(count, *[1] * (values.ndim - 1)).to(values)
+        return _Share.apply(values, factor)
+
+    refinement = prediction.refinement
+    return dataclasses.replace(
+        prediction,
+        raw=RawAttributes(**{name: by_frame(values) for name, values in prediction.raw.items()}),
+        shadow=by_frame(prediction.shadow),
+        template_offsets=by_frame(prediction.template_offsets.expand(count, -1, -1)),
+        refinement=Refinement(
+            pose=by_frame(refinement.pose),
+            betas=by_frame(refinement.betas.expand(count, -1)),
+            transl=by_frame(refinement.transl),
+        ),
+    )

@@ -1,0 +1,82 @@
+"""Temporal weights that say what the pre-pass found: their start, and what holds them there."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from wildghand.dpd.dpd import DynamicPerturbation
+
+#: Steps of Adam, and the size of the first, that bring temporal weights to their start.
+_STEPS, _RATE = 50, 3e-3
+#: Frames that one step of the fit looks at, at most.
+_LOOKED_AT = 64
+
+
+@dataclass(frozen=True, eq=False)
+class TemporalTarget:
+    """Temporal weights that the fit should not stray from.
+
+    Any factor may move from omega to varphi and back without changing a bias. Frames of the same
+    severity therefore end at any omega unless something says what it should be.
+    """
+
+    #: (R,) in [0, 1) where each frame's omega should be.
+    omega: Tensor
+    #: (R,) in [0, 1] how much each frame is held there.
+    hold: Tensor
+
+    @classmethod
+    def judged(cls, clean: Tensor, scale: float) -> TemporalTarget:
+        """What the pre-pass says.
+
+        Args:
+            clean: (R,) probability that nothing perturbs a frame.
+            scale: omega of a frame that is surely perturbed. 0: omega of clean frames should be
+                0, and the others are free.
+        """
+        if scale > 0.0:
+            return cls(scale * (1.0 - clean), torch.ones_like(clean))
+        return cls(torch.zeros_like(clean), clean)
+
+    def begin(self, modules: Sequence[DynamicPerturbation]) -> None:
+        """Bring temporal weights to their targets, and biases to zero.
+
+        Where the targets are zero the module's own start does that. Elsewhere phi and psi are
+        fitted to them, and varphi is set to zero: it has a gradient from the first step, because
+        omega is not zero.
+        """
+        if not bool((self.omega > 0.0).any()):
+            return
+        for module in modules:
+            learnt = [*module.phi.parameters(), *module.psi.parameters()]
+            optimizer = torch.optim.Adam(learnt, lr=_RATE)
+            for step in range(_STEPS):
+                optimizer.param_groups[0]["lr"] = _RATE * (1.0 - step / _STEPS)
+                optimizer.zero_grad(set_to_none=True)
+                self._strayed(module, slice(None)).backward()
+                optimizer.step()
+            for layer in module.varphi.parameters():
+                nn.init.zeros_(layer)
+            module.zero_grad(set_to_none=True)
+
+    def strayed(self, modules: Sequence[DynamicPerturbation], first: int) -> Tensor:
+        """Mean over frames of the held square of the distance to the target; a sum over hands.
+
+        Args:
+            modules: of the hands, at least one.
+            first: a frame of this step's batch. In long clips it and every k-th frame before and
+                after it is looked at, so that a step costs no more than in short ones.
+        """
+        stride = math.ceil(len(self.omega) / _LOOKED_AT)
+        part = slice(first % stride, None, stride)
+        return torch.stack([self._strayed(module, part) for module in modules]).sum()
+
+    def _strayed(self, module: DynamicPerturbation, part: slice) -> Tensor:
+        frames = torch.arange(len(self.omega), device=self.omega.device)[part]
+        distance = module.temporal(frames).omega - self.omega[part]
+        return (self.hold[part] * distance.square()).mean()

@@ -1,0 +1,53 @@
+"""WildGHand as an entry of the benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from hwp_bench.methods.contract import Budget, Report
+from hwp_bench.methods.request import TrainingCapture
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.fit.fit import Fit
+from wildghand.fit.optimise import optimise
+from wildghand.gaussians.device import choose_device
+from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
+from wildghand.model.settings import read_settings
+from wildghand.splat.warmup import warm_up
+
+
+class WildGHandMethod:
+    """See `hwp_bench.methods.contract.Method`.
+
+    Args:
+        settings: any of the fields of `wildghand.model.settings.WildGHandSettings`.
+        seed: of anchors, initial weights, order of the frames and dropout; on one machine's CPU
+            the same seed and number of steps give the same avatar bit for bit.
+
+    Raises:
+        BadMethod: a setting is unknown or out of range.
+        MissingDependency: CUDA was asked for and is not there.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
+        self.settings = read_settings(settings)
+        self.seed = seed
+        self.device = choose_device(self.settings.device)
+        if self.device.type == "cpu":
+            # Compiling takes some ten seconds once on a machine; it is no part of a fit.
+            warm_up()
+            warm_up_loss()
+
+    def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> WildGHandAvatar:
+        """Fit an avatar to the training frames (the validation frames are left alone).
+
+        Args:
+            training: what the method may see of the capture.
+            budget: when to stop; without steps the settings' number holds.
+            report: where checkpoints are offered.
+
+        Raises:
+            BadInput: no training frame can be used.
+            DidNotConverge: the fit diverged at once.
+        """
+        return optimise(Fit(training, self.settings, self.seed, self.device), budget, report)

@@ -1,0 +1,1 @@
+"""What every method on anchored Gaussians shares: rig, attributes, losses, frames, schedule."""

@@ -1,0 +1,159 @@
+"""Attributes of N Gaussians before and after their activation."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from types import MappingProxyType
+
+import torch
+from torch import Tensor
+
+from hwp_bench.base.errors import ShapeMismatch, UsageError
+
+#: Channels of each raw attribute, in the order in which they are concatenated.
+SIZES: Mapping[str, int] = MappingProxyType(
+    {"offsets": 3, "log_scales": 3, "quats": 4, "logit_opacities": 1, "logit_colors": 3}
+)
+
+#: Channels of all of them.
+CHANNELS = sum(SIZES.values())
+
+
+@dataclass(frozen=True, eq=False)
+class RawAttributes:
+    """What the network predicts and DPD adds its biases to; `Activation` makes it drawable.
+
+    Leading dimensions are B frames or none. A sum broadcasts them, so that attributes of all
+    frames, (N, k), and biases of each frame, (B, N, k), add up to (B, N, k).
+    """
+
+    #: (..., N, 3) displacement in the anchor's frame before the bound.
+    offsets: Tensor
+    #: (..., N, 3) natural logarithms of the standard deviations, relative to a bias.
+    log_scales: Tensor
+    #: (..., N, 4) orientation in the anchor's frame, (w, x, y, z), any length but 0.
+    quats: Tensor
+    #: (..., N, 1) opacity before the sigmoid.
+    logit_opacities: Tensor
+    #: (..., N, 3) sRGB colour before the sigmoid.
+    logit_colors: Tensor
+
+    def __post_init__(self) -> None:
+        for name, tensor in self.items():
+            if tensor.ndim < 2 or tensor.shape[-1] != SIZES[name]:
+                raise ShapeMismatch(
+                    f"is {tuple(tensor.shape)}, wanted (..., N, {SIZES[name]})", field=name
+                )
+
+    def __len__(self) -> int:
+        """N."""
+        return self.offsets.shape[-2]
+
+    def items(self) -> Iterator[tuple[str, Tensor]]:
+        """Name and tensor of each attribute, in the order of `SIZES`."""
+        return ((item.name, getattr(self, item.name)) for item in fields(self))
+
+    def __add__(self, other: RawAttributes) -> RawAttributes:
+        """Attribute by attribute, leading dimensions broadcast."""
+        added = {name: tensor + getattr(other, name) for name, tensor in self.items()}
+        return RawAttributes(**added)
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> RawAttributes:
+        """Apply a function to each tensor."""
+        return RawAttributes(**{name: function(tensor) for name, tensor in self.items()})
+
+    def concatenate(self) -> Tensor:
+        """Return all channels side by side.
+
+        Returns:
+            (..., N, 14), in the order of `SIZES`.
+        """
+        return torch.cat([tensor for _, tensor in self.items()], dim=-1)
+
+    @classmethod
+    def split(cls, channels: Tensor) -> RawAttributes:
+        """Take concatenated channels apart: the inverse of `concatenate`.
+
+        Args:
+            channels: (..., N, 14).
+
+        Raises:
+            ShapeMismatch: not 14 channels.
+        """
+        if channels.ndim < 2 or channels.shape[-1] != CHANNELS:
+            raise ShapeMismatch(
+                f"are {tuple(channels.shape)}, wanted (..., N, {CHANNELS})", field="channels"
+            )
+        parts = channels.split(list(SIZES.values()), dim=-1)
+        return cls(**dict(zip(SIZES, parts, strict=True)))
+
+
+@dataclass(frozen=True, eq=False)
+class Attributes:
+    """Gaussians in their anchors' frames, in the units of the rasterizer."""
+
+    #: (..., N, 3) m, from the anchor, in its frame.
+    offsets: Tensor
+    #: (..., N, 3) standard deviations in m.
+    scales: Tensor
+    #: (..., N, 4) of length 1, orientation in the anchor's frame.
+    quats: Tensor
+    #: (..., N) in (0, 1).
+    opacities: Tensor
+    #: (..., N, 3) sRGB in (0, 1), before the shadow coefficient.
+    colors: Tensor
+
+
+@dataclass(frozen=True)
+class Activation:
+    """Turns raw attributes into attributes."""
+
+    #: Largest displacement from the anchor along each axis of its frame, m. The authors' form
+    #: (sigmoid - 0.5) * 1.2 / 32 is the same function with 0.01875.
+    max_offset: float = 0.01875
+    #: Added to the raw logarithms of the scales; exp(-5) is 6.7 mm (the authors' value).
+    log_scale_bias: float = -5.0
+    #: Smallest standard deviation, m; thinner than paper explains nothing of a hand.
+    min_scale: float = 2e-5
+    #: Largest standard deviation, m; nor does a Gaussian as wide as a finger, and it costs time.
+    max_scale: float = 1e-2
+
+    def __post_init__(self) -> None:
+        if not (math.isfinite(self.max_offset) and self.max_offset > 0.0):
+            raise UsageError(
+                f"is {self.max_offset}", field="max_offset", remedy="Use a length in m above 0."
+            )
+        if not math.isfinite(self.log_scale_bias):
+            raise UsageError(
+                f"is {self.log_scale_bias}", field="log_scale_bias", remedy="Use a finite number."
+            )
+        if not 0.0 < self.min_scale <= self.max_scale < math.inf:
+            raise UsageError(
+                f"are {self.min_scale} and {self.max_scale}",
+                field="min_scale, max_scale",
+                remedy="Use lengths in m above 0, the smaller one first.",
+            )
+
+    def __call__(self, raw: RawAttributes) -> Attributes:
+        """Activate: bounded offsets and exponentials, unit quaternions, sigmoids.
+
+        Args:
+            raw: (..., N, k) each.
+
+        Returns:
+            Attributes with the same leading dimensions.
+        """
+        return Attributes(
+            # tanh(x / 2) = 2 (sigmoid(x) - 0.5)
+            offsets=self.max_offset * torch.tanh(0.5 * raw.offsets),
+            scales=torch.exp(
+                (raw.log_scales + self.log_scale_bias).clamp(
+                    math.log(self.min_scale), math.log(self.max_scale)
+                )
+            ),
+            quats=torch.nn.functional.normalize(raw.quats, dim=-1),
+            opacities=raw.logit_opacities.squeeze(-1).sigmoid(),
+            colors=raw.logit_colors.sigmoid(),
+        )

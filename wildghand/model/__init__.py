@@ -1,0 +1,1 @@
+"""The model that is fitted, and its settings."""

@@ -1,0 +1,269 @@
+"""The model that is fitted: network, perturbation biases, frame-wise corrections, and drawing."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from wildghand.dpd.dpd import DynamicPerturbation
+from wildghand.dpd.scale_gradients import taught
+from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.clip import TrainingClip
+from wildghand.gaussians.quaternions import quat_multiply, quat_rotate, quat_third_axis
+from wildghand.gaussians.rig import AnchorPoses, HandRig
+from wildghand.network import Prediction, PredictionNetwork
+from wildghand.splat import rasterize
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """Gaussians in B frames, as `wildghand.splat.rasterize` takes them."""
+
+    #: (B, N, 3) m, world.
+    means: Tensor
+    #: (B, N, 4) of length 1, world.
+    quats: Tensor
+    #: (N, 3) or (B, N, 3) m.
+    scales: Tensor
+    #: (N,) or (B, N) in (0, 1).
+    opacities: Tensor
+    #: (B, N, 3) sRGB.
+    colors: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class HandState:
+    """What the model says of one hand in B training frames; the regularisers read it."""
+
+    #: Output of the network.
+    prediction: Prediction
+    #: Biases of the attributes before activation; None while perturbations are not modelled.
+    biases: RawAttributes | None
+    #: (B,) temporal weight before dropout; zeros while perturbations are not modelled.
+    omega: Tensor
+    #: (B, N) opacities that were drawn.
+    opacities: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """B training frames as the model explains them."""
+
+    #: (B, H, W, 3) sRGB over black, with the frames' gains.
+    image: Tensor
+    #: (B, H, W, 1) coverage.
+    coverage: Tensor
+    #: By side.
+    hands: Mapping[str, HandState]
+
+    @property
+    def omega(self) -> Tensor:
+        """(B,) the temporal weight of largest magnitude among the hands."""
+        weights = torch.stack([hand.omega for hand in self.hands.values()])
+        chosen = weights.abs().argmax(dim=0, keepdim=True)
+        return weights.gather(0, chosen)[0]
+
+
+class WildGHandModel(nn.Module):
+    """Gaussians of one or two hands, and what differs from frame to frame of the training clip.
+
+    Args:
+        rigs: by side; they carry the Gaussians.
+        network: predicts the attributes.
+        frame_count: R, training frames that are fitted.
+        dpd: model perturbations as biases of the attributes.
+        embedding: width of the temporal embedding.
+
+    Attributes:
+        log_gains: (R, 3) log of the gain on the sRGB picture of each frame.
+        pose_steps: (S, R, 16, 3) rad, added to the given poses of the hands in order.
+        transl_steps: (S, R, 3) m, added to the given translations.
+    """
+
+    def __init__(
+        self,
+        rigs: Mapping[str, HandRig],
+        network: PredictionNetwork,
+        frame_count: int,
+        *,
+        dpd: bool = True,
+        embedding: int = 256,
+    ) -> None:
+        super().__init__()
+        self.rigs = dict(rigs)
+        self.network = network
+        self.perturbation = nn.ModuleDict(
+            {side: DynamicPerturbation(frame_count, embedding) for side in rigs} if dpd else {}
+        )
+        self.log_gains = nn.Parameter(torch.zeros(frame_count, 3))
+        self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
+        self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
+
+    def finite(self) -> bool:
+        """Whether every fitted number is finite."""
+        return all(bool(value.isfinite().all()) for value in self.parameters())
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """A copy of the state that the fit no longer changes."""
+        return {name: value.detach().clone() for name, value in self.state_dict().items()}
+
+    @property
+    def biases(self) -> list[DynamicPerturbation]:
+        """The perturbation modules of the hands; none while perturbations are not modelled."""
+        return [self.biases_of(side) for side in self.perturbation]
+
+    def biases_of(self, side: str) -> DynamicPerturbation:
+        """The perturbation module of one hand."""
+        module = self.perturbation[side]
+        assert isinstance(module, DynamicPerturbation)
+        return module
+
+    def draw_frames(
+        self,
+        clip: TrainingClip,
+        rows: Tensor,
+        width: int,
+        height: int,
+        *,
+        kept: Mapping[str, Tensor] | None = None,
+        shares: Tensor | None = None,
+        move: bool = False,
+        refine: bool = False,
+    ) -> Drawing:
+        """Draw training frames with everything that is particular to them.
+
+        Args:
+            clip: hands and cameras.
+            rows: (B,) int64 positions among the training frames.
+            width, height: px.
+            kept: (B,) bool by side: False leaves a frame's biases out; None: never.
+            shares: (B,) how much the canonical hand learns from each frame, 0-1; None: all.
+            move: add `pose_steps` and `transl_steps` to the given parameters.
+            refine: apply the network's refinement of the parameters (head iv).
+        """
+        states, parts = {}, []
+        for index, (side, rig) in enumerate(self.rigs.items()):
+            anchors = clip.hand(side, rows)
+            pose, betas, transl = clip.parameters[side]
+            pose, transl = pose[rows], transl[rows]
+            if move:
+                pose = pose + self.pose_steps[index, rows]
+                transl = transl + self.transl_steps[index, rows]
+            prediction = self._predict(side, anchors, pose.detach())
+            learning = prediction if shares is None else taught(prediction, shares)
+            if refine:
+                step = learning.refinement
+                pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
+            if move or refine:
+                anchors = rig.follow(pose, betas, transl)
+            raw, biases = learning.raw, None
+            omega = pose.new_zeros(len(rows))
+            if side in self.perturbation:
+                module = self.biases_of(side)
+                temporal = module.temporal(rows)
+                omega = temporal.omega
+                weight = omega
+                if kept is not None:
+                    weight = torch.where(kept[side].to(omega.device), omega, omega.new_zeros(()))
+                biases = module.biases(raw, temporal.z, weight)
+                raw = raw + biases
+            gaussians = self._dress(anchors, learning, raw)
+            parts.append(gaussians)
+            states[side] = HandState(prediction, biases, omega, gaussians.opacities)
+        image, coverage = _rasterize(parts, clip.viewmats[rows], clip.Ks[rows], width, height)
+        # The picture lies over black, so a gain on it is one on every Gaussian.
+        image = image * self.log_gains[rows].exp()[:, None, None]
+        return Drawing(image, coverage, states)
+
+    def draw(
+        self,
+        hands: Mapping[str, tuple[Tensor, Tensor, Tensor]],
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+        *,
+        refine: bool = False,
+    ) -> tuple[Tensor, Tensor]:
+        """Draw hands in any pose, free of what perturbed the training frames.
+
+        Args:
+            hands: pose (B, 16, 3), betas (10,), transl (B, 3) by side.
+            viewmats: (B, 4, 4).
+            Ks: (B, 3, 3) px.
+            width, height: px.
+            refine: apply the network's refinement of the parameters (head iv).
+
+        Returns:
+            (B, H, W, 3) sRGB over black and (B, H, W, 1) coverage.
+        """
+        parts = [
+            self.gaussians(side, *hands[side], refine=refine) for side in self.rigs if side in hands
+        ]
+        return _rasterize(parts, viewmats, Ks, width, height)
+
+    def gaussians(
+        self, side: str, pose: Tensor, betas: Tensor, transl: Tensor, *, refine: bool = False
+    ) -> Gaussians:
+        """The Gaussians of one hand in any pose, free of perturbations.
+
+        Args:
+            side: which hand.
+            pose: (B, 16, 3) axis-angle, rad.
+            betas: (10,).
+            transl: (B, 3) m.
+            refine: apply the network's refinement of the parameters (head iv).
+        """
+        rig = self.rigs[side]
+        anchors = rig.pose(pose, betas, transl)
+        prediction = self._predict(side, anchors, pose)
+        if refine:
+            step = prediction.refinement
+            anchors = rig.follow(pose + step.pose, betas + step.betas, transl + step.transl)
+        return self._dress(anchors, prediction, prediction.raw)
+
+    def _predict(self, side: str, anchors: AnchorPoses, pose: Tensor) -> Prediction:
+        return self.network(side, quat_third_axis(anchors.orientations), pose)
+
+    def _dress(self, anchors: AnchorPoses, prediction: Prediction, raw: RawAttributes) -> Gaussians:
+        """p' = p_g + v': the predicted offset from the vertex that heads iii and iv moved."""
+        attributes = self.network.activation(raw)
+        offsets = attributes.offsets + prediction.template_offsets
+        return Gaussians(
+            means=anchors.positions + quat_rotate(anchors.orientations, offsets),
+            quats=quat_multiply(anchors.orientations, attributes.quats),
+            scales=attributes.scales,
+            opacities=attributes.opacities,
+            colors=attributes.colors * prediction.shadow,
+        )
+
+
+def _rasterize(
+    parts: list[Gaussians], viewmats: Tensor, Ks: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    def joined(name: str, shared: int) -> Tensor:
+        tensors = [getattr(part, name) for part in parts]
+        if len(tensors) == 1:
+            return tensors[0]
+        if any(tensor.dim() > shared for tensor in tensors):
+            tensors = [
+                tensor if tensor.dim() > shared else tensor.expand(len(viewmats), *tensor.shape)
+                for tensor in tensors
+            ]
+        return torch.cat(tensors, dim=tensors[0].dim() - shared)
+
+    image, coverage, _ = rasterize(
+        joined("means", 2),
+        joined("quats", 2),
+        joined("scales", 2),
+        joined("opacities", 1),
+        joined("colors", 2),
+        viewmats,
+        Ks,
+        width,
+        height,
+    )
+    return image, coverage

@@ -1,0 +1,145 @@
+"""Terms of the fit's objective, each a mean, so that no weight depends on sizes."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, fields
+
+import torch
+from torch import Tensor
+
+from hwp_bench.base.errors import ShapeMismatch, UsageError
+from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.losses import photometric_loss
+
+
+@dataclass(frozen=True)
+class TermWeights:
+    """Weight of each term.
+
+    The defaults are the authors' weights divided by their 100 for the reconstruction, but for
+    the two terms that cost the clean fit several dB: opacity and silhouette.
+    """
+
+    #: Weighted reconstruction.
+    reconstruction: float = 1.0
+    #: `bias_size`: biases of the perturbation module.
+    bias: float = 1e-3
+    #: `distance_to_one` of the shadow coefficients.
+    shadow: float = 1e-5
+    #: `distance_to_one` of the opacities.
+    opacity: float = 0.0
+    #: `SurfaceLaplacian.offsets`: template offsets (head iii).
+    laplacian_offsets: float = 1e-3
+    #: `SurfaceLaplacian.roughness` of the log scales.
+    laplacian_scales: float = 1e-3
+    #: `SurfaceLaplacian.roughness` of the colours.
+    laplacian_colors: float = 1e-3
+    #: `silhouette`: coverage against the hand's mask.
+    silhouette: float = 0.0
+    #: `weight_reward`: keeps PAO from weighing everything with 0.
+    weight_reward: float = 5e-3
+    #: `cross_hand`: texture features of the two hands, where there are two.
+    cross_hand: float = 1e-3
+    #: A perceptual distance (`wildghand.gaussians.perceptual`).
+    perceptual: float = 0.0
+
+    def __post_init__(self) -> None:
+        for item in fields(self):
+            value = getattr(self, item.name)
+            if not (math.isfinite(value) and value >= 0.0):
+                raise UsageError(
+                    f"is {value}", field=item.name, remedy="Use a finite number, 0 or more."
+                )
+
+
+#: The paper's weights; reconstruction, silhouette, the two other Laplacians, the texture term
+#: and the perceptual weight are the authors', whom the paper does not contradict.
+PAPER_TERMS = TermWeights(
+    reconstruction=100.0,
+    bias=0.1,
+    shadow=0.001,
+    opacity=0.1,
+    laplacian_offsets=0.1,
+    laplacian_scales=0.1,
+    laplacian_colors=0.1,
+    silhouette=1.0,
+    weight_reward=0.5,
+    cross_hand=0.1,
+    perceptual=0.1,
+)
+
+
+def reconstruction(
+    prediction: Tensor, target: Tensor, weights: Tensor, dssim_weight: float = 0.0
+) -> Tensor:
+    """Weighted L1, with a share of D-SSIM; pixels that are not finite in the target are left out.
+
+    Args:
+        prediction: (B, H, W, 3) float, sRGB.
+        target: (B, H, W, 3) float of the same type.
+        weights: (B, H, W) W, not negative.
+        dssim_weight: share of 1 - SSIM in [0, 1]; the paper has 0.
+
+    Returns:
+        scalar, differentiable in `prediction` and `weights`.
+
+    Raises:
+        ShapeMismatch: the three do not describe the same images.
+    """
+    if prediction.shape == target.shape and weights.shape == target.shape[:-1]:
+        finite = target.isfinite()
+        if not bool(finite.all()):
+            target = torch.where(finite, target, prediction.detach())
+            weights = weights * finite.all(dim=-1)
+    return photometric_loss(prediction, target, weights, dssim_weight)
+
+
+def bias_size(biases: RawAttributes) -> Tensor:
+    """Mean over Gaussians and frames of |Delta g|_1, the sum over the 14 channels."""
+    sizes = [tensor.abs().sum(dim=-1).mean() for _, tensor in biases.items()]
+    return torch.stack(sizes).sum()
+
+
+def distance_to_one(values: Tensor) -> Tensor:
+    """Mean of (x - 1)^2: for shadow coefficients and opacities, any shape."""
+    return (values - 1.0).square().mean()
+
+
+def silhouette(coverage: Tensor, hand: Tensor) -> Tensor:
+    """Mean of (alpha - y_h)^2; the authors', not in the paper.
+
+    Args:
+        coverage: (B, H, W) or (B, H, W, 1) alpha of the rendering.
+        hand: (B, H, W), bool or in [0, 1].
+
+    Raises:
+        ShapeMismatch: the two do not describe the same images.
+    """
+    if coverage.ndim == hand.ndim + 1:
+        coverage = coverage.squeeze(-1)
+    if coverage.shape != hand.shape:
+        raise ShapeMismatch(
+            f"has shape {tuple(hand.shape)}, the coverage {tuple(coverage.shape)}", field="hand"
+        )
+    return (coverage - hand.to(coverage)).square().mean()
+
+
+def weight_reward(weights: Tensor) -> Tensor:
+    """Minus the mean of W, (B, H, W): lowest where nothing is weighed down."""
+    return -weights.mean()
+
+
+def cross_hand(left: Tensor, right: Tensor) -> Tensor:
+    """Mean of |T_left - T_right|: texture features of the two hands, (N, F) each.
+
+    Raises:
+        ShapeMismatch: the hands have different numbers of Gaussians or features.
+    """
+    if left.shape != right.shape:
+        raise ShapeMismatch(
+            f"have the shapes {tuple(left.shape)} and {tuple(right.shape)}",
+            field="left, right",
+            remedy="Both hands need as many Gaussians.",
+        )
+    return (left - right).abs().mean()

@@ -1,0 +1,1 @@
+"""PAO, perturbation-aware optimization: weights of frames, regions and pixels."""

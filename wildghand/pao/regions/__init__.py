@@ -1,0 +1,28 @@
+"""The hand y_h and the regions y_u of a frame."""
+
+from wildghand.pao.regions.cache import RegionCache, Segmenter
+from wildghand.pao.regions.frame_regions import (
+    FrameRegions,
+    Regions,
+    overlapping,
+    partition,
+    stack_regions,
+)
+from wildghand.pao.regions.hand import graph_cut_hands, hand_of_mask
+from wildghand.pao.regions.sam import SegmentAnything, open_sam
+from wildghand.pao.regions.superpixels import Superpixels
+
+__all__ = [
+    "FrameRegions",
+    "RegionCache",
+    "Regions",
+    "SegmentAnything",
+    "Segmenter",
+    "Superpixels",
+    "graph_cut_hands",
+    "hand_of_mask",
+    "open_sam",
+    "overlapping",
+    "partition",
+    "stack_regions",
+]

@@ -1,0 +1,161 @@
+"""The regions y_u of pictures: one label for each pixel, and which labels a region is made of."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hwp_bench.base.errors import ShapeMismatch, UsageError
+
+#: Most labels of one picture; they are stored as 16-bit numbers.
+MAX_LABELS = 65536
+
+
+@dataclass(frozen=True, eq=False)
+class FrameRegions:
+    """U regions of one picture.
+
+    Regions that do not overlap are their labels. Regions that do (Segment Anything's) are unions
+    of atoms, the sets of pixels that lie in the same regions; then labels number the atoms.
+    """
+
+    #: (H, W) uint16, 0 to A - 1.
+    labels: np.ndarray
+    #: (A, U) bool, whether an atom lies in a region; None where atom u is region u.
+    membership: np.ndarray | None = None
+
+    @property
+    def count(self) -> int:
+        """U."""
+        return self.atoms if self.membership is None else self.membership.shape[1]
+
+    @property
+    def atoms(self) -> int:
+        """A."""
+        if self.membership is not None:
+            return len(self.membership)
+        return int(self.labels.max()) + 1 if self.labels.size else 0
+
+
+def partition(labels: np.ndarray) -> FrameRegions:
+    """Regions that cover the picture without overlap.
+
+    Args:
+        labels: (H, W) integers, any values; they are renumbered from 0 without gaps.
+
+    Raises:
+        UsageError: not an (H, W) array of integers, or more than 65,536 different ones.
+    """
+    if labels.ndim != 2 or labels.dtype.kind not in "iu":
+        raise UsageError(f"are {labels.dtype} of shape {labels.shape}", field="labels")
+    values, numbered = np.unique(labels, return_inverse=True)
+    _check_count(len(values))
+    return FrameRegions(numbered.reshape(labels.shape).astype(np.uint16))
+
+
+def overlapping(masks: np.ndarray) -> FrameRegions:
+    """Regions that may overlap and may leave pixels out.
+
+    Args:
+        masks: (U, H, W) bool; U may be 0.
+
+    Raises:
+        UsageError: another shape or type, or more than 65,536 different overlaps.
+    """
+    if masks.ndim != 3 or masks.dtype != np.bool_:
+        raise UsageError(f"are {masks.dtype} of shape {masks.shape}", field="masks")
+    count, height, width = masks.shape
+    # Pixels with the same bits are one atom. The last bit is never set: no regions at all are
+    # then no special case.
+    bits = np.zeros((height * width, count + 1), dtype=bool)
+    bits[:, :count] = masks.reshape(count, height * width).T
+    packed = np.packbits(bits, axis=1)
+    rows = packed.view(np.dtype((np.void, packed.shape[1]))).ravel()
+    _, first, labels = np.unique(rows, return_index=True, return_inverse=True)
+    _check_count(len(first))
+    membership = np.ascontiguousarray(bits[first, :count])
+    return FrameRegions(labels.reshape(height, width).astype(np.uint16), membership)
+
+
+def _check_count(count: int) -> None:
+    if count > MAX_LABELS:
+        raise UsageError(
+            f"there are {count} regions", field="labels", remedy=f"At most {MAX_LABELS}."
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Regions:
+    """The regions of B frames of one size, ready for sums; regions that a frame lacks are empty."""
+
+    #: (B, H, W) int64: atom of each pixel, plus A for each frame before its own.
+    index: Tensor
+    #: A, atoms that each frame is given.
+    atoms: int
+    #: (B, A, U) of 0 and 1; None where atom u is region u.
+    membership: Tensor | None = None
+
+    @property
+    def count(self) -> int:
+        """U."""
+        return self.atoms if self.membership is None else self.membership.shape[2]
+
+    def sums(self, values: Tensor) -> Tensor:
+        """Sum of the pixels of each region.
+
+        Args:
+            values: (B, H, W) float.
+
+        Returns:
+            (B, U); no gradient.
+        """
+        total = torch.bincount(
+            self.index.flatten(),
+            values.detach().flatten(),
+            minlength=len(self.index) * self.atoms,
+        ).reshape(len(self.index), self.atoms)
+        if self.membership is None:
+            return total
+        return torch.einsum("ba,bau->bu", total, self.membership.to(total))
+
+    def spread(self, values: Tensor) -> Tensor:
+        """Sum over regions of value times mask.
+
+        Args:
+            values: (B, U) float.
+
+        Returns:
+            (B, H, W), differentiable in `values`.
+        """
+        if self.membership is not None:
+            values = torch.einsum("bu,bau->ba", values, self.membership.to(values))
+        return values.flatten()[self.index]
+
+
+def stack_regions(frames: Sequence[FrameRegions], device: torch.device | str = "cpu") -> Regions:
+    """Put the regions of B frames together.
+
+    Args:
+        frames: all of one picture size, at least one.
+        device: where the tensors live.
+
+    Raises:
+        ShapeMismatch: no frame, or frames of different sizes.
+    """
+    sizes = {frame.labels.shape for frame in frames}
+    if len(sizes) != 1:
+        raise ShapeMismatch(f"have the sizes {sorted(sizes)}", field="frames")
+    atoms = max(frame.atoms for frame in frames)
+    labels = torch.from_numpy(np.stack([frame.labels for frame in frames]).astype(np.int64))
+    index = labels + atoms * torch.arange(len(frames))[:, None, None]
+    if all(frame.membership is None for frame in frames):
+        return Regions(index.to(device), atoms)
+    membership = torch.zeros(len(frames), atoms, max(frame.count for frame in frames))
+    for frame, made in zip(frames, membership, strict=True):
+        member = np.eye(frame.atoms) if frame.membership is None else frame.membership
+        made[: member.shape[0], : member.shape[1]] = torch.from_numpy(member.astype(np.float32))
+    return Regions(index.to(device), atoms, membership.to(device))

@@ -1,0 +1,74 @@
+"""The hand's mask y_h without a network."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from hwp_bench.base.errors import ShapeMismatch
+
+
+def hand_of_mask(mask: np.ndarray) -> np.ndarray:
+    """y_h from a capture's estimated mask, the default.
+
+    Args:
+        mask: (..., H, W) uint8 coverage, 255 = hand.
+
+    Returns:
+        (..., H, W) bool, pixels that are hand by more than a half.
+    """
+    return np.asarray(mask) > 127
+
+
+def graph_cut_hands(
+    pictures: Sequence[np.ndarray], silhouettes: Sequence[np.ndarray]
+) -> Iterator[np.ndarray]:
+    """y_h of raw frames: graph cuts prompted by the projected hand, one colour model for all.
+
+    Args:
+        pictures: (H, W, 3) uint8 sRGB each.
+        silhouettes: (H, W) bool each, where the posed hand would be seen if nothing covered it;
+            where it is empty, so is the mask.
+
+    Yields:
+        (H, W) bool for each frame.
+
+    Raises:
+        ShapeMismatch: a silhouette that does not belong to its picture.
+
+    Source: `hwp_bench.importers.segment`, which the video import uses.
+    """
+    from hwp_bench.importers.segment import NARROW, Prompt, segment_clip
+
+    if len(pictures) != len(silhouettes) or any(
+        picture.shape[:2] != drawn.shape
+        for picture, drawn in zip(pictures, silhouettes, strict=True)
+    ):
+        raise ShapeMismatch("do not fit the pictures", field="silhouettes")
+    if not pictures:
+        return
+
+    def prompt(frame: int) -> Prompt:
+        drawn = np.where(silhouettes[frame], 255, 0).astype(np.uint8)
+        return Prompt(drawn, np.zeros(drawn.shape, dtype=bool), detected=True)
+
+    segmented = segment_clip(
+        lambda frame: np.ascontiguousarray(pictures[frame]),
+        prompt,
+        len(pictures),
+        _hand_size(silhouettes),
+        NARROW,
+    )
+    for _, masks in segmented:
+        yield masks.hand > 127
+
+
+def _hand_size(silhouettes: Sequence[np.ndarray]) -> float:
+    """Median over the frames of the larger side of the silhouette's box, px."""
+    sides = [
+        max(np.ptp(np.flatnonzero(drawn.any(axis=axis))) + 1.0 for axis in (0, 1))
+        for drawn in silhouettes
+        if drawn.any()
+    ]
+    return float(np.median(sides)) if sides else 1.0

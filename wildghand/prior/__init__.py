@@ -1,0 +1,1 @@
+"""The prior over subjects that a fit starts from."""
