@@ -5,8 +5,12 @@ from __future__ import annotations
 import csv
 import io
 import json
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
+
+from hwp_bench.base.files import atomic_write
 
 #: Spellings of a table by file ending.
 FORMATS = ("md", "tex", "csv", "json")
@@ -275,3 +279,10 @@ def print_table(table: Table) -> None:
     console.print(grid)
     for note in table.notes:
         console.print(Text(note, style="dim"))
+
+
+def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
+    """Write every table in every format: `overall.md`, `overall.tex`, ..."""
+    for name, table in tables.items():
+        for form in FORMATS:
+            atomic_write(folder / f"{name}.{form}", spell(table, form))

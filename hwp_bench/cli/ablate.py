@@ -121,11 +121,11 @@ def run(args: argparse.Namespace) -> int:
 def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.analysis.statistics.pairing import common_metrics
     from hwp_bench.base.progress import notice
-    from hwp_bench.base.tables import print_table
+    from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.evaluate.ablate.effects import cost_effects, score_effects
     from hwp_bench.evaluate.ablate.record import ablation_record, write_record
     from hwp_bench.evaluate.ablate.tables import ablation_tables
-    from hwp_bench.report.summary import HEADLINE, write_tables
+    from hwp_bench.report.summary import HEADLINE
 
     metrics = common_metrics(list(ablation.runs.values()), HEADLINE)
     effects = score_effects(ablation, metrics)

@@ -26,10 +26,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.progress import JobProgress
-    from hwp_bench.base.tables import Column, Table, print_table
+    from hwp_bench.base.tables import Column, Table, print_table, write_tables
     from hwp_bench.cli.evaluate import report_outcome
     from hwp_bench.evaluate.evaluation import EvaluationSettings, evaluate
-    from hwp_bench.report.summary import all_tables, write_tables
+    from hwp_bench.report.summary import all_tables
     from hwp_bench.sim import ensure_suite
 
     out = Path(args.out)

@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hwp_bench.stability.registry import Case, Outcome
+    from hwp_bench.stability import Case, Outcome
 
 _EXAMPLES = """examples:
   hwp-bench stability
@@ -46,7 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; 1 if anything that must hold does not."""
-    from hwp_bench.stability.registry import find_cases, run_cases
+    from hwp_bench.stability import find_cases, run_cases
 
     cases = find_cases(args.group, args.provider)
     _check_backends(cases, args.backend)

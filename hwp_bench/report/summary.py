@@ -4,11 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from pathlib import Path
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import atomic_write
-from hwp_bench.base.tables import FORMATS, Cell, Column, Table, spell
+from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
 from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import Results
@@ -50,13 +48,6 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
         "micro": mean_table(results, {"All frames": [m.overall.micro for m in means]}, HEADLINE),
         "paper": mean_table(results, groups, PAPER, _PAPER_NOTE),
     }
-
-
-def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
-    """Write every table in every spelling: `overall.md`, `overall.tex`, ..."""
-    for name, table in tables.items():
-        for form in FORMATS:
-            atomic_write(folder / f"{name}.{form}", spell(table, form))
 
 
 def overall_table(

@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.stability.registry import Case, Context, Measured
+from hwp_bench.stability import Case, Context, Measured
 from wildghand.dpd.dpd import DynamicPerturbation, drop
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes

@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator
 
 import torch
 
-from hwp_bench.stability.registry import Case, Context, Measured
+from hwp_bench.stability import Case, Context, Measured
 from wildghand.splat.hard_scenes import (
     DIFFERENTIABLE,
     PER_GAUSSIAN,

@@ -14,9 +14,8 @@ from hwp_bench.analysis.cost.summary import BUDGETS, MethodCost, method_costs, m
 from hwp_bench.analysis.cost.tables import cost_tables, machine_notes
 from hwp_bench.analysis.statistics.pairing import MethodRuns, refuse_unlike
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.tables import Table
+from hwp_bench.base.tables import Table, write_tables
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.report.summary import write_tables
 
 #: Name of the plain baseline, the reference where it is among the methods.
 PLAIN = "plain"

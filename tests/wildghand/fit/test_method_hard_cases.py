@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from hwp_bench.stability.registry import Case, Context, find_cases
+from hwp_bench.stability import Case, Context, find_cases
 from wildghand.fit.hard_cases import cases
 
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 import pytest
 
-from hwp_bench.stability.registry import Case, Context
+from hwp_bench.stability import Case, Context
 from wildghand.splat.hard_cases import cases
 
 CASES = [(case, backend) for case in cases() for backend in case.backends]

@@ -10,8 +10,7 @@ import pytest
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.cli.main import main
-from hwp_bench.stability import registry
-from hwp_bench.stability.registry import Case, Context, Measured, find_cases, run_cases
+from hwp_bench.stability import Case, Context, Measured, find_cases, registry, run_cases
 
 
 def fine(context: Context) -> Measured:

@@ -1,0 +1,153 @@
+"""Rooms import only what lies below them. Oracle: every import statement of the tree.
+
+`docs/architecture.md` states the layers: its tables of rooms are in order, from the lowest to the
+highest, and this test reads them.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+PAGE = ROOT / "docs" / "architecture.md"
+PACKAGES = ("hwp_bench", "wildghand")
+
+
+def modules() -> dict[str, Path]:
+    """Every module of the packages, by dotted name."""
+    found = {}
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+            found[name.removesuffix(".__init__")] = path
+    return found
+
+
+def imports(name: str, path: Path, known: dict[str, Path]) -> Iterator[str]:
+    """Every module of the packages that a module imports: at its top, in functions, for types."""
+    for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+        targets: list[str] = []
+        if isinstance(node, ast.Import):
+            targets = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            assert node.level == 0, f"{name}: a relative import"
+            module = node.module or ""
+            both = [f"{module}.{alias.name}" for alias in node.names]
+            targets = [one if one in known else module for one in both]
+        yield from (target for target in targets if target.split(".")[0] in PACKAGES)
+
+
+def layers(package: str) -> list[str]:
+    """The rooms of a package in the order of the page's table, lowest first."""
+    rows = re.findall(rf"^\| `{package}/(\w+)` \|", PAGE.read_text("utf-8"), re.MULTILINE)
+    assert len(rows) == len(set(rows))
+    return rows
+
+
+def room(name: str) -> str:
+    """The room of a module: `base` of `hwp_bench.base.errors`; `` of a package's `__init__`."""
+    return [*name.split("."), ""][1]
+
+
+MODULES = modules()
+IMPORTS = {name: sorted(set(imports(name, path, MODULES))) for name, path in MODULES.items()}
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_the_page_names_every_room(package: str) -> None:
+    there = {room(name) for name in MODULES if name.split(".")[0] == package} - {""}
+    assert set(layers(package)) == there
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_rooms_import_only_what_lies_below(package: str) -> None:
+    rank = {name: place for place, name in enumerate(layers(package))}
+    wrong = [
+        f"{name} imports {target}"
+        for name, targets in IMPORTS.items()
+        for target in targets
+        if name.split(".")[0] == target.split(".")[0] == package
+        and room(name)
+        and room(target)
+        and rank[room(name)] < rank[room(target)]
+    ]
+    assert wrong == []
+
+
+def test_the_benchmark_never_imports_the_methods() -> None:
+    wrong = [
+        f"{name} imports {target}"
+        for name, targets in IMPORTS.items()
+        for target in targets
+        if name.startswith("hwp_bench") and target.startswith("wildghand")
+    ]
+    assert wrong == []
+
+
+def test_the_rasterizer_imports_nothing_of_the_method() -> None:
+    allowed = ("wildghand.splat", "hwp_bench.base", "hwp_bench.stability")
+    wrong = [
+        f"{name} imports {target}"
+        for name, targets in IMPORTS.items()
+        for target in targets
+        if name.startswith("wildghand.splat") and not target.startswith(allowed)
+    ]
+    assert wrong == []
+
+
+def test_no_module_lies_loose_in_the_method() -> None:
+    assert [path.name for path in (ROOT / "wildghand").glob("*.py")] == ["__init__.py"]
+
+
+def circles(graph: dict[str, set[str]]) -> list[list[str]]:
+    """Circles that a walk along the edges of a graph comes upon; none means there is none."""
+    state: dict[str, str] = {}
+    found: list[list[str]] = []
+
+    def visit(name: str, path: list[str]) -> None:
+        state[name] = "open"
+        for target in sorted(graph.get(name, set())):
+            if state.get(target) == "open":
+                found.append([*path[path.index(target) :], target])
+            elif target not in state:
+                visit(target, [*path, target])
+        state[name] = "done"
+
+    for name in graph:
+        if name not in state:
+            visit(name, [name])
+    return found
+
+
+def test_the_search_for_circles_finds_one() -> None:
+    assert circles({"a": {"b"}, "b": {"c"}, "c": {"a"}}) == [["a", "b", "c", "a"]]
+    assert circles({"a": {"b", "c"}, "b": {"c"}}) == []
+
+
+def test_no_modules_import_one_another_in_a_circle() -> None:
+    # What is imported for types, or when a function runs, counts too. A package's `__init__`
+    # that gives out the names of its modules stands above them.
+    graph = {name: {to for to in targets if to != name} for name, targets in IMPORTS.items()}
+    assert circles(graph) == []
+
+
+@pytest.mark.parametrize(
+    "parent", sorted({n.rpartition(".")[0] for n in MODULES if n.count(".") > 1})
+)
+def test_parts_of_a_package_do_not_import_one_another_in_a_circle(parent: str) -> None:
+    def part(name: str) -> str:
+        return (
+            name.removeprefix(f"{parent}.").split(".")[0] if name.startswith(f"{parent}.") else ""
+        )
+
+    graph: dict[str, set[str]] = {}
+    for name, targets in IMPORTS.items():
+        if part(name):
+            others = {part(target) for target in targets} - {"", part(name)}
+            graph.setdefault(part(name), set()).update(others)
+    assert circles(graph) == []
