@@ -1,4 +1,4 @@
-"""A table and its spellings: Markdown, LaTeX, CSV, JSON, terminal."""
+"""A table and its formats: Markdown, LaTeX, CSV, JSON, terminal."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 
 from hwp_bench.base.files import atomic_write
 
-#: Spellings of a table by file ending.
+#: Formats of a table by file ending.
 FORMATS = ("md", "tex", "csv", "json")
 
 Cell = str | float | int | None
@@ -109,14 +109,15 @@ def without_empty_columns(table: Table) -> Table:
     )
 
 
-def spell(table: Table, form: str) -> str:
+def format_table(table: Table, format_name: str) -> str:
     """Return a table as text.
 
     Args:
         table: the table.
-        form: `md`, `tex`, `csv` or `json`.
+        format_name: one of `FORMATS`.
     """
-    return {"md": to_markdown, "tex": to_latex, "csv": to_csv, "json": to_json}[form](table)
+    writers = {"md": to_markdown, "tex": to_latex, "csv": to_csv, "json": to_json}
+    return writers[format_name](table)
 
 
 def to_markdown(table: Table) -> str:
@@ -284,5 +285,5 @@ def print_table(table: Table) -> None:
 def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
     """Write every table in every format: `overall.md`, `overall.tex`, ..."""
     for name, table in tables.items():
-        for form in FORMATS:
-            atomic_write(folder / f"{name}.{form}", spell(table, form))
+        for ending in FORMATS:
+            atomic_write(folder / f"{name}.{ending}", format_table(table, ending))

@@ -41,7 +41,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format",
         choices=("terminal", "md", "tex", "csv"),
         default="terminal",
-        help="spelling of the tables (default terminal)",
+        help="format of the tables (default terminal)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON with full precision")
 
@@ -51,12 +51,12 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from hwp_bench.analysis.statistics.compare import compare, standings
+    from hwp_bench.analysis.statistics.comparison_tables import differences_table, standings_table
     from hwp_bench.analysis.statistics.pairing import common_metrics, group_runs, refuse_unlike
-    from hwp_bench.analysis.statistics.tables import differences_table, standings_table
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.tables import print_table, spell
+    from hwp_bench.base.tables import format_table, print_table
     from hwp_bench.metrics import metric
-    from hwp_bench.report.summary import HEADLINE
+    from hwp_bench.report.evaluation_tables import HEADLINE
     from hwp_bench.results import read_all
 
     if not 100 <= args.resamples <= 1_000_000:
@@ -87,7 +87,7 @@ def run(args: argparse.Namespace) -> int:
             if args.format == "terminal":
                 print_table(table)
             else:
-                print(spell(table, args.format))
+                print(format_table(table, args.format))
     if args.json:
         json.dump(value, sys.stdout, indent=1)
         print()

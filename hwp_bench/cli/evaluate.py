@@ -118,7 +118,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluate.evaluation import evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.report.summary import all_tables
+    from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.run.engine.options import engine_for, needs_of
 
     settings = evaluation_settings(args)

@@ -60,15 +60,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--format",
         choices=("terminal", "md", "tex", "csv", "json"),
         default="terminal",
-        help="spelling of the table (default terminal)",
+        help="format of the table (default terminal)",
     )
     parser.add_argument("--json", action="store_true", help="the same as --format json")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.tables import print_table, spell
-    from hwp_bench.report.choose import TableRequest, make_table
+    from hwp_bench.base.tables import format_table, print_table
+    from hwp_bench.report.requested_table import TableRequest, make_table
 
     table = make_table(
         TableRequest(
@@ -84,5 +84,5 @@ def run(args: argparse.Namespace) -> int:
     if form == "terminal":
         print_table(table)
     else:
-        print(spell(table, form), end="")
+        print(format_table(table, form), end="")
     return 0

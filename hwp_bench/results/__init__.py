@@ -1,13 +1,14 @@
 """Results: one JSON file with every frame's scores, and all that is needed to trust them."""
 
-from hwp_bench.results.find import read_all, result_files
 from hwp_bench.results.schema import (
     CaptureResult,
     CurvePoint,
     FrameResult,
     MethodId,
     Results,
+    read_all,
     read_results,
+    result_files,
     write_results,
 )
 

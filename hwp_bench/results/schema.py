@@ -1,19 +1,26 @@
-"""The result file: dataclasses, and reading that checks what it is given."""
+"""The result file: its records, how it is found, and reading that checks what it is given."""
 
 from __future__ import annotations
 
 import os
+from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import BadResult
-from hwp_bench.base.files import read_json, write_json
+from hwp_bench.base.files import canonical_json, inside, read_json, write_json
 from hwp_bench.base.records import parse_record
 from hwp_bench.metrics.aggregate import CaptureScores
 
 #: Version of the result file.
 SCHEMA = "hwp-results/1"
+#: Name of the file that makes a folder an ablation.
+ABLATION = "ablation.json"
+#: Version of that file.
+ABLATION_SCHEMA = "hwp-ablation/1"
+# Longest text of a setting's value.
+_SHOWN = 40
 
 
 @dataclass(frozen=True)
@@ -169,6 +176,39 @@ def read_results(path: str | os.PathLike[str]) -> Results:
     return parse_record(Results, value, where=os.fspath(path))
 
 
+def result_files(path: str | os.PathLike[str]) -> list[Path]:
+    """Return the result files that a path stands for.
+
+    Args:
+        path: a `results.json`, a results folder, an `ablation.json`, or an ablation's folder.
+
+    Raises:
+        BadInput: an `ablation.json` is damaged, or names a file outside its folder.
+        BadResult: it is of another version.
+    """
+    place = Path(path)
+    record = place / ABLATION if place.is_dir() else place
+    if record.name != ABLATION or not record.is_file():
+        return [place / "results.json" if place.is_dir() else place]
+    value = read_json(record)
+    if not isinstance(value, dict) or value.get("schema") != ABLATION_SCHEMA:
+        raise BadResult(f"is no ablation of schema {ABLATION_SCHEMA}", where=record)
+    try:
+        names = [name for variant in value["variants"] for name in variant["results"]]
+        return [inside(record.parent, name) for name in names]
+    except (KeyError, TypeError) as error:
+        raise BadResult("does not list its results", where=record, field="variants") from error
+
+
+def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Results]:
+    """Read every evaluation that some paths stand for, in order.
+
+    Raises:
+        BadInput, BadResult: one is missing or damaged.
+    """
+    return [read_results(file) for path in paths for file in result_files(path)]
+
+
 def score_rows(results: Results) -> list[CaptureScores]:
     """Return the captures as `hwp_bench.metrics.aggregate` takes them."""
     return [
@@ -180,3 +220,32 @@ def score_rows(results: Results) -> list[CaptureScores]:
         )
         for capture in results.captures
     ]
+
+
+def differing_settings(results: Sequence[Results]) -> list[str]:
+    """Return for each result those of its settings in which results of its title differ.
+
+    Returns:
+        Texts such as `prior = "", steps = 300`, with `default` where a result says nothing; empty
+        where all settings are the same.
+    """
+    spelled = [
+        {name: canonical_json(value) for name, value in result.method.settings.items()}
+        for result in results
+    ]
+    told = []
+    for result, mine in zip(results, spelled, strict=True):
+        twins = [
+            table
+            for other, table in zip(results, spelled, strict=True)
+            if other.method.title == result.method.title
+        ]
+        names = sorted({name for table in twins for name in table})
+        told.append(
+            ", ".join(
+                f"{name} = {mine[name][:_SHOWN]}" if name in mine else f"{name} default"
+                for name in names
+                if len({table.get(name) for table in twins}) > 1
+            )
+        )
+    return told

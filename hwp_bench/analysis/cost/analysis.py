@@ -7,11 +7,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.analysis.cost.cost_tables import cost_tables, machine_notes, seconds_table
+from hwp_bench.analysis.cost.curves import FrontPart, MeanCurve, mean_curve, pareto_front
 from hwp_bench.analysis.cost.figure import draw_pareto, write_figure
-from hwp_bench.analysis.cost.front import FrontPart, MeanCurve, mean_curve, pareto_front
-from hwp_bench.analysis.cost.seconds import seconds_table
-from hwp_bench.analysis.cost.summary import BUDGETS, MethodCost, method_costs, method_curves, window
-from hwp_bench.analysis.cost.tables import cost_tables, machine_notes
+from hwp_bench.analysis.cost.method_cost import (
+    BUDGETS,
+    MethodCost,
+    method_costs,
+    method_curves,
+    window,
+)
 from hwp_bench.analysis.statistics.pairing import MethodRuns, refuse_unlike
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Table, write_tables

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.analysis.cost.front import FrontPart, MeanCurve
+from hwp_bench.analysis.cost.curves import FrontPart, MeanCurve
 from hwp_bench.base.files import atomic_write
 from hwp_bench.metrics import metric as metric_facts
 

@@ -10,7 +10,7 @@ import numpy as np
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.results import CaptureResult, Results
-from hwp_bench.results.differences import differing_settings
+from hwp_bench.results.schema import differing_settings
 from hwp_bench.taxonomy import PERTURBATIONS
 
 #: Scope of the headline: every perturbation counts the same, as the macro mean of the tables.

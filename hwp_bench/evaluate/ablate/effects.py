@@ -9,10 +9,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hwp_bench.analysis.statistics.bootstrap import RESAMPLES, Estimate, bootstrap_mean
+from hwp_bench.analysis.statistics.compare import holm
 from hwp_bench.analysis.statistics.pairing import MethodRuns, scopes
-from hwp_bench.analysis.statistics.several import holm
 from hwp_bench.evaluate.ablate.design import Effect
-from hwp_bench.evaluate.ablate.run import AblationRuns
+from hwp_bench.evaluate.ablate.runs import AblationRuns
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.results import CaptureResult
 from hwp_bench.taxonomy import PERTURBATIONS

@@ -11,19 +11,19 @@ from markupsafe import Markup
 from hwp_bench.analysis.cost.analysis import CostAnalysis, analyse_cost
 from hwp_bench.analysis.statistics.bootstrap import bootstrap_mean
 from hwp_bench.analysis.statistics.compare import compare, macro_by_seed, standings
+from hwp_bench.analysis.statistics.comparison_tables import differences_table, standings_table
 from hwp_bench.analysis.statistics.pairing import MethodRuns, group_runs, refuse_unlike, scopes
-from hwp_bench.analysis.statistics.tables import differences_table, standings_table
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Table
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
+from hwp_bench.report.evaluation_tables import all_tables, same_data
 from hwp_bench.report.page.pictures import Album, frame_sheets, mask_sheet
 from hwp_bench.report.page.plots import Bar, bar_plot, pareto_plot
 from hwp_bench.report.page.strips import StripMethod, strip_plot
 from hwp_bench.report.page.tables import to_html
 from hwp_bench.report.sources import Source, find_captures, temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
-from hwp_bench.report.summary import all_tables, same_data
 from hwp_bench.results import Results
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 

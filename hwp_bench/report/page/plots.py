@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from markupsafe import Markup
 
-from hwp_bench.analysis.cost.front import FrontPart, MeanCurve
+from hwp_bench.analysis.cost.curves import FrontPart, MeanCurve
 from hwp_bench.analysis.statistics.bootstrap import Estimate
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.page.svg import (

@@ -7,7 +7,7 @@ import io
 import json
 from dataclasses import replace
 
-from hwp_bench.base.tables import Column, Table, print_table, spell, without_empty_columns
+from hwp_bench.base.tables import Column, Table, format_table, print_table, without_empty_columns
 
 TABLE = Table(
     "Scores & more",
@@ -34,7 +34,7 @@ def test_ranks_follow_direction_and_printed_digits() -> None:
 
 
 def test_markdown_marks_best_and_second_and_escapes() -> None:
-    text = spell(TABLE, "md")
+    text = format_table(TABLE, "md")
     assert r"| best\|one | **22.00** | **0.250** | 3 |" in text
     assert r"| plain\_fit | <u>20.12</u> | <u>0.500</u> | 3 |" in text
     assert "Single PSNR ↑" in text
@@ -43,7 +43,7 @@ def test_markdown_marks_best_and_second_and_escapes() -> None:
 
 
 def test_latex_is_booktabs_with_groups_and_escapes() -> None:
-    text = spell(TABLE, "tex")
+    text = format_table(TABLE, "tex")
     assert r"\textbf{22.00}" in text
     assert r"\underline{20.12}" in text
     assert r"\multicolumn{2}{c}{Single}" in text
@@ -57,11 +57,11 @@ def test_latex_is_booktabs_with_groups_and_escapes() -> None:
 
 
 def test_csv_and_json_keep_full_precision() -> None:
-    rows = list(csv.reader(io.StringIO(spell(TABLE, "csv"))))
+    rows = list(csv.reader(io.StringIO(format_table(TABLE, "csv"))))
     assert rows[0] == ["Method", "Single PSNR", "Single Distance", "Frames"]
     assert float(rows[1][1]) == 20.123456
     assert rows[3][2] == ""
-    value = json.loads(spell(TABLE, "json"))
+    value = json.loads(format_table(TABLE, "json"))
     assert value["rows"][0]["Single PSNR"] == 20.123456
     assert value["rows"][2]["Single Distance"] is None
     assert value["columns"][2]["higher_is_better"] is False
@@ -81,7 +81,7 @@ def test_rows_are_ranked_within_their_block_and_published_ones_never() -> None:
     kept = replace(table, unranked=frozenset({3}))
     assert [kept.rank(row, 1) for row in range(4)] == [1, 0, None, None]
     # A line between the blocks, and the one under the heading.
-    assert spell(table, "tex").count(r"\midrule") == 2
+    assert format_table(table, "tex").count(r"\midrule") == 2
 
 
 def test_columns_without_any_value_are_dropped() -> None:

@@ -13,8 +13,8 @@ import pytest
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import write_json
-from hwp_bench.base.tables import spell
-from hwp_bench.report.choose import TableRequest, make_table
+from hwp_bench.base.tables import format_table
+from hwp_bench.report.requested_table import TableRequest, make_table
 from hwp_bench.results import FrameResult, Results, write_results
 
 GOLDEN = Path(__file__).with_name("golden")
@@ -86,7 +86,7 @@ def test_layouts_are_as_they_were_looked_at(number: int, folders, ablation) -> N
     table = make_table(TableRequest(paths, paper=number, published=number > 2))
     for form in ("md", "tex"):
         file = GOLDEN / f"table{number}.{form}"
-        text = spell(table, form)
+        text = format_table(table, form)
         if os.environ.get("HWP_GOLDEN") == "write":
             file.parent.mkdir(exist_ok=True)
             file.write_text(text, encoding="utf-8")

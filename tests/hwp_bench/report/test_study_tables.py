@@ -10,7 +10,7 @@ import pytest
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import write_json
 from hwp_bench.capture import Capture
-from hwp_bench.report.choose import TableRequest, make_table
+from hwp_bench.report.requested_table import TableRequest, make_table
 from hwp_bench.report.sources import Source, find_captures, mean_severity, temporal_weights
 from hwp_bench.report.study_tables import robustness_table
 from hwp_bench.results import Results, write_results

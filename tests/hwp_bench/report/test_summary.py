@@ -8,7 +8,7 @@ import pytest
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import write_tables
-from hwp_bench.report.summary import all_tables
+from hwp_bench.report.evaluation_tables import all_tables
 from hwp_bench.results import FrameResult, Results
 
 

@@ -14,10 +14,9 @@ from hypothesis import strategies as st
 from made_results import made_results
 
 from hwp_bench.analysis.cost.analysis import analyse_cost, write_cost
-from hwp_bench.analysis.cost.curves import Curve, curve_of
-from hwp_bench.analysis.cost.front import mean_curve, pareto_front
-from hwp_bench.analysis.cost.seconds import run_seconds, seconds_table
-from hwp_bench.analysis.cost.summary import method_costs
+from hwp_bench.analysis.cost.cost_tables import run_seconds, seconds_table
+from hwp_bench.analysis.cost.curves import Curve, curve_of, mean_curve, pareto_front
+from hwp_bench.analysis.cost.method_cost import method_costs
 from hwp_bench.analysis.statistics.pairing import group_runs
 from hwp_bench.base.errors import UsageError
 from hwp_bench.cli.main import main

@@ -8,10 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from hwp_bench.analysis.statistics.blocks import make_blocks
-from hwp_bench.analysis.statistics.bootstrap import bootstrap_mean
+from hwp_bench.analysis.statistics.bootstrap import FEWEST, bootstrap_mean, make_blocks
 from hwp_bench.analysis.statistics.coverage import STUDIES, Study, coverage, simulate
-from hwp_bench.analysis.statistics.skewness import FEWEST
 from hwp_bench.base.errors import UsageError
 
 

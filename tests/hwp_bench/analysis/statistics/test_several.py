@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hwp_bench.analysis.statistics.several import holm, tie_groups
+from hwp_bench.analysis.statistics.compare import holm, tie_groups
 
 
 def test_holm_by_hand() -> None:

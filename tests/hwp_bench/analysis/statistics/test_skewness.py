@@ -8,12 +8,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy import stats
 
-from hwp_bench.analysis.statistics.skewness import (
-    bent,
-    nearest_to_even,
-    reaches,
+from hwp_bench.analysis.statistics.bootstrap import (
+    hall_transform,
+    interval_reaches,
+    inverse_hall_transform,
+    least_extreme,
     skewness_of_mean,
-    straightened,
 )
 
 SKEWS = st.floats(-1, 1)
@@ -39,25 +39,27 @@ def test_what_has_no_shape_has_no_skewness() -> None:
 @given(st.floats(-30, 30), SKEWS)
 def test_bending_is_undone(value: float, skew: float) -> None:
     """Tolerance: the cube root loses digits where the curve is flat."""
-    assert bent(straightened(value, skew), skew) == pytest.approx(value, abs=1e-5)
+    assert hall_transform(inverse_hall_transform(value, skew), skew) == pytest.approx(
+        value, abs=1e-5
+    )
 
 
 @given(st.floats(-10, 10), st.floats(0, 5), SKEWS)
 def test_bending_keeps_the_order(value: float, more: float, skew: float) -> None:
-    assert bent(value + more, skew) >= bent(value, skew) - 1e-9
+    assert hall_transform(value + more, skew) >= hall_transform(value, skew) - 1e-9
 
 
 @given(st.floats(1.9, 5), SKEWS)
 def test_the_interval_only_grows_and_turns_with_the_sign(quantile: float, skew: float) -> None:
-    below, above = reaches(quantile, skew)
+    below, above = interval_reaches(quantile, skew)
     assert min(below, above) >= quantile
-    assert reaches(quantile, -skew) == pytest.approx((above, below))
+    assert interval_reaches(quantile, -skew) == pytest.approx((above, below))
     if abs(skew) > 0.01:
         assert (above > below) == (skew > 0)
-    assert reaches(quantile, 0.0) == (quantile, quantile)
+    assert interval_reaches(quantile, 0.0) == (quantile, quantile)
 
 
 def test_of_two_probabilities_the_weaker_holds() -> None:
-    assert nearest_to_even(0.9, 0.97) == 0.9
-    assert nearest_to_even(0.01, 0.2) == 0.2
-    assert nearest_to_even(0.4, 0.6) == 0.5
+    assert least_extreme(0.9, 0.97) == 0.9
+    assert least_extreme(0.01, 0.2) == 0.2
+    assert least_extreme(0.4, 0.6) == 0.5

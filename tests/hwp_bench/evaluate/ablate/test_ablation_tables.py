@@ -8,11 +8,11 @@ import pytest
 from made_results import made_results
 
 from hwp_bench.analysis.statistics.pairing import MethodRuns
-from hwp_bench.base.tables import Table, spell
+from hwp_bench.base.tables import Table, format_table
+from hwp_bench.evaluate.ablate.ablation_tables import ablation_tables
 from hwp_bench.evaluate.ablate.design import make_design
 from hwp_bench.evaluate.ablate.effects import cost_effects, score_effects
-from hwp_bench.evaluate.ablate.run import AblationRuns
-from hwp_bench.evaluate.ablate.tables import ablation_tables
+from hwp_bench.evaluate.ablate.runs import AblationRuns
 from hwp_bench.methods.manifest import read_manifest
 
 MANIFEST = """
@@ -65,7 +65,7 @@ smoke: 4 captures, seeds 0, 1; protocol hwp-v1; means over captures of means ove
 
 
 def test_the_ablation_table_is_the_papers_with_its_cost(tables) -> None:
-    assert spell(tables["ablation"], "md") == GOLDEN
+    assert format_table(tables["ablation"], "md") == GOLDEN
 
 
 def rows(table: Table) -> list[tuple]:

@@ -1,26 +1,30 @@
-"""The tables of an ablation."""
+"""What an ablation says: its tables, and its record `ablation.json`."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
 
-from hwp_bench.analysis.cost.seconds import seconds_table
+from hwp_bench.analysis.cost.cost_tables import seconds_table
 from hwp_bench.analysis.statistics.compare import macro_by_seed
-from hwp_bench.analysis.statistics.pairing import MethodRuns, common_metrics
-from hwp_bench.analysis.statistics.tables import (
+from hwp_bench.analysis.statistics.comparison_tables import (
     ONE_CAPTURE,
     estimate_cells,
     estimate_columns,
     scope_title,
 )
-from hwp_bench.base.tables import Cell, Column, Table
+from hwp_bench.analysis.statistics.pairing import MethodRuns, common_metrics
+from hwp_bench.base.files import write_json
+from hwp_bench.base.tables import Cell, Column, Table, to_object
 from hwp_bench.evaluate.ablate.effects import CostEffect, ScoreEffect, seconds
-from hwp_bench.evaluate.ablate.run import AblationRuns
+from hwp_bench.evaluate.ablate.runs import AblationRuns, result_folder
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import Scores, aggregate
-from hwp_bench.report.summary import HEADLINE, PAPER
+from hwp_bench.report.evaluation_tables import HEADLINE, PAPER
 from hwp_bench.results import Results
-from hwp_bench.results.schema import score_rows
+from hwp_bench.results.schema import ABLATION, ABLATION_SCHEMA, score_rows
 from hwp_bench.taxonomy import PERTURBATIONS
 
 #: Scopes of the effects table; perturbations have one of their own.
@@ -210,3 +214,51 @@ def seed_table(ablation: AblationRuns, metrics: Sequence[str]) -> Table:
 def total_seconds(results: Sequence[Results]) -> float:
     """Return the seconds of all method processes of some evaluations."""
     return sum(capture.wall_seconds for result in results for capture in result.captures)
+
+
+def ablation_record(
+    ablation: AblationRuns,
+    effects: Sequence[ScoreEffect],
+    costs: Sequence[CostEffect],
+    tables: Mapping[str, Table],
+) -> dict[str, Any]:
+    """Return the JSON object of an ablation; paths are relative to its folder."""
+    design = ablation.design
+    first = ablation.results[0]
+    switches = (*design.components, *design.alternatives)
+    return {
+        "schema": ABLATION_SCHEMA,
+        "method": {"name": first.method.name, "digest": first.method.digest},
+        "preset": first.method.preset,
+        "suite": first.suite,
+        "budget": first.budget,
+        "frames": first.frames,
+        "toolkit": first.toolkit,
+        "environment": first.environment,
+        "seeds": sorted(
+            result.seed for result in next(iter(ablation.runs.values())).seeds.values()
+        ),
+        "captures": [
+            {"id": c.id, "digest": c.digest, "split_digest": c.split_digest} for c in first.captures
+        ],
+        "switches": [asdict(item) for item in switches],
+        "variants": [
+            {
+                **asdict(variant),
+                "results": [
+                    f"{result_folder(variant.name, seed)}/results.json"
+                    for seed in ablation.runs[variant.name].seeds
+                ],
+            }
+            for variant in design.variants
+        ],
+        "process_seconds": total_seconds(ablation.results),
+        "score_effects": [asdict(item) for item in effects],
+        "cost_effects": [asdict(item) for item in costs],
+        "tables": {name: to_object(table) for name, table in tables.items()},
+    }
+
+
+def write_record(out: Path, record: Mapping[str, Any]) -> Path:
+    """Write `ablation.json`."""
+    return write_json(out / ABLATION, dict(record))

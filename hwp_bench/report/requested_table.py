@@ -11,6 +11,7 @@ from hwp_bench.analysis.statistics.pairing import group_runs
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.base.tables import Table
+from hwp_bench.report.evaluation_tables import all_tables, same_data
 from hwp_bench.report.paper_layouts import (
     DISTANCE,
     LAYOUTS,
@@ -30,9 +31,8 @@ from hwp_bench.report.study_tables import (
     seeds_table,
     severity_table,
 )
-from hwp_bench.report.summary import all_tables, same_data
 from hwp_bench.results import read_results
-from hwp_bench.results.find import ABLATION
+from hwp_bench.results.schema import ABLATION
 
 #: Table of the paper whose numbers go with a table of ours.
 PAPER_OF = {"overall": 3, "paper": 3, "perturbations": 5, "bias": 9, "seeds": 10}

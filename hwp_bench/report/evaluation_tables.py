@@ -10,8 +10,7 @@ from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
 from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import Results
-from hwp_bench.results.differences import differing_settings
-from hwp_bench.results.schema import score_rows
+from hwp_bench.results.schema import differing_settings, score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: Metrics of the headline tables, where an evaluation has them.
