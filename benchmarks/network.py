@@ -12,6 +12,7 @@ test frames and on every fifth training frame.
 from __future__ import annotations
 
 import argparse
+import sys
 import tempfile
 import time
 from collections.abc import Callable
@@ -21,13 +22,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from baselines.plain.model import make_model
-from baselines.plain.optimise import learning_rates
-from baselines.plain.settings import PlainSettings
 from hwp_bench.base.tables import Column, Table, print_table
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import split_for
 from hwp_bench.hands import load_template
+from hwp_bench.methods.manifest import find_method
 from hwp_bench.methods.request import RunSettings, TrainingCapture, open_request, write_request
 from wildghand.gaussians.clip import TrainingClip
 from wildghand.gaussians.frames import TrainingFrames, load_frames
@@ -103,6 +102,11 @@ def time_network(size: str, count: int, rounds: int) -> Table:
 
 def plain(training: TrainingCapture, frames: TrainingFrames, count: int) -> Contender:
     """Free attributes of every Gaussian, as the plain baseline fits them."""
+    sys.path.insert(0, str(find_method("plain")))
+    from plain_fit.model import make_model
+    from plain_fit.optimise import learning_rates
+    from plain_fit.settings import PlainSettings
+
     settings = PlainSettings()
     model = make_model(
         {side: training.template(side) for side in training.sides},

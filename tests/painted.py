@@ -8,7 +8,6 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from baselines.plain.model import PlainAvatar, make_model
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, HandModelId
 from hwp_bench.capture.reader import open_capture
 from hwp_bench.hands import load_template
@@ -16,6 +15,7 @@ from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.methods.contract import Avatar, Camera, HandPose
 from hwp_bench.methods.request import TrainingCapture
 from hwp_bench.metrics.pixels import quantize
+from plain_fit.model import PlainAvatar, make_model
 
 #: Frames and edge of the capture.
 FRAMES, SIZE = 40, 64

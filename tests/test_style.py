@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = [
     path
-    for folder in ("hwp_bench", "wildghand", "baselines", "benchmarks", "tests")
+    for folder in ("hwp_bench", "wildghand", "baselines", "benchmarks", "tests", "tools")
     for path in sorted((ROOT / folder).rglob("*.py"))
 ]
 

@@ -16,7 +16,7 @@ def data_folder(name: str) -> Path:
     In an installed wheel it lies inside the package `hwp_bench`, in a checkout beside it.
 
     Args:
-        name: `splits` or `leaderboard`.
+        name: `baselines`, `leaderboard` or `splits`.
 
     Raises:
         HwpError: it is in neither place: the installation is broken.

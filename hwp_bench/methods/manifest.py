@@ -13,7 +13,7 @@ from typing import Any
 
 from hwp_bench.base.errors import BadMethod
 from hwp_bench.base.files import inside
-from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.packages import PACKAGES, data_folder
 from hwp_bench.base.text import has_odd_characters
 from hwp_bench.methods.contents import method_digest
 from hwp_bench.methods.json_values import check_plain
@@ -106,11 +106,10 @@ def find_method(text: str) -> Path:
     """
     if (Path(text) / MANIFEST).is_file():
         return Path(text)
-    package = PACKAGES
-    for relative in (text.rstrip("/"), f"baselines/{text}"):
-        candidate = package / relative
-        if candidate.is_relative_to(package) and (candidate / MANIFEST).is_file():
-            return candidate
+    name = text.rstrip("/").removeprefix("baselines/")
+    for folder in _shipped_folders():
+        if folder.name == name:
+            return folder
     raise BadMethod(
         f"is no method directory: it has no {MANIFEST}",
         where=text,
@@ -207,6 +206,9 @@ def _presets(value: Any, where: Path) -> dict[str, dict[str, Any]]:
 
 def shipped_methods() -> list[MethodManifest]:
     """Return the methods that ship with the toolkit: the reference entry and the baselines."""
-    package = PACKAGES
-    folders = [package / "wildghand", *sorted((package / "baselines").iterdir())]
-    return [read_manifest(folder) for folder in folders if (folder / MANIFEST).is_file()]
+    return [read_manifest(folder) for folder in _shipped_folders()]
+
+
+def _shipped_folders() -> list[Path]:
+    folders = [PACKAGES / "wildghand", *sorted(data_folder("baselines").iterdir())]
+    return [folder for folder in folders if (folder / MANIFEST).is_file()]

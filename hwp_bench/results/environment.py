@@ -53,7 +53,10 @@ def environment() -> dict[str, Any]:
 def code_digest() -> str:
     """Return the SHA-256 (hex) of the toolkit's own modules: names and contents."""
     root = packages.PACKAGES / "hwp_bench"
-    return files_digest(root, root.rglob("*.py"))
+    # The shipped methods lie in `_data` in a wheel and elsewhere in a checkout.
+    shipped = root / "_data"
+    modules = (path for path in root.rglob("*.py") if not path.is_relative_to(shipped))
+    return files_digest(root, modules)
 
 
 def _processor() -> str:

@@ -11,12 +11,12 @@ import pytest
 import torch
 from painted import QUICK, SilentReport, TrainingMaker, painted_avatar
 
-from baselines.plain.method import PlainMethod
-from baselines.plain.model import PlainAvatar
 from hwp_bench.base.errors import DidNotConverge, MissingDependency, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, Camera, HandPose
 from hwp_bench.methods.request import TrainingCapture
+from plain_fit.method import PlainMethod
+from plain_fit.model import PlainAvatar
 
 
 def masked_psnr(avatar: PlainAvatar, training: TrainingCapture, capture: Capture) -> float:

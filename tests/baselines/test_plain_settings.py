@@ -8,10 +8,10 @@ from typing import Any
 
 import pytest
 
-from baselines.plain.method import PlainMethod
-from baselines.plain.settings import PlainSettings, read_settings
 from hwp_bench.base.errors import BadMethod
 from hwp_bench.methods import find_method, read_manifest
+from plain_fit.method import PlainMethod
+from plain_fit.settings import PlainSettings, read_settings
 
 
 def test_defaults_hold_where_nothing_is_said() -> None:
@@ -62,7 +62,7 @@ def test_the_manifest_and_all_its_presets_can_be_read() -> None:
 
 
 def test_every_setting_has_a_line_of_documentation() -> None:
-    import baselines.plain.settings as module
+    import plain_fit.settings as module
 
     lines = Path(module.__file__).read_text().splitlines()
     for field in dataclasses.fields(PlainSettings):

@@ -8,8 +8,8 @@ import pytest
 import torch
 from painted import painted_avatar
 
-from baselines.plain.model import PlainModel
 from hwp_bench.base.errors import DidNotConverge
+from plain_fit.model import PlainModel
 from wildghand.gaussians.guard import MAX_RISE, WINDOW, Guard
 
 

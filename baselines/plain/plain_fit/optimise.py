@@ -6,11 +6,11 @@ import math
 
 import torch
 
-from baselines.plain.model import PlainAvatar, PlainModel
-from baselines.plain.settings import PlainSettings
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Budget, Report
 from hwp_bench.methods.request import TrainingCapture
+from plain_fit.model import PlainAvatar, PlainModel
+from plain_fit.settings import PlainSettings
 from wildghand.gaussians.clip import TrainingClip
 from wildghand.gaussians.frames import TrainingFrames
 from wildghand.gaussians.guard import Guard

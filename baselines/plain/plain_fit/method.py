@@ -10,11 +10,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from baselines.plain.model import PlainAvatar, make_model
-from baselines.plain.optimise import fit_model
-from baselines.plain.settings import read_settings
 from hwp_bench.methods.contract import Budget, Report
 from hwp_bench.methods.request import TrainingCapture
+from plain_fit.model import PlainAvatar, make_model
+from plain_fit.optimise import fit_model
+from plain_fit.settings import read_settings
 from wildghand.gaussians.device import choose_device
 from wildghand.gaussians.frames import load_frames
 from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
@@ -25,7 +25,7 @@ class PlainMethod:
     """See `hwp_bench.methods.contract.Method`.
 
     Args:
-        settings: any of the fields of `baselines.plain.settings.PlainSettings`.
+        settings: any of the fields of `plain_fit.settings.PlainSettings`.
         seed: of the anchors and of the order of the frames; on one machine's CPU the same seed
             and number of steps give the same avatar bit for bit.
 

@@ -1,1 +1,0 @@
-"""Baselines of HWP bench: one method directory each."""

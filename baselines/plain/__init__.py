@@ -1,1 +1,0 @@
-"""The plain baseline; `method.toml` is its entry."""

@@ -1,0 +1,1 @@
+"""The plain baseline: Gaussians anchored on the hand, fitted to every training frame alike."""
