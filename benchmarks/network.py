@@ -26,8 +26,9 @@ from hwp_bench.base.tables import Column, Table, print_table
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import split_for
 from hwp_bench.hands import load_template
+from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from hwp_bench.methods.manifest import find_method
-from hwp_bench.methods.request import RunSettings, TrainingCapture, open_request, write_request
+from hwp_bench.methods.request import open_request, write_request
 from wildghand.gaussians.clip import TrainingClip
 from wildghand.gaussians.frames import TrainingFrames, load_frames
 from wildghand.gaussians.losses import photometric_loss

@@ -91,8 +91,8 @@ def make_training(make_painted: Callable[..., Capture], tmp_path: Path) -> Calla
     from painted import FRAMES, QUICK
 
     from hwp_bench.capture.splits import contiguous_split
-    from hwp_bench.methods.contract import Budget
-    from hwp_bench.methods.request import RunSettings, open_request, write_request
+    from hwp_bench.methods.contract import Budget, RunSettings
+    from hwp_bench.methods.request import open_request, write_request
 
     def make(hands: str = "right", **settings: object) -> Any:
         capture = make_painted(hands)

@@ -12,8 +12,7 @@ from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, Hand
 from hwp_bench.capture.reader import open_capture
 from hwp_bench.hands import load_template
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.methods.contract import Avatar, Camera, HandPose
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import Avatar, Camera, HandPose, TrainingCapture
 from hwp_bench.metrics.pixels import quantize
 from plain_fit.model import PlainAvatar, make_model
 

@@ -115,11 +115,17 @@ def _methods() -> Table:
             method.title,
             ", ".join(method.presets),
             ", ".join(method.switches) or "-",
+            method.authors or "-",
+            method.licence or "-",
+            method.url or "-",
             method.description,
         )
         for method in shipped_methods()
     )
-    columns = ("method", "title", "presets", "switches", "description")
+    columns = (
+        *("method", "title", "presets", "switches"),
+        *("authors", "licence", "url", "description"),
+    )
     return Table("Methods that ship with the toolkit", tuple(map(Column, columns)), rows)
 
 

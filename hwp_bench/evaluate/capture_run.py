@@ -23,9 +23,10 @@ from hwp_bench.evaluate.scoring import (
     score_predictions,
 )
 from hwp_bench.methods.contents import exposed_digest
+from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.methods.predictions import Prediction, read_predictions
-from hwp_bench.methods.request import RunSettings, write_request
+from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, CurvePoint

@@ -15,10 +15,9 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluate.capture_run import Job, read_result
 from hwp_bench.evaluate.jobs import evaluation_job
-from hwp_bench.methods.contract import Budget
-from hwp_bench.methods.json_values import check_plain
+from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
-from hwp_bench.methods.request import RunSettings
+from hwp_bench.methods.settings import check_plain
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
@@ -47,7 +46,7 @@ class EvaluationSettings:
     seed: int = 0
     #: When to stop fitting.
     budget: Budget = field(default_factory=Budget)
-    #: Training frames that the method is given, one of `methods.material.FRAME_CHOICES`.
+    #: Training frames that the method is given, one of `methods.contract.FRAME_CHOICES`.
     frames: str = "perturbed"
     #: Seconds after which a method is killed on one capture.
     time_limit: float = DEFAULT_TIME_LIMIT

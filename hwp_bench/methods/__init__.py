@@ -1,8 +1,16 @@
 """The method contract, method directories, and the runner that keeps test frames away."""
 
-from hwp_bench.methods.contract import Avatar, Budget, Camera, HandPose, Method, Report
+from hwp_bench.methods.contract import (
+    Avatar,
+    Budget,
+    Camera,
+    HandPose,
+    Method,
+    Report,
+    TrainingCapture,
+)
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
-from hwp_bench.methods.request import TrainingCapture, open_request
+from hwp_bench.methods.request import open_request
 
 __all__ = [
     "Avatar",

@@ -2,52 +2,59 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.images import read_gray, read_rgb
+from hwp_bench.capture.layout import CAMERAS, HANDS, image_path
+from hwp_bench.capture.schema import SIDES, HandModelId
+from hwp_bench.capture.splits import Split
+from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands
+from hwp_bench.hands.parameters import HandParameters
+
 if TYPE_CHECKING:
-    from hwp_bench.methods.request import TrainingCapture
+    from hwp_bench.hands.template import HandTemplate
+
+#: Name of the file that describes a request folder.
+REQUEST = "request.json"
+#: Training frames as they were captured; their clean versions; only those without perturbation.
+FRAME_CHOICES = ("perturbed", "clean", "unperturbed-only")
 
 
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """One pinhole camera, OpenCV axes."""
+class Method(Protocol):
+    """A way to make an avatar from a training capture.
 
-    #: (3, 3) intrinsics, px; pixel centres lie at +0.5.
-    K: np.ndarray
-    #: (4, 4) world to camera, m.
-    viewmat: np.ndarray
-    #: Image width, px.
-    width: int
-    #: Image height, px.
-    height: int
+    The entry of `method.toml` names a callable that takes `settings` (the preset's table, with
+    what the command line overrides) and `seed`, and returns an object with this method.
+    """
 
+    def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> Avatar:
+        """Fit an avatar.
 
-@dataclass(frozen=True, eq=False)
-class HandPose:
-    """The parameters of one hand in one frame."""
+        Args:
+            training: training and validation frames with masks, and the hand parameters and
+                cameras of every frame.
+            budget: when to stop.
+            report: where to offer checkpoints.
 
-    #: `right` or `left`.
-    side: str
-    #: (16, 3) axis-angle, rad.
-    pose: np.ndarray
-    #: (10,) shape.
-    betas: np.ndarray
-    #: (3,) m.
-    transl: np.ndarray
+        Returns:
+            The avatar that the test frames are rendered with.
+        """
+        ...
 
 
-@dataclass(frozen=True)
-class Budget:
-    """How much fitting is allowed; a method stops at whichever limit it meets first."""
+class MethodFactory(Protocol):
+    """What `entry.python` of `method.toml` names."""
 
-    #: Seconds on the method's clock, which stands still while checkpoints are scored.
-    seconds: float | None = None
-    #: Optimiser steps; None leaves the method's preset.
-    steps: int | None = None
+    def __call__(self, settings: Mapping[str, Any], seed: int) -> Method:
+        """Make the method with its settings."""
+        ...
 
 
 class Avatar(Protocol):
@@ -88,31 +95,135 @@ class Report(Protocol):
         ...
 
 
-class Method(Protocol):
-    """A way to make an avatar from a training capture.
+@dataclass(frozen=True)
+class Budget:
+    """How much fitting is allowed; a method stops at whichever limit it meets first."""
 
-    The entry of `method.toml` names a callable that takes `settings` (the preset's table, with
-    what the command line overrides) and `seed`, and returns an object with this method.
+    #: Seconds on the method's clock, which stands still while checkpoints are scored.
+    seconds: float | None = None
+    #: Optimiser steps; None leaves the method's preset.
+    steps: int | None = None
+
+
+@dataclass(frozen=True)
+class RunSettings:
+    """How a method is run on one capture."""
+
+    #: Settings of the method: the preset's table with overrides.
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    #: Seed of everything random.
+    seed: int = 0
+    #: When to stop fitting.
+    budget: Budget = field(default_factory=Budget)
+    #: Which training frames are given, one of `FRAME_CHOICES`; all but the first are oracles.
+    frames: str = FRAME_CHOICES[0]
+
+
+class TrainingCapture:
+    """What a method sees of a capture.
+
+    Attributes:
+        root: the request folder.
+        id: the capture's id.
+        sides: the hands in it, `right`, `left` or both.
+        width: frame width, px.
+        height: frame height, px.
+        fps: frames per second.
+        hand_model: the hand model that the parameters belong to.
+        split: which frames train, validate, and are to be predicted.
+        hands: estimated parameters of every frame, by side.
+        cameras: the cameras of every frame.
+        run: settings, seed and budget.
     """
 
-    def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> Avatar:
-        """Fit an avatar.
+    def __init__(self, root: Path, value: Mapping[str, Any]) -> None:
+        self.root = root
+        self.id: str = value["id"]
+        self.sides: tuple[str, ...] = SIDES[value["hands"]]
+        self.width: int = value["width"]
+        self.height: int = value["height"]
+        self.fps: float = value["fps"]
+        self.hand_model = HandModelId(**value["hand_model"])
+        self.split = Split.from_json(value["split"], where=os.fspath(root / REQUEST))
+        self.hands: dict[str, HandParameters] = read_hands(
+            root / HANDS, self.sides, self.split.frame_count
+        )
+        self.cameras: Cameras = read_cameras(root / CAMERAS, self.split.frame_count)
+        self.run = RunSettings(
+            value["settings"], value["seed"], Budget(**value["budget"]), value["frames"]
+        )
+        self._train = np.array(value["train"], dtype=np.int64)
 
-        Args:
-            training: training and validation frames with masks, and the hand parameters and
-                cameras of every frame.
-            budget: when to stop.
-            report: where to offer checkpoints.
+    @property
+    def train(self) -> np.ndarray:
+        """Indices of the training frames."""
+        return self._train
 
-        Returns:
-            The avatar that the test frames are rendered with.
+    @property
+    def validation(self) -> np.ndarray:
+        """Indices of the validation frames."""
+        return self.split.validation
+
+    @property
+    def targets(self) -> np.ndarray:
+        """Indices of the frames to predict; their pixels are not here."""
+        return self.split.test
+
+    def frame(self, frame: int) -> np.ndarray:
+        """Read a training or validation frame: (H, W, 3) uint8 sRGB."""
+        return read_rgb(image_path(self.root, "frames", frame), (self.height, self.width))
+
+    def mask(self, frame: int) -> np.ndarray:
+        """Read its estimated visible-hand mask: (H, W) uint8, 255 = hand."""
+        return read_gray(image_path(self.root, "masks", frame), (self.height, self.width))
+
+    def hand_poses(self, frame: int) -> dict[str, HandPose]:
+        """Return the parameters of every hand in one frame, by side."""
+        return {
+            side: HandPose(side, hand.pose[frame], hand.betas, hand.transl[frame])
+            for side, hand in self.hands.items()
+        }
+
+    def camera(self, frame: int) -> Camera:
+        """Return the camera of one frame."""
+        return Camera(self.cameras.Ks[frame], self.cameras.viewmats[frame], self.width, self.height)
+
+    def template(self, side: str) -> HandTemplate:
+        """Load the hand template of one side.
+
+        Raises:
+            BadInput: the template that is installed here is another than the capture's.
         """
-        ...
+        from hwp_bench.capture.hand_model import load_matching_template
+
+        if side not in self.sides:
+            raise UsageError(f"this capture has no {side} hand", where=self.root)
+        return load_matching_template(self.hand_model, self.sides, side, where=self.root)
 
 
-class MethodFactory(Protocol):
-    """What `entry.python` of `method.toml` names."""
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One pinhole camera, OpenCV axes."""
 
-    def __call__(self, settings: Mapping[str, Any], seed: int) -> Method:
-        """Make the method with its settings."""
-        ...
+    #: (3, 3) intrinsics, px; pixel centres lie at +0.5.
+    K: np.ndarray
+    #: (4, 4) world to camera, m.
+    viewmat: np.ndarray
+    #: Image width, px.
+    width: int
+    #: Image height, px.
+    height: int
+
+
+@dataclass(frozen=True, eq=False)
+class HandPose:
+    """The parameters of one hand in one frame."""
+
+    #: `right` or `left`.
+    side: str
+    #: (16, 3) axis-angle, rad.
+    pose: np.ndarray
+    #: (10,) shape.
+    betas: np.ndarray
+    #: (3,) m.
+    transl: np.ndarray

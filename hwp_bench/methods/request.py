@@ -1,136 +1,38 @@
 """The folder that a method is given: everything it may see of a capture, and nothing more.
 
 A request holds the training and validation frames with their masks, and for every frame,
-test frames included, the estimated hand parameters and the cameras. No test pixel, no truth and
-no word about the perturbations is in it.
+test frames included, the estimated hand parameters and the cameras. It holds no test pixel, no
+truth and no word about the perturbations.
+
+The frames are those that were captured, or an oracle's choice of them. The oracles bound what any
+method can reach on a simulated capture: the same fit on the clean version of every frame, and the
+same fit on only those frames that nothing perturbs.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.capture.layout import CAMERAS, HANDS, image_path
-from hwp_bench.capture.schema import SIDES, HandModelId
+from hwp_bench.capture.layout import CAMERAS, HANDS, IMAGE_FOLDERS, image_path
 from hwp_bench.capture.splits import Split
-from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands, write_cameras, write_hands
+from hwp_bench.capture.tracks import write_cameras, write_hands
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.methods.contract import Budget, Camera, HandPose
-from hwp_bench.methods.material import FRAME_CHOICES, training_material
+from hwp_bench.methods.contract import FRAME_CHOICES, REQUEST, RunSettings, TrainingCapture
 
 if TYPE_CHECKING:
     from hwp_bench.capture import Capture
-    from hwp_bench.hands.template import HandTemplate
 
 #: Version of the request folder.
 SCHEMA = "hwp-request/1"
-#: Name of the file that describes it.
-REQUEST = "request.json"
-
-
-@dataclass(frozen=True)
-class RunSettings:
-    """How a method is run on one capture."""
-
-    #: Settings of the method: the preset's table with overrides.
-    settings: Mapping[str, Any]
-    #: Seed of everything random.
-    seed: int = 0
-    #: When to stop fitting.
-    budget: Budget = field(default_factory=Budget)
-    #: Which training frames are given, one of `FRAME_CHOICES`; all but the first are oracles.
-    frames: str = FRAME_CHOICES[0]
-
-
-class TrainingCapture:
-    """What a method sees of a capture.
-
-    Attributes:
-        root: the request folder.
-        id: the capture's id.
-        sides: the hands in it, `right`, `left` or both.
-        width: frame width, px.
-        height: frame height, px.
-        fps: frames per second.
-        hand_model: the hand model that the parameters belong to.
-        split: which frames train, validate, and are to be predicted.
-        hands: estimated parameters of every frame, by side.
-        cameras: the cameras of every frame.
-        run: settings, seed and budget.
-    """
-
-    def __init__(self, root: Path, value: Mapping[str, Any]) -> None:
-        self.root = root
-        self.id: str = value["id"]
-        self.sides: tuple[str, ...] = SIDES[value["hands"]]
-        self.width: int = value["width"]
-        self.height: int = value["height"]
-        self.fps: float = value["fps"]
-        self.hand_model = HandModelId(**value["hand_model"])
-        self.split = Split.from_json(value["split"], where=os.fspath(root / REQUEST))
-        self.hands: dict[str, HandParameters] = read_hands(
-            root / HANDS, self.sides, self.split.frame_count
-        )
-        self.cameras: Cameras = read_cameras(root / CAMERAS, self.split.frame_count)
-        self.run = RunSettings(
-            value["settings"], value["seed"], Budget(**value["budget"]), value["frames"]
-        )
-        self._train = np.array(value["train"], dtype=np.int64)
-
-    @property
-    def train(self) -> np.ndarray:
-        """Indices of the training frames."""
-        return self._train
-
-    @property
-    def validation(self) -> np.ndarray:
-        """Indices of the validation frames."""
-        return self.split.validation
-
-    @property
-    def targets(self) -> np.ndarray:
-        """Indices of the frames to predict; their pixels are not here."""
-        return self.split.test
-
-    def frame(self, frame: int) -> np.ndarray:
-        """Read a training or validation frame: (H, W, 3) uint8 sRGB."""
-        return read_rgb(image_path(self.root, "frames", frame), (self.height, self.width))
-
-    def mask(self, frame: int) -> np.ndarray:
-        """Read its estimated visible-hand mask: (H, W) uint8, 255 = hand."""
-        return read_gray(image_path(self.root, "masks", frame), (self.height, self.width))
-
-    def hand_poses(self, frame: int) -> dict[str, HandPose]:
-        """Return the parameters of every hand in one frame, by side."""
-        return {
-            side: HandPose(side, hand.pose[frame], hand.betas, hand.transl[frame])
-            for side, hand in self.hands.items()
-        }
-
-    def camera(self, frame: int) -> Camera:
-        """Return the camera of one frame."""
-        return Camera(self.cameras.Ks[frame], self.cameras.viewmats[frame], self.width, self.height)
-
-    def template(self, side: str) -> HandTemplate:
-        """Load the hand template of one side.
-
-        Raises:
-            BadInput: the template that is installed here is another than the capture's.
-        """
-        from hwp_bench.capture.hand_model import load_matching_template
-
-        if side not in self.sides:
-            raise UsageError(f"this capture has no {side} hand", where=self.root)
-        return load_matching_template(self.hand_model, self.sides, side, where=self.root)
 
 
 def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) -> Path:
@@ -191,3 +93,82 @@ def open_request(path: str | os.PathLike[str]) -> TrainingCapture:
         return TrainingCapture(root, value)
     except (KeyError, TypeError) as error:
         raise BadInput(f"lacks or has a wrong field ({error})", where=root / REQUEST) from error
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """Where the training part of a request comes from."""
+
+    #: Indices of the training frames.
+    train: np.ndarray
+    #: Kind of image that is given as frames, a key of `IMAGE_FOLDERS`.
+    frames: str
+    #: Kind of image that is given as masks.
+    masks: str
+    #: Hand parameters by side.
+    hands: dict[str, HandParameters]
+
+
+def training_material(capture: Capture, split: Split, choice: str) -> Material:
+    """Return what a method is given of a capture.
+
+    Args:
+        capture: the capture.
+        split: its split.
+        choice: one of `FRAME_CHOICES`. `clean` gives, besides clean frames and their masks, the
+            true hand parameters in perturbed frames: an estimator would not have been misled.
+
+    Raises:
+        UsageError: no such choice, or the capture does not know its clean frames or severities;
+            or no training frame is unperturbed.
+    """
+    if choice not in FRAME_CHOICES:
+        raise UsageError(f"{choice!r} is none of {', '.join(FRAME_CHOICES)}", field="frames")
+    hands = dict(capture.hands)
+    if choice == "perturbed":
+        return Material(split.train, "frames", "masks", hands)
+    perturbed = _perturbed(capture)
+    if choice == "unperturbed-only":
+        train = split.train[~perturbed[split.train]]
+        if not len(train):
+            raise UsageError("has no unperturbed training frame", where=capture.root)
+        return Material(train, "frames", "masks", hands)
+    truth = capture.true_hands
+    missing = [
+        kind
+        for kind in ("clean", "clean_masks")
+        if not (capture.root / IMAGE_FOLDERS[kind]).is_dir()
+    ]
+    if truth is None or missing:
+        raise UsageError(
+            "does not know its clean frames",
+            where=capture.root,
+            remedy="Only simulated captures do; use --frames perturbed.",
+        )
+    mended = {side: _mended(hand, truth[side], perturbed) for side, hand in hands.items()}
+    return Material(split.train, "clean", "clean_masks", mended)
+
+
+def _perturbed(capture: Capture) -> np.ndarray:
+    """(F,) bool, true where any perturbation acts."""
+    acts = np.zeros(len(capture), dtype=bool)
+    for name, severities in capture.info.perturbations.items():
+        if severities is None:
+            raise UsageError(
+                f"does not know in which frames {name} acts",
+                where=capture.root,
+                remedy="Use --frames perturbed.",
+            )
+        acts |= np.array(severities) > 0
+    return acts
+
+
+def _mended(
+    estimate: HandParameters, truth: HandParameters, perturbed: np.ndarray
+) -> HandParameters:
+    return replace(
+        estimate,
+        pose=np.where(perturbed[:, None, None], truth.pose, estimate.pose),
+        transl=np.where(perturbed[:, None], truth.transl, estimate.transl),
+        valid=estimate.valid | (perturbed & truth.valid),
+    )

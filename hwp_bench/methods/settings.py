@@ -9,12 +9,17 @@ from __future__ import annotations
 import dataclasses
 import difflib
 import math
+import os
 import types
 import typing
 from collections.abc import Mapping
 from typing import Any, TypeVar
 
 from hwp_bench.base.errors import BadMethod, HwpError
+from hwp_bench.base.files import MAX_JSON_INTEGER
+
+#: Deepest table in a table that is read.
+MAX_DEPTH = 16
 
 Settings = TypeVar("Settings")
 
@@ -77,7 +82,7 @@ def _read(cls: type[Settings], values: Mapping[str, Any], where: str, prefix: st
         if name not in items:
             close = difflib.get_close_matches(name, items, n=1)
             raise BadMethod(
-                "is no setting of this method",
+                "is not a setting of this method",
                 where=where,
                 field=field,
                 remedy=f"Did you mean {prefix + close[0]!r}?" if close else f"Known: {[*items]}.",
@@ -112,12 +117,46 @@ def _checked(value: Any, kind: Any, rules: Mapping[str, Any], where: str, field:
         return value
     if kind is str:
         if not isinstance(value, str) or (choices and value not in choices):
-            raise bad(f"Use one of {', '.join(choices)}." if choices else "Use a text.")
+            raise bad(f"Use one of {', '.join(choices)}." if choices else "Use text.")
         return value
     numbers = (int,) if kind is int else (int, float)
     if isinstance(value, bool) or not isinstance(value, numbers):
-        raise bad("Use a whole number." if kind is int else "Use a number.")
+        raise bad("Use an integer." if kind is int else "Use a number.")
     low, high = rules.get("range", (0.0, math.inf))
     if not low <= value <= high or not math.isfinite(value):
         raise bad(f"Use {low:g} to {high:g}.")
     return value if kind is int else float(value)
+
+
+def check_plain(
+    value: Any, where: str | os.PathLike[str], field: str, *, depth: int = MAX_DEPTH
+) -> None:
+    """Refuse a value that JSON cannot hold: settings are plain values, so that they have a digest.
+
+    Args:
+        value: finite numbers, text, true and false, and lists and tables of these.
+        where: the file, for messages.
+        field: its place in the file, for messages.
+        depth: levels of tables that may still follow.
+
+    Raises:
+        BadMethod: there is a date, an infinite, undefined or very large number, or too deep
+            a nesting; the field is named.
+    """
+    if depth == 0:
+        raise BadMethod("is nested too deeply", where=where, field=field[:100])
+    if isinstance(value, dict):
+        for name, item in value.items():
+            check_plain(item, where, f"{field}.{name}", depth=depth - 1)
+    elif isinstance(value, list):
+        for item in value:
+            check_plain(item, where, field, depth=depth - 1)
+    elif isinstance(value, float):
+        if not math.isfinite(value):
+            raise BadMethod(f"is {value}, not a finite number", where=where, field=field[:100])
+    elif isinstance(value, int):
+        if abs(value) > MAX_JSON_INTEGER:
+            raise BadMethod("is too large a number", where=where, field=field[:100])
+    elif not isinstance(value, str):
+        problem = f"is a {type(value).__name__}, not a number, text, list or table"
+        raise BadMethod(problem, where=where, field=field[:100])

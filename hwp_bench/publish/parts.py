@@ -16,7 +16,8 @@ from hwp_bench.base.files import atomic_folder, write_json
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.layout import CAMERAS, HANDS, IMAGE_FOLDERS, METADATA, TRUE_HANDS
 from hwp_bench.capture.splits import Split, split_for
-from hwp_bench.methods.request import RunSettings, write_request
+from hwp_bench.methods.contract import RunSettings
+from hwp_bench.methods.request import write_request
 from hwp_bench.publish.commitment import SALT_BYTES, commitment, joint_commitment, target_content
 
 #: Version of the public manifest.

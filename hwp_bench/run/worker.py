@@ -19,8 +19,8 @@ from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture.layout import frame_name
-from hwp_bench.methods.contract import Avatar, MethodFactory
-from hwp_bench.methods.request import TrainingCapture, open_request
+from hwp_bench.methods.contract import Avatar, MethodFactory, TrainingCapture
+from hwp_bench.methods.request import open_request
 from hwp_bench.run.clock import ReportClock, peak_memory
 from hwp_bench.run.facts import RunFacts
 

@@ -13,8 +13,7 @@ from painted import QUICK, SilentReport, TrainingMaker, painted_avatar
 
 from hwp_bench.base.errors import DidNotConverge, MissingDependency, UsageError
 from hwp_bench.capture import Capture
-from hwp_bench.methods.contract import Budget, Camera, HandPose
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import Budget, Camera, HandPose, TrainingCapture
 from plain_fit.method import PlainMethod
 from plain_fit.model import PlainAvatar
 

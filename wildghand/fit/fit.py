@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import drop
 from wildghand.dpd.temporal_loss import TemporalTarget

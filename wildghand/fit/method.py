@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from hwp_bench.methods.contract import Budget, Report
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fit.fit import Fit
 from wildghand.fit.optimise import optimise

@@ -15,8 +15,8 @@ from hwp_bench.base.locks import sole_use
 from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, contiguous_split
-from hwp_bench.methods.contract import Avatar, Budget
-from hwp_bench.methods.request import REQUEST, RunSettings, open_request, write_request
+from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings
+from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import save_avatar
 from wildghand.fit.fit import Fit

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fit.parallel import ALONE, World
 from wildghand.gaussians.frames import TrainingFrames
 from wildghand.model.model import Drawing

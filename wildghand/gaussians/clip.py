@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import torch
 
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 
 #: Most memory that posed anchors are kept in, bytes; longer clips are posed step by step.

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import TrainingCapture
 
 
 @dataclass(frozen=True, eq=False)

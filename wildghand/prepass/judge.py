@@ -12,7 +12,7 @@ import numpy as np
 from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.capture import Cameras, Capture
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import TrainingCapture
 from wildghand.prepass.conclusion import conclude
 from wildghand.prepass.cues import LEAST_PIXELS, explain
 from wildghand.prepass.edges import border_width

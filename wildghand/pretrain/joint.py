@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fit.fit import Fit
 from wildghand.fit.rates import make_optimizer
 from wildghand.gaussians.schedule import batches

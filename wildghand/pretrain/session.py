@@ -13,8 +13,8 @@ from hwp_bench.base.files import sha256_file, sha256_json
 from hwp_bench.base.locks import sole_use
 from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.methods.contract import Budget
-from hwp_bench.methods.request import REQUEST, RunSettings, open_request, write_request
+from hwp_bench.methods.contract import REQUEST, Budget, RunSettings
+from hwp_bench.methods.request import open_request, write_request
 from wildghand.fit.optimise import Watchers
 from wildghand.fit.saved import load_state, save_state
 from wildghand.fit.session import SAVE_EVERY, STATE, every_frame

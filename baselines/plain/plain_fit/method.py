@@ -10,8 +10,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from hwp_bench.methods.contract import Budget, Report
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from plain_fit.model import PlainAvatar, make_model
 from plain_fit.optimise import fit_model
 from plain_fit.settings import read_settings

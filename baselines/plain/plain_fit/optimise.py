@@ -7,8 +7,7 @@ import math
 import torch
 
 from hwp_bench.base.progress import notice
-from hwp_bench.methods.contract import Budget, Report
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from plain_fit.model import PlainAvatar, PlainModel
 from plain_fit.settings import PlainSettings
 from wildghand.gaussians.clip import TrainingClip

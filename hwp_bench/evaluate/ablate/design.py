@@ -9,8 +9,7 @@ from itertools import combinations, product
 from typing import Any
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.methods.manifest import MANIFEST, MethodManifest
-from hwp_bench.methods.switches import Switch
+from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
 
 #: Components that are crossed when nothing is asked for.
 DEFAULT_FACTORS = 2
@@ -106,7 +105,7 @@ def make_design(
     effects = _factorial_effects(components) if factorial else _out_effects(components)
     for alternative in alternatives:
         variants.append(_variant((alternative,)))
-        contrast = {FULL: 1.0, alternative.thrown: -1.0}
+        contrast = {FULL: 1.0, alternative.variant_name: -1.0}
         effects.append(Effect(f"not {alternative.title}", "alternative", contrast))
     return Design(components, alternatives, tuple(variants), tuple(effects))
 
@@ -145,7 +144,7 @@ def _variant(thrown: tuple[Switch, ...]) -> Variant:
 
 def name_of(thrown: Sequence[Switch]) -> str:
     """Return the name of the variant with these switches thrown."""
-    return "+".join(item.thrown for item in thrown) or FULL
+    return "+".join(item.variant_name for item in thrown) or FULL
 
 
 def _factorial_effects(components: Sequence[Switch]) -> list[Effect]:

@@ -58,7 +58,7 @@ def test_no_command_and_unknown_commands_are_usage_errors(capsys) -> None:
 @pytest.mark.parametrize(
     ("words", "status", "problem"),
     [
-        (["evaluate", "nowhere"], 1, "nowhere: is no method directory"),
+        (["evaluate", "nowhere"], 1, "nowhere: is not a method directory"),
         (["evaluate", "baselines/plain", "--capture", "nowhere"], 1, "nowhere: is no capture"),
         (["evaluate", "plain", "--capture", "x", "--budget", "-3"], 2, "--budget: -3.0"),
         (["evaluate", "plain", "--capture", "x", "--set", "a b=1"], 2, "is not NAME=VALUE"),

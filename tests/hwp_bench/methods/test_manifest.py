@@ -38,27 +38,38 @@ def test_a_manifest_is_read(tmp_path: Path) -> None:
         manifest.preset("fast")
 
 
+def test_authors_terms_and_page_are_kept(tmp_path: Path) -> None:
+    plain = read_manifest(_write(tmp_path, GOOD))
+    assert (plain.authors, plain.licence, plain.url) == ("", "", "")
+    text = (
+        'authors = ["A. Hand", "B. Glove"]\nlicence = "MIT"\nurl = "https://mine.example"\n[entry]'
+    )
+    manifest = read_manifest(_write(tmp_path, GOOD.replace("[entry]", text)))
+    assert manifest.authors == "A. Hand, B. Glove"
+    assert (manifest.licence, manifest.url) == ("MIT", "https://mine.example")
+
+
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
         ("hwp-method/1", "hwp-method/9", "schema: is 'hwp-method/9'"),
-        ('name = "mine"', 'name = "a/b"', "'a/b' is no method name"),
+        ('name = "mine"', 'name = "a/b"', "'a/b' is not a method name"),
         ('name = "mine"', "name = 3", "name: must be one line"),
         ('title = "My method"', 'title = "a\\nb"', "title: must be one line"),
         ('title = "My method"', f'title = "{"x" * 2000}"', "title: must be one line"),
-        ("title", "titel", "titel: is no field of a method. Did you mean 'title'?"),
+        ("title", "titel", "titel: is not a field of a method. Did you mean 'title'?"),
         ("package.module:Make", "package/module", "is not module:callable"),
-        ("python =", "pyhton =", "entry.pyhton: is no field of a method. Did you mean 'python'"),
+        ("python =", "pyhton =", "entry.pyhton: is not a field of a method. Did you mean 'python'"),
         ("python =", 'command = ["x"]\npython =', "exactly one of python, command, predictions"),
         ("[presets.smoke]\nsteps = 5", "[presets]\nsmoke = 5", "must be tables of settings"),
-        ("[entry]", "[entry", "no valid TOML"),
+        ("[entry]", "[entry", "not valid TOML"),
         ('title = "My method"', 'title = "a\\u009bb"', "title: must be one line"),
         ('title = "My method"', 'title = "a\\u202eb"', "title: must be one line"),
-        ("steps = 5", "steps = nan", "presets.smoke.steps: is nan, no finite number"),
-        ("steps = 5", "steps = [1, -inf]", "presets.smoke.steps: is -inf, no finite number"),
-        ("steps = 5", "steps = 1979-05-27", "presets.smoke.steps: is a date, neither"),
+        ("steps = 5", "steps = nan", "presets.smoke.steps: is nan, not a finite number"),
+        ("steps = 5", "steps = [1, -inf]", "presets.smoke.steps: is -inf, not a finite number"),
+        ("steps = 5", "steps = 1979-05-27", "presets.smoke.steps: is a date, not a"),
         ("steps = 5", f"steps = {'9' * 30}", "presets.smoke.steps: is too large a number"),
-        ("steps = 5", f"steps = {'9' * 5000}", "no valid TOML"),
+        ("steps = 5", f"steps = {'9' * 5000}", "not valid TOML"),
         ("steps = 5", f"steps = {'[' * 20}{']' * 20}", "presets.smoke.steps: is nested too deeply"),
         ("steps = 5", f"steps = {'[' * 3000}{']' * 3000}", "method.toml: is"),
     ],
@@ -92,6 +103,38 @@ def test_shipped_methods_are_found_by_name_and_by_path() -> None:
     assert find_method("plain").resolve() == find_method("baselines/plain").resolve()
 
 
+@pytest.mark.parametrize("name", ["plain", "interaction-gaussian", "wildghand"])
+def test_shipped_methods_are_found_from_any_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert read_manifest(find_method(name)).name == name
+    if name != "wildghand":
+        assert find_method(f"baselines/{name}/") == find_method(name)
+
+
+def test_shipped_methods_are_found_in_a_wheel(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    inside = tmp_path / "hwp_bench" / "_data" / "baselines" / "plain"
+    inside.mkdir(parents=True)
+    _write(inside, GOOD)
+    monkeypatch.setattr("hwp_bench.base.packages.PACKAGES", tmp_path)
+    monkeypatch.setattr("hwp_bench.methods.manifest.PACKAGES", tmp_path)
+    monkeypatch.chdir(tmp_path)
+    assert find_method("plain") == find_method("baselines/plain") == inside
+    assert [manifest.name for manifest in shipped_methods()] == ["mine"]
+
+
+@pytest.mark.parametrize("name", ["../plain", "baselines/../wildghand", ".", ""])
+def test_a_name_leads_to_no_other_folder(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(BadMethod, match="not a method directory"):
+        find_method(name)
+
+
 def test_the_digest_follows_the_code_and_nothing_else(tmp_path: Path) -> None:
     first = read_manifest(_write(tmp_path, GOOD)).digest
     (tmp_path / "notes.txt").write_text("x")
@@ -113,22 +156,26 @@ def test_switches_are_read_in_the_order_of_the_file(tmp_path: Path) -> None:
     switches = read_manifest(_write(tmp_path, GOOD + SWITCHES)).switches
     assert list(switches) == ["weighting", "binary-mask"]
     component, alternative = switches.values()
-    assert (component.title, component.thrown) == ("Weighting", "no-weighting")
+    assert (component.title, component.variant_name) == ("Weighting", "no-weighting")
     assert (component.alternative, dict(component.settings)) == (False, {"weighting": False})
-    assert (alternative.title, alternative.thrown) == ("binary-mask", "binary-mask")
+    assert (alternative.title, alternative.variant_name) == ("binary-mask", "binary-mask")
     assert (alternative.alternative, dict(alternative.settings)) == (True, {"weighting": "mask"})
 
 
 @pytest.mark.parametrize(
     ("old", "new", "problem"),
     [
-        ("switches.binary-mask", "switches.Binary", "switches.Binary: is no name of a switch"),
+        ("switches.binary-mask", "switches.Binary", "switches.Binary: is not a name of a switch"),
         ('title = "Weighting"', "title = 3", "switches.weighting.title: must be one line"),
-        ('title = "Weighting"', "titel = 3", "switches.weighting.titel: is no field of a switch"),
+        (
+            'title = "Weighting"',
+            "titel = 3",
+            "switches.weighting.titel: is not a field of a switch",
+        ),
         ("settings_off", "description = 'a'\nsettings_on = {a = 1}\nsettings_off", "exactly one"),
         ("settings_off = {weighting = false}", "", "exactly one of settings_off and settings_on"),
         ("{weighting = false}", "{}", "must be a table of at least one setting"),
-        ("{weighting = false}", "{'a b' = 1}", "'a b' is no name of a setting"),
+        ("{weighting = false}", "{'a b' = 1}", "'a b' is not a name of a setting"),
         ("switches.binary-mask", "switches.no-weighting", "two switches make a variant"),
     ],
 )

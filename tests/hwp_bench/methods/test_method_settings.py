@@ -47,7 +47,7 @@ def test_what_comes_later_wins() -> None:
     ("values", "message"),
     [
         ({"inner": 3}, "inner: must be a table"),
-        ({"inner.widht": 3}, r"inner\.widht: is no setting.*'inner\.width'"),
+        ({"inner.widht": 3}, r"inner\.widht: is not a setting.*'inner\.width'"),
         ({"inner": {"width": 11}}, r"inner\.width: is '11'.*1 to 10"),
         ({"inner": {"width": 7}}, "inner: .*width.*is 7"),
         ({"inner.kind": "three"}, "one, two"),

@@ -11,8 +11,8 @@ from small_captures import CaptureMaker
 
 from hwp_bench.base.errors import BadImage, BadInput, HwpError, UsageError
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.methods.contract import Budget
-from hwp_bench.methods.request import RunSettings, open_request, write_request
+from hwp_bench.methods.contract import Budget, RunSettings
+from hwp_bench.methods.request import open_request, write_request
 
 RUN = RunSettings({"steps": 3}, seed=7, budget=Budget(seconds=5.0))
 

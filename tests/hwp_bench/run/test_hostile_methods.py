@@ -393,5 +393,5 @@ def test_an_archive_is_no_method(tmp_path: Path, form: str) -> None:
 
     method = _method(tmp_path / "method", "")
     archive = shutil.make_archive(str(tmp_path / "archive"), form, method)
-    with pytest.raises(BadMethod, match="is no method directory"):
+    with pytest.raises(BadMethod, match="is not a method directory"):
         read_manifest(find_method(archive))

@@ -19,8 +19,8 @@ from painted import FRAMES, SilentReport
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.methods.contract import Budget
-from hwp_bench.methods.request import RunSettings, TrainingCapture, open_request, write_request
+from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
+from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
 from wildghand.fit import parallel
 from wildghand.fit.fit import Fit

@@ -19,8 +19,7 @@ from hwp_bench.base.errors import BadInput, BadMethod, DidNotConverge, UsageErro
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Capture
 from hwp_bench.methods import find_method, read_manifest
-from hwp_bench.methods.contract import Budget
-from hwp_bench.methods.request import TrainingCapture
+from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.cli.main import main

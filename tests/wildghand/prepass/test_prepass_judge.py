@@ -14,8 +14,8 @@ from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.capture import CaptureInfo, CaptureWriter, HandModelId, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import load_template
-from hwp_bench.methods.contract import Budget
-from hwp_bench.methods.request import RunSettings, open_request, write_request
+from hwp_bench.methods.contract import Budget, RunSettings
+from hwp_bench.methods.request import open_request, write_request
 from wildghand.prepass import Judgement, PrepassInput, PrepassSettings, judge_capture, judge_frames
 from wildghand.prepass.footprint import HandSurfaces
 

@@ -23,8 +23,8 @@ from hwp_bench.base.files import sha256_file
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, HandModelId, open_capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.methods.contract import Budget
-from hwp_bench.methods.request import RunSettings, TrainingCapture, open_request, write_request
+from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
+from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
 from wildghand.fit.fit import Fit
