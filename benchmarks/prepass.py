@@ -8,7 +8,7 @@ Spearman correlation of 1 - clean with the true severity (the largest of its per
 the area under the ROC curve of clean against perturbed frames; the share of clean frames judged
 clean and of frames of severity 3 to 5 judged not; median absolute error of the log
 gains; and, over pixels of the hand in frames with objects, the area under the curve of the pixel
-weights for visible against covered pixels, beside that of the estimated mask alone. A second table
+weights for visible against covered pixels, next to that of the estimated mask. A second table
 compares the estimated severity of every perturbation that the capture carries with the true one.
 """
 
@@ -26,14 +26,18 @@ from scipy.stats import rankdata, spearmanr
 
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import contiguous_split
-from wildghand.prepass import Judgement, PrepassInput, judge_frames
+from wildghand.prepass import (
+    FrameAssessment,
+    PrepassInput,
+    capture_input,
+    estimated_severity,
+    judge_frames,
+)
 from wildghand.prepass.intensity import log_light_table
-from wildghand.prepass.judge import capture_input
-from wildghand.prepass.severity import estimated_severity
 
 
 def load(capture: Capture) -> PrepassInput:
-    """What the pre-pass may see of a capture's training frames."""
+    """The training frames of a capture, without its truth."""
     train = contiguous_split(capture.info.id, len(capture)).train
     return capture_input(capture, train)
 
@@ -54,7 +58,7 @@ def area_under_curve(scores: np.ndarray, positive: np.ndarray) -> float:
     return float((rankdata(scores)[positive].sum() - ones * (ones + 1) / 2) / (ones * zeros))
 
 
-def gain_error(capture: Capture, judgement: Judgement) -> tuple[float, float]:
+def gain_error(capture: Capture, judgement: FrameAssessment) -> tuple[float, float]:
     """Median and 90 % quantile of the absolute error of the log gains."""
     table, errors = log_light_table(), []
     for row, frame in enumerate(judgement.indices.tolist()):
@@ -66,7 +70,7 @@ def gain_error(capture: Capture, judgement: Judgement) -> tuple[float, float]:
 
 
 def covered_pixels(capture: Capture, weights: Mapping[int, np.ndarray]) -> tuple[float, float]:
-    """Area under the curve of weights and of the estimated mask alone, visible against covered.
+    """Area under the curve of weights and of the estimated mask, visible against covered.
 
     Args:
         capture: with the truth.
@@ -90,14 +94,14 @@ def covered_pixels(capture: Capture, weights: Mapping[int, np.ndarray]) -> tuple
     )
 
 
-def judged_weights(judgement: Judgement, objects: np.ndarray | None) -> dict[int, np.ndarray]:
+def judged_weights(judgement: FrameAssessment, objects: np.ndarray | None) -> dict[int, np.ndarray]:
     """Pixel weights of the frames in which objects act."""
     acting = np.zeros(len(judgement)) if objects is None else objects
     rows = np.flatnonzero(acting)
     return {int(judgement.indices[row]): judgement.pixel_weights[row] for row in rows}
 
 
-def level_rows(name: str, judgement: Judgement, truth: dict[str, np.ndarray]) -> list[str]:
+def level_rows(name: str, judgement: FrameAssessment, truth: dict[str, np.ndarray]) -> list[str]:
     """Rows of the second table: estimated against true levels of what the capture carries."""
     rows, levels = [], estimated_severity(judgement)
     for kind, true in truth.items():
@@ -108,8 +112,8 @@ def level_rows(name: str, judgement: Judgement, truth: dict[str, np.ndarray]) ->
     return rows
 
 
-def draw(capture: Capture, given: PrepassInput, judgement: Judgement, folder: Path) -> None:
-    """Draw the judgement over time beside the truth, and some frames with their weights."""
+def draw(capture: Capture, given: PrepassInput, judgement: FrameAssessment, folder: Path) -> None:
+    """Draw the judgement over time next to the truth, and some frames with their weights."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -164,7 +168,7 @@ def draw(capture: Capture, given: PrepassInput, judgement: Judgement, folder: Pa
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("captures", nargs="+", type=Path, help="capture folders")
-    parser.add_argument("--pictures", type=Path, help="folder for pictures")
+    parser.add_argument("--pictures", type=Path, help="folder for images")
     parser.add_argument("--threads", type=int, default=1, help="threads (1)")
     args = parser.parse_args()
     torch.set_num_threads(args.threads)

@@ -18,7 +18,7 @@ from wildghand.pao.regions import FrameRegions, Regions, stack_regions
 from wildghand.pao.regions.cache import RegionCache
 from wildghand.pao.regions.superpixels import Superpixels
 from wildghand.pao.robust import blended_residual, residual_weights, running_median
-from wildghand.prepass import Judgement, PrepassInput, judge_frames
+from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +138,7 @@ class Weighting:
 
 def judge(
     training: TrainingCapture, frames: TrainingFrames, settings: WildGHandSettings
-) -> Judgement:
+) -> FrameAssessment:
     """Run the pre-pass on the frames that are fitted."""
     return judge_frames(
         PrepassInput(

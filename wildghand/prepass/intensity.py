@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from hwp_bench.base.colors import srgb_to_linear
 from wildghand.gaussians.shading import sh_basis
-from wildghand.prepass.mode import densest
+from wildghand.prepass.robust_location import densest
 from wildghand.prepass.settings import PrepassSettings
 
 #: 8-bit values outside this range say nothing about the light: noise, or clipped.
@@ -25,10 +26,8 @@ _SKIN_SCALE = 0.3
 
 
 def log_light_table() -> np.ndarray:
-    """(256,) float32: log of linear light for each 8-bit sRGB value (IEC 61966-2-1)."""
-    srgb = np.arange(256) / 255.0
-    linear = np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
-    return np.log(linear + _FOOT).astype(np.float32)
+    """(256,) float32: log of linear light for each 8-bit sRGB value."""
+    return np.log(srgb_to_linear(np.arange(256) / 255.0) + _FOOT).astype(np.float32)
 
 
 def shading_basis(normals: np.ndarray) -> np.ndarray:
@@ -37,7 +36,7 @@ def shading_basis(normals: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class Samples:
+class LightSamples:
     """M pixels of R frames, ordered by frame."""
 
     #: (R + 1,) int64: frame r has the samples starts[r] to starts[r + 1].
@@ -72,7 +71,7 @@ class IntensityModel:
 
 
 def fit_intensity(
-    samples: Samples, cell_normals: np.ndarray, settings: PrepassSettings
+    samples: LightSamples, cell_normals: np.ndarray, settings: PrepassSettings
 ) -> IntensityModel:
     """Fit albedo, shading and gains by turns, with weights that leave outliers out.
 

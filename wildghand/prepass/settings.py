@@ -34,7 +34,7 @@ class PrepassSettings:
     misplacement_floor: float = 0.0006
     #: Least hidden share of the hand that does.
     hidden_floor: float = 0.02
-    #: Evidence (`wildghand.prepass.verdict.evidence`) at which a frame is as likely clean as not.
+    #: Evidence (`wildghand.prepass.classify.evidence`) at which a frame is as likely clean as not.
     tolerance: float = 1.2
     #: Deviation from which a cue by itself calls a frame blurred or misplaced.
     clear_deviation: float = 3.0

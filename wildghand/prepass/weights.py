@@ -7,8 +7,8 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from wildghand.prepass.look import Look
-from wildghand.prepass.mode import normal_value
+from wildghand.prepass.measurements import FrameMeasurements
+from wildghand.prepass.robust_location import normal_value
 from wildghand.prepass.settings import PrepassSettings
 
 # Edge of the window over which residuals are shared out, px.
@@ -21,7 +21,7 @@ _UNMASKED = 0.3
 
 def weigh_pixels(
     masks: np.ndarray,
-    looks: Mapping[int, Look],
+    measured: Mapping[int, FrameMeasurements],
     clean: np.ndarray,
     cell_count: int,
     settings: PrepassSettings,
@@ -34,7 +34,7 @@ def weigh_pixels(
 
     Args:
         masks: (R, H, W) uint8, 255 = visible hand.
-        looks: by row; rows that are missing cannot be used. Not empty.
+        measured: by row; rows that are missing cannot be used. Not empty.
         clean: (R,) probability that nothing perturbs a frame.
         cell_count: number of cells of the surface.
         settings: how far off halves a weight.
@@ -43,12 +43,12 @@ def weigh_pixels(
         (R, H, W) uint8, 255 = full weight; 255 also outside silhouette and mask, where there is
         nothing to judge by.
     """
-    found = list(looks.values())
-    cells = [look.cells for look in found]
-    trusts = clean[list(looks)].tolist()
-    residuals = [look.explained.residual for look in found]
-    tints = [look.explained.tint for look in found]
-    levels = np.array([look.explained.level for look in found])
+    found = list(measured.values())
+    cells = [one.cells for one in found]
+    trusts = clean[list(measured)].tolist()
+    residuals = [one.residual for one in found]
+    tints = [one.tint for one in found]
+    levels = np.array([one.level for one in found])
     tint_levels = np.array([np.median(tint) for tint in tints])
     level, tint_level = (
         max(normal_value(values, settings.clean_share)[0], _LEAST_LEVEL)
@@ -58,16 +58,16 @@ def weigh_pixels(
     normal = normal_residuals(residuals, cells, trusts, cell_count, level, prior)
     normal_tint = normal_tints(tints, cells, trusts, cell_count, tint_level, prior)
     weights = np.full(masks.shape, 255, dtype=np.uint8)
-    for row, look in looks.items():
+    for row, one in measured.items():
         seen = masks[row].reshape(-1) / 255.0
         weight = np.ones(seen.size)
-        shared = _shared(look.explained.residual, look.pixels, masks[row].shape)
-        weight[look.pixels] = (
-            _fit(shared, settings.residual_scale * normal[look.cells])
-            * _fit(look.explained.tint, settings.tint_scale * normal_tint[look.cells])
-            * (_UNMASKED + (1.0 - _UNMASKED) * seen[look.pixels])
+        shared = _shared(one.residual, one.pixels, masks[row].shape)
+        weight[one.pixels] = (
+            _fit(shared, settings.residual_scale * normal[one.cells])
+            * _fit(one.tint, settings.tint_scale * normal_tint[one.cells])
+            * (_UNMASKED + (1.0 - _UNMASKED) * seen[one.pixels])
         )
-        weight[look.beyond] = _fit(look.explained.tint_beyond, settings.tint_scale * tint_level)
+        weight[one.beyond] = _fit(one.tint_beyond, settings.tint_scale * tint_level)
         weights[row] = np.round(255.0 * weight).reshape(masks[row].shape)
     return weights
 

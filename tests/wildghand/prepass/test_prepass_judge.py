@@ -14,9 +14,13 @@ from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.capture import CaptureInfo, CaptureWriter, HandModelId, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import load_template
-from hwp_bench.methods.contract import Budget, RunSettings
-from hwp_bench.methods.request import open_request, write_request
-from wildghand.prepass import Judgement, PrepassInput, PrepassSettings, judge_capture, judge_frames
+from wildghand.prepass import (
+    FrameAssessment,
+    PrepassInput,
+    PrepassSettings,
+    capture_input,
+    judge_frames,
+)
 from wildghand.prepass.footprint import HandSurfaces
 
 Lit = tuple[np.ndarray, np.ndarray]
@@ -25,9 +29,9 @@ HIT = np.arange(8, 14)
 SPARED = np.setdiff1d(np.arange(FRAMES), np.arange(7, 15))
 
 
-def check_ranges(judgement: Judgement, count: int) -> None:
+def check_ranges(judgement: FrameAssessment, count: int) -> None:
     """Every field is finite and in its range."""
-    for field in fields(Judgement):
+    for field in fields(FrameAssessment):
         values = getattr(judgement, field.name)
         assert len(values) == count, field.name
         assert np.isfinite(values.astype(np.float64)).all(), field.name
@@ -56,8 +60,6 @@ def test_known_gains_are_recovered_to_0_05(lit_frames: Lit) -> None:
     np.testing.assert_allclose(judgement.log_gains, gains, atol=0.05)
     assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
     assert (judgement.omega_dropout[SPARED] == 0.3).all()
-    # Around the middle of the scale an sRGB value follows light to the power 1 / 2.2.
-    np.testing.assert_allclose(judgement.display_log_gains, judgement.log_gains / 2.2)
 
 
 def test_blurred_frames_are_flagged_and_measured(lit_frames: Lit) -> None:
@@ -192,7 +194,7 @@ def test_misplaced_hands_ask_for_refinement(lit_frames: Lit) -> None:
 def test_same_frames_same_judgement(lit_frames: Lit) -> None:
     given = as_input(developed(lit_frames[0]), lit_frames[1])
     first, second = judge_frames(given), judge_frames(given)
-    for field in fields(Judgement):
+    for field in fields(FrameAssessment):
         np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name))
 
 
@@ -279,7 +281,7 @@ def test_arrays_of_other_frames_are_refused(lit_frames: Lit) -> None:
         replace(given, masks=given.masks[:3])
 
 
-def test_a_request_is_judged_like_its_frames(lit_frames: Lit, tmp_path: Path) -> None:
+def test_frames_read_from_a_capture_are_judged_the_same(lit_frames: Lit, tmp_path: Path) -> None:
     images, template = developed(lit_frames[0]), load_template("anny", "right")
     given = as_input(images, lit_frames[1])
     info = CaptureInfo(
@@ -301,9 +303,7 @@ def test_a_request_is_judged_like_its_frames(lit_frames: Lit, tmp_path: Path) ->
             writer.frame(frame, images[frame])
             writer.mask(frame, given.masks[frame])
     split = contiguous_split("lit", FRAMES)
-    run = RunSettings({}, 0, Budget())
-    request = write_request(tmp_path / "request", open_capture(tmp_path / "lit"), split, run)
-    judgement = judge_capture(open_request(request))
+    judgement = judge_frames(capture_input(open_capture(tmp_path / "lit"), split.train))
     expected = judge_frames(only(given, split.train))
     assert judgement.indices.tolist() == split.train.tolist()
     # hands.npz may hold the parameters in single precision.

@@ -10,10 +10,9 @@ from hypothesis.extra.numpy import arrays
 
 from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.importers.silhouette import draw_silhouette
-from wildghand.prepass.edges import border_width
-from wildghand.prepass.mode import densest, excess, normal_value
-from wildghand.prepass.outlines import misplacement
-from wildghand.prepass.verdict import clean_probability, evidence
+from wildghand.prepass.borders import border_width, misplacement
+from wildghand.prepass.classify import clean_probability, evidence
+from wildghand.prepass.robust_location import densest, excess, normal_value
 from wildghand.prepass.zbuffer import draw_faces, mix_corners
 
 

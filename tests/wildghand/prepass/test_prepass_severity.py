@@ -13,8 +13,7 @@ import pytest
 from hwp_bench.capture import Capture
 from hwp_bench.taxonomy import PERTURBATIONS
 from wildghand.cli.main import main
-from wildghand.prepass.judgement import neutral_judgement
-from wildghand.prepass.severity import CUES, estimated_severity
+from wildghand.prepass.assessment import CUES, estimated_severity, neutral_assessment
 
 
 def test_every_perturbation_has_a_cue() -> None:
@@ -23,7 +22,7 @@ def test_every_perturbation_has_a_cue() -> None:
 
 @pytest.mark.parametrize("kind", list(CUES))
 def test_levels_grow_with_their_cue_and_with_no_other(kind: str) -> None:
-    neutral = neutral_judgement(np.arange(4), np.array([True, True, True, False]), (8, 8), 0.3)
+    neutral = neutral_assessment(np.arange(4), np.array([True, True, True, False]), (8, 8), 0.3)
     cue, deviations = CUES[kind]
     judgement = dataclasses.replace(
         neutral,

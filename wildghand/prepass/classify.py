@@ -1,37 +1,41 @@
-"""From the measurements of all frames to the judgement."""
+"""Frames are compared with each other: which are clean, how sure that is, and what is off."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from wildghand.prepass.judgement import Judgement
-from wildghand.prepass.look import Look
-from wildghand.prepass.mode import densest, excess, normal_value
+from wildghand.prepass.assessment import FrameAssessment
+from wildghand.prepass.measurements import FrameMeasurements
+from wildghand.prepass.robust_location import densest, excess, normal_value
 from wildghand.prepass.settings import PrepassSettings
-from wildghand.prepass.verdict import clean_probability, evidence
 from wildghand.prepass.weights import weigh_pixels
 
+# Deviation at which a cue starts to count; it grows like a logarithm beyond.
+_ONSET = 3.0
+# Steepness of the probability.
+_EXPONENT = 3
 
-def conclude(
+
+def classify_frames(
     indices: np.ndarray,
     masks: np.ndarray,
-    looks: Mapping[int, Look],
+    measured: Mapping[int, FrameMeasurements],
     cell_count: int,
     settings: PrepassSettings,
-) -> Judgement:
-    """Compare the frames with each other and judge them.
+) -> FrameAssessment:
+    """Compare the frames with each other and assess them.
 
     Args:
         indices: (R,) ascending frame numbers.
         masks: (R, H, W) uint8.
-        looks: by row; rows that are missing cannot be used. Not empty.
+        measured: by row; rows that are missing cannot be used. Not empty.
         cell_count: number of cells of the surface.
         settings: floors and thresholds.
     """
     count, share = len(indices), settings.clean_share
-    rows = np.array(sorted(looks))
+    rows = np.array(sorted(measured))
     usable = np.zeros(count, dtype=bool)
     usable[rows] = True
 
@@ -43,14 +47,14 @@ def conclude(
         result[rows] = values
         return result
 
-    found = [looks[row] for row in rows.tolist()]
-    gains = gathered([look.explained.gain for look in found])
+    found = [measured[row] for row in rows.tolist()]
+    gains = gathered([one.gain for one in found])
     gains = gains - densest(gains, share)[0]
-    level = gathered([look.explained.level for look in found])
-    texture = gathered([look.explained.texture for look in found])
-    border = gathered([look.border for look in found])
-    misplaced = gathered([look.misplacement for look in found])
-    hidden = gathered([look.hidden for look in found])
+    level = gathered([one.level for one in found])
+    texture = gathered([one.texture for one in found])
+    border = gathered([one.border for one in found])
+    misplaced = gathered([one.misplacement for one in found])
+    hidden = gathered([one.hidden for one in found])
 
     off_gain = excess(np.linalg.norm(gains, axis=1), share, settings.gain_floor)
     off_level = excess(np.log(np.maximum(level, 1e-4)), share, settings.residual_floor)
@@ -65,7 +69,7 @@ def conclude(
     sharp_border = float(np.exp(normal_value(np.log(border), share)[0]))
     extent = np.sqrt(np.maximum(np.nan_to_num(border) ** 2 - sharp_border**2, 0.0))
     refine = (off_place > settings.clear_deviation) & (off_border < settings.clear_deviation)
-    return Judgement(
+    return FrameAssessment(
         indices=indices,
         usable=usable,
         clean=clean,
@@ -83,6 +87,36 @@ def conclude(
         misplacement_deviation=spread(off_place),
         hidden=spread(hidden),
         hidden_deviation=spread(off_hidden),
-        motion=spread(gathered([look.motion for look in found])),
-        pixel_weights=weigh_pixels(masks, looks, clean, cell_count, settings),
+        motion=spread(gathered([one.motion for one in found])),
+        pixel_weights=weigh_pixels(masks, measured, clean, cell_count, settings),
     )
+
+
+def evidence(deviations: Sequence[np.ndarray], indices: np.ndarray, tolerance: float) -> np.ndarray:
+    """Weigh all cues together, and neighbouring frames with them.
+
+    Each cue adds log(1 + (deviation / 3)^2): a single cue can decide, none outweighs the rest.
+    Perturbations last for a while, so that a frame takes half of its evidence from the frames
+    before and after, if they are given. A neighbour counts up to `tolerance`: it can decide
+    about a doubtful frame, but the last clean frame before an episode stays clean.
+
+    Args:
+        deviations: arrays (R,), not negative.
+        indices: (R,) ascending frame numbers.
+        tolerance: evidence at which a frame is as likely clean as not, positive.
+
+    Returns:
+        (R,) not negative.
+    """
+    own = sum((np.log1p((d / _ONSET) ** 2) for d in deviations), start=np.zeros(len(indices)))
+    before, after = own.copy(), own.copy()
+    neighbours = np.diff(indices) == 1
+    heard = np.minimum(own, tolerance)
+    before[1:][neighbours] = heard[:-1][neighbours]
+    after[:-1][neighbours] = heard[1:][neighbours]
+    return 0.25 * before + 0.5 * own + 0.25 * after
+
+
+def clean_probability(evidence: np.ndarray, tolerance: float) -> np.ndarray:
+    """(R,) in (0, 1]: 1 without evidence, a half at `tolerance`."""
+    return 1.0 / (1.0 + (evidence / tolerance) ** _EXPONENT)

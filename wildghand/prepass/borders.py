@@ -1,4 +1,4 @@
-"""How sharp a frame is: the width of the hand's border in the picture."""
+"""The hand's border in an image and in its mask: its width, its place, and the parts that hide."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
 
-# Reach of a profile to either side of the border, share of the picture's edge.
+# Reach of a profile to either side of the border, share of the image's edge.
 _REACH = 0.1
 # Step along a profile, px.
 _STEP = 0.5
@@ -20,21 +20,24 @@ _POINTS = 250
 # Profiles that a bin needs.
 _LEAST = 6
 
+# Difference of silhouette and mask at a sound border, px.
+_SLACK = 1
+
 
 def border_width(image: np.ndarray, mask: np.ndarray) -> float:
     """Width of the border between hand and background, in its most blurred direction.
 
     Profiles across the outline of the mask are projected on the difference of the colours at
-    their ends and scaled to a range of 1, so that their steepest place tells the width:
-    1 / slope. The outline itself may
-    be off by some pixels. Widths are medians over the profiles of like direction.
+    their ends and scaled to a range of 1, so that their steepest slope gives the width:
+    1 / slope. The outline itself may be off by some pixels. Widths are medians over the profiles
+    of similar direction.
 
     Args:
         image: (H, W, 3) uint8.
         mask: (H, W) bool, visible hand.
 
     Returns:
-        px; not a number where too little of the border can be read.
+        px; NaN where too little of the border can be read.
     """
     reach = max(4.0, _REACH * max(mask.shape))
     points, directions = _outline(mask)
@@ -76,6 +79,57 @@ def border_width(image: np.ndarray, mask: np.ndarray) -> float:
     return float(max(medians)) if medians else float(np.median(width))
 
 
+def misplacement(mask: np.ndarray, silhouette: np.ndarray) -> float:
+    """Mean distance by which the mask lies outside the silhouette.
+
+    The mask of a misplaced hand lies outside the silhouette on one side and lacks a part of it on
+    the other. An object in front removes pixels from the mask and adds none outside. So only the
+    outside tells them apart.
+
+    Args:
+        mask: (H, W) bool, visible hand.
+        silhouette: (H, W) bool, the estimated hands; not empty.
+
+    Returns:
+        Share of the hand's size, the square root of its area. Differences of `_SLACK` px at the
+        border are not counted.
+    """
+    near = _grow(silhouette, _SLACK)
+    outside = float(np.count_nonzero(mask & ~near))
+    ring = float(np.count_nonzero(near & ~silhouette))
+    return outside / max(ring, 1.0) / float(np.sqrt(np.count_nonzero(silhouette)))
+
+
+class ShownCells:
+    """How often each cell of the surface is in the mask when it is in the silhouette.
+
+    A cell that no mask shows (the wrist inside a sleeve) does not count as hidden.
+    """
+
+    def __init__(self, cell_count: int) -> None:
+        self._drawn = np.zeros(cell_count, dtype=np.int64)
+        self._shown = np.zeros(cell_count, dtype=np.int64)
+
+    def add(self, cells: np.ndarray, masked: np.ndarray) -> None:
+        """Count one frame: (P,) cells of its pixels and (P,) bool whether the mask has them."""
+        self._drawn += np.bincount(cells, minlength=len(self._drawn))
+        self._shown += np.bincount(cells[masked], minlength=len(self._drawn))
+
+    def hidden_share(self, cells: np.ndarray, masked: np.ndarray) -> float:
+        """Share of a frame's pixels that other frames show and its mask lacks."""
+        known = 2 * self._shown[cells] > self._drawn[cells]
+        lacking = int(np.count_nonzero(known & ~masked))
+        return lacking / max(int(np.count_nonzero(known)), 1)
+
+
+def interior(area: np.ndarray, margin: int) -> np.ndarray:
+    """(H, W) bool: the pixels of an area that lie more than `margin` px inside; 1 at least."""
+    shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
+    # The hand goes on beyond the border of the image.
+    eroded = cv2.erode(area.astype(np.uint8), shape, borderType=cv2.BORDER_REPLICATE)
+    return eroded.astype(bool)
+
+
 def _outline(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(N, 2) pixels (x, y) on the outline and (N, 2) unit directions outward."""
     solid = mask.astype(np.uint8)
@@ -96,3 +150,8 @@ def _outline(mask: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     sound = length > 1e-3
     points = np.stack([columns, rows], axis=1)[sound].astype(np.float64)
     return points, slope[sound] / length[sound, None]
+
+
+def _grow(area: np.ndarray, margin: int) -> np.ndarray:
+    shape = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * margin + 1, 2 * margin + 1))
+    return cv2.dilate(area.astype(np.uint8), shape).astype(bool)

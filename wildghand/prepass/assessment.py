@@ -1,18 +1,30 @@
-"""What the pre-pass says about the training frames."""
+"""The assessment of frames: the result of the pre-pass, and the severities estimated from it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import cv2
 import numpy as np
 
-#: Exponent between sRGB values and linear light around the middle of the scale.
-_DISPLAY_EXPONENT = 1.0 / 2.2
+#: The cue that tells each perturbation, and how many of its deviations make one level: about
+#: what they are on simulated captures, where the levels are known (docs/prepass.md).
+CUES: Mapping[str, tuple[str, float]] = MappingProxyType(
+    {
+        "hand_object_interaction": ("hidden_deviation", 1.0),
+        "complex_poses": ("misplacement_deviation", 5.0),
+        "illumination": ("gain_deviation", 2.5),
+        "motion_blur": ("blur_deviation", 0.7),
+    }
+)
+#: A frame at or above this probability counts as unperturbed.
+CLEAN_FROM = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Judgement:
+class FrameAssessment:
     """R training frames, in the order in which they were given.
 
     Deviations are in robust standard deviations of the frames that agree, one-sided: 0 = as
@@ -21,7 +33,7 @@ class Judgement:
 
     #: (R,) which frames of the capture they are.
     indices: np.ndarray
-    #: (R,) bool: the estimated hands are valid, lie in the picture, and mask and frame show
+    #: (R,) bool: the estimated hands are valid, lie in the image, and mask and frame show
     #: something. Other frames are judged unclean with gain 0.
     usable: np.ndarray
     #: (R,) probability in [0, 1] that nothing perturbs the frame.
@@ -54,8 +66,8 @@ class Judgement:
     hidden: np.ndarray
     #: (R,) deviation of `hidden`.
     hidden_deviation: np.ndarray
-    #: (R,) median way of the projected hand since the frame before, px; 0 where that is no
-    #: training frame. Parameters alone; it does not enter `clean`.
+    #: (R,) median path of the projected hand since the frame before, px; 0 where that is not a
+    #: training frame. From the parameters only; it does not enter `clean`.
     motion: np.ndarray
     #: (R, H, W) uint8, 255 = full weight: initial weights of the pixels.
     pixel_weights: np.ndarray
@@ -63,16 +75,11 @@ class Judgement:
     def __len__(self) -> int:
         return len(self.indices)
 
-    @property
-    def display_log_gains(self) -> np.ndarray:
-        """(R, 3) the gains as factors on sRGB values, log: about `log_gains` / 2.2."""
-        return self.log_gains * _DISPLAY_EXPONENT
 
-
-def neutral_judgement(
+def neutral_assessment(
     indices: np.ndarray, usable: np.ndarray, size: tuple[int, int], omega_dropout: float
-) -> Judgement:
-    """Everything that can be used is clean: where there is too little to compare.
+) -> FrameAssessment:
+    """Call every usable frame clean, because there is too little to compare.
 
     Args:
         indices: (R,) frames.
@@ -83,7 +90,7 @@ def neutral_judgement(
     count = len(indices)
     good = usable.astype(np.float64)
     zeros = np.zeros(count)
-    return Judgement(
+    return FrameAssessment(
         indices=indices,
         usable=usable,
         clean=good,
@@ -106,21 +113,42 @@ def neutral_judgement(
     )
 
 
-def enlarged(judgement: Judgement, factor: int, size: tuple[int, int]) -> Judgement:
-    """A judgement of shrunk frames, brought back to their size.
+def enlarged(assessment: FrameAssessment, factor: int, size: tuple[int, int]) -> FrameAssessment:
+    """The assessment of shrunk frames, brought back to their size.
 
     Args:
-        judgement: of frames at 1 / factor of the resolution.
+        assessment: of frames at 1 / factor of the resolution.
         factor: at least 1.
         size: height and width of the frames.
     """
     weights = [
         cv2.resize(weight, size[::-1], interpolation=cv2.INTER_LINEAR)
-        for weight in judgement.pixel_weights
+        for weight in assessment.pixel_weights
     ]
     return replace(
-        judgement,
+        assessment,
         pixel_weights=np.stack(weights),
-        blur_extent=judgement.blur_extent * factor,
-        motion=judgement.motion * factor,
+        blur_extent=assessment.blur_extent * factor,
+        motion=assessment.motion * factor,
     )
+
+
+def estimated_severity(assessment: FrameAssessment) -> dict[str, np.ndarray]:
+    """Guess how strongly each perturbation acts in each frame.
+
+    Each cue also reacts to other perturbations: blur moves outlines, and an object hides texture.
+    `assessment.clean` is reliable; how it is split among the perturbations is a guess.
+
+    Args:
+        assessment: of R frames.
+
+    Returns:
+        (R,) int, 0-5, for each perturbation of the taxonomy; 0 wherever the frame is judged
+        clean or cannot be used.
+    """
+    acting = (assessment.clean < CLEAN_FROM) & assessment.usable
+    levels = {}
+    for kind, (cue, deviations) in CUES.items():
+        level = np.clip(np.rint(getattr(assessment, cue) / deviations), 0, 5)
+        levels[kind] = np.where(acting, level, 0).astype(np.int64)
+    return levels
