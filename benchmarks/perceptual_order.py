@@ -16,12 +16,10 @@ import cv2
 import numpy as np
 from skimage import data
 
+from hwp_bench.base.images import as_uint8
 from hwp_bench.metrics.aggregate import mean_scores
 from hwp_bench.metrics.lpips_weights import load_available
-from hwp_bench.metrics.pixels import quantize
 from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.psnr import psnr
-from hwp_bench.metrics.region import scored_pixels
 from hwp_bench.metrics.score import Network, score_frame
 
 #: Side of the pictures and radius of the disc, px.
@@ -45,12 +43,12 @@ def blur(image: np.ndarray, sigma: float) -> np.ndarray:
 
 def gamma(image: np.ndarray, exponent: float) -> np.ndarray:
     """Every sRGB value raised to a power: darker above 1."""
-    return quantize((image / 255.0) ** exponent)
+    return as_uint8((image / 255.0) ** exponent)
 
 
 def noise(image: np.ndarray, sigma: float) -> np.ndarray:
     """Independent Gaussian noise per channel of a standard deviation in 8-bit levels."""
-    return quantize((image + np.random.default_rng(0).normal(0.0, sigma, image.shape)) / 255.0)
+    return as_uint8((image + np.random.default_rng(0).normal(0.0, sigma, image.shape)) / 255.0)
 
 
 def jpeg(image: np.ndarray, loss: float) -> np.ndarray:
@@ -111,10 +109,9 @@ def score(
 def at_equal_psnr(kind: Kind, target: np.ndarray) -> tuple[float, np.ndarray]:
     """The strength at which the PSNR falls to `EQUAL_PSNR`, by bisection, and its picture."""
     weak, strong = kind.limits
-    region = scored_pixels(disc(), erosion=HWP_V1.mask_erosion)
     for _ in range(20):
         middle = float(np.sqrt(weak * strong))
-        if psnr(kind.apply(target, middle) / 255.0, target / 255.0, region) > EQUAL_PSNR:
+        if score(kind.apply(target, middle), target)["psnr"] > EQUAL_PSNR:
             weak = middle
         else:
             strong = middle

@@ -8,12 +8,12 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, HandModelId
 from hwp_bench.capture.reader import open_capture
 from hwp_bench.hands import load_template
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.methods.contract import Avatar, Camera, HandPose, TrainingCapture
-from hwp_bench.metrics.pixels import quantize
 from plain_fit.model import PlainAvatar, make_model
 
 #: Frames and edge of the capture.
@@ -111,6 +111,6 @@ def paint_capture(path: Path, hands: str) -> Capture:
             rgba = avatar.render(poses, camera).astype(np.float64)
             background = np.full(3, 0.35)
             image = rgba[..., :3] + (1.0 - rgba[..., 3:]) * background
-            writer.frame(frame, quantize(image))
+            writer.frame(frame, as_uint8(image))
             writer.mask(frame, np.where(rgba[..., 3] > 0.5, 255, 0).astype(np.uint8))
     return open_capture(path)

@@ -126,6 +126,32 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
     return path
 
 
+def as_uint8(image: np.ndarray) -> np.ndarray:
+    """Return an image in the 8 bits that it has on disk.
+
+    Args:
+        image: any shape, sRGB; uint8 is returned as it is; float has 0 for black and 1 for
+            white, and values outside are clipped, as renderings overshoot.
+
+    Returns:
+        uint8 of the same shape: 255 * image, rounded half to even.
+
+    Raises:
+        BadImage: of another type, or a value is NaN or infinite.
+    """
+    if image.dtype == np.uint8:
+        return image
+    if not np.issubdtype(image.dtype, np.floating):
+        raise BadImage(
+            f"an image is uint8 or float, not {image.dtype}",
+            field="image",
+            remedy="A float image has values from 0 to 1.",
+        )
+    if not np.isfinite(image).all():
+        raise BadImage("the image holds NaN or infinite values", field="image")
+    return np.rint(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
 def pixel_digest(pixels: np.ndarray) -> str:
     """Return the SHA-256 (hex) of decoded pixels: shape, type and samples, not the file's bytes.
 

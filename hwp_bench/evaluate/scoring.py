@@ -16,8 +16,8 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.layout import frame_name
 from hwp_bench.methods.predictions import Prediction
 from hwp_bench.metrics.batch import Frame, score_frames
+from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.region import scored_pixels
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import FrameResult
 

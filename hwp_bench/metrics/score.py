@@ -7,23 +7,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.base.errors import ShapeMismatch
-from hwp_bench.metrics.perceptual import oriented_distance
-from hwp_bench.metrics.pixels import check_prediction, check_truth
-from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, Protocol
-from hwp_bench.metrics.psnr import decibels, squared_error
-from hwp_bench.metrics.region import (
+from hwp_bench.base.errors import BadImage, BadInput, BadPrediction, ShapeMismatch
+from hwp_bench.base.images import as_uint8
+from hwp_bench.metrics.oriented_distance import oriented_distance
+from hwp_bench.metrics.pixels import (
     Box,
     bounding_box,
+    check_prediction,
+    check_truth,
     composite,
     crop,
     hand_pixels,
     scored_pixels,
 )
-from hwp_bench.metrics.ssim import ssim_box, ssim_map
+from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, Protocol
+from hwp_bench.metrics.psnr_ssim import decibels, squared_error, ssim_box, ssim_map
 
 #: A distance of two (H, W, 3) float images in [0, 1]; `hwp_bench.metrics.lpips.Lpips` is one.
 Network = Callable[[np.ndarray, np.ndarray], float]
+#: Largest value of a float image: renderings overshoot 1, and one in 0 to 255 is a mistake.
+FLOAT_LIMIT = 2.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,8 +59,9 @@ def score_frame(
     Pixels outside the mask never matter, in either image.
 
     Args:
-        prediction: (H, W, 3) uint8, sRGB.
-        target: (H, W, 3) uint8, sRGB.
+        prediction: (H, W, 3) uint8, or float in [0, 1], sRGB. A float image is scored as the 8 bits
+            that it has on disk: clipped, rounded half to even.
+        target: (H, W, 3) like `prediction`.
         mask: (H, W) uint8 (above 127 is hand) or bool, the data set's own visible-hand mask.
         protocols: which protocols to score in.
         coverage: True where `mask` holds the share of each pixel that the hand covers
@@ -68,18 +72,21 @@ def score_frame(
         metric name -> score, the names of `table.metric_names(protocols, networks)`.
 
     Raises:
-        BadImage: target or mask have the wrong type.
-        BadPrediction: the prediction has the wrong type.
+        BadImage: target or mask have the wrong type, or the target has values that an image
+            cannot have.
+        BadPrediction: the same of the prediction.
         ShapeMismatch: the three do not describe the same image, or it is smaller than the
             window of SSIM.
         EmptyMask: no pixel to score; this depends on mask and protocol only, never on the
             prediction, so it is the same for every method.
     """
+    target = _eight_bits(target, "target", BadImage)
     check_truth(target, mask)
     chosen = tuple(protocols)
     hand = hand_pixels(mask)
     covered = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=coverage)
     bounding_box(covered if HWP_V1 in chosen else hand)
+    prediction = _eight_bits(prediction, "prediction", BadPrediction)
     check_prediction(prediction, target)
 
     unit = 1.0 / 255.0**2
@@ -89,6 +96,23 @@ def score_frame(
     for protocol in chosen:
         scores |= _SCORERS[protocol.name](pair, protocol, networks or {})
     return scores
+
+
+def _eight_bits(image: np.ndarray, field: str, error: type[BadInput]) -> np.ndarray:
+    """The image as uint8; float images are converted, and an impossible one is refused by name."""
+    if not np.issubdtype(image.dtype, np.floating):
+        return image
+    try:
+        pixels = as_uint8(image)
+    except BadImage as found:
+        raise error(f"the {field} cannot be scored: {found.problem}", field=field) from found
+    if image.size and image.max() > FLOAT_LIMIT:
+        raise error(
+            f"the {field} is a float image with values up to {image.max():.4g}",
+            field=field,
+            remedy="A float image has values from 0 to 1; divide one of 0 to 255 by 255.",
+        )
+    return pixels
 
 
 def _score_hwp_v1(

@@ -147,9 +147,9 @@ def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
         )
     if not np.isfinite(rgba).all():
         raise MethodFailed("render returned NaN or infinity", field=f"frame {frame}")
-    from hwp_bench.metrics.pixels import quantize
+    from hwp_bench.base.images import as_uint8
 
-    return quantize(np.asarray(rgba[:, :, :3], dtype=np.float64))
+    return as_uint8(np.asarray(rgba[:, :, :3], dtype=np.float64))
 
 
 def device_name(avatar: Avatar) -> str:

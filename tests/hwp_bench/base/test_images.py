@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch
-from hwp_bench.base.images import pixel_digest, read_gray, read_rgb, write_image
+from hwp_bench.base.images import as_uint8, pixel_digest, read_gray, read_rgb, write_image
 
 
 @pytest.fixture
@@ -167,3 +167,33 @@ def test_a_folder_or_a_pipe_is_no_image(tmp_path: Path) -> None:
     for name in ("pipe.png", "."):
         with pytest.raises(BadImage, match="does not exist"):
             read_rgb(tmp_path / name)
+
+
+def test_as_uint8_clips_and_rounds_half_to_even():
+    # Halves in float64: k + 0.5 levels over 255 times 255 may not be exact, so take those that are.
+    levels = np.arange(255) + 0.5
+    halves = levels / 255.0
+    exact = halves * 255.0 == levels
+    expected = np.where(np.arange(255) % 2 == 0, np.arange(255), np.arange(255) + 1)
+    assert exact.sum() > 100
+    np.testing.assert_array_equal(as_uint8(halves)[exact], expected[exact])
+    np.testing.assert_array_equal(as_uint8(np.array([-3.0, 0.0, 1.0, 7.0])), [0, 0, 255, 255])
+
+
+def test_as_uint8_undoes_the_division_by_255():
+    levels = np.arange(256, dtype=np.uint8)
+    for dtype in (np.float32, np.float64):
+        np.testing.assert_array_equal(as_uint8((levels / 255.0).astype(dtype)), levels)
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_as_uint8_refuses_what_is_not_a_number(bad):
+    with pytest.raises(BadImage, match="NaN or infinite"):
+        as_uint8(np.array([0.5, bad]))
+
+
+def test_as_uint8_keeps_bytes_and_refuses_other_integers():
+    pixels = np.arange(3, dtype=np.uint8)
+    assert as_uint8(pixels) is pixels
+    with pytest.raises(BadImage, match="not int16"):
+        as_uint8(pixels.astype(np.int16))

@@ -1,4 +1,4 @@
-"""One frame: against the single functions, by arithmetic, and as properties."""
+"""One frame: against scikit-image on whole images, by arithmetic, and as properties."""
 
 from __future__ import annotations
 
@@ -9,14 +9,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from skimage.metrics import structural_similarity
 
 from hwp_bench.base.errors import BadImage, BadPrediction, EmptyMask, ShapeMismatch
+from hwp_bench.base.images import as_uint8
 from hwp_bench.metrics import HWP_V1, PAPER_WILDGHAND, metric, metric_names
-from hwp_bench.metrics.perceptual import oriented_distance
-from hwp_bench.metrics.psnr import psnr, psnr_box, psnr_full
-from hwp_bench.metrics.region import hand_pixels, scored_pixels
+from hwp_bench.metrics.oriented_distance import oriented_distance
+from hwp_bench.metrics.pixels import bounding_box, crop, hand_pixels, scored_pixels
+from hwp_bench.metrics.protocol import PSNR_CAP
+from hwp_bench.metrics.psnr_ssim import decibels, squared_error, ssim_box, ssim_map
 from hwp_bench.metrics.score import score_frame
-from hwp_bench.metrics.ssim import ssim, ssim_box, ssim_full, ssim_map
 
 
 def blob_mask(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
@@ -40,30 +42,69 @@ def random_frame(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 seeds = st.integers(0, 2**32 - 1)
 
 
+def plain_psnr(x: np.ndarray, y: np.ndarray) -> float:
+    """PSNR of all pixels of two float images."""
+    error = float(np.mean((x - y) ** 2))
+    return PSNR_CAP if error == 0 else min(PSNR_CAP, -10 * math.log10(error))
+
+
+def plain_ssim(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """scikit-image's SSIM of every pixel of two float images, window Gaussian 11/1.5."""
+    _, similarity = structural_similarity(
+        x,
+        y,
+        full=True,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=1.5,
+        use_sample_covariance=False,
+        data_range=1.0,
+    )
+    return similarity.mean(axis=2)
+
+
 @given(seeds, st.booleans())
 @settings(max_examples=40, deadline=None)
-def test_the_single_pass_equals_the_single_functions(seed, coverage):
-    """Oracle: the functions for whole images; shared work may not change a score (1e-10)."""
+def test_the_single_pass_equals_whole_images(seed, coverage):
+    """Oracle: numpy and scikit-image on the whole frame; shared work may not change a score."""
     prediction, target, mask = random_frame(seed)
     if coverage:
         mask[::3] = np.minimum(mask[::3], 200)
         mask[mask.shape[0] // 2, mask.shape[1] // 2] = 255
     x, y = prediction / 255.0, target / 255.0
     region, hand = scored_pixels(mask, erosion=1, coverage=coverage), hand_pixels(mask)
+    on_region = [image * region[..., None] for image in (x, y)]
+    on_hand = [image * hand[..., None] for image in (x, y)]
+    padded = [np.pad(image, ((5, 5), (5, 5), (0, 0))) for image in on_region]
+    box = bounding_box(region).grown(HWP_V1.box_padding)
+    tight = bounding_box(hand).at_least(PAPER_WILDGHAND.smallest_box)
+    released = [crop(image, tight) for image in on_hand]
     expected = {
-        "psnr": psnr(x, y, region),
-        "psnr_full": psnr_full(x, y, region),
-        "psnr_box": psnr_box(x, y, region),
-        "psnr_edge": psnr(x, y, hand),
-        "ssim": ssim(x, y, region),
-        "ssim_full": ssim_full(x, y, region),
+        "psnr": plain_psnr(x[region], y[region]),
+        "psnr_full": plain_psnr(*on_region),
+        "psnr_box": plain_psnr(*(crop(image, box) for image in on_region)),
+        "psnr_edge": plain_psnr(x[hand], y[hand]),
+        "ssim": plain_ssim(*padded)[5:-5, 5:-5][region].mean(),
+        "ssim_full": plain_ssim(*on_region)[5:-5, 5:-5].mean(),
         "oriented_distance": oriented_distance(x, y, region),
-        "paper_psnr": psnr_full(x, y, hand),
-        "paper_ssim": ssim_box(x, y, hand),
+        "paper_psnr": plain_psnr(*on_hand),
+        "paper_ssim": structural_similarity(*released, channel_axis=2, data_range=2.0),
     }
     scores = score_frame(prediction, target, mask, coverage=coverage)
     assert set(scores) == set(metric_names())
     assert scores == pytest.approx(expected, abs=1e-10)
+
+
+@given(seeds)
+@settings(max_examples=10, deadline=None)
+def test_float_images_score_as_the_eight_bits_that_they_become(seed):
+    prediction, target, mask = random_frame(seed)
+    expected = score_frame(prediction, target, mask)
+    assert score_frame(prediction / 255.0, target / 255.0, mask) == expected
+    assert score_frame((prediction / 255.0).astype(np.float32), target, mask) == expected
+    # A rendering that overshoots is clipped, as it is when it is written.
+    bright = np.where(prediction == 255, 1.3, prediction / 255.0)
+    assert score_frame(bright, target, mask) == expected
 
 
 @given(seeds)
@@ -154,15 +195,16 @@ def test_the_textured_disc_shows_why_conventions_matter():
     target = np.clip(0.5 + 2.5 * (texture - 0.5), 0, 1) * mask[..., None]
     prediction = np.clip(target + 0.078 * rng.normal(size=target.shape), 0, 1) * mask[..., None]
 
-    hand, full = psnr(prediction, target, mask), psnr_full(prediction, target, mask)
-    box = psnr_box(prediction, target, mask, padding=0)
+    scores = score_frame(prediction, target, mask, coverage=True)
+    hand, full = scores["psnr"], scores["psnr_full"]
+    x, y = as_uint8(prediction) / 255.0, as_uint8(target) / 255.0
+    box = decibels(float(squared_error(x, y).sum()) / bounding_box(mask).area)
     assert full - hand == pytest.approx(10.0, abs=0.02)
     assert box - hand == pytest.approx(-10 * math.log10(math.pi / 4), abs=0.1)
 
-    full_uniform = float(ssim_map(prediction, target, PAPER_WILDGHAND.ssim).mean())
-    full_gaussian = ssim_full(prediction, target, mask)
-    box_uniform = ssim_box(prediction, target, mask)
-    hand_gaussian = ssim(prediction, target, mask)
+    full_uniform = float(ssim_map(x, y, PAPER_WILDGHAND.ssim).mean())
+    full_gaussian, hand_gaussian = scores["ssim_full"], scores["ssim"]
+    box_uniform = ssim_box(x, y, mask)
     assert full_uniform > full_gaussian > box_uniform > hand_gaussian
     assert full_gaussian - hand_gaussian > 0.2
 
@@ -210,10 +252,16 @@ def test_what_does_not_fit_is_refused_by_name():
         score_frame(prediction[1:], target, mask)
     with pytest.raises(ShapeMismatch, match="mask"):
         score_frame(prediction, target, mask[1:])
-    with pytest.raises(BadPrediction, match="float64"):
-        score_frame(prediction / 255.0, target, mask)
+    with pytest.raises(BadPrediction, match="int16"):
+        score_frame(prediction.astype(np.int16), target, mask)
+    with pytest.raises(BadPrediction, match=r"prediction: .* up to 255\. .*divide"):
+        score_frame(prediction.astype(np.float32) + 255 - prediction.max(), target, mask)
+    with pytest.raises(BadPrediction, match=r"prediction: .*NaN"):
+        score_frame(np.full(target.shape, np.nan), target, mask)
     with pytest.raises(BadImage, match="target"):
-        score_frame(prediction, target / 255.0, mask)
+        score_frame(prediction, target.astype(np.int16), mask)
+    with pytest.raises(BadImage, match=r"target: .*divide"):
+        score_frame(prediction, target.astype(np.float64), mask)
     small = np.zeros((10, 10, 3), np.uint8)
     with pytest.raises(ShapeMismatch, match="window"):
         score_frame(small, small, np.full((10, 10), 255, np.uint8))

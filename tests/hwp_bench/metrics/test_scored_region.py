@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy import ndimage
 
 from hwp_bench.base.errors import EmptyMask
-from hwp_bench.metrics.region import (
+from hwp_bench.metrics.pixels import (
     Box,
     bounding_box,
     composite,

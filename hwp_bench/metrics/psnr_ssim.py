@@ -1,14 +1,26 @@
-"""Structural similarity with every convention stated (Wang et al., 2004)."""
+"""The formulas of PSNR and SSIM, with every convention stated (Wang et al., 2004)."""
 
 from __future__ import annotations
+
+import math
 
 import cv2
 import numpy as np
 
 from hwp_bench.base.errors import ShapeMismatch
-from hwp_bench.metrics.pixels import check_same_shape
-from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, SsimSettings
-from hwp_bench.metrics.region import bounding_box, composite, crop
+from hwp_bench.metrics.pixels import bounding_box, check_same_shape, composite, crop
+from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PSNR_CAP, SsimSettings
+
+
+def decibels(mse: float, cap: float = PSNR_CAP) -> float:
+    """-10 log10(mse) for data range 1, at most `cap`; `cap` for mse = 0."""
+    return cap if mse <= 0.0 else min(cap, -10.0 * math.log10(mse))
+
+
+def squared_error(prediction: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Squared difference of two (H, W, 3) float images, mean over channels: (H, W) float64."""
+    difference = np.subtract(prediction, target, dtype=np.float64)
+    return np.einsum("ijk,ijk->ij", difference, difference) / difference.shape[2]
 
 
 def ssim_map(x: np.ndarray, y: np.ndarray, settings: SsimSettings = HWP_V1.ssim) -> np.ndarray:
@@ -51,16 +63,15 @@ def ssim_map(x: np.ndarray, y: np.ndarray, settings: SsimSettings = HWP_V1.ssim)
     return similarity[r : similarity.shape[0] - r, r : similarity.shape[1] - r]
 
 
-def ssim(
+def ssim_box(
     prediction: np.ndarray,
     target: np.ndarray,
     mask: np.ndarray,
-    settings: SsimSettings = HWP_V1.ssim,
+    settings: SsimSettings = PAPER_WILDGHAND.ssim,
 ) -> float:
-    """SSIM averaged over the windows whose centre lies in `mask`.
+    """SSIM averaged over all windows inside the tight box of `mask`, black outside it.
 
-    Both images are put on black outside `mask`, and the black goes on beyond the frame, so
-    every pixel of the mask has its whole window.
+    The released evaluator's form. A box smaller than the window is grown to its size.
 
     Args:
         prediction: (H, W, 3) float in [0, 1], sRGB.
@@ -75,42 +86,8 @@ def ssim(
         ShapeMismatch: the three do not describe the same image.
         EmptyMask: no pixel to score.
 
-    Source: protocol hwp-v1; the oracle in the tests is scikit-image's
-    `structural_similarity(..., full=True)` with the same window.
-    """
-    check_same_shape(prediction, target, mask)
-    tight = bounding_box(mask)
-    box = tight.grown(settings.radius)
-    x, y = (crop(composite(image, mask), box) for image in (prediction, target))
-    return float(ssim_map(x, y, settings)[crop(mask, tight)].mean())
-
-
-def ssim_full(
-    prediction: np.ndarray,
-    target: np.ndarray,
-    mask: np.ndarray,
-    settings: SsimSettings = HWP_V1.ssim,
-) -> float:
-    """SSIM averaged over all windows inside the frame, black outside `mask`.
-
-    Windows that see no pixel of the mask count 1, so a small hand scores high whatever it
-    looks like. Arguments and errors are those of `ssim`; frames smaller than the window are a
-    `ShapeMismatch`.
-    """
-    check_same_shape(prediction, target, mask)
-    return float(ssim_map(composite(prediction, mask), composite(target, mask), settings).mean())
-
-
-def ssim_box(
-    prediction: np.ndarray,
-    target: np.ndarray,
-    mask: np.ndarray,
-    settings: SsimSettings = PAPER_WILDGHAND.ssim,
-) -> float:
-    """SSIM averaged over all windows inside the tight box of `mask`, black outside it.
-
-    The released evaluator's form. A box smaller than the window is grown to its size.
-    Arguments and errors are those of `ssim`.
+    Source: protocol paper-wildghand; the oracle in the tests is scikit-image's
+    `structural_similarity` with its defaults and a data range of 2.
     """
     check_same_shape(prediction, target, mask)
     box = bounding_box(mask).at_least(settings.size)
