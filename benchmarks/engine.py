@@ -26,7 +26,7 @@ import numpy as np
 
 from benchmarks.engine_work import INPUT_BYTES, Wait
 from hwp_bench.run.engine import Engine, Folder, Job, LocalEngine
-from hwp_bench.run.engine.job import Report
+from hwp_bench.run.engine.job import OnProgress
 from hwp_bench.run.engine.parallel import ParallelEngine
 
 #: Captures, variants and seeds of the modelled study.
@@ -42,8 +42,8 @@ def make_jobs(folder: Path, source: Path, count: int, seconds: float) -> list[Jo
     def make(number: int) -> Job:
         output = folder / str(number)
 
-        def here(report: Report) -> None:
-            work({"capture": source}, output, report)
+        def here(on_progress: OnProgress) -> None:
+            work({"capture": source}, output, on_progress)
 
         inputs = {"capture": Folder(source)}
         return Job(f"job {number}", here, work, output, lambda: False, inputs)

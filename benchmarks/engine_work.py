@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hwp_bench.run.engine.job import Report
+from hwp_bench.run.engine.job import OnProgress
 
 #: Bytes of the input, about a capture of the suite `mini`.
 INPUT_BYTES = 8 << 20
@@ -22,7 +22,7 @@ class Wait:
     #: Seconds that it waits.
     seconds: float
 
-    def __call__(self, inputs: Mapping[str, Path], output: Path, report: Report) -> None:
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
         """Do the job; see `hwp_bench.run.engine.job.Work`."""
         content = (inputs["capture"] / "frames.bin").read_bytes()
         time.sleep(self.seconds)

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.run.engine import Folder, Job, Needs
-from hwp_bench.run.engine.job import Report
+from hwp_bench.run.engine.job import OnProgress
 from hwp_bench.run.engine.view import NoView
 
 
@@ -31,8 +31,8 @@ class Write:
     #: Seconds that it waits.
     seconds: float = 0.0
 
-    def __call__(self, inputs: Mapping[str, Path], output: Path, report: Report) -> None:
-        report(1, 2)
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
+        on_progress(1, 2)
         if self.fault == "refuse":
             raise BadInput("is wrong", where="a.png", field="x", remedy="Mend it.")
         if self.fault == "break":
@@ -54,7 +54,7 @@ def write_job(folder: Path, work: Write, *inputs: Path, cpus: float = 1.0) -> Jo
     folders = {str(number): path for number, path in enumerate(inputs)}
     return Job(
         text=work.text,
-        here=lambda report: work(folders, output, report),
+        here=lambda on_progress: work(folders, output, on_progress),
         work=work,
         output=output,
         finished=(output / "out.txt").is_file,

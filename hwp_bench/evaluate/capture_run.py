@@ -30,11 +30,9 @@ from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, CurvePoint
-from hwp_bench.run.facts import RunFacts
+from hwp_bench.run.output import CHECKPOINTS, DIAGNOSTICS, RunFacts
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
-from hwp_bench.run.sandbox.confinement import Confinement
-from hwp_bench.run.surroundings import hand_model_files
-from hwp_bench.run.worker import CHECKPOINTS, DIAGNOSTICS
+from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
 
 #: Most bytes of temporal weights and weight masks that are kept of a capture.
 MAX_DIAGNOSTICS = 64 << 20

@@ -15,7 +15,7 @@ from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.run.engine import Folder, Needs
 from hwp_bench.run.engine import Job as EngineJob
-from hwp_bench.run.engine.job import Report
+from hwp_bench.run.engine.job import OnProgress
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class EvaluateCapture:
     #: Backbones of LPIPS that are scored.
     networks: tuple[str, ...]
 
-    def __call__(self, inputs: Mapping[str, Path], output: Path, report: Report) -> None:
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
         """Evaluate; see `hwp_bench.run.engine.job.Work`.
 
         Raises:
@@ -57,7 +57,7 @@ class EvaluateCapture:
                 where=job.capture.info.id,
                 remedy="Install the same version everywhere, and change nothing while jobs run.",
             )
-        evaluate_capture(job, output, report)
+        evaluate_capture(job, output, on_progress)
 
 
 def evaluation_job(job: Job, folder: Path, text: str, needs: Needs) -> EngineJob:
@@ -76,8 +76,8 @@ def evaluation_job(job: Job, folder: Path, text: str, needs: Needs) -> EngineJob
         inputs["method"] = Folder(root)
     bare = replace(job, manifest=None, capture=None, networks={})  # type: ignore[arg-type]
 
-    def here(report: Report) -> None:
-        evaluate_capture(job, folder, report)
+    def here(on_progress: OnProgress) -> None:
+        evaluate_capture(job, folder, on_progress)
 
     return EngineJob(
         text=text,

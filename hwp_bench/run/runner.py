@@ -15,28 +15,34 @@ from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.base.text import shown
 from hwp_bench.methods.manifest import MethodManifest
-from hwp_bench.run.facts import RunFacts, read_facts
-from hwp_bench.run.sandbox.confinement import Confinement
-from hwp_bench.run.sandbox.leftovers import remove_odd_files
-from hwp_bench.run.sandbox.supervise import MAX_PROCESSES, Limits, Outcome, Program, run_program
-from hwp_bench.run.surroundings import apart, inherited
-from hwp_bench.run.worker import FAILURE, PREDICTIONS, PROGRESS, RUN
+from hwp_bench.run.output import FAILURE, LOG, PREDICTIONS, PROGRESS, RUN, RunFacts, read_facts
+from hwp_bench.run.sandbox.confinement import (
+    Confinement,
+    plain_environment,
+    sandbox_environment,
+)
+from hwp_bench.run.sandbox.supervise import (
+    MAX_PROCESSES,
+    Limits,
+    Outcome,
+    Program,
+    remove_odd_files,
+    run_confined,
+)
 
 #: Seconds a method may take on one capture unless told otherwise.
 DEFAULT_TIME_LIMIT = 3600.0
-#: What a method printed, inside its output folder.
-LOG = "log.txt"
 
 _REMEDIES = {
     "time": "Raise --time-limit, or give the method a --budget.",
     "memory": "Raise --memory-limit, or make the method smaller.",
-    "processes": "A method must do with fewer.",
+    "processes": "Make the method start fewer.",
 }
 
 
 @dataclass(frozen=True)
 class RunRecord:
-    """What a run left behind."""
+    """The outcome of a run."""
 
     #: Folder of the predicted frames.
     predictions: Path
@@ -44,7 +50,7 @@ class RunRecord:
     facts: RunFacts
     #: Wall time of the whole process, start-up included, seconds.
     wall_seconds: float
-    #: How the process was kept apart: `namespaces`, or `processes` with the reason why not more;
+    #: How the process was isolated: `namespaces`, or `processes` with the reason why not more;
     #: None for submitted predictions.
     isolation: str | None = None
 
@@ -67,11 +73,11 @@ def run_method(
         request: the request folder.
         output: a folder of the run's own; emptied first.
         time_limit: seconds after which the process and its children are killed.
-        confinement: how it is kept apart, and its memory limit; None takes the defaults.
+        confinement: how it is confined, and its memory limit; None takes the defaults.
         on_progress: called with (done, total) steps now and then.
 
     Returns:
-        Where the predictions lie, and what the run took.
+        Where the predictions lie, and the facts of the run.
 
     Raises:
         MethodFailed: it crashed, or ran out of time or memory; the message names the log. Or
@@ -88,14 +94,14 @@ def run_method(
                 remedy=f"Put the frames into {manifest.entry}/{capture_id}/.",
             )
         return RunRecord(folder, RunFacts(), 0.0)
-    wanted = confinement or Confinement()
+    confinement = confinement or Confinement()
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
-    limits = Limits(time_limit, wanted.memory_bytes)
+    limits = Limits(time_limit, confinement.memory_bytes)
     started = time.perf_counter()
-    # Behind walls the working folder is another one, and a relative path would lead nowhere.
-    places = request.absolute(), output.absolute()
-    outcome, isolation = _run(manifest, *places, wanted, limits, on_progress)
+    # In a sandbox the working folder is another one, and a relative path would lead nowhere.
+    folders = request.absolute(), output.absolute()
+    outcome, isolation = _run(manifest, *folders, confinement, limits, on_progress)
     wall = time.perf_counter() - started
     remove_odd_files(output)
     log = output / LOG
@@ -127,26 +133,28 @@ def _run(
     manifest: MethodManifest,
     request: Path,
     output: Path,
-    wanted: Confinement,
+    confinement: Confinement,
     limits: Limits,
     on_progress: Callable[[int, int], None] | None,
 ) -> tuple[Outcome, str]:
-    """Run behind the best walls that are wanted and to be had; says which they were."""
+    """Run in the best sandbox that is asked for and possible; says which it was."""
     command = _command(manifest, request, output)
 
     def poll() -> None:
         if on_progress is not None:
             _show_progress(output / PROGRESS, on_progress)
 
-    if wanted.mode != "none":
-        environment, places = apart(manifest, command, request, output, wanted)
+    if confinement.mode != "none":
+        environment, places = sandbox_environment(
+            manifest.root, command, request, output, confinement
+        )
         walled = Program(command, output, environment, places, output / LOG)
-        outcome = run_program(walled, limits, poll)
+        outcome = run_confined(walled, limits, poll)
         if outcome.refused is None:
             return outcome, "namespaces"
-        if wanted.mode == "required":
+        if confinement.mode == "required":
             raise MethodFailed(
-                f"namespaces are required and not to be had ({outcome.refused})",
+                f"namespaces are required, but the system refuses them ({outcome.refused})",
                 where=manifest.name,
                 field="isolation",
                 remedy="docs/threat-model.md says what they need.",
@@ -154,8 +162,8 @@ def _run(
         isolation = f"processes ({outcome.refused})"
     else:
         isolation = "processes"
-    plain = Program(command, output, inherited(), None, output / LOG)
-    outcome = run_program(plain, limits, poll)
+    plain = Program(command, output, plain_environment(), None, output / LOG)
+    outcome = run_confined(plain, limits, poll)
     if outcome.refused is not None:
         raise MethodFailed(f"could not be started ({outcome.refused})", where=manifest.name)
     return outcome, isolation

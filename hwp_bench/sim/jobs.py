@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hwp_bench.base.errors import HwpError
 from hwp_bench.run.engine import Engine, Job, Needs
-from hwp_bench.run.engine.job import Report
+from hwp_bench.run.engine.job import OnProgress
 from hwp_bench.sim.scene import Scene
 
 #: Seconds between two counts of the frames that wait.
@@ -37,10 +37,10 @@ class RenderCapture:
     #: Whether one that is there is replaced.
     overwrite: bool = False
 
-    def __call__(self, inputs: Mapping[str, Path], output: Path, report: Report) -> None:
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
         """Render; see `hwp_bench.run.engine.job.Work`."""
         ended = threading.Event()
-        watch = threading.Thread(target=self._count, args=(output, report, ended), daemon=True)
+        watch = threading.Thread(target=self._count, args=(output, on_progress, ended), daemon=True)
         watch.start()
         try:
             self.render(output)
@@ -77,11 +77,11 @@ class RenderCapture:
             exr=self.exr,
         )
 
-    def _count(self, output: Path, report: Report, ended: threading.Event) -> None:
+    def _count(self, output: Path, on_progress: OnProgress, ended: threading.Event) -> None:
         """Tell how many frames wait beside the capture to be."""
         total = self.frame_count or self.scene.frame_count
         while not ended.wait(_COUNT_SECONDS):
-            report(sum(1 for _ in output.parent.glob(f".{output.name}.*/*.npz")), total)
+            on_progress(sum(1 for _ in output.parent.glob(f".{output.name}.*/*.npz")), total)
 
 
 def render_job(work: RenderCapture, output: Path, needs: Needs) -> Job:
@@ -95,7 +95,7 @@ def render_job(work: RenderCapture, output: Path, needs: Needs) -> Job:
     return Job(
         text=work.scene.id,
         # In turn, a render shows its own progress.
-        here=lambda report: work.render(output),
+        here=lambda on_progress: work.render(output),
         work=work,
         output=output,
         finished=lambda: work.keep and is_capture(output),

@@ -1,4 +1,4 @@
-"""What a job is, and what an engine does with jobs."""
+"""A job, what an engine does with jobs, and the engine that most runs need: one after another."""
 
 from __future__ import annotations
 
@@ -7,19 +7,21 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-#: Takes (done, total) steps of a job.
-Report = Callable[[int, int], None]
-#: Called when a job begins, with (index, count, text); returns what takes its steps, if anything.
-OnStart = Callable[[int, int, str], Report | None]
+from hwp_bench.base.errors import HwpError
+
+#: Is told (done, total) steps of a job.
+OnProgress = Callable[[int, int], None]
+#: Called when a job begins, with (index, count, text); returns what is told its steps, if anything.
+OnStart = Callable[[int, int, str], OnProgress | None]
 #: Called with the index of a job whose result is in its folder.
 OnDone = Callable[[int], None]
-#: Times that a job is begun anew after its worker was lost.
+#: Times that a job is started again after its worker was lost.
 RETRIES = 3
 
 
 @dataclass(frozen=True)
 class Needs:
-    """What one job takes of a machine."""
+    """The share of a machine that one job takes."""
 
     #: Processors; also the threads that a job is given when several run at once.
     cpus: float = 1.0
@@ -31,7 +33,7 @@ class Needs:
 class Folder:
     """A folder that a job reads."""
 
-    #: Where it lies on the machine that asks for the job.
+    #: Where it lies on the machine that orders the job.
     path: Path
     #: Names directly inside it that the job does not need.
     skip: tuple[str, ...] = ()
@@ -40,13 +42,13 @@ class Folder:
 class Work(Protocol):
     """The work of a job that leaves this process: importable, and small when pickled."""
 
-    def __call__(self, inputs: Mapping[str, Path], output: Path, report: Report) -> None:
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
         """Do the work.
 
         Args:
             inputs: the folders that the job named, where they lie on this machine.
-            output: folder that takes the result; it may hold an earlier start's.
-            report: takes (done, total) steps now and then.
+            output: folder that takes the result; it may hold an earlier attempt's.
+            on_progress: is told (done, total) steps now and then.
 
         Raises:
             HwpError: the work cannot be done; a second try would not help.
@@ -61,16 +63,16 @@ class Job:
     #: What a person is shown.
     text: str
     #: Does the work in this process.
-    here: Callable[[Report], None]
+    here: Callable[[OnProgress], None]
     #: Does the same anywhere else.
     work: Work
     #: Folder of the result.
     output: Path
-    #: Whether the result of this very job is there already.
+    #: Whether the result of exactly this job is there already.
     finished: Callable[[], bool]
     #: Folders that `work` reads, by name.
     inputs: Mapping[str, Folder] = field(default_factory=dict)
-    #: What it takes of a machine.
+    #: The share of a machine that it takes.
     needs: Needs = field(default_factory=Needs)
 
 
@@ -97,3 +99,59 @@ class Engine(Protocol):
                 are finished first.
         """
         ...
+
+
+class LocalEngine:
+    """Runs jobs one after another in this process; each has the whole machine."""
+
+    in_turn = True
+
+    def __enter__(self) -> LocalEngine:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
+        """Run jobs; see `Engine.run`."""
+        for index, job in enumerate(jobs):
+            on_progress = on_start(index, len(jobs), job.text) if on_start else None
+            job.here(on_progress or ignore)
+            on_done(index)
+
+
+def ignore(done: int, total: int) -> None:
+    """Be told the steps of a job that nobody watches."""
+
+
+class Failures:
+    """Collects the errors of jobs, so that all are tried before the first is raised."""
+
+    def __init__(self) -> None:
+        self._errors: list[HwpError] = []
+
+    def add(self, error: HwpError) -> None:
+        """Note an error."""
+        self._errors.append(error)
+
+    def raise_first(self, count: int) -> None:
+        """Raise the first error, if any, saying how many of `count` jobs failed."""
+        if not self._errors:
+            return
+        first = self._errors[0]
+        if len(self._errors) == 1:
+            raise first
+        raise type(first)(
+            f"{first.problem} (the first of {len(self._errors)} failures in {count} jobs)",
+            where=first.where,
+            field=first.field,
+            remedy=first.remedy,
+        ) from first
+
+
+def lost(text: str, retries: int, reason: str) -> HwpError:
+    """Return the error of a job that lost its worker too often."""
+    return HwpError(
+        f"the worker of the job {text!r} was lost {retries + 1} times ({reason})",
+        remedy="Is there enough memory? Start again with the same arguments: finished jobs stay.",
+    )

@@ -53,9 +53,9 @@ def engine_for(args: argparse.Namespace) -> Engine:
     kind, separator, address = args.engine.partition("://")
     if kind not in ("local", "ray") or (separator and (kind == "local" or not address)):
         raise UsageError(
-            f"{args.engine!r} is no engine",
+            f"{args.engine!r} is not an engine",
             field="--engine",
-            remedy="There are local, ray, and ray://HOST:PORT.",
+            remedy="Use local, ray, or ray://HOST:PORT.",
         )
     if not 1 <= args.jobs <= 1024:
         raise UsageError(f"{args.jobs} is not between 1 and 1024", field="--jobs")
@@ -66,7 +66,7 @@ def engine_for(args: argparse.Namespace) -> Engine:
     if kind == "ray":
         if args.jobs != 1:
             raise UsageError(
-                "is for --engine local",
+                "works only with --engine local",
                 field="--jobs",
                 remedy="On a cluster --job-cpus and --job-gpus say how many jobs a node takes.",
             )
@@ -82,7 +82,7 @@ def engine_for(args: argparse.Namespace) -> Engine:
         from hwp_bench.run.engine.view import JobsView
 
         return ParallelEngine(args.jobs, JobsView())
-    from hwp_bench.run.engine.local import LocalEngine
+    from hwp_bench.run.engine.job import LocalEngine
 
     return LocalEngine()
 

@@ -2,26 +2,33 @@
 
 from __future__ import annotations
 
+import math
+import os
 import queue
 import threading
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 
-from hwp_bench.base.errors import HwpError
-from hwp_bench.run.engine.devices import shares, visible_gpus
-from hwp_bench.run.engine.failures import Failures, lost
-from hwp_bench.run.engine.job import RETRIES, Job, Needs, OnDone, OnStart
-from hwp_bench.run.engine.process import Errand, WorkerLost, run_errand, thread_environment
+from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.run.engine.job import RETRIES, Failures, Job, Needs, OnDone, OnStart, lost
+from hwp_bench.run.engine.process import (
+    VISIBLE_GPUS,
+    LocalJob,
+    WorkerLost,
+    run_in_process,
+    thread_environment,
+)
 from hwp_bench.run.engine.view import JobsView, NoView
 
 
 class ParallelEngine:
-    """Runs up to `at_once` jobs at once; a job whose process is killed is begun anew.
+    """Runs up to `at_once` jobs at once; a job whose process is killed is started again.
 
     Args:
         at_once: how many jobs run at once.
         view: shows the jobs; nothing if None.
-        retries: times that a job is begun anew.
+        retries: times that a job is started again.
     """
 
     in_turn = False
@@ -41,7 +48,7 @@ class ParallelEngine:
 
     def run(self, jobs: Sequence[Job], on_done: OnDone, on_start: OnStart | None = None) -> None:
         """Run jobs; see `Engine.run`."""
-        # Asked for before anything runs: whoever wants too many GPUs is told at once.
+        # Before anything runs: whoever asks for too many GPUs is told at once.
         visible = visible_gpus()
         needs = max((job.needs for job in jobs), key=lambda item: item.gpus, default=Needs())
         places: queue.SimpleQueue[tuple[int, dict[str, str]]] = queue.SimpleQueue()
@@ -85,7 +92,7 @@ class ParallelEngine:
     ) -> None:
         if job.finished():
             return
-        errand = Errand(
+        local = LocalJob(
             job.work,
             {name: folder.path.absolute() for name, folder in job.inputs.items()},
             job.output.absolute(),
@@ -94,8 +101,8 @@ class ParallelEngine:
         for attempt in range(self._retries + 1):
             self._view.start(index, job.text, f"place {place}")
             try:
-                run_errand(
-                    errand, lambda done, total: self._view.steps(index, done, total), stop.is_set
+                run_in_process(
+                    local, lambda done, total: self._view.steps(index, done, total), stop.is_set
                 )
                 return
             except WorkerLost as error:
@@ -112,3 +119,43 @@ def _next(
             return ended.get(timeout=1.0)
         except queue.Empty:
             continue
+
+
+def visible_gpus() -> list[str]:
+    """Return the GPUs that this process may use, as `CUDA_VISIBLE_DEVICES` names them."""
+    if VISIBLE_GPUS in os.environ:
+        return [name.strip() for name in os.environ[VISIBLE_GPUS].split(",") if name.strip()]
+    # The driver's own list; asking it costs no import of a GPU library.
+    cards = Path("/proc/driver/nvidia/gpus")
+    return [str(number) for number, _ in enumerate(cards.iterdir())] if cards.is_dir() else []
+
+
+def shares(jobs: int, needs: Needs, gpus: list[str]) -> list[dict[str, str]]:
+    """Divide GPUs among jobs that run at once.
+
+    Args:
+        jobs: how many run at once.
+        needs: of each job; below one GPU several jobs share one, above one it is rounded up.
+        gpus: the GPUs that there are.
+
+    Returns:
+        Environment variables for each place in the row of jobs; empty where no GPU is asked for,
+        and the job then sees what this process sees.
+
+    Raises:
+        UsageError: there are too few.
+    """
+    if needs.gpus == 0:
+        return [{} for _ in range(jobs)]
+    each = 1 if needs.gpus <= 1 else math.ceil(needs.gpus)
+    sharing = max(1, int(1 / needs.gpus + 1e-9))
+    needed = math.ceil(jobs / sharing) * each
+    if needed > len(gpus):
+        raise UsageError(
+            f"{jobs} jobs of {needs.gpus:g} GPUs at once need {needed} GPUs, and there are "
+            f"{len(gpus)}",
+            field="--jobs",
+            remedy="Run fewer at once, or give each a fraction of a GPU with --job-gpus.",
+        )
+    first = [slot // sharing * each for slot in range(jobs)]
+    return [{VISIBLE_GPUS: ",".join(gpus[start : start + each])} for start in first]

@@ -1,4 +1,4 @@
-"""Folders on the way between machines: one spelling, one digest, nothing outside the folder."""
+"""Folders on the way between machines: one format, one digest, nothing outside the folder."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def folder_digest(root: Path, skip: Sequence[str] = ()) -> str:
         skip: names directly inside it that do not count.
 
     Raises:
-        BadInput: it is no folder, or holds a link, something that is no file, or too much.
+        BadInput: it is not a folder, or it holds a link, something that is not a file, or too much.
     """
     total = hashlib.sha256()
     for name, path in _entries(root, skip):
@@ -101,7 +101,7 @@ def unpack(parcel: Parcel, target: Path, *, replace: bool = False) -> None:
             os.chmod(temporary, 0o755)
             _extract(parcel.data, temporary)
             if folder_digest(temporary) != parcel.digest:
-                raise BadInput("arrived damaged: its digest is another", where=target)
+                raise BadInput("arrived damaged: its digest is different", where=target)
             _swap(temporary, target, replace)
         finally:
             shutil.rmtree(temporary, ignore_errors=True)
@@ -120,7 +120,7 @@ def _swap(temporary: Path, target: Path, replace: bool) -> None:
     try:
         os.rename(temporary, target)
     except OSError:
-        # Another process brought the same folder first.
+        # Another process made the same folder first.
         if replace or not target.is_dir():
             raise
     shutil.rmtree(retired, ignore_errors=True)
@@ -151,7 +151,7 @@ def _extract(data: bytes, root: Path) -> None:
 def _entries(root: Path, skip: Sequence[str]) -> Iterator[tuple[str, Path]]:
     """Yield (name, path) of every folder and file, in one order."""
     if not root.is_dir():
-        raise BadInput("is no folder", where=root)
+        raise BadInput("is not a folder", where=root)
     found: list[tuple[str, Path]] = []
     size = 0
     for folder, folders, files in os.walk(root, onerror=_refuse):
@@ -163,7 +163,7 @@ def _entries(root: Path, skip: Sequence[str]) -> Iterator[tuple[str, Path]]:
             facts = path.lstat()
             if not (stat.S_ISREG(facts.st_mode) or stat.S_ISDIR(facts.st_mode)):
                 raise BadInput(
-                    "is a link or no file, and such are not sent to other machines",
+                    "is a link or not a plain file, and is not sent to other machines",
                     where=path,
                     remedy="Put a copy of the file in its place.",
                 )

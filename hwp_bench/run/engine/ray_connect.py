@@ -36,7 +36,7 @@ def import_ray() -> Any:
     Raises:
         MissingDependency: it is not installed.
     """
-    # Nothing about a run is told to others.
+    # No statistics about a run are sent to anybody.
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     try:
         import ray
@@ -56,7 +56,7 @@ def head_address(address: str | None) -> str | None:
         address: what came after `ray://`; None takes the variable RAY_ADDRESS, if it is set.
 
     Raises:
-        UsageError: it is no address.
+        UsageError: it is not an address.
     """
     text = os.environ.get("RAY_ADDRESS", "") if address is None else address
     if address is None and text in ("", "auto", "local"):
@@ -82,7 +82,7 @@ def check_head(address: str) -> None:
     except OSError as error:
         reason = error.strerror or str(error) or type(error).__name__
         raise HwpError(
-            f"no Ray head at {address} ({reason})", field="--engine", remedy=_REMEDY
+            f"there is no Ray head at {address} ({reason})", field="--engine", remedy=_REMEDY
         ) from error
     try:
         done = subprocess.run(

@@ -1,4 +1,4 @@
-"""Jobs on a Ray cluster: Ray schedules them and begins them anew when a worker is lost."""
+"""Jobs on a Ray cluster: Ray schedules them and starts them again when a worker is lost."""
 
 from __future__ import annotations
 
@@ -7,17 +7,25 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hwp_bench.base.errors import HwpError
-from hwp_bench.run.engine.failures import Failures, lost, parse_error
-from hwp_bench.run.engine.job import RETRIES, Folder, Job, Needs, OnDone, OnStart
+from hwp_bench.run.engine.job import (
+    RETRIES,
+    Failures,
+    Folder,
+    Job,
+    Needs,
+    OnDone,
+    OnStart,
+    lost,
+)
 from hwp_bench.run.engine.parcel import folder_digest, pack, unpack
-from hwp_bench.run.engine.process import thread_environment
+from hwp_bench.run.engine.process import parse_error, thread_environment
 from hwp_bench.run.engine.ray_connect import connected, head_address
 from hwp_bench.run.engine.ray_task import Board, Input, Order, Reply, run_order, toolkit_digest
 from hwp_bench.run.engine.view import JobsView, NoView
 
-#: Seconds between two looks at the jobs.
+#: Seconds between two checks of the jobs.
 LOOK_SECONDS = 0.5
-#: Seconds that jobs may take to stop when they are not wanted any more.
+#: Seconds that jobs may take to stop when their results are no longer needed.
 STOP_SECONDS = 20.0
 
 
@@ -30,10 +38,10 @@ class RayEngine:
         view: shows the jobs; nothing if None.
         shared: whether nodes may look for inputs at their place here, and take them if the
             content is the same. Inputs that are not found are sent.
-        retries: times that a job is begun anew after its worker or node was lost.
+        retries: times that a job is started again after its worker or node was lost.
 
     Raises:
-        UsageError: the address is none.
+        UsageError: the address is not HOST:PORT.
         MissingDependency: on entering, Ray is not installed.
         HwpError: on entering, there is no such cluster.
     """
@@ -96,7 +104,7 @@ class _Run:
         self._numbers: dict[int, int] = {}
         self._places: dict[int, str] = {}
         self._board = self._start_board()
-        self._picture: Any = None
+        self._news: Any = None
 
     def all(self) -> None:
         failures = Failures()
@@ -159,7 +167,7 @@ class _Run:
             )
             for name, folder in job.inputs.items()
         }
-        # Ray begins an order anew by itself; a new number is an order that it never had.
+        # Ray starts an order again by itself; a new number is an order that it never had.
         number = self._orders
         self._orders += 1
         self._numbers[index] = number
@@ -195,23 +203,23 @@ class _Run:
     def _start_board(self) -> Any:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        # Where the jobs are ordered from, so that no lost node takes it along.
+        # On the node that orders the jobs, so that no lost node takes it along.
         here = self._ray.get_runtime_context().get_node_id()
         place = NodeAffinitySchedulingStrategy(here, soft=True)
         return self._ray.remote(Board).options(num_cpus=0, scheduling_strategy=place).remote()
 
     def _show(self) -> None:
-        # Asked for now, looked at when it is there: jobs do not wait for their picture.
-        if self._picture is None:
-            self._picture = self._board.read.remote()
-        ready, _ = self._ray.wait([self._picture], timeout=0)
+        # Asked for now, read when it is there: jobs do not wait for the news.
+        if self._news is None:
+            self._news = self._board.read.remote()
+        ready, _ = self._ray.wait([self._news], timeout=0)
         if not ready:
             return
         try:
-            last: Mapping[int, tuple[str, int, int]] = self._ray.get(self._picture)
+            last: Mapping[int, tuple[str, int, int]] = self._ray.get(self._news)
         except self._ray.exceptions.RayError:
             last = {}
-        self._picture = self._board.read.remote()
+        self._news = self._board.read.remote()
         for index in self._pending.values():
             place, done, total = last.get(self._numbers[index], ("", 0, 0))
             if place and self._places.get(index) != place:
@@ -231,7 +239,7 @@ class _Run:
                 )
 
     def _cancel(self) -> None:
-        """Stop what still runs, so that no method goes on without anyone to take its result."""
+        """Stop what still runs, so that no method goes on when nobody takes its result."""
         pending = list(self._pending)
         for reference in pending:
             self._ray.cancel(reference)

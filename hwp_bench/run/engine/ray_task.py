@@ -1,4 +1,4 @@
-"""What runs on a node of a Ray cluster: find the inputs, do the job, send the result."""
+"""The part that runs on a node of a Ray cluster: find the inputs, do the job, send the result."""
 
 from __future__ import annotations
 
@@ -14,13 +14,17 @@ from typing import Any
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import cache_root, files_digest
 from hwp_bench.base.packages import PACKAGES
-from hwp_bench.run.engine.devices import VISIBLE
-from hwp_bench.run.engine.failures import error_record
 from hwp_bench.run.engine.job import RETRIES, Work
 from hwp_bench.run.engine.parcel import Parcel, folder_digest, pack, unpack
-from hwp_bench.run.engine.process import Errand, WorkerLost, run_errand
+from hwp_bench.run.engine.process import (
+    VISIBLE_GPUS,
+    LocalJob,
+    WorkerLost,
+    error_record,
+    run_in_process,
+)
 
-#: Packages beside each other whose source decides what a job does.
+#: Packages and folders whose source decides what a job does.
 SOURCES = ("hwp_bench", "wildghand", "baselines")
 #: Endings of that source: programs, settings, and the free hand.
 SUFFIXES = {".py", ".toml", ".npz"}
@@ -32,7 +36,7 @@ class Input:
 
     #: Digest of its content.
     digest: str
-    #: Where it lies for whoever asks; None where nodes must not look there.
+    #: Where it lies on the machine that orders; None where nodes must not look there.
     path: str | None
     #: Names directly inside it that do not count.
     skip: tuple[str, ...] = ()
@@ -42,7 +46,7 @@ class Input:
 class Order:
     """A job on its way to a node."""
 
-    #: Number of this order; a job that is ordered again gets another.
+    #: Number of this order; a job that is ordered again gets a new one.
     number: int
     #: What to do.
     work: Work
@@ -58,7 +62,7 @@ class Order:
 
 @dataclass(frozen=True)
 class Reply:
-    """What comes back: a result, or inputs that are not there, or an error."""
+    """The answer of a node: a result, or the names of missing inputs, or an error."""
 
     #: The result folder.
     result: Parcel | None = None
@@ -117,16 +121,16 @@ def _find_inputs(
 
     found: dict[str, Path] = {}
     missing = []
-    for name, wanted in order.inputs.items():
-        cached = cache_root() / "engine" / "inputs" / wanted.digest
+    for name, ordered in order.inputs.items():
+        cached = cache_root() / "engine" / "inputs" / ordered.digest
         if cached.is_dir():
             found[name] = cached
-        elif _is_shared(wanted):
-            found[name] = Path(str(wanted.path))
+        elif _is_shared(ordered):
+            found[name] = Path(str(ordered.path))
         elif name in sent:
             parcel = ray.get(sent[name][0])
-            if parcel.digest != wanted.digest:
-                raise BadInput("another folder was sent than was ordered", field=name)
+            if parcel.digest != ordered.digest:
+                raise BadInput("another folder was sent than the one that was ordered", field=name)
             unpack(parcel, cached)
             found[name] = cached
         else:
@@ -134,12 +138,12 @@ def _find_inputs(
     return found, tuple(missing)
 
 
-def _is_shared(wanted: Input) -> bool:
+def _is_shared(ordered: Input) -> bool:
     """Whether the folder lies at the same place here, on a file system that nodes share."""
-    if wanted.path is None or not Path(wanted.path).is_dir():
+    if ordered.path is None or not Path(ordered.path).is_dir():
         return False
     try:
-        return folder_digest(Path(wanted.path), wanted.skip) == wanted.digest
+        return folder_digest(Path(ordered.path), ordered.skip) == ordered.digest
     except HwpError:
         return False
 
@@ -147,26 +151,26 @@ def _is_shared(wanted: Input) -> bool:
 def _run(order: Order, inputs: Mapping[str, Path], tell: Any) -> Parcel:
     environment = dict(order.environment)
     if not order.gpus:
-        environment[VISIBLE] = ""
+        environment[VISIBLE_GPUS] = ""
     with tempfile.TemporaryDirectory(prefix="hwp-engine-") as name:
         scratch = Path(name)
         output = scratch / "result"
-        errand = Errand(order.work, inputs, output, environment, (scratch,))
+        job = LocalJob(order.work, inputs, output, environment, (scratch,))
         for attempt in range(RETRIES + 1):
             with contextlib.suppress(WorkerLost):
-                run_errand(errand, tell, lambda: False)
+                run_in_process(job, tell, lambda: False)
                 break
             if attempt == RETRIES:
                 raise HwpError(
                     f"the process of a job was killed {RETRIES + 1} times",
                     where=socket.gethostname(),
-                    remedy="Is the memory enough? Ask for more processors with --job-cpus.",
+                    remedy="Is there enough memory? Ask for more processors with --job-cpus.",
                 )
         return pack(output)
 
 
 class Board:
-    """What every order has said of itself last; lives on the node that gave the orders."""
+    """The last news of every order; lives on the node that gave the orders."""
 
     def __init__(self) -> None:
         self._last: dict[int, tuple[str, int, int]] = {}

@@ -1,4 +1,4 @@
-"""All jobs in one view on standard error: what runs where, how far it is, what has ended."""
+"""All jobs in one view on standard error: which run where, how far they are, which have ended."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class _Line:
 
 
 class JobsView(TerminalBar):
-    """A bar for all jobs and one for each that runs; elsewhere than on a terminal, lines.
+    """A bar for all jobs and one for each that runs; lines of text where there is no terminal.
 
     A context manager. `begin` says how many jobs there are; then every job is told of by its
     index, from any thread.
@@ -48,7 +48,7 @@ class JobsView(TerminalBar):
             self._all = self._bar.add_task("jobs", total=count)
 
     def start(self, index: int, text: str, place: str) -> None:
-        """Say that a job begins at a place, or begins anew at another."""
+        """Say that a job begins at a place, or begins again at another."""
         again = index in self._lines
         self.drop(index)
         line = _Line(f"{text}, on {place}")
@@ -80,7 +80,7 @@ class JobsView(TerminalBar):
             self._bar.update(self._all, completed=self._ended)
 
     def say(self, text: str) -> None:
-        """Tell a person something beside the jobs."""
+        """Tell a person something about the jobs."""
         self._say(text)
 
     def _say(self, text: str) -> None:
@@ -90,7 +90,7 @@ class JobsView(TerminalBar):
             self._bar.console.print(text, markup=False, highlight=False)
 
     def drop(self, index: int) -> None:
-        """Take a job out of the picture that has not begun after all."""
+        """Take a job out of the view that has not begun after all."""
         line = self._lines.pop(index, None)
         if line is not None and line.task is not None and self._bar is not None:
             self._bar.remove_task(line.task)

@@ -1,5 +1,6 @@
-"""Run a stranger's program: without network, away from other files, with limits, to the last child.
+"""Run an untrusted program: without network, away from other files, with limits, to the last child.
 
-`confinement` says what is wanted, `places` what the program may see, `supervise` starts it and
-watches it. `launch` runs in between, in a process of its own, and imports nothing heavy.
+`confinement` says how far it is confined and what it finds; `supervise` starts and watches it.
+`launch` runs in between, in a process of its own that imports nothing heavy; `root` and `syscalls`
+build the walls.
 """

@@ -1,8 +1,8 @@
-"""The process between the toolkit and a stranger's program: builds its walls, then waits for it.
+"""The process between the toolkit and an untrusted program: builds the sandbox, then waits.
 
-It is started with a bare interpreter (`-I -S`) for its speed. Its order comes as JSON on standard
-input, so that the program finds nothing of it; its report goes to a descriptor that the program
-does not inherit.
+A bare interpreter (`-I -S`) runs it, for speed, so it imports nothing heavy. Its order comes as
+JSON on standard input, so that the program finds nothing of it; its report goes to a descriptor
+that the program does not inherit.
 """
 
 from __future__ import annotations
@@ -13,10 +13,10 @@ import os
 import resource
 import signal
 import sys
+import time
 from typing import Any, NoReturn
 
 from hwp_bench.run.sandbox import syscalls
-from hwp_bench.run.sandbox.offspring import end_descendants
 from hwp_bench.run.sandbox.root import enter_root, raise_loopback
 
 _NAMESPACES = (
@@ -26,6 +26,8 @@ _NAMESPACES = (
     | syscalls.CLONE_NEWNET
     | syscalls.CLONE_NEWIPC
 )
+# Most seconds that are spent on ending descendants; a storm of forks could go on for ever.
+_PATIENCE = 5.0
 
 
 def main(report: int) -> None:
@@ -44,17 +46,17 @@ def main(report: int) -> None:
     os.dup2(silence, 0)
     os.close(silence)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
-    _volunteer()
+    _offer_to_oom_killer()
     try:
-        run = _run_apart if order["places"] is not None else _run_watched
+        run = _run_in_namespaces if order["places"] is not None else _run_watched
         answer = run(order)
     except OSError as error:
         answer = {"stage": "sandbox", "problem": str(error.args[-1])}
     os.write(report, json.dumps(answer).encode())
 
 
-def _volunteer() -> None:
-    """Where memory runs out altogether, the kernel should end the method, not the toolkit."""
+def _offer_to_oom_killer() -> None:
+    """Have the kernel end the method first, not the toolkit, when the machine's memory runs out."""
     with contextlib.suppress(OSError), open("/proc/self/oom_score_adj", "w") as stream:
         stream.write("1000")
 
@@ -69,24 +71,24 @@ def _run_watched(order: dict[str, Any]) -> dict[str, Any]:
     # Set before the child exists: its end must never be a question of timing.
     signal.signal(signal.SIGTERM, _end_all)
     if os.getppid() != order["parent"]:
-        raise OSError("whoever asked for the run is gone")
+        raise OSError("the process that asked for the run is gone")
     child, problem = _start(order)
     if problem:
         return {"stage": "command", "problem": problem}
     status = _wait(child)
     if linux:
-        end_descendants()
+        _end_descendants()
     return {"status": status}
 
 
 def _end_all(*_: object) -> NoReturn:
     signal.signal(signal.SIGTERM, signal.SIG_IGN)
     if sys.platform == "linux":
-        end_descendants()
+        _end_descendants()
     os._exit(1)
 
 
-def _run_apart(order: dict[str, Any]) -> dict[str, Any]:
+def _run_in_namespaces(order: dict[str, Any]) -> dict[str, Any]:
     """Run the command in namespaces of its own; the kernel ends them with their first process."""
     user, group = os.getuid(), os.getgid()
     syscalls.unshare(_NAMESPACES)
@@ -99,7 +101,7 @@ def _run_apart(order: dict[str, Any]) -> dict[str, Any]:
             table.write(text)
     syscalls.die_with_parent(signal.SIGKILL)
     if os.getppid() != order["parent"]:
-        raise OSError("whoever asked for the run is gone")
+        raise OSError("the process that asked for the run is gone")
     go_read, go_write = os.pipe()
     answer_read, answer_write = os.pipe()
     first = os.fork()
@@ -117,7 +119,7 @@ def _run_apart(order: dict[str, Any]) -> dict[str, Any]:
 
 
 def _be_first(order: dict[str, Any], go: int, answer: int) -> NoReturn:
-    """What the first process of the new process namespace does; never returns."""
+    """Do the work of the first process of the new process namespace; never returns."""
     result: dict[str, Any] = {"stage": "sandbox", "problem": "failed"}
     try:
         syscalls.die_with_parent(signal.SIGKILL)
@@ -143,7 +145,7 @@ def _be_first(order: dict[str, Any], go: int, answer: int) -> NoReturn:
 
 
 def _start(order: dict[str, Any]) -> tuple[int, str]:
-    """Start the command; returns its process id, and what is wrong where it cannot be started."""
+    """Start the command; returns its process id, and the problem where it cannot be started."""
     read, write = os.pipe()
     child = os.fork()
     if child == 0:
@@ -166,8 +168,43 @@ def _start(order: dict[str, Any]) -> tuple[int, str]:
 
 
 def _wait(child: int) -> int:
-    """Wait for one child, and bury the orphans that end meanwhile."""
+    """Wait for one child, and collect the orphans that end meanwhile."""
     while True:
         process, status = os.waitpid(-1, 0)
         if process == child:
             return os.waitstatus_to_exitcode(status)
+
+
+def _end_descendants() -> None:
+    """Kill children and their children until none is left.
+
+    The process must have adopted its orphans, or those are out of reach.
+    """
+    deadline = time.monotonic() + _PATIENCE
+    while time.monotonic() < deadline:
+        family = _descendants(os.getpid())
+        for process in family:
+            with contextlib.suppress(ProcessLookupError, PermissionError):
+                os.kill(process, signal.SIGKILL)
+        try:
+            while os.waitpid(-1, os.WNOHANG)[0]:
+                pass
+        except ChildProcessError:
+            return
+        time.sleep(0.005)
+
+
+def _descendants(root: int) -> list[int]:
+    children: dict[int, list[int]] = {}
+    for name in os.listdir("/proc"):
+        if name.isdigit():
+            with contextlib.suppress(OSError, ValueError, IndexError):
+                with open(f"/proc/{name}/stat", "rb") as stream:
+                    # The name in brackets may hold anything; the parent is two words after it.
+                    parent = int(stream.read().rpartition(b")")[2].split()[1])
+                children.setdefault(parent, []).append(int(name))
+    found, new = [], [root]
+    while new:
+        new = [child for parent in new for child in children.get(parent, [])]
+        found += new
+    return found

@@ -1,4 +1,4 @@
-"""Start a stranger's program behind its walls, watch its time and memory, and end all of it."""
+"""Start an untrusted program in its sandbox, watch its time and memory, and end all of it."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import signal
+import stat
 import subprocess
 import sys
 import threading
@@ -13,12 +14,14 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from hwp_bench.base.errors import MethodFailed
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.run.sandbox.root import Place
-from hwp_bench.run.sandbox.usage import memory_of, processes_of
+
+if TYPE_CHECKING:
+    import psutil
 
 #: Bytes of a program's output that are kept; the rest is counted and thrown away.
 MAX_LOG_BYTES = 1024 * 1024
@@ -35,15 +38,15 @@ _LAUNCH = (
 
 @dataclass(frozen=True)
 class Program:
-    """What is run, and where."""
+    """An untrusted program: what is run, and where."""
 
-    #: Its words.
+    #: The words of its command.
     command: Sequence[str]
     #: Its working folder.
     folder: Path
-    #: Everything that it finds in its environment.
+    #: All its environment variables.
     environment: Mapping[str, str]
-    #: What it sees of the file system; None starts it without namespaces.
+    #: The places of the file system that it sees; None starts it without namespaces.
     places: Sequence[Place] | None
     #: File that takes what it prints.
     log: Path
@@ -71,7 +74,7 @@ class Outcome:
     refused: str | None = None
 
 
-def run_program(
+def run_confined(
     program: Program, limits: Limits, on_poll: Callable[[], None] | None = None
 ) -> Outcome:
     """Run a program to its end; whatever ends it, no process of it is left.
@@ -125,6 +128,21 @@ def run_program(
     return Outcome(answer["status"])
 
 
+def remove_odd_files(folder: Path) -> None:
+    """Remove links, pipes, sockets and devices from a folder and all folders in it.
+
+    A link that leads nowhere inside a sandbox leads to real files outside it: the toolkit would
+    read a test frame for a prediction. To be called when no process of the program is left.
+    """
+    for root, folders, files in os.walk(folder, followlinks=False):
+        for name in (*folders, *files):
+            path = os.path.join(root, name)
+            with contextlib.suppress(OSError):
+                mode = os.lstat(path).st_mode
+                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+                    os.unlink(path)
+
+
 def _order(program: Program) -> bytes:
     order = {
         "command": list(program.command),
@@ -148,10 +166,10 @@ def _watch(
             return "time"
         if now >= measure:
             measure = now + _MEASURE_SECONDS
-            family = processes_of(process.pid)
+            family = _processes_of(process.pid)
             if len(family) > MAX_PROCESSES:
                 return "processes"
-            if memory_of(family, limits.memory) > limits.memory:
+            if _memory_of(family, limits.memory) > limits.memory:
                 return "memory"
             if on_poll is not None:
                 on_poll()
@@ -183,3 +201,38 @@ def _drain(stream: IO[bytes], log: Path) -> None:
             dropped += len(chunk) - len(part)
         if dropped:
             target.write(f"\n[{dropped} further bytes were not kept]\n".encode())
+
+
+def _processes_of(root: int) -> list[psutil.Process]:
+    """Return the running descendants of a process, as far as the system shows them."""
+    import psutil
+
+    with contextlib.suppress(psutil.Error):
+        return psutil.Process(root).children(recursive=True)
+    return []
+
+
+def _memory_of(processes: Sequence[psutil.Process], enough: int) -> int:
+    """Return the memory of some processes together, bytes.
+
+    What they share is counted once. That is slow to find out, so it is looked at only where the
+    plain sum, which is never smaller, lies above `enough`.
+    """
+    total = sum(_resident(process) for process in processes)
+    return total if total <= enough else sum(_proportional(process) for process in processes)
+
+
+def _resident(process: psutil.Process) -> int:
+    import psutil
+
+    with contextlib.suppress(psutil.Error):
+        return process.memory_info().rss
+    return 0
+
+
+def _proportional(process: psutil.Process) -> int:
+    import psutil
+
+    with contextlib.suppress(psutil.Error, AttributeError):
+        return process.memory_full_info().pss
+    return _resident(process)

@@ -300,7 +300,7 @@ def test_a_system_that_refuses_is_named_and_the_run_goes_on(
 ) -> None:
     # A place of no known source cannot be bound: the same path as a refusing kernel takes.
     monkeypatch.setattr(
-        "hwp_bench.run.surroundings.visible_places",
+        "hwp_bench.run.sandbox.confinement.visible_places",
         lambda **_: [("read", "/no/such/place", "")],
     )
     method = read_manifest(_method(tmp_path / "method", ""))
@@ -308,7 +308,7 @@ def test_a_system_that_refuses_is_named_and_the_run_goes_on(
     record = run_method(*places)
     assert record.isolation is not None
     assert record.isolation.startswith("processes (")
-    with pytest.raises(MethodFailed, match="namespaces are required and not to be had"):
+    with pytest.raises(MethodFailed, match="namespaces are required, but the system refuses them"):
         run_method(*places, confinement=Confinement("required"))
 
 

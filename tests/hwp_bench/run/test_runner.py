@@ -15,9 +15,9 @@ from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
 from hwp_bench.methods.predictions import read_prediction
 from hwp_bench.methods.request import write_request
-from hwp_bench.run.clock import ReportClock, schedule
 from hwp_bench.run.runner import run_method
 from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
+from hwp_bench.run.worker import ReportClock, schedule
 
 PYTHON = """
 import numpy as np

@@ -11,8 +11,7 @@ from engine_jobs import Told, Write, write_job
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
-from hwp_bench.run.engine.devices import shares
-from hwp_bench.run.engine.parallel import ParallelEngine
+from hwp_bench.run.engine.parallel import ParallelEngine, shares
 
 
 def texts(folder: Path) -> dict[str, str]:
@@ -109,7 +108,9 @@ def test_a_stop_ends_the_jobs_and_leaves_what_was_finished(tmp_path: Path) -> No
         ParallelEngine(2).run(jobs, stop)
     assert set(texts(tmp_path)) == {"quick"}
     left = [child.cmdline() for child in psutil.Process().children(recursive=True)]
-    assert not [words for words in left if "hwp_bench.run.engine.worker" in words]
+    assert not [
+        words for words in left if any("hwp_bench.run.engine.process" in word for word in words)
+    ]
 
 
 def test_gpus_are_divided_or_refused() -> None:

@@ -18,13 +18,13 @@ from hwp_bench.run.engine import ray_connect
 @pytest.mark.parametrize(
     ("words", "problem"),
     [
-        (["--engine", "slurm"], "'slurm' is no engine"),
-        (["--engine", "ray://"], "'ray://' is no engine"),
-        (["--engine", "local://x"], "is no engine"),
+        (["--engine", "slurm"], "'slurm' is not an engine"),
+        (["--engine", "ray://"], "'ray://' is not an engine"),
+        (["--engine", "local://x"], "is not an engine"),
         (["--jobs", "0"], "--jobs: 0 is not between"),
         (["--job-cpus", "0"], "--job-cpus"),
         (["--job-gpus", "nan"], "--job-gpus"),
-        (["--engine", "ray", "--jobs", "2"], "--jobs: is for --engine local"),
+        (["--engine", "ray", "--jobs", "2"], "--jobs: works only with --engine local"),
     ],
 )
 @pytest.mark.parametrize(
@@ -66,9 +66,11 @@ def test_what_is_no_address_is_refused(text: str) -> None:
 
 
 def test_nobody_at_the_address_is_said_in_bounded_time(monkeypatch) -> None:
-    with pytest.raises(HwpError, match=r"no Ray head at 127\.0\.0\.1:1 \(Connection refused\)"):
+    with pytest.raises(
+        HwpError, match=r"there is no Ray head at 127\.0\.0\.1:1 \(Connection refused\)"
+    ):
         ray_connect.check_head("127.0.0.1:1")
-    with pytest.raises(HwpError, match=r"no Ray head at nowhere\.invalid:6379"):
+    with pytest.raises(HwpError, match=r"there is no Ray head at nowhere\.invalid:6379"):
         ray_connect.check_head("nowhere.invalid:6379")
     # Somebody listens who is no Ray head.
     monkeypatch.setattr(ray_connect, "ANSWER_SECONDS", 2.0)

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.run.sandbox.confinement import Confinement
-from hwp_bench.run.sandbox.places import visible_places
+from hwp_bench.run.sandbox.confinement import Confinement, visible_places
 
 
 def test_outer_places_come_first_and_the_deeper_rule_wins(tmp_path: Path) -> None:

@@ -1,4 +1,7 @@
-"""What a run says of itself in `run.json`; the worker writes it, and a command may."""
+"""The output folder of a run: the names in it, and the facts that `run.json` holds.
+
+The worker writes it for a Python method; a command may write the same files.
+"""
 
 from __future__ import annotations
 
@@ -8,6 +11,20 @@ from pathlib import Path
 from hwp_bench.base.files import read_json
 from hwp_bench.base.records import parse_record
 
+#: Folder of the predicted test frames inside the output folder.
+PREDICTIONS = "predictions"
+#: Folder of the validation frames of each checkpoint inside the output folder.
+CHECKPOINTS = "checkpoints"
+#: Folder of files that a method writes about itself, for pictures and tables; optional.
+DIAGNOSTICS = "diagnostics"
+#: Time, steps and memory of the run.
+RUN = "run.json"
+#: How far the fit is.
+PROGRESS = "progress.json"
+#: Why the run failed.
+FAILURE = "failure.json"
+#: What the method printed.
+LOG = "log.txt"
 #: Largest `run.json` that is read, bytes.
 MAX_BYTES = 10 * 1024 * 1024
 
@@ -26,7 +43,7 @@ class Checkpoint:
 
 @dataclass(frozen=True)
 class RunFacts:
-    """What a run took; None where the method does not say."""
+    """Time, steps and memory of a run; None where the method does not say."""
 
     #: Seconds on the method's clock.
     fit_seconds: float | None = None
