@@ -1,81 +1,213 @@
-"""Frozen dataclasses from untrusted JSON, checked by their annotations."""
+"""Frozen dataclasses from untrusted JSON or TOML: the one reader of every format.
+
+A format is a frozen dataclass; `parse_record` makes one out of a table that a file held::
+
+    @dataclass(frozen=True)
+    class Lamp:
+        name: Line                                     # one line of text, required
+        power: float = number(1.0, 0.0, 100.0)         # bounded; may be absent
+        kind: Literal["disc", "point"] = "disc"        # one of several words
+        place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        gains: list[Annotated[float, Meta(gt=0.0, lt=10.0)]] | None = None
+
+    lamp = parse_record(Lamp, table, where="scene.toml", field="lamps[0]", error=BadInput)
+
+Fields are str, int, float, bool, Literal, `list[X]`, `dict[str, X]`, `tuple[...]`, other
+dataclasses, any of these `| None`, or `Any` (which is not checked; see `check_json_values`).
+`msgspec` does the checking, on a strict twin of the dataclass: a bool is not an int, an int is a
+float, NaN and infinity are refused, and so is text with control characters. Bounds are
+`msgspec.Meta` in an `Annotated` type, or the metadata of `number` and `choice`. A pattern in a
+`Meta` needs a `description`, which messages show, and must exclude control characters itself.
+
+A missing field takes its default, so that a format may get additional fields. A field that was
+taken out of a format stays readable when the class lists it::
+
+    removed_fields: ClassVar[tuple[str, ...]] = ("loss",)
+
+What no type can say belongs in `__post_init__`, which raises `UsageError(problem, field=name)`;
+the reader adds the file and the path.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import math
-from dataclasses import MISSING, fields
-from types import UnionType
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+import os
+from collections.abc import Mapping
+from typing import Annotated, Any, TypeVar, cast
 
-from hwp_bench.base.errors import BadResult
-from hwp_bench.base.text import has_odd_characters, shown
+import msgspec
+from msgspec import UNSET, Meta
+
+from hwp_bench.base.errors import BadResult, HwpError
+from hwp_bench.base.files import MAX_JSON_INTEGER
+from hwp_bench.base.record_types import Rules, brief, explain, join, strict_twin
+from hwp_bench.base.text import ODD_CHARACTERS, shown
 
 Record = TypeVar("Record")
 
+#: Longest piece of a name or value that a message repeats.
+_SHOWN = 100
 
-def parse_record(kind: type[Record], value: Any, *, where: str, field: str = "") -> Record:
-    """Make a dataclass out of JSON, checking every field by its annotation.
+#: A text of at most 1,000 characters without a line break.
+Line = Annotated[
+    str,
+    Meta(
+        pattern=rf"\A[^\n{ODD_CHARACTERS}]*\Z",
+        max_length=1000,
+        description="one line of at most 1,000 characters",
+    ),
+]
+#: A text that is not empty, of at most 10,000 characters.
+Text = Annotated[str, Meta(min_length=1, max_length=10_000)]
+
+
+def number(default: Any, low: float = 0.0, high: float = math.inf) -> Any:
+    """A dataclass field for a number within [low, high]."""
+    return dataclasses.field(default=default, metadata={"range": (low, high)})
+
+
+def choice(default: str, *others: str) -> Any:
+    """A dataclass field for one of several words."""
+    return dataclasses.field(default=default, metadata={"choices": (default, *others)})
+
+
+def parse_record(
+    kind: type[Record],
+    value: Any,
+    *,
+    where: str | os.PathLike[str],
+    field: str = "",
+    error: type[HwpError] = BadResult,
+    numbers: tuple[float, float] = (-math.inf, math.inf),
+    complete: bool = False,
+    ignore_unknown: bool = False,
+) -> Record:
+    """Make a dataclass out of a table, checking every field by its annotation.
 
     Args:
-        kind: a dataclass of str, int, float, bool, Any, dict, list, further dataclasses, and
-            unions of one of them with None.
+        kind: the dataclass; see the module.
         value: what the file holds.
-        where: the file, for the message.
-        field: path of `value` in the file, ending in a full stop.
-
-    Returns:
-        The record; fields that are missing have their default, where there is one.
+        where: the file, for messages.
+        field: path of `value` in the file, such as `captures[0]`; empty for the whole file.
+        error: raised when something is wrong.
+        numbers: range of numbers that have no bounds of their own.
+        complete: refuse a missing field even where the dataclass has a default.
+        ignore_unknown: skip unknown fields instead of refusing them.
 
     Raises:
-        BadResult: a field is missing, unknown, of the wrong type, not finite, or holds a
-            control character; it is named.
+        error: the value is not a table, or a field is missing, unknown (the message says which
+            name is close), of the wrong type, out of range, not finite, or holds a control
+            character; or the dataclass refuses the values together. File and field are named.
+    """
+    rules = Rules(*numbers, complete, ignore_unknown)
+    twin = strict_twin(cast("type", kind), rules)
+
+    def refuse(problem: str, path: str, remedy: str | None = None) -> HwpError:
+        return error(problem, where=where, field=shown(path) or None, remedy=remedy)
+
+    def build(item: Any, path: str) -> Any:
+        if isinstance(item, dict):
+            return {key: build(part, join(path, key)) for key, part in item.items()}
+        if isinstance(item, list | tuple):
+            return type(item)(build(part, f"{path}[{i}]") for i, part in enumerate(item))
+        if not isinstance(item, msgspec.Struct):
+            return item
+        names = set(item.__struct_fields__) - set(item.__removed__)  # type: ignore[attr-defined]
+        given = {name: getattr(item, name) for name in names}
+        made = {n: build(v, join(path, n)) for n, v in given.items() if v is not UNSET}
+        try:
+            return item.__record__(**made)  # type: ignore[attr-defined]
+        except HwpError as fault:
+            raise refuse(fault.problem, join(path, fault.field or ""), fault.remedy) from fault
+
+    start = field.rstrip(".")
+    try:
+        converted = msgspec.convert(value, twin)
+    except msgspec.ValidationError as fault:
+        raise refuse(*explain(twin, value, start)) from fault
+    return build(converted, start)
+
+
+def without_schema(
+    value: Any,
+    schema: str,
+    *,
+    where: str | os.PathLike[str],
+    error: type[HwpError] = BadResult,
+    remedy: str | None = None,
+) -> dict[str, Any]:
+    """Check the version that a file states in its field `schema`; return the other fields.
+
+    Raises:
+        error: the value is not a table, or is of another version.
     """
     if not isinstance(value, dict):
-        raise BadResult("must be a JSON object", where=where, field=field.rstrip(".") or None)
-    hints = get_type_hints(kind)
-    listed = fields(kind)  # type: ignore[arg-type]
-    names = {item.name for item in listed}
-    spared = {i.name for i in listed if (i.default, i.default_factory) != (MISSING, MISSING)}
-    for name in sorted((names ^ value.keys()) - (spared - value.keys())):
-        problem = "is missing" if name in names else "is not known"
-        raise BadResult(problem, where=where, field=f"{field}{name}")
-    converted = {
-        name: _convert(hints[name], item, where, f"{field}{name}") for name, item in value.items()
-    }
-    return kind(**converted)
+        raise error("must be a JSON object", where=where)
+    found = value.get("schema")
+    if found != schema:
+        stated = f"is {brief(found)}" if "schema" in value else "is missing"
+        problem = f"{stated} where {schema!r} is read"
+        raise error(problem, where=where, field="schema", remedy=remedy)
+    return {key: item for key, item in value.items() if key != "schema"}
 
 
-def _convert(hint: Any, value: Any, where: str, field: str) -> Any:
-    origin, arguments = get_origin(hint), get_args(hint)
-    if origin is UnionType:
-        if value is None and type(None) in arguments:
-            return None
-        return _convert(arguments[0], value, where, field)
-    if origin is list:
-        if isinstance(value, list):
-            return [
-                _convert(arguments[0], item, where, f"{field}[{index}].")
-                for index, item in enumerate(value)
-            ]
-    elif origin is dict:
-        if isinstance(value, dict):
-            if any(has_odd_characters(key) for key in value):
-                raise BadResult("holds a control character in a name", where=where, field=field)
-            return {
-                key: _convert(arguments[1], item, where, f"{field}.{key}")
-                for key, item in value.items()
-            }
-    elif hint is Any:
-        return value
-    elif hint is float:
-        if isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value):
-            return float(value)
-    elif hint in (int, str, bool):
-        if isinstance(value, str) and has_odd_characters(value):
-            raise BadResult("holds a control character", where=where, field=shown(field))
-        if isinstance(value, hint) and not (hint is int and isinstance(value, bool)):
-            return value
-    else:
-        prefix = field if field.endswith(".") else f"{field}."
-        return parse_record(hint, value, where=where, field=prefix)
-    raise BadResult(f"is {str(value)[:60]!r}, of the wrong type", where=where, field=field)
+def unfold(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Turn dotted names into tables: `{"a.b": 1}` means `{"a": {"b": 1}}`.
+
+    Tables that are named twice are merged; later entries win.
+    """
+    tree: dict[str, Any] = {}
+    for name, value in values.items():
+        head, dot, rest = str(name).partition(".")
+        if dot:
+            value = {rest: value}
+        tree[head] = _merged(tree.get(head), unfold(value) if isinstance(value, Mapping) else value)
+    return tree
+
+
+def _merged(before: Any, after: Any) -> Any:
+    if not isinstance(before, dict) or not isinstance(after, dict):
+        return after
+    return {**before, **{name: _merged(before.get(name), item) for name, item in after.items()}}
+
+
+def check_json_values(
+    value: Any,
+    *,
+    where: str | os.PathLike[str],
+    field: str,
+    error: type[HwpError] = BadResult,
+    depth: int = 16,
+) -> None:
+    """Refuse what JSON cannot hold: for values of type `Any` that are kept or digested.
+
+    Args:
+        value: numbers, texts, truth values, or lists or tables of such.
+        where: the file, for messages.
+        field: path of `value` in the file.
+        error: raised when something is wrong.
+        depth: deepest nesting that is accepted.
+
+    Raises:
+        error: there is a date or other object, a number that is not finite or is absurdly large,
+            or too deep a nesting; the field is named.
+    """
+    problem = None
+    if depth == 0:
+        problem = "is nested too deeply"
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            path = join(field, str(name))
+            check_json_values(item, where=where, field=path, error=error, depth=depth - 1)
+    elif isinstance(value, list):
+        for item in value:
+            check_json_values(item, where=where, field=field, error=error, depth=depth - 1)
+    elif isinstance(value, float) and not math.isfinite(value):
+        problem = f"is {value}, not a finite number"
+    elif isinstance(value, int) and abs(value) > MAX_JSON_INTEGER:
+        problem = "is too large a number"
+    elif not isinstance(value, str | int | float):
+        problem = f"is a {type(value).__name__}, not a number, text, list or table"
+    if problem:
+        raise error(problem, where=where, field=shown(field)[:_SHOWN])

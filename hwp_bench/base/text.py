@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import re
 
-# Control characters but tab and line feed, and the marks that reverse the direction of writing.
-_ODD = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069]")
+#: Control characters except tab and line feed, and the marks that reverse the direction of
+#: writing: what stands between the brackets of a regular expression.
+ODD_CHARACTERS = "\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069"
+_ODD = re.compile(f"[{ODD_CHARACTERS}]")
 
 
 def has_odd_characters(text: str) -> bool:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 from collections.abc import Iterable, Sequence
 from dataclasses import asdict, dataclass
@@ -12,7 +11,7 @@ from typing import Any
 
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import atomic_write, read_json, sha256_json
-from hwp_bench.base.records import parse_record
+from hwp_bench.base.records import parse_record, without_schema
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.aggregate import aggregate
 from hwp_bench.results import Results
@@ -33,6 +32,14 @@ class Entry:
     #: Name of its file without the ending.
     name: str
     #: The results, every frame's scores included.
+    results: Results
+
+
+@dataclass(frozen=True)
+class _File:
+    """The content of an entry's file, next to its `schema`."""
+
+    digest: str
     results: Results
 
 
@@ -87,13 +94,9 @@ def read_entries(folder: Path) -> list[Entry]:
 
 def _read(file: Path) -> Entry:
     value = read_json(file, max_bytes=MAX_ENTRY_BYTES)
-    if not isinstance(value, dict) or value.get("schema") != SCHEMA:
-        raise BadResult(f"is no entry of schema {SCHEMA}", where=file)
-    if value.keys() != {"schema", "digest", "results"}:
-        odd = ", ".join(sorted(value.keys() ^ {"schema", "digest", "results"}))
-        raise BadResult(f"has other fields than an entry ({odd})", where=file)
-    results = parse_record(Results, value["results"], where=os.fspath(file), field="results.")
-    if value["digest"] != digest(results):
+    entry = parse_record(_File, without_schema(value, SCHEMA, where=file), where=file)
+    results = entry.results
+    if entry.digest != digest(results):
         raise BadResult(
             "is not the digest of the content: the entry was changed by hand",
             where=file,

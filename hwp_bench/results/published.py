@@ -9,7 +9,7 @@ from pathlib import Path
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import read_json
 from hwp_bench.base.packages import data_folder
-from hwp_bench.base.records import parse_record
+from hwp_bench.base.records import parse_record, without_schema
 
 #: Version of the file.
 SCHEMA = "hwp-published/1"
@@ -104,7 +104,4 @@ def read_published(path: str | os.PathLike[str] | None = None) -> Published:
     """
     file = Path(path) if path is not None else data_folder("leaderboard") / "published.json"
     value = read_json(file)
-    if not isinstance(value, dict) or value.get("schema") != SCHEMA:
-        raise BadResult(f"holds no published numbers of schema {SCHEMA}", where=file)
-    value = {key: item for key, item in value.items() if key != "schema"}
-    return parse_record(Published, value, where=os.fspath(file))
+    return parse_record(Published, without_schema(value, SCHEMA, where=file), where=file)

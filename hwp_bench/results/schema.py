@@ -10,7 +10,7 @@ from typing import Any
 
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import canonical_json, inside, read_json, write_json
-from hwp_bench.base.records import parse_record
+from hwp_bench.base.records import parse_record, without_schema
 from hwp_bench.metrics.aggregate import CaptureScores
 
 #: Version of the result file.
@@ -170,10 +170,7 @@ def read_results(path: str | os.PathLike[str]) -> Results:
     if path.is_dir():
         path = path / "results.json"
     value = read_json(path)
-    if not isinstance(value, dict) or value.get("schema") != SCHEMA:
-        raise BadResult(f"is no result file of schema {SCHEMA}", where=path)
-    value = {key: item for key, item in value.items() if key != "schema"}
-    return parse_record(Results, value, where=os.fspath(path))
+    return parse_record(Results, without_schema(value, SCHEMA, where=path), where=path)
 
 
 def result_files(path: str | os.PathLike[str]) -> list[Path]:

@@ -104,7 +104,7 @@ def test_foreign_calls_are_refused_by_name_and_not_made(file: Path, tmp_path: Pa
         "numpy._core.multiarray._reconstruct.__globals__": (
             b"\x80\x04\x8c\x16numpy._core.multiarray\x8c\x18_reconstruct.__globals__\x93."
         ),
-        "hwp_bench.base.unpickle.load_pickle": b"chwp_bench.unpickle\nload_pickle\n.",
+        "hwp_bench.base.unpickle.load_pickle": b"chwp_bench.base.unpickle\nload_pickle\n.",
     }.items():
         file.write_bytes(raw)
         with pytest.raises(UnsafePickle) as caught:

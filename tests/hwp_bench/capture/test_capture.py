@@ -78,7 +78,7 @@ def test_the_writer_refuses_what_contradicts(make_capture: CaptureMaker, tmp_pat
         CaptureWriter(tmp_path / "x", info, {"right": hand_parameters(9)}, track)
     with pytest.raises(BadCapture, match="9 cameras"):
         CaptureWriter(tmp_path / "x", info, hands, cameras(9, 32))
-    with pytest.raises(BadCapture, match="no capture id"):
+    with pytest.raises(BadCapture, match="not a capture id"):
         CaptureWriter(tmp_path / "x", replace(info, id="../up"), hands, track)
     with (
         pytest.raises(UsageError, match="exists"),
@@ -108,12 +108,12 @@ def _edit(root: Path, **changes: object) -> None:
     [
         ({"schema": "hwp-capture/9"}, "schema: is 'hwp-capture/9'"),
         ({"fps": "DELETE"}, "fps: is missing"),
-        ({"fps": -1}, "fps: is '-1'"),
-        ({"width": 1.5}, "width: is '1.5'"),
+        ({"fps": -1}, "fps: is -1, expected a finite number above 0"),
+        ({"width": 1.5}, "width: is 1.5, expected an integer from 1 to 8192"),
         ({"frame_count": True}, "frame_count"),
         ({"frame_count": 10**9}, "frame_count"),
-        ({"hands": "three"}, "not one of right, left, both"),
-        ({"id": "a/b"}, "no capture id"),
+        ({"hands": "three"}, "hands: is 'three', expected one of right, left, both"),
+        ({"id": "a/b"}, "not a capture id"),
         ({"perturbations": {"fog": None}}, "no perturbation 'fog'"),
         ({"perturbations": {"motion_blur": [0]}}, "list of 12 severities"),
         ({"perturbations": {"motion_blur": [9] * 12}}, "severity 9 of frame 0"),

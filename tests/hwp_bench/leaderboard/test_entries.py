@@ -65,7 +65,9 @@ def test_other_names_and_fields_are_refused(make_entry, tmp_path) -> None:
     with pytest.raises(BadResult, match="note"):
         read_entries(tmp_path)
     moved.write_text("{}")
-    with pytest.raises(BadResult, match="no entry of schema"):
+    with pytest.raises(
+        BadResult, match="schema: is missing where 'hwp-leaderboard-entry/1' is read"
+    ):
         read_entries(tmp_path)
 
 

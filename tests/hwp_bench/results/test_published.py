@@ -82,7 +82,7 @@ def test_data_sets_are_as_in_the_papers_first_table() -> None:
 @pytest.mark.parametrize(
     ("change", "problem"),
     [
-        ({"schema": "other"}, "no published numbers"),
+        ({"schema": "other"}, "schema: is 'other' where 'hwp-published/1' is read"),
         ({"extra": 1}, "extra: is not known"),
         ({"tables": [{}]}, r"tables\[0\].*is missing"),
     ],

@@ -21,15 +21,15 @@ def test_results_round_trip(make_results, tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("path", "value", "problem"),
     [
-        (["schema"], "other", "no result file of schema"),
-        (["seed"], "0", "seed: is '0', of the wrong type"),
-        (["seed"], None, "seed: is 'None'"),
+        (["schema"], "other", "schema: is 'other' where 'hwp-results/1' is read"),
+        (["seed"], "0", "seed: is '0', expected an integer"),
+        (["seed"], None, "seed: is None, expected an integer"),
         (["extra"], 1, "extra: is not known"),
-        (["captures", 0, "frames", 1, "frame"], 1.5, "captures[0].frames[1].frame: is '1.5'"),
+        (["captures", 0, "frames", 1, "frame"], 1.5, "captures[0].frames[1].frame: is 1.5"),
         (["captures", 0, "frames", 1, "scores", "psnr"], "x", "frames[1].scores.psnr"),
         (["captures", 0, "steps"], True, "captures[0].steps"),
         (["captures", 0, "curve"], {}, "captures[0].curve"),
-        (["method"], [], "method: must be a JSON object"),
+        (["method"], [], "method: must be a table"),
     ],
 )
 def test_wrong_fields_are_named(make_results, tmp_path: Path, path, value, problem: str) -> None:

@@ -1,0 +1,176 @@
+"""The record reader. Oracle: the dataclass built by hand, and the standard types of JSON."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, ClassVar, Literal
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from msgspec import Meta
+
+from hwp_bench.base.errors import BadInput, BadMethod, BadResult, UsageError
+from hwp_bench.base.records import (
+    Line,
+    Text,
+    check_json_values,
+    choice,
+    number,
+    parse_record,
+    unfold,
+    without_schema,
+)
+
+
+@dataclass(frozen=True)
+class Part:
+    width: int = number(4, 1, 10)
+    kind: str = choice("one", "two")
+    shape: Literal["round", "flat"] = "round"
+
+    def __post_init__(self) -> None:
+        if self.width == 7:
+            raise UsageError("is 7", field="width", remedy="Use 8.")
+
+
+@dataclass(frozen=True)
+class Whole:
+    removed_fields: ClassVar[tuple[str, ...]] = ("loss",)
+    count: int
+    rate: float = 0.5
+    on: bool = True
+    limit: float | None = None
+    part: Part = field(default_factory=Part)
+    parts: list[Part] = field(default_factory=list)
+    scores: dict[str, float] = field(default_factory=dict)
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    steps: tuple[int, ...] = ()
+    line: Line = ""
+    text: Text = "text"
+    free: dict[str, Any] = field(default_factory=dict)
+    fps: Annotated[float, Meta(gt=0.0, lt=1000.0)] = 30.0
+
+
+def read(**values: Any) -> Whole:
+    return parse_record(Whole, {"count": 1, **values}, where="file.json")
+
+
+def test_what_is_absent_has_its_default_and_what_was_removed_is_dropped() -> None:
+    assert read() == Whole(1)
+    assert read(loss=0.5, part={"width": 2}) == Whole(1, part=Part(2))
+
+
+finite = st.floats(allow_nan=False, allow_infinity=False)
+plain = st.text(st.characters(codec="ascii", categories=["L", "N", "P"]), max_size=8)
+
+
+@given(
+    st.builds(
+        Whole,
+        count=st.integers(-(2**60), 2**60),
+        rate=finite,
+        on=st.booleans(),
+        limit=st.none() | finite,
+        parts=st.lists(st.builds(Part, width=st.integers(1, 6)), max_size=3),
+        scores=st.dictionaries(plain, finite, max_size=3),
+        place=st.tuples(finite, finite, finite),
+        steps=st.lists(st.integers(0, 9), max_size=3).map(tuple),
+        line=plain,
+        text=st.just("a\n\tb"),
+        free=st.dictionaries(plain, st.none() | finite | st.lists(plain), max_size=3),
+    )
+)
+def test_a_record_survives_json(record: Whole) -> None:
+    assert parse_record(Whole, json.loads(json.dumps(asdict(record))), where="f") == record
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"count": True}, "count: is True, expected an integer"),
+        ({"count": 1.0}, "count: is 1.0, expected an integer"),
+        ({"count": "1"}, "count: is '1', expected an integer"),
+        ({"count": None}, "count: is None, expected an integer"),
+        ({"rate": True}, "rate: is True, expected a finite number"),
+        ({"rate": math.nan}, "rate: is nan, expected a finite number"),
+        ({"rate": math.inf}, "rate: is inf, expected a finite number"),
+        ({"rate": 10**400}, "rate: is an absurdly large number"),
+        ({"limit": "none"}, "limit: is 'none', expected a finite number"),
+        ({"on": 1}, "on: is 1, expected true or false"),
+        ({"part": 3}, "part: must be a table"),
+        ({"part": {"widht": 3}}, "part.widht: is not known. Did you mean 'part.width'?"),
+        ({"colour": 3}, "colour: is not known. Known: count, rate, on"),
+        ({"part": {"width": 11}}, "part.width: is 11, expected an integer from 1 to 10"),
+        ({"part": {"width": 7}}, "file.json: part.width: is 7. Use 8."),
+        ({"parts": [{}, {"kind": "four"}]}, "parts[1].kind: is 'four', expected one of one, two"),
+        ({"part": {"shape": "oval"}}, "part.shape: is 'oval', expected one of round, flat"),
+        ({"scores": {"a": 1, "b": math.inf}}, "scores.b: is inf"),
+        ({"scores": {"p\x00": 1.0}}, "scores.p?: holds a control character"),
+        ({"scores": [1.0]}, "scores: is [1.0], expected a table"),
+        ({"parts": {}}, "parts: is {}, expected a list"),
+        ({"place": [1, 2]}, "place: is [1, 2], expected a list of 3"),
+        ({"place": [1, 2, "x"]}, "place[2]: is 'x', expected a finite number"),
+        ({"steps": [1, 2.0]}, "steps[1]: is 2.0, expected an integer"),
+        ({"line": "a\nb"}, "line: is 'a\\nb', expected one line of at most 1,000 characters"),
+        ({"line": "\x1b[31m"}, "line: holds a control character"),
+        ({"line": "x" * 1001}, "expected one line of at most 1,000 characters"),
+        ({"text": ""}, "text: is '', expected a text of 1 to 10,000 characters"),
+        ({"text": "a\u202eb"}, "text: holds a control character"),
+        ({"fps": 0}, "fps: is 0, expected a finite number above 0 and below 1000"),
+        ({"fps": math.nan}, "fps: is nan"),
+        ({"\x1b[2J": 1}, "?[2J: is not known"),
+    ],
+)
+def test_faults_are_named(values: dict[str, Any], message: str) -> None:
+    with pytest.raises(BadResult) as caught:
+        read(**values)
+    assert message in str(caught.value)
+    assert "\x1b" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+def test_the_caller_chooses_path_error_and_strictness() -> None:
+    with pytest.raises(BadMethod, match=r"^m\.toml: a\[0\]\.count: is missing$"):
+        parse_record(Whole, {}, where="m.toml", field="a[0]", error=BadMethod)
+    with pytest.raises(BadInput, match=r"^f: must be a table"):
+        parse_record(Whole, [], where="f", error=BadInput)
+    with pytest.raises(BadResult, match="rate: is -1, expected a finite number at least 0"):
+        parse_record(Whole, {"count": 1, "rate": -1}, where="f", numbers=(0.0, math.inf))
+    with pytest.raises(BadResult, match="is missing"):
+        parse_record(Whole, {"count": 1}, where="f", complete=True)
+    loose = {"count": 1, "more": 2, "part": {"more": 1}}
+    assert parse_record(Whole, loose, where="f", ignore_unknown=True) == Whole(1)
+
+
+def test_dotted_names_are_tables() -> None:
+    assert unfold({"a.b.c": 1, "a.b": {"d": 2}, "e": 3}) == {"a": {"b": {"c": 1, "d": 2}}, "e": 3}
+    assert unfold({"a": {"b.c": 1}, "a.b.c": 2}) == {"a": {"b": {"c": 2}}}
+
+
+def test_versions_are_checked() -> None:
+    assert without_schema({"schema": "a/1", "b": 2}, "a/1", where="f") == {"b": 2}
+    with pytest.raises(BadResult, match="f: schema: is 'a/2' where 'a/1' is read"):
+        without_schema({"schema": "a/2"}, "a/1", where="f")
+    with pytest.raises(BadResult, match="f: schema: is missing where 'a/1' is read"):
+        without_schema({}, "a/1", where="f")
+    with pytest.raises(BadInput, match="f: must be a JSON object"):
+        without_schema([], "a/1", where="f", error=BadInput)
+
+
+@pytest.mark.parametrize(
+    ("value", "message"),
+    [
+        ({"a": [1, math.nan]}, r"s\.a: is nan, not a finite number"),
+        ({"a": 2**64}, r"s\.a: is too large a number"),
+        ({"a": {1, 2}}, r"s\.a: is a set, not a number, text, list or table"),
+        ({"a": None}, r"s\.a: is a NoneType"),
+        ([[[[1]]]], "nested too deeply"),
+    ],
+)
+def test_values_that_json_cannot_hold_are_refused(value: Any, message: str) -> None:
+    check_json_values({"a": [1, "b", True, 0.5]}, where="f", field="s")
+    with pytest.raises(BadResult, match=message):
+        check_json_values(value, where="f", field="s", depth=4)
