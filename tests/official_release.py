@@ -16,7 +16,7 @@ import numpy as np
 import torch
 
 from hwp_bench.hands import HandTemplate, pose_hand
-from hwp_bench.importers.silhouette import draw_silhouette
+from hwp_bench.hands.raster import draw_silhouette
 
 WIDTH, HEIGHT = 400, 300
 FOCAL = 5000.0 / 256.0 * WIDTH

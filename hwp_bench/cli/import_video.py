@@ -76,9 +76,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     # FFmpeg's own remarks on a damaged video would stand beside our one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    from hwp_bench.importers.decode import parse_frame_range
-    from hwp_bench.importers.options import VideoImport
-    from hwp_bench.importers.video import import_video
+    from hwp_bench.importers.video import VideoImport, import_video, parse_frame_range
 
     options = VideoImport(
         hand=args.hand,
@@ -107,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
 def _print(clip: ImportedClip, args: argparse.Namespace) -> None:
     import numpy as np
 
-    from hwp_bench.importers.store import SHEET_NAME
+    from hwp_bench.importers.shared.writing import SHEET_NAME
 
     facts = clip.facts()
     error, before = clip.error, clip.error_landmarks_only

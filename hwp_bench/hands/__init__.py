@@ -19,16 +19,21 @@ if TYPE_CHECKING:
         anchors_from_vertices,
         sample_surface,
     )
-    from hwp_bench.hands.articulation import joint_angles, joint_axes, pose_from_joint_angles
-    from hwp_bench.hands.camera import project
-    from hwp_bench.hands.joint_limits import JointLimits, anatomical_limits, joint_limit_penalty
-    from hwp_bench.hands.landmarks import landmark_order
+    from hwp_bench.hands.articulation import (
+        JointLimits,
+        anatomical_limits,
+        joint_angles,
+        joint_axes,
+        joint_limit_penalty,
+        pose_from_joint_angles,
+    )
     from hwp_bench.hands.parameters import HandParameters
-    from hwp_bench.hands.skinning import PosedHand, TemplateTensors, pose_hand
+    from hwp_bench.hands.skeleton import landmark_order
+    from hwp_bench.hands.skinning import PosedHand, pose_hand, project
     from hwp_bench.hands.sources import load_template
-    from hwp_bench.hands.subdivision import subdivide
     from hwp_bench.hands.surface import to_trimesh, vertex_normals
-    from hwp_bench.hands.template import HandTemplate, mirror_template
+    from hwp_bench.hands.template import HandTemplate, TemplateTensors, mirror_template
+    from hwp_bench.hands.topology import boundary_vertices, subdivide
 
 __all__ = [
     "HandParameters",
@@ -43,6 +48,7 @@ __all__ = [
     "anchor_positions",
     "anchor_uv",
     "anchors_from_vertices",
+    "boundary_vertices",
     "joint_angles",
     "joint_axes",
     "joint_limit_penalty",
@@ -68,16 +74,21 @@ _HOMES = {
         "anchors_from_vertices",
         "sample_surface",
     ),
-    "articulation": ("joint_angles", "joint_axes", "pose_from_joint_angles"),
-    "camera": ("project",),
-    "joint_limits": ("JointLimits", "anatomical_limits", "joint_limit_penalty"),
-    "landmarks": ("landmark_order",),
+    "articulation": (
+        "JointLimits",
+        "anatomical_limits",
+        "joint_angles",
+        "joint_axes",
+        "joint_limit_penalty",
+        "pose_from_joint_angles",
+    ),
+    "skeleton": ("landmark_order",),
     "parameters": ("HandParameters",),
-    "skinning": ("PosedHand", "TemplateTensors", "pose_hand"),
+    "skinning": ("PosedHand", "pose_hand", "project"),
     "sources": ("load_template",),
-    "subdivision": ("subdivide",),
+    "topology": ("boundary_vertices", "subdivide"),
     "surface": ("to_trimesh", "vertex_normals"),
-    "template": ("HandTemplate", "mirror_template"),
+    "template": ("HandTemplate", "TemplateTensors", "mirror_template"),
 }
 
 

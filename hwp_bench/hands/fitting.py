@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadInput, DidNotConverge
-from hwp_bench.hands.joint_limits import anatomical_limits, joint_limit_penalty
+from hwp_bench.hands.articulation import anatomical_limits, joint_limit_penalty
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.hands.skinning import PosedHand, TemplateTensors, pose_hand
+from hwp_bench.hands.skinning import PosedHand, only_fingertips, pose_hand
 from hwp_bench.hands.surface import vertex_normals
-from hwp_bench.hands.template import HandTemplate
+from hwp_bench.hands.template import HandTemplate, TemplateTensors
+from hwp_bench.hands.topology import boundary_vertices
 
 #: Points farther from the fitted surface than this are not drawn to it, m.
 REACH = 0.03
@@ -103,10 +104,11 @@ class _Fit:
         self, template: HandTemplate, targets: FitTargets, start: HandParameters, chosen: np.ndarray
     ) -> None:
         self.whole = template.to_torch(torch.float64)
-        self.tips = _only_tips(self.whole)
+        self.tips = only_fingertips(self.whole)
         self.limits = anatomical_limits(template)
         self.faces = self.whole.faces
-        self.border = _border(template.faces)
+        # What is nearest to the open wrist may be forearm.
+        self.border = boundary_vertices(template.faces)
         self.chosen = chosen
 
         def known(values: np.ndarray | None) -> torch.Tensor | None:
@@ -200,7 +202,7 @@ class _Fit:
         for points, own in zip(self.skin.numpy(), vertices.numpy(), strict=True):
             distance, nearest = cKDTree(own).query(points)
             index.append(nearest)
-            usable.append((distance < REACH) & ~self.border[nearest])
+            usable.append((distance < REACH) & ~np.isin(nearest, self.border))
         found = torch.from_numpy(np.stack(index))
         picked = torch.gather(normals, 1, found[..., None].expand(-1, -1, 3))
         return found, picked, torch.from_numpy(np.stack(usable))
@@ -214,25 +216,3 @@ class _Fit:
 
 def _squared(values: torch.Tensor, known: torch.Tensor) -> torch.Tensor:
     return (torch.where(known, values, 0.0) ** 2).sum() / known.sum().clamp_min(1)
-
-
-def _only_tips(tensors: TemplateTensors) -> TemplateTensors:
-    """The template with no vertices but the finger tips: landmarks need no others."""
-    tips = tensors.fingertips
-    return replace(
-        tensors,
-        vertices=tensors.vertices[tips],
-        shape_basis=tensors.shape_basis[tips],
-        pose_basis=None if tensors.pose_basis is None else tensors.pose_basis[tips],
-        weights=tensors.weights[tips],
-        fingertips=torch.arange(len(tips)),
-    )
-
-
-def _border(faces: np.ndarray) -> np.ndarray:
-    """(V,) bool, true for vertices of the open wrist: what is nearest to them may be forearm."""
-    edges = np.sort(faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2), axis=1)
-    unique, count = np.unique(edges, axis=0, return_counts=True)
-    border = np.zeros(faces.max() + 1, dtype=bool)
-    border[unique[count == 1]] = True
-    return border

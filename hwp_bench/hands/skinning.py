@@ -1,44 +1,20 @@
-"""Posing a hand: shape, pose correctives, forward kinematics and linear blend skinning."""
+"""Posing a hand (shape, correctives, kinematics, linear blend skinning) and projecting it."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 
 from hwp_bench.base.errors import ShapeMismatch
-from hwp_bench.hands.landmarks import landmark_order
 from hwp_bench.hands.rotations import axis_angle_to_matrix
-from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, HandTemplate
+from hwp_bench.hands.skeleton import landmark_order
+from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, TemplateTensors
 
 # The joints at each distance from the wrist; every template has this tree.
 _LEVELS = ((1, 4, 7, 10, 13), (2, 5, 8, 11, 14), (3, 6, 9, 12, 15))
 # Where each joint stands once the levels are joined: the wrist, then one level after the other.
 _LEVEL_ORDER = (0, 1, 6, 11, 2, 7, 12, 3, 8, 13, 4, 9, 14, 5, 10, 15)
-
-
-@dataclass(frozen=True, eq=False)
-class TemplateTensors:
-    """The arrays of a `HandTemplate` that posing reads, on one device and in one type."""
-
-    #: (V, 3) rest vertices, m.
-    vertices: torch.Tensor
-    #: (F, 3) int64 vertex indices.
-    faces: torch.Tensor
-    #: (V, 3, 10).
-    shape_basis: torch.Tensor
-    #: (V, 3, 135) or None.
-    pose_basis: torch.Tensor | None
-    #: (16, 3) rest joints, m.
-    joints: torch.Tensor
-    #: (16, 3, 10).
-    joint_basis: torch.Tensor
-    #: (V, 16).
-    weights: torch.Tensor
-    #: (15, 3) axis-angle rad.
-    mean_pose: torch.Tensor
-    #: (5,) int64.
-    fingertips: torch.Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,30 +29,6 @@ class PosedHand:
     landmarks: torch.Tensor
     #: (B, 16, 4, 4) rigid motion of each joint: shaped rest space to posed space.
     transforms: torch.Tensor
-
-
-def tensors_from_template(
-    template: HandTemplate,
-    dtype: torch.dtype | None = None,
-    device: torch.device | str | None = None,
-) -> TemplateTensors:
-    """Copy a template's arrays to tensors; float32 on the CPU unless told otherwise."""
-    dtype = dtype or torch.float32
-
-    def real(array: object) -> torch.Tensor:
-        return torch.as_tensor(array, dtype=dtype, device=device)
-
-    return TemplateTensors(
-        vertices=real(template.vertices),
-        faces=torch.as_tensor(template.faces, device=device),
-        shape_basis=real(template.shape_basis),
-        pose_basis=None if template.pose_basis is None else real(template.pose_basis),
-        joints=real(template.joints),
-        joint_basis=real(template.joint_basis),
-        weights=real(template.weights),
-        mean_pose=real(template.mean_pose.reshape(-1, 3)),
-        fingertips=torch.as_tensor(template.fingertips, device=device),
-    )
 
 
 def pose_hand(
@@ -130,6 +82,59 @@ def pose_hand(
         joints=joints,
         landmarks=points[:, list(landmark_order())],
         transforms=_homogeneous(turns, shifts),
+    )
+
+
+def project(
+    points: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """Project points with one pinhole camera for each frame.
+
+    Camera axes: x right, y down, z forward. The centre of the top left pixel is (0.5, 0.5).
+
+    Args:
+        points: (B, P, 3) m, world.
+        viewmats: (B, 4, 4) world to camera.
+        Ks: (B, 3, 3) intrinsics, px.
+
+    Returns:
+        pixels: (B, P, 2) px; a point in the camera's own plane (zero depth) gets a finite
+            place far off screen, with no gradient from the division.
+        depth: (B, P) m along z; not positive behind the camera.
+
+    Raises:
+        ShapeMismatch: the arguments do not describe the same frames.
+    """
+    frames = points.shape[0]
+    for field, value, shape in (
+        ("points", points, (frames, *points.shape[1:2], 3)),
+        ("viewmats", viewmats, (frames, 4, 4)),
+        ("Ks", Ks, (frames, 3, 3)),
+    ):
+        if tuple(value.shape) != shape:
+            raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
+    in_camera = points @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]
+    depth = in_camera[..., 2]
+    tiny = torch.finfo(depth.dtype).eps
+    safe = torch.where(depth.abs() < tiny, torch.full_like(depth, tiny), depth)
+    rays = torch.cat([in_camera[..., :2] / safe[..., None], torch.ones_like(safe[..., None])], -1)
+    return (rays @ Ks.mT)[..., :2], depth
+
+
+def only_fingertips(template: TemplateTensors) -> TemplateTensors:
+    """Return the template without any vertices but the finger tips.
+
+    Joints and landmarks are posed as before, at a small part of the cost.
+    """
+    tips = template.fingertips
+    basis = template.pose_basis
+    return replace(
+        template,
+        vertices=template.vertices[tips],
+        shape_basis=template.shape_basis[tips],
+        pose_basis=None if basis is None else basis[tips],
+        weights=template.weights[tips],
+        fingertips=torch.arange(len(tips), device=tips.device),
     )
 
 

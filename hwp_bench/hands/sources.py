@@ -9,8 +9,7 @@ import numpy as np
 
 from hwp_bench.base.arrays import read_npz, take
 from hwp_bench.base.errors import BadHandModel, UsageError
-from hwp_bench.hands.landmarks import SIDES
-from hwp_bench.hands.subdivision import MANO_HD_NAME, mano_hd
+from hwp_bench.hands.skeleton import SIDES
 from hwp_bench.hands.template import (
     JOINT_COUNT,
     SHAPE_COUNT,
@@ -18,6 +17,7 @@ from hwp_bench.hands.template import (
     make_template,
     mirror_template,
 )
+from hwp_bench.hands.topology import MANO_HD_NAME, mano_hd
 
 #: Name and version of the free template; a new version is another model with other digests.
 FREE_NAME = "anny-1"

@@ -9,12 +9,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hwp_bench.base.errors import BadHandModel
-from hwp_bench.hands.landmarks import PARENTS, SIDES
+from hwp_bench.hands.skeleton import PARENTS, SIDES
 
 if TYPE_CHECKING:
     import torch
-
-    from hwp_bench.hands.skinning import TemplateTensors
 
 #: Number of shape parameters of every template.
 SHAPE_COUNT = 10
@@ -76,9 +74,48 @@ class HandTemplate:
             dtype: floating type; float32 if None.
             device: where to put them; the CPU if None.
         """
-        from hwp_bench.hands.skinning import tensors_from_template
+        import torch
 
-        return tensors_from_template(self, dtype=dtype, device=device)
+        dtype = dtype or torch.float32
+
+        def real(array: np.ndarray) -> torch.Tensor:
+            return torch.as_tensor(array, dtype=dtype, device=device)
+
+        return TemplateTensors(
+            vertices=real(self.vertices),
+            faces=torch.as_tensor(self.faces, device=device),
+            shape_basis=real(self.shape_basis),
+            pose_basis=None if self.pose_basis is None else real(self.pose_basis),
+            joints=real(self.joints),
+            joint_basis=real(self.joint_basis),
+            weights=real(self.weights),
+            mean_pose=real(self.mean_pose.reshape(-1, 3)),
+            fingertips=torch.as_tensor(self.fingertips, device=device),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class TemplateTensors:
+    """The arrays of a `HandTemplate` that posing reads, on one device and in one type."""
+
+    #: (V, 3) rest vertices, m.
+    vertices: torch.Tensor
+    #: (F, 3) int64 vertex indices.
+    faces: torch.Tensor
+    #: (V, 3, 10).
+    shape_basis: torch.Tensor
+    #: (V, 3, 135) or None.
+    pose_basis: torch.Tensor | None
+    #: (16, 3) rest joints, m.
+    joints: torch.Tensor
+    #: (16, 3, 10).
+    joint_basis: torch.Tensor
+    #: (V, 16).
+    weights: torch.Tensor
+    #: (15, 3) axis-angle rad.
+    mean_pose: torch.Tensor
+    #: (5,) int64.
+    fingertips: torch.Tensor
 
 
 def make_template(

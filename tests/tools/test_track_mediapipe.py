@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 
-from hwp_bench.importers.landmarks import read_landmarks
+from hwp_bench.importers.shared.landmarks import read_landmarks
 
 PROGRAM = Path(__file__).resolve().parents[2] / "tools" / "track_mediapipe.py"
 

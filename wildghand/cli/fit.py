@@ -139,8 +139,7 @@ def _capture(args: argparse.Namespace) -> Path:
             field="--landmarks",
             remedy="docs/video.md says how to make them.",
         )
-    from hwp_bench.importers.options import VideoImport
-    from hwp_bench.importers.video import import_video
+    from hwp_bench.importers.video import VideoImport, import_video
 
     folder = args.out.with_name(args.out.name + ".capture")
     if not folder.is_dir():

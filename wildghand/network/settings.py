@@ -9,7 +9,7 @@ from types import MappingProxyType
 from typing import Any
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.hands.landmarks import SIDES
+from hwp_bench.hands.skeleton import SIDES
 from hwp_bench.methods.settings import choice, number
 from wildghand.gaussians.attributes import CHANNELS
 

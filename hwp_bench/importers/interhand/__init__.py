@@ -1,6 +1,6 @@
 """InterHand2.6M: annotations, hands, capture."""
 
-from hwp_bench.importers.interhand.importing import InterHandImport, import_interhand
+from hwp_bench.importers.interhand.from_interhand import InterHandImport, import_interhand
 from hwp_bench.importers.interhand.sequences import PAPER_SEQUENCES, Sequence, find_sequence
 
 __all__ = [

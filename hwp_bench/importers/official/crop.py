@@ -16,11 +16,16 @@ What the released loader (`wildghand/data_single.py`, `data_multi.py`) does othe
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.importers.crop import cut, resample
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.images import read_gray, read_rgb
+from hwp_bench.base.progress import progress
+from hwp_bench.importers.official.records import OfficialRecords
+from hwp_bench.importers.shared.windows import cut, resample
 
 #: A mask pixel above this is hand, as in the released loader.
 MASK_THRESHOLD = 100
@@ -45,6 +50,69 @@ class CroppedFrame:
     K: np.ndarray
     corner: np.ndarray
     side: float
+
+
+def crop_frames(
+    records: OfficialRecords, size: int, *, compat: bool
+) -> tuple[list[CroppedFrame], np.ndarray]:
+    """Read and crop every frame of a capture.
+
+    Args:
+        records: of the capture.
+        size: edge of the crops, px.
+        compat: crop as the released loader does.
+
+    Returns:
+        The crops, and (F, 2) half the size of the whole frames, px.
+
+    Raises:
+        BadInput: an image or a mask is unusable, or a frame has neither a box nor a hand.
+    """
+
+    def one(frame: int) -> tuple[CroppedFrame, tuple[float, float]]:
+        picture = read_rgb(records.images[frame])
+        mask = read_gray(records.masks[frame], picture.shape[:2])
+        box = records.boxes[frame]
+        if box is None and compat:
+            # The loader then halves the intrinsics and leaves the frame as it is, which no
+            # network of 256 px can take.
+            raise BadInput(
+                "has no bbox_inter, without which the released loader does not crop",
+                where=records.images[frame],
+                remedy="Import it without --official-compat.",
+            )
+        if box is None:
+            seen = [hand.landmarks[frame] for hand in records.sides.values() if hand.valid[frame]]
+            if not seen:
+                raise BadInput("has neither a box nor a hand", where=records.images[frame])
+            box = box_of_landmarks(np.concatenate(seen))
+        crop = official_crop if compat else correct_crop
+        height, width = picture.shape[:2]
+        cropped = crop(picture, mask, box, float(records.focal[frame]), size)
+        return cropped, (width / 2.0, height / 2.0)
+
+    count = len(records.images)
+    with ThreadPoolExecutor(4) as pool, progress("cropping frames", count) as update:
+        crops, centres = [], []
+        for done, (crop, centre) in enumerate(pool.map(one, range(count)), start=1):
+            crops.append(crop)
+            centres.append(centre)
+            update(done)
+    return crops, np.array(centres)
+
+
+def tracked_joints(
+    records: OfficialRecords, sides: tuple[str, ...], crops: list[CroppedFrame], size: int
+) -> np.ndarray:
+    """Return the tracker's joints in the crops: (F, 21 * sides, 2) px, NaN where not valid."""
+    corners = np.array([crop.corner for crop in crops], dtype=np.float64)
+    scales = size / np.array([crop.side for crop in crops], dtype=np.float64)
+    points = []
+    for side in sides:
+        hand = records.sides[side]
+        moved = (hand.landmarks - corners[:, None]) * scales[:, None, None]
+        points.append(np.where(hand.valid[:, None, None], moved, np.nan))
+    return np.concatenate(points, axis=1)
 
 
 def box_of_landmarks(landmarks: np.ndarray) -> np.ndarray:

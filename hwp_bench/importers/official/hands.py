@@ -9,16 +9,16 @@ about the centre has to be believed.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
+from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
 from hwp_bench.hands.fitting import FitTargets, FittingSettings, fit_hand
 from hwp_bench.hands.mano import FINGERTIPS
-from hwp_bench.importers.official.records import SideRecords
+from hwp_bench.importers.official.records import OfficialRecords, SideRecords
 
 #: Stored vertices that MANO misses by more than this (median frame, mm) mean that the file does
 #: not follow the convention that is assumed, or was made with another hand model.
@@ -38,6 +38,39 @@ class ImportedHand:
 
     hand: HandParameters
     error_mm: np.ndarray
+
+
+def import_hands(
+    records: OfficialRecords,
+    sides: tuple[str, ...],
+    centres: np.ndarray,
+    model: str,
+    *,
+    compat: bool,
+    where: str,
+) -> dict[str, ImportedHand]:
+    """Take the hands of a capture over, by side.
+
+    Args:
+        records: of the capture.
+        sides: the hands that the capture has.
+        centres: (F, 2) px, half the frames' sizes.
+        model: the hand model, as `load_template` takes it: MANO is taken over, the free hand
+            is fitted.
+        compat: use the translations that the released loader uses.
+        where: the folder, for messages.
+    """
+    mean = load_template(model, "right").mean_pose
+    made = {}
+    for side in sides:
+        hand = _swapped(records, side) if compat else records.sides[side]
+        template = load_template(model, side)
+        if model.startswith("mano:"):
+            made[side] = mano_hand(hand, template, mean, where=where)
+        else:
+            knuckle = hand.camera + (records.root_rel if side == "left" else 0.0)
+            made[side] = free_hand(hand, template, records.focal, centres, knuckle)
+    return made
 
 
 def own_rotations(pose: np.ndarray, side: str) -> np.ndarray:
@@ -131,3 +164,17 @@ def free_hand(
     targets = FitTargets(landmarks, rays, records.vertices[:, ::2])
     fitted = fit_hand(template, targets, start, settings)
     return ImportedHand(fitted.parameters, fitted.skin_mm)
+
+
+def _swapped(records: OfficialRecords, side: str) -> SideRecords:
+    """A hand with the other one's translation, as the released loader hands it to its network.
+
+    The loader lists pose and shape as (right, left) and the translations as (left, right). Where
+    the tracker gives both hands one translation, which it mostly does, nothing changes.
+    """
+    own = records.sides[side]
+    other = records.sides.get("left" if side == "right" else "right")
+    if other is None:
+        return own
+    moved = own.vertices - own.camera[:, None] + other.camera[:, None]
+    return replace(own, vertices=moved, camera=other.camera, valid=own.valid & other.valid)

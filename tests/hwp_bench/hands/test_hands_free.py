@@ -12,8 +12,8 @@ import pytest
 from hwp_bench.base.arrays import read_npz, write_npz
 from hwp_bench.base.errors import BadHandModel, BadInput, UsageError
 from hwp_bench.hands import HandTemplate, load_template, sources, to_trimesh
-from hwp_bench.hands.landmarks import FINGERS, finger_joints
-from hwp_bench.hands.shape_space import align_hands, shape_components, stretch_fingers
+from hwp_bench.hands.anny_extract import align_hands, shape_components, stretch_fingers
+from hwp_bench.hands.skeleton import FINGERS, finger_joints
 
 
 def test_every_machine_finds_the_same_hand(free_right: HandTemplate) -> None:

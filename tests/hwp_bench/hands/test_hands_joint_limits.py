@@ -19,8 +19,7 @@ from hwp_bench.hands import (
     pose_hand,
 )
 from hwp_bench.hands.articulation import rest_flexion
-from hwp_bench.hands.landmarks import FINGERS, finger_joints
-from hwp_bench.hands.palm import palm_directions
+from hwp_bench.hands.skeleton import FINGERS, finger_joints, palm_directions
 from hwp_bench.hands.template import rebuilt
 
 SIDES = ("right", "left")

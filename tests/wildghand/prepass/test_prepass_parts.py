@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hwp_bench.base.colors import linear_to_srgb
-from hwp_bench.importers.silhouette import draw_silhouette
+from hwp_bench.hands.raster import draw_silhouette
 from wildghand.prepass.borders import border_width, misplacement
 from wildghand.prepass.classify import clean_probability, evidence
 from wildghand.prepass.robust_location import densest, excess, normal_value

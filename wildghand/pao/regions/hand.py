@@ -37,9 +37,9 @@ def graph_cut_hands(
     Raises:
         ShapeMismatch: a silhouette that does not belong to its picture.
 
-    Source: `hwp_bench.importers.segment`, which the video import uses.
+    Source: `hwp_bench.importers.video.segmentation`, which the video import uses.
     """
-    from hwp_bench.importers.segment import NARROW, Prompt, segment_clip
+    from hwp_bench.importers.video.segmentation import NARROW, Prompt, segment_clip
 
     if len(pictures) != len(silhouettes) or any(
         picture.shape[:2] != drawn.shape

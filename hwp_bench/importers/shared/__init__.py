@@ -1,0 +1,1 @@
+"""What imports share: landmarks, crop windows, overlays, writing."""

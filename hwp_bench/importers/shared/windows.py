@@ -1,0 +1,118 @@
+"""The square window that follows a hand through a video, and the camera that belongs to it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from hwp_bench.importers.shared.landmarks import Landmarks
+
+#: Room around the outermost landmark, as a share of the window's half side; finger tips reach
+#: about 10 % of the hand beyond their landmark, and a little background shows the silhouette.
+MARGIN = 0.22
+#: The window's centre is smoothed over this time (standard deviation, s): a window that
+#: trembles with the landmarks would make a still background move.
+CENTRE_SECONDS = 0.3
+
+
+@dataclass(frozen=True)
+class CropWindows:
+    """One square window for each frame, of one size, at whole pixels.
+
+    Whole pixels and one size mean that all frames are resampled alike: no frame is sharper than
+    another, and the focal length of the cropped camera is constant.
+
+    Attributes:
+        corners: (F, 2) int64, x and y of the top left corner; may lie outside the picture.
+        side: pixels of the whole frame.
+        size: pixels of the resampled crop.
+    """
+
+    corners: np.ndarray
+    side: int
+    size: int
+
+    @property
+    def scale(self) -> float:
+        """Pixels of the crop for each pixel of the whole frame."""
+        return self.size / self.side
+
+    def intrinsics(self, focal: float, width: int, height: int) -> np.ndarray:
+        """Camera matrices of the cropped frames.
+
+        Args:
+            focal: focal length in pixels of the whole frame.
+            width: whole frame, px; the principal point is its centre.
+            height: px.
+
+        Returns:
+            (F, 3, 3) float64. Pixel centres are at +0.5 in both pictures, so cropping is a
+            shift and resampling a scale, with no half-pixel term.
+        """
+        matrices = np.zeros((len(self.corners), 3, 3))
+        matrices[:, 0, 0] = matrices[:, 1, 1] = focal * self.scale
+        centre = np.array([width / 2.0, height / 2.0])
+        matrices[:, :2, 2] = (centre - self.corners) * self.scale
+        matrices[:, 2, 2] = 1.0
+        return matrices
+
+
+def follow_hand(landmarks: Landmarks, fps: float, size: int) -> CropWindows:
+    """Choose windows that hold all landmarks of every detected frame.
+
+    Args:
+        landmarks: of the selected frames; at least one is detected.
+        fps: frames per second, for the smoothing.
+        size: px of the resampled crop.
+    """
+    from scipy.ndimage import gaussian_filter1d
+
+    seen = np.flatnonzero(landmarks.detected)
+    low, high = landmarks.image[seen].min(axis=1), landmarks.image[seen].max(axis=1)
+    middle = (low + high) / 2.0
+    frames = np.arange(len(landmarks.score))
+    path = np.stack([np.interp(frames, seen, middle[:, axis]) for axis in (0, 1)], axis=1)
+    path = gaussian_filter1d(path, sigma=CENTRE_SECONDS * fps, axis=0, mode="nearest")
+    reach = np.maximum(high - path[seen], path[seen] - low).max()
+    side = max(int(np.ceil(2.0 * reach * (1.0 + MARGIN))), 2)
+    return CropWindows(np.round(path - side / 2.0).astype(np.int64), side, size)
+
+
+def cut(picture: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
+    """Cut a square out of a picture; what lies outside the picture is black.
+
+    Args:
+        picture: (H, W) or (H, W, C).
+        corner: (2,) integer x and y.
+        side: px.
+
+    Returns:
+        (side, side) or (side, side, C), a copy.
+    """
+    height, width = picture.shape[:2]
+    x, y = int(corner[0]), int(corner[1])
+    square = np.zeros((side, side, *picture.shape[2:]), dtype=picture.dtype)
+    left, right = max(x, 0), min(x + side, width)
+    top, bottom = max(y, 0), min(y + side, height)
+    if left < right and top < bottom:
+        square[top - y : bottom - y, left - x : right - x] = picture[top:bottom, left:right]
+    return square
+
+
+def resample(square: np.ndarray, size: int) -> np.ndarray:
+    """Resample a square picture: by area where it shrinks (no aliasing), linearly where it grows.
+
+    Args:
+        square: (S, S) or (S, S, C) uint8.
+        size: px.
+
+    Returns:
+        (size, size) or (size, size, C) uint8.
+    """
+    import cv2
+
+    if square.shape[0] == size:
+        return square
+    method = cv2.INTER_AREA if size < square.shape[0] else cv2.INTER_LINEAR
+    return cv2.resize(square, (size, size), interpolation=method)

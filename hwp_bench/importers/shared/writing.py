@@ -1,0 +1,73 @@
+"""Writing an imported capture: frames, masks, the overlay sheet and the import's own report."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.progress import progress
+from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter
+from hwp_bench.hands.parameters import HandParameters
+
+#: Name of the overlay sheet among the capture's extra files.
+SHEET_NAME = "overlay.png"
+#: Name of the report among the capture's extra files.
+REPORT_NAME = "import.json"
+
+
+def refuse_existing(out: str | os.PathLike[str], *, overwrite: bool) -> None:
+    """Refuse an output folder before minutes of work, not after them.
+
+    Args:
+        out: the capture folder to make.
+        overwrite: whether a folder that is not empty may be replaced.
+
+    Raises:
+        UsageError: `out` is a file, or a folder that is not empty.
+    """
+    path = Path(out)
+    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
+        raise UsageError("exists already", where=path, remedy="Choose another place, or --force.")
+
+
+def write_capture(
+    out: str | os.PathLike[str],
+    info: CaptureInfo,
+    hands: Mapping[str, HandParameters],
+    cameras: Cameras,
+    frames: Iterable[tuple[np.ndarray, np.ndarray]],
+    sheet: Callable[[], np.ndarray],
+    facts: Mapping[str, Any],
+    *,
+    overwrite: bool,
+) -> None:
+    """Write a capture, whole or not at all.
+
+    Args:
+        out: the capture folder to make.
+        info: what the capture says of itself.
+        hands: parameters by side.
+        cameras: one camera a frame.
+        frames: for each frame its image (H, W, 3) uint8 sRGB and its mask (H, W) uint8.
+        sheet: draws the overlay sheet, (H, W, 3) uint8; called once all frames are written.
+        facts: the numbers by which to judge the import, stored as JSON.
+        overwrite: replace an existing folder.
+    """
+    import cv2
+
+    with (
+        CaptureWriter(out, info, hands, cameras, overwrite=overwrite) as writer,
+        progress("writing the capture", info.frame_count) as update,
+    ):
+        for frame, (image, mask) in enumerate(frames):
+            writer.frame(frame, image)
+            writer.mask(frame, mask)
+            update(frame + 1)
+        writer.extra(SHEET_NAME, cv2.imencode(".png", sheet()[:, :, ::-1])[1].tobytes())
+        writer.extra(REPORT_NAME, json.dumps(dict(facts), indent=1) + "\n")

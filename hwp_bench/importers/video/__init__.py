@@ -1,0 +1,19 @@
+"""A video of one hand and its tracked landmarks: frames, fit, masks, capture."""
+
+from hwp_bench.importers.video.from_video import import_video
+from hwp_bench.importers.video.imported_clip import ImportedClip
+from hwp_bench.importers.video.settings import (
+    FitSettings,
+    FrameRange,
+    VideoImport,
+    parse_frame_range,
+)
+
+__all__ = [
+    "FitSettings",
+    "FrameRange",
+    "ImportedClip",
+    "VideoImport",
+    "import_video",
+    "parse_frame_range",
+]

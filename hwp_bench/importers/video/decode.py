@@ -1,0 +1,242 @@
+"""The frames of a video: decoding them, and cutting the hand's window out of each."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.images import MAX_PIXELS, read_gray
+from hwp_bench.importers.shared.windows import CropWindows, cut, resample
+from hwp_bench.importers.video.contour import FIELD_SIZE
+from hwp_bench.importers.video.settings import FrameRange
+
+
+@dataclass(frozen=True)
+class VideoInfo:
+    """What a video is.
+
+    Attributes:
+        path: the file.
+        width: pixels, after the rotation that the file asks for.
+        height: pixels.
+        fps: frames per second; 30 where the file does not say.
+        stated_frames: number of frames that the container states, 0 where it does not.
+    """
+
+    path: Path
+    width: int
+    height: int
+    fps: float
+    stated_frames: int
+
+
+def probe(path: str | os.PathLike[str]) -> VideoInfo:
+    """Open a video and decode its first frame.
+
+    Raises:
+        BadInput: missing, empty, no video that OpenCV reads, no frame, or frames too large.
+    """
+    path = Path(path)
+    with _opened(path) as capture:
+        import cv2
+
+        width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if width * height > MAX_PIXELS:
+            raise BadInput(
+                f"is {width}x{height}, above the limit of {MAX_PIXELS} px per frame", where=path
+            )
+        fps = float(capture.get(cv2.CAP_PROP_FPS))
+        stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
+        found, frame = capture.read()
+        if not found or frame is None:
+            raise BadInput("holds no frame that can be decoded", where=path)
+    return VideoInfo(
+        path=path,
+        width=frame.shape[1],
+        height=frame.shape[0],
+        fps=fps if np.isfinite(fps) and 0 < fps <= 1000 else 30.0,
+        stated_frames=int(stated) if np.isfinite(stated) and 0 < stated < 2**31 else 0,
+    )
+
+
+@dataclass(frozen=True, eq=False)
+class Pictures:
+    """The frames of a clip at two resolutions.
+
+    Attributes:
+        frames: (F, size, size, 3) uint8 RGB, what the capture stores.
+        working: (F, S, S, 3) uint8 RGB, what masks are cut in: the video's own resolution, at
+            most twice the stored one.
+    """
+
+    frames: np.ndarray
+    working: np.ndarray
+
+
+def working_size(windows: CropWindows) -> int:
+    """Edge of the working pictures, px."""
+    return min(windows.side, 2 * windows.size)
+
+
+def check_memory(windows: CropWindows) -> None:
+    """Refuse a clip that would not fit into memory, before minutes of work.
+
+    Raises:
+        UsageError: the pictures would take more than the free memory.
+    """
+    import psutil
+
+    edge = working_size(windows)
+    # Colours at both resolutions, the mask, the distance field, and the posed vertices.
+    each = 3 * edge**2 + 4 * windows.size**2 + 2 * FIELD_SIZE**2 + 200_000
+    needed, free = len(windows.corners) * each, psutil.virtual_memory().available
+    if needed > free:
+        raise UsageError(
+            f"{len(windows.corners)} frames need about {needed / 1e9:.1f} GB of memory, "
+            f"{free / 1e9:.1f} GB are free",
+            field="--frames",
+            remedy="Take fewer frames with --frames or --stride, or a smaller --size.",
+        )
+
+
+def read_pictures(
+    info: VideoInfo,
+    selection: FrameRange,
+    windows: CropWindows,
+    update: Callable[[int], None] | None = None,
+) -> Pictures:
+    """Decode the video once and keep the window of every selected frame.
+
+    Raises:
+        BadInput: the video ends early, goes on longer than the landmarks, or is damaged.
+    """
+    count, edge = len(windows.corners), working_size(windows)
+    frames = np.zeros((count, windows.size, windows.size, 3), dtype=np.uint8)
+    working = np.zeros((count, edge, edge, 3), dtype=np.uint8)
+    done = 0
+    for _, picture in read_frames(info, selection):
+        if done < count:
+            square = cut(picture, windows.corners[done], windows.side)
+            frames[done] = resample(square, windows.size)
+            working[done] = resample(square, edge)
+        done += 1
+        if update is not None:
+            update(min(done, count))
+    if done != count:
+        raise BadInput(
+            f"yields {done} frames where the landmarks have {count}",
+            where=info.path,
+            remedy="The video may be truncated, or the landmarks belong to another one.",
+        )
+    return Pictures(frames, working)
+
+
+def read_masks(
+    folder: str | os.PathLike[str],
+    info: VideoInfo,
+    indices: np.ndarray,
+    windows: CropWindows,
+) -> np.ndarray:
+    """Read the user's masks and cut the windows out of them.
+
+    Args:
+        folder: images of the video's size whose names end in the frame number (`000012.png`,
+            `frame_12.png`); above 127 is hand.
+        info: the video.
+        indices: (F,) frame numbers to read.
+        windows: of those frames.
+
+    Returns:
+        (F, S, S) uint8 at the working resolution, 255 = hand.
+
+    Raises:
+        BadInput: no such folder, or a frame has no mask.
+        BadImage: a mask is damaged or not of the video's size.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        raise BadInput("is no folder", where=folder, field="--masks")
+    numbered: dict[int, Path] = {}
+    for path in sorted(folder.iterdir()):
+        number = re.search(r"(\d+)$", path.stem)
+        if number and path.suffix.lower() in (".png", ".jpg", ".jpeg", ".bmp"):
+            numbered[int(number[1])] = path
+    missing = [int(frame) for frame in indices if int(frame) not in numbered]
+    if missing:
+        raise BadInput(
+            f"{len(missing)} of {len(indices)} frames have no mask, first frame {missing[0]}",
+            where=folder,
+            field="--masks",
+            remedy="Name the masks by the frame's number in the video, from 0: 000000.png, ...",
+        )
+    edge = working_size(windows)
+    masks = np.zeros((len(indices), edge, edge), dtype=np.uint8)
+    for row, frame in enumerate(indices):
+        mask = read_gray(numbered[int(frame)], (info.height, info.width))
+        masks[row] = resample(cut(mask, windows.corners[row], windows.side), edge)
+    return masks
+
+
+def read_frames(info: VideoInfo, selection: FrameRange) -> Iterator[tuple[int, np.ndarray]]:
+    """Decode the selected frames, one after the other.
+
+    Args:
+        info: the probed video.
+        selection: which frames; those between are decoded and dropped, because seeking is not
+            exact in every container.
+
+    Yields:
+        (index in the video, (H, W, 3) uint8 RGB).
+
+    Raises:
+        BadInput: the size changes on the way, or the video ends before `selection.stop`.
+    """
+    import cv2
+
+    index = 0
+    with _opened(info.path) as capture:
+        while selection.stop is None or index < selection.stop:
+            if not capture.grab():
+                break
+            if index >= selection.start and (index - selection.start) % selection.stride == 0:
+                found, frame = capture.retrieve()
+                if not found or frame is None or frame.shape != (info.height, info.width, 3):
+                    raise BadInput(
+                        f"frame {index} cannot be decoded at {info.width}x{info.height}",
+                        where=info.path,
+                        remedy="Re-encode the video, or take other frames with --frames.",
+                    )
+                yield index, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
+            index += 1
+    if selection.stop is not None and index < selection.stop:
+        raise BadInput(
+            f"ends after {index} frames where {selection.stop} are asked for",
+            where=info.path,
+            remedy="Choose other frames with --frames; the file may be truncated.",
+        )
+
+
+@contextlib.contextmanager
+def _opened(path: Path) -> Iterator[Any]:
+    import cv2
+
+    if not path.is_file():
+        raise BadInput("does not exist", where=path, remedy="Give a video file.")
+    if path.stat().st_size == 0:
+        raise BadInput("is empty (0 bytes)", where=path)
+    capture = cv2.VideoCapture(os.fspath(path))
+    try:
+        if not capture.isOpened():
+            raise BadInput("is no video that can be read", where=path)
+        yield capture
+    finally:
+        capture.release()

@@ -1,0 +1,270 @@
+"""Fitting a hand to a whole clip: first its landmarks, then its outline too."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+
+from hwp_bench.base.errors import DidNotConverge
+from hwp_bench.hands import HandTemplate, pose_hand
+from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, Landmarks
+from hwp_bench.importers.video.clip_model import ClipModel, PosedClip
+from hwp_bench.importers.video.contour import ContourEnergy
+from hwp_bench.importers.video.fit_terms import LandmarkEnergy
+from hwp_bench.importers.video.rigid_start import rigid_start
+from hwp_bench.importers.video.settings import FitSettings
+
+#: Focal length that is taken for likely where none is given, as a share of the picture's longer
+#: side: a horizontal field of view of 64 degrees, between a webcam and a phone's main camera.
+LIKELY_FOCAL = 0.8
+# Variables that are the same in all frames; they wait until every frame has found its pose.
+_CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
+# Variables that the outline says nothing reliable about.
+_HELD_BY_LANDMARKS = ("log_focal", "log_size")
+#: First step of each variable, in its own unit; constants move slower than poses.
+LEARNING_RATES = {
+    "turn": 0.02,
+    "fingers": 0.03,
+    "anchor": 0.03,
+    "log_depth": 0.01,
+    "betas": 0.02,
+    "offsets": 0.0003,
+    "log_size": 0.003,
+    "log_focal": 0.003,
+}
+# The rate rises over the first steps and ends at this share.
+_WARM_UP = 20
+_LAST_RATE = 0.02
+
+
+@dataclass(frozen=True)
+class Footage:
+    """What the fit knows of the pictures.
+
+    Attributes:
+        width: whole frame, px.
+        height: px.
+        fps: frames per second between the selected frames.
+        focal: focal length in px, or None to estimate it.
+    """
+
+    width: int
+    height: int
+    fps: float
+    focal: float | None
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(2,) principal point, px: the middle of the frame."""
+        return np.array([self.width / 2.0, self.height / 2.0])
+
+    @property
+    def first_focal(self) -> float:
+        """The given or the likely focal length, px."""
+        return self.focal if self.focal is not None else LIKELY_FOCAL * max(self.width, self.height)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedClip:
+    """A fit in progress: the model with its variables, and the energy without pictures.
+
+    Attributes:
+        model: the clip.
+        energy: landmark energy.
+        settings: as fitted.
+    """
+
+    model: ClipModel
+    energy: LandmarkEnergy
+    settings: FitSettings
+
+
+@dataclass(frozen=True)
+class ReprojectionError:
+    """Distance between fitted and tracked landmarks in the detected frames, px.
+
+    Attributes:
+        mean: over frames and the 21 landmarks.
+        median: over both.
+        percentile_95: over both.
+        worst_landmark: name of the landmark with the largest mean.
+        worst_landmark_mean: its mean.
+        without_offsets: mean where the model's bare joints and finger tips are compared.
+        by_frame: (F,) mean of each frame; NaN where nothing was detected.
+    """
+
+    mean: float
+    median: float
+    percentile_95: float
+    worst_landmark: str
+    worst_landmark_mean: float
+    without_offsets: float
+    by_frame: np.ndarray
+
+
+def fit_landmarks(
+    landmarks: Landmarks,
+    template: HandTemplate,
+    footage: Footage,
+    settings: FitSettings,
+    update: Callable[[int], None] | None = None,
+) -> FittedClip:
+    """Fit pose, shape, place and (unless given) focal length to the landmarks of a clip.
+
+    Raises:
+        DidNotConverge: the energy left the finite numbers.
+    """
+    rest = pose_hand(
+        template.to_torch(torch.float64),
+        torch.zeros(1, 16, 3, dtype=torch.float64),
+        torch.zeros(10, dtype=torch.float64),
+        torch.zeros(1, 3, dtype=torch.float64),
+    ).landmarks[0]
+    focal = footage.first_focal
+    start = rigid_start(landmarks, rest.numpy(), focal, footage.centre)
+    model = ClipModel(template, start, focal, footage.centre)
+    energy = LandmarkEnergy(
+        landmarks, model, settings, footage.fps, focal if footage.focal is None else None
+    )
+    hold = () if footage.focal is None else ("log_focal",)
+    descend(model, energy.from_afar, settings.start_steps, hold=_CONSTANTS, update=update)
+
+    def later(step: int) -> None:
+        if update is not None:
+            update(settings.start_steps + step)
+
+    descend(model, energy, settings.landmark_steps, hold=hold, update=later)
+    return FittedClip(model, energy, settings)
+
+
+def fit_outline(
+    fitted: FittedClip, contour: ContourEnergy, update: Callable[[int], None] | None = None
+) -> None:
+    """Refine a fit, in place, so that the mesh's outline meets the masks' outline."""
+    settings = fitted.settings
+
+    def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        return fitted.energy(model, posed) + contour(model, posed)
+
+    for done in range(settings.contour_rounds):
+        contour.rematch(fitted.model)
+        descend(
+            fitted.model,
+            energy,
+            settings.contour_steps,
+            rate=settings.contour_rate,
+            hold=_HELD_BY_LANDMARKS,
+        )
+        if update is not None:
+            update((done + 1) * settings.contour_steps)
+
+
+def reprojection_error(fitted: FittedClip, landmarks: Landmarks) -> ReprojectionError:
+    """Measure how well the fit explains the tracked landmarks."""
+    model = fitted.model
+    with torch.no_grad():
+        pixels = model.pixels(model.posed().landmarks).numpy()
+        offsets = model.variables.offsets.clone()
+        model.variables.offsets.zero_()
+        bare = model.pixels(model.posed().landmarks).numpy()
+        model.variables.offsets.copy_(offsets)
+    seen = landmarks.detected
+    error = np.linalg.norm(pixels - landmarks.image, axis=-1)
+    by_landmark = error[seen].mean(axis=0)
+    worst = int(by_landmark.argmax())
+    return ReprojectionError(
+        mean=float(error[seen].mean()),
+        median=float(np.median(error[seen])),
+        percentile_95=float(np.percentile(error[seen], 95)),
+        worst_landmark=LANDMARK_NAMES[worst],
+        worst_landmark_mean=float(by_landmark[worst]),
+        without_offsets=float(np.linalg.norm(bare - landmarks.image, axis=-1)[seen].mean()),
+        by_frame=np.where(seen, error.mean(axis=1), np.nan),
+    )
+
+
+def descend(
+    model: ClipModel,
+    energy: Callable[[ClipModel, PosedClip], torch.Tensor],
+    steps: int,
+    *,
+    rate: float = 1.0,
+    hold: tuple[str, ...] = (),
+    update: Callable[[int], None] | None = None,
+) -> float:
+    """Lower an energy over the model's variables, in place.
+
+    Args:
+        model: the clip.
+        energy: maps the model and its posed clip to a scalar.
+        steps: number of steps.
+        rate: factor on all learning rates.
+        hold: variables that stay.
+        update: told the number of steps done.
+
+    Returns:
+        The last energy.
+
+    Raises:
+        DidNotConverge: the energy is not finite.
+    """
+    groups = [
+        {"params": [getattr(model.variables, field.name)], "lr": rate * LEARNING_RATES[field.name]}
+        for field in fields(model.variables)
+        if field.name not in hold
+    ]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+
+    def schedule(step: int) -> float:
+        fall = 0.5 * (1.0 + math.cos(math.pi * step / steps))
+        return min(1.0, (step + 1) / _WARM_UP) * (_LAST_RATE + (1.0 - _LAST_RATE) * fall)
+
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, schedule)
+    with _one_thread():
+        return _run(model, energy, steps, optimizer, scheduler, update)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Hold torch to one thread: its operations here are too small to share out.
+
+    On a busy machine the threads of a small operation wait for each other, and a fit takes
+    several times as long.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+def _run(
+    model: ClipModel,
+    energy: Callable[[ClipModel, PosedClip], torch.Tensor],
+    steps: int,
+    optimizer: torch.optim.Optimizer,
+    scheduler: torch.optim.lr_scheduler.LRScheduler,
+    update: Callable[[int], None] | None,
+) -> float:
+    value = math.nan
+    for step in range(steps):
+        optimizer.zero_grad(set_to_none=True)
+        loss = energy(model, model.posed())
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            raise DidNotConverge(
+                f"the fit of the hand left the finite numbers in step {step}",
+                remedy="Check the landmarks; a focal length far off can do this too (--focal).",
+            )
+        loss.backward()
+        optimizer.step()
+        scheduler.step()
+        if update is not None:
+            update(step + 1)
+    return value

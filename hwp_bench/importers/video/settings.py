@@ -1,0 +1,172 @@
+"""Settings of a video import: what the user chooses, and the numbers of the hand fit."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.base.errors import UsageError
+
+
+@dataclass(frozen=True)
+class FrameRange:
+    """Which frames of a video to take: start, start + stride, ... below stop.
+
+    Attributes:
+        start: first frame, counted from 0.
+        stop: end, not included; None = to the end.
+        stride: step.
+    """
+
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or self.stride < 1 or (self.stop is not None and self.stop <= self.start):
+            raise UsageError(
+                f"{self.start}:{'' if self.stop is None else self.stop} with stride {self.stride} "
+                "selects no frames",
+                field="--frames",
+                remedy="Use A:B with 0 <= A < B, and a stride of at least 1.",
+            )
+
+    def indices(self, frame_count: int) -> np.ndarray:
+        """Return the selected indices of a video of `frame_count` frames, (F,) int64."""
+        stop = frame_count if self.stop is None else min(self.stop, frame_count)
+        return np.arange(self.start, stop, self.stride)
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """Weights and scales of the energy that `fit_clip` minimises.
+
+    Every term is a sum over frames of a robust function of residual / scale, so a scale is the
+    size of an error that is still ordinary.
+    """
+
+    #: Steps of Adam from the rigid start, led by the world landmarks.
+    start_steps: int = 150
+    #: Steps of Adam after that, on all landmarks, with outliers let go.
+    landmark_steps: int = 450
+    #: Steps of Adam in each round against the masks.
+    contour_steps: int = 120
+    #: Rounds of: find the mesh's outline, pull it to the mask's outline.
+    contour_rounds: int = 3
+    #: Factor on the learning rates in those rounds: only corrections are left.
+    contour_rate: float = 0.3
+    #: Landmark error in the picture, as a share of the hand's size in the picture.
+    image_scale: float = 0.012
+    #: Error of centred world landmarks, m; the tracker's bones change by 5 mm between frames.
+    world_scale: float = 0.015
+    #: Weight of the world landmarks; they guide depth, the picture decides the rest.
+    world_weight: float = 0.5
+    #: Weight of the image landmarks in the first steps, beside 1 of the world landmarks.
+    start_image_weight: float = 0.05
+    #: Acceleration of landmarks in space, m per (1/30 s)^2.
+    motion_scale: float = 0.003
+    #: Acceleration of joint angles, rad per (1/30 s)^2.
+    turning_scale: float = 0.06
+    #: Weight of both smoothness terms.
+    motion_weight: float = 0.3
+    #: Weight of the joint-limit penalty (rad^2 beyond the anatomical range).
+    limit_weight: float = 300.0
+    #: Overlap of fingers with each other or the palm, m.
+    contact_scale: float = 0.003
+    #: Weight of that overlap.
+    contact_weight: float = 0.5
+    #: Weight of the finger angles squared: what nothing else decides stays near the rest pose.
+    pose_weight: float = 0.02
+    #: Constant distance between the tracker's landmark and the model's joint, m.
+    offset_scale: float = 0.004
+    #: Share of the frames that shape, offsets, scale and focal length priors weigh as much as:
+    #: the tracker's errors repeat from frame to frame, so a clip is worth far fewer views.
+    prior_share: float = 0.1
+    #: Uncertainty of the metres in the world landmarks (log).
+    size_scale: float = 0.05
+    #: Uncertainty of the default focal length (log).
+    focal_scale: float = 0.15
+    #: Outline error in the picture, as a share of the hand's size in the picture.
+    contour_scale: float = 0.007
+    #: How far an outline vertex looks for the mask's outline, as a share of the hand's size.
+    contour_reach: float = 0.06
+    #: Weight of one outline vertex; neighbours say the same, so each counts little.
+    contour_weight: float = 0.2
+
+
+@dataclass(frozen=True)
+class VideoImport:
+    """Choices of a video import; checked when made.
+
+    Raises:
+        UsageError: a choice makes no sense; it names the option.
+    """
+
+    #: Which hand is in the picture: `right` or `left`.
+    hand: str = "right"
+    #: Focal length in px of the whole frame, or None to estimate it.
+    focal: float | None = None
+    #: Folder with masks of the user's own, or None to cut them out.
+    masks: Path | None = None
+    #: Edge of the stored square frames, px.
+    size: int = 256
+    #: Which frames to take.
+    frames: FrameRange = field(default_factory=FrameRange)
+    #: Id of the capture, or None for the name of the output folder.
+    id: str | None = None
+    #: What the hand does.
+    action: str = "unknown"
+    #: What recorded the video.
+    device: str = "unknown"
+    #: Terms under which the frames may be used.
+    licence: str = "unknown"
+    #: Perturbations that the user says are in the clip; how severe in which frame is unknown.
+    perturbations: tuple[str, ...] = ()
+    #: Hand model, as `load_template` takes it.
+    hand_model: str = "anny"
+    #: Frames whose tracker score is lower count as not detected.
+    min_score: float = 0.5
+    #: Further place for the overlay sheet, or None.
+    sheet: Path | None = None
+    #: Replace an existing capture.
+    overwrite: bool = False
+    #: Numbers of the fit.
+    fit: FitSettings = field(default_factory=FitSettings)
+
+    def __post_init__(self) -> None:
+        rules = (
+            ("--hand", self.hand in ("right", "left"), "must be right or left"),
+            ("--focal", self.focal is None or 1 <= self.focal <= 1e6, "must be 1 to 1e6 px"),
+            ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
+            ("--min-score", 0 <= self.min_score <= 1, "must be in [0, 1]"),
+            ("--licence", bool(self.licence), "must not be empty"),
+        )
+        for option, good, problem in rules:
+            if not good:
+                raise UsageError(problem, field=option)
+
+    def capture_id(self, out: str | os.PathLike[str]) -> str:
+        """Return the id of the capture that is written to `out`."""
+        return self.id or Path(out).absolute().name
+
+
+def parse_frame_range(text: str | None, stride: int) -> FrameRange:
+    """Read `A:B`, `A:` or `:B`.
+
+    Raises:
+        UsageError: not of that form, or it selects nothing.
+    """
+    if text is None:
+        return FrameRange(stride=stride)
+    head, colon, tail = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return FrameRange(int(head or 0), int(tail) if tail else None, stride)
+    except ValueError as error:
+        raise UsageError(
+            f"{text!r} is no range", field="--frames", remedy="Use A:B, A: or :B."
+        ) from error

@@ -1,0 +1,232 @@
+"""The whole import. Oracle: a video drawn from the hand model with known parameters."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from synthetic_clip import FOCAL, SyntheticClip, make_clip, write_landmarks, write_video
+
+from hwp_bench.base.errors import BadInput, HwpError, UsageError
+from hwp_bench.base.images import read_rgb, write_image
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.check import check_capture
+from hwp_bench.cli.main import main
+from hwp_bench.hands import load_template, pose_hand, project
+from hwp_bench.hands.raster import overlap
+from hwp_bench.importers.video.from_video import import_video
+from hwp_bench.importers.video.settings import FitSettings, FrameRange, VideoImport
+
+FRAMES = 16
+QUICK = FitSettings(start_steps=60, landmark_steps=120, contour_steps=30, contour_rounds=1)
+REAL = Path(__file__).resolve().parents[5] / "shared" / "data" / "real_hand"
+
+
+@pytest.fixture(scope="module")
+def clip() -> SyntheticClip:
+    return make_clip(FRAMES)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, clip: SyntheticClip) -> Path:
+    """Video, landmarks (frame 5 not seen) and masks."""
+    folder = tmp_path_factory.mktemp("video")
+    write_video(folder / "hand.avi", [clip.picture(frame) for frame in range(FRAMES)])
+    score = np.ones(FRAMES)
+    score[5] = 0.0
+    write_landmarks(folder / "hand.npz", clip.landmarks, score=score)
+    (folder / "masks").mkdir()
+    for frame in range(FRAMES):
+        write_image(folder / "masks" / f"{frame:06d}.png", clip.silhouette(frame))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def capture(folder: Path) -> Capture:
+    options = VideoImport(size=128, fit=QUICK, focal=FOCAL, licence="CC0")
+    import_video(folder / "hand.avi", folder / "hand.npz", folder / "capture", options)
+    return open_capture(folder / "capture")
+
+
+def true_mask(clip: SyntheticClip, capture: Capture, frame: int) -> np.ndarray:
+    """The true silhouette in the capture's crop, by an affine warp of the whole frame."""
+    crop = capture.info.source["crop"]
+    scale = capture.info.width / crop["side"]
+    x, y = np.array(crop["corners"][frame]) * scale
+    # OpenCV has pixel centres at whole numbers: the half pixel is scaled too.
+    matrix = np.array([[scale, 0, 0.5 * scale - 0.5 - x], [0, scale, 0.5 * scale - 0.5 - y]])
+    warped = cv2.warpAffine(clip.silhouette(frame), matrix, capture.size[::-1])
+    return warped > 127
+
+
+def test_the_capture_is_sound(capture: Capture, clip: SyntheticClip) -> None:
+    assert check_capture(capture.root).ok
+    info = capture.info
+    assert (info.hands, info.fps, info.frame_count, info.width) == ("right", 30.0, FRAMES, 128)
+    assert info.perturbations == {}
+    assert (info.hand_model.name, info.hand_model.digest) == (
+        clip.template.name,
+        clip.template.digest,
+    )
+    assert info.source["focal"] == {"px": pytest.approx(FOCAL, rel=1e-5), "from": "user"}
+    assert info.source["fit"]["frames_detected"] == FRAMES - 1
+    np.testing.assert_array_equal(capture.hands["right"].valid, np.arange(FRAMES) != 5)
+    extra = json.loads((capture.root / "extra" / "import.json").read_text())
+    assert extra == info.source["fit"]
+    assert read_rgb(capture.root / "extra" / "overlay.png").shape[2] == 3
+
+
+def test_the_stored_hand_lies_on_the_true_hand(capture: Capture, clip: SyntheticClip) -> None:
+    # Through the capture's own cameras, against the truth moved to the crop: 2 px of 128.
+    hand = capture.hands["right"]
+    tensors = load_template().to_torch(torch.float64)
+    posed = pose_hand(
+        tensors,
+        torch.from_numpy(hand.pose),
+        torch.from_numpy(hand.betas),
+        torch.from_numpy(hand.transl),
+    )
+    cameras = capture.cameras
+    pixels, depth = project(
+        posed.landmarks, torch.from_numpy(cameras.viewmats), torch.from_numpy(cameras.Ks)
+    )
+    crop = capture.info.source["crop"]
+    truth = (clip.landmarks.image - np.array(crop["corners"])[:, None]) * 128 / crop["side"]
+    error = np.linalg.norm(pixels.numpy() - truth, axis=-1)
+    assert error.mean() < 2.0
+    assert error[5].mean() < 4.0  # the frame that was not seen is bridged
+    assert depth.min() > 0.2
+
+
+def test_masks_cover_the_true_hand(capture: Capture, clip: SyntheticClip) -> None:
+    for frame in range(FRAMES):
+        found = capture.mask(frame) > 127
+        assert overlap(found, true_mask(clip, capture, frame)) > 0.9
+
+
+def test_frames_are_the_video(capture: Capture, clip: SyntheticClip) -> None:
+    crop = capture.info.source["crop"]
+    (x, y), side = crop["corners"][3], crop["side"]
+    padded = np.pad(clip.picture(3), ((side, side), (side, side), (0, 0)))
+    square = padded[y + side : y + 2 * side, x + side : x + 2 * side]
+    expected = cv2.resize(square, (128, 128), interpolation=cv2.INTER_AREA)
+    # JPEG on noise of 4 levels, averaged.
+    assert np.abs(capture.frame(3).astype(float) - expected).mean() < 4
+
+
+def test_the_command_prints_the_numbers_and_saves_the_sheet(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(FitSettings, "__init__", lambda self: _set(self, QUICK))
+    sheet = folder / "sheet.png"
+    words = ["data", "import-video", str(folder / "hand.avi"), str(folder / "by_command")]
+    words += ["--landmarks", str(folder / "hand.npz"), "--size", "96", "--frames", "6:16"]
+    words += ["--stride", "2", "--sheet", str(sheet), "--perturbations", "motion_blur"]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert "mean reprojection error of the 21 joints:" in out
+    assert "px at 320x240" in out
+    assert "overlap of mesh and mask: 0.9" in out
+    assert read_rgb(sheet).shape[0] > 96
+    info = open_capture(folder / "by_command").info
+    assert (info.id, info.frame_count, info.fps) == ("by_command", 5, 15.0)
+    assert info.source["frames"] == [6, 8, 10, 12, 14]
+    assert info.perturbations == {"motion_blur": None}
+    # Again: refused without --force, done with it.
+    assert main(words) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main([*words, "--force", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["frames"] == 5
+
+
+def _set(settings: FitSettings, values: FitSettings) -> None:
+    settings.__dict__.update(values.__dict__)
+
+
+def test_own_masks_are_taken(folder: Path, clip: SyntheticClip) -> None:
+    options = VideoImport(size=96, fit=QUICK, focal=FOCAL, masks=folder / "masks")
+    result = import_video(folder / "hand.avi", folder / "hand.npz", folder / "own", options)
+    capture = open_capture(folder / "own")
+    assert capture.info.source["masks"] == "user"
+    for frame in (0, 7):
+        assert overlap(capture.mask(frame) > 127, true_mask(clip, capture, frame)) > 0.97
+    assert result.masks.overlap[result.source.landmarks.detected].min() > 0.9
+
+
+BAD_INPUTS = {
+    "landmarks of another video": ("hand.npz", {"count": FRAMES - 2}, BadInput, "frames"),
+    "no such masks": ("hand.npz", {"masks": "nowhere"}, BadInput, "--masks"),
+    "missing masks": ("hand.npz", {"masks": "few"}, BadInput, "no mask, first frame 3"),
+    "no such perturbation": ("hand.npz", {"perturbations": ("fog",)}, BadInput, "fog"),
+    "bad id": ("hand.npz", {"id": "a/b"}, BadInput, "a/b"),
+    "too few frames": ("hand.npz", {"frames": FrameRange(0, 2)}, UsageError, "--frames"),
+    "hand never seen": ("hand.npz", {"frames": FrameRange(5, 6)}, UsageError, "--frames"),
+    "beyond the end": ("hand.npz", {"frames": FrameRange(50, 60)}, UsageError, "--frames"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_INPUTS)
+def test_bad_input_is_one_clear_error_and_leaves_nothing(
+    folder: Path, clip: SyntheticClip, tmp_path: Path, case: str
+) -> None:
+    name, changes, kind, message = BAD_INPUTS[case]
+    changes = dict(changes)
+    landmarks = folder / name
+    if "count" in changes:
+        few = clip.landmarks.select(np.arange(changes.pop("count")))
+        landmarks = write_landmarks(tmp_path / "few.npz", few)
+    if "masks" in changes:
+        changes["masks"] = tmp_path / str(changes["masks"])
+    if case == "missing masks":
+        for frame in range(3):
+            write_image(tmp_path / "few" / f"mask_{frame}.png", clip.silhouette(frame))
+    before = set(tmp_path.iterdir())
+    with pytest.raises(kind, match=message):
+        import_video(
+            folder / "hand.avi", landmarks, tmp_path / "out", replace(VideoImport(), **changes)
+        )
+    assert set(tmp_path.iterdir()) == before
+
+
+def test_a_mask_of_another_size_is_named(folder: Path, tmp_path: Path) -> None:
+    for frame in range(FRAMES):
+        write_image(tmp_path / f"{frame}.png", np.zeros((24, 32), dtype=np.uint8))
+    with pytest.raises(HwpError, match="32x24 pixels where 320x240"):
+        import_video(
+            folder / "hand.avi",
+            folder / "hand.npz",
+            tmp_path / "out",
+            VideoImport(masks=tmp_path, fit=QUICK),
+        )
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [("hand", "both"), ("focal", 0.0), ("focal", float("nan")), ("size", 8), ("min_score", 2.0)],
+)
+def test_options_that_make_no_sense_are_refused(field: str, value: object) -> None:
+    with pytest.raises(UsageError):
+        replace(VideoImport(), **{field: value})
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not REAL.is_dir(), reason="the study material is not here")
+def test_a_part_of_the_real_video(tmp_path: Path) -> None:
+    # Frames 590 to 621 open and make a fist, fast; the issue's bound is 8 px at 1280x720.
+    options = VideoImport(
+        frames=FrameRange(590, 621),
+        fit=FitSettings(start_steps=80, landmark_steps=200, contour_steps=60),
+    )
+    result = import_video(
+        REAL / "human_hand_video.mp4", REAL / "landmarks.npz", tmp_path / "real", options
+    )
+    assert result.error.mean < 5.0
+    assert result.hand.valid.all()
+    assert result.masks.overlap.mean() > 0.9
+    assert result.masks.overlap.mean() > result.overlap_landmarks_only + 0.02
+    assert check_capture(tmp_path / "real").ok
