@@ -1,4 +1,4 @@
-"""One run at a time on one output: whoever comes second is told so, and changes nothing."""
+"""One process at a time on one folder: whoever comes second is refused, or waits."""
 
 from __future__ import annotations
 
@@ -8,45 +8,53 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from hwp_bench.base.errors import HwpError
+from hwp_bench.base.progress import notice
 
 #: Name of the lock file inside an output folder.
 LOCK = ".lock"
 
 
 @contextlib.contextmanager
-def sole_use(folder: str | os.PathLike[str]) -> Iterator[None]:
-    """Hold an output folder for this process; a killed process lets go of it by itself.
+def exclusive(folder: str | os.PathLike[str], *, wait: bool = False) -> Iterator[None]:
+    """Hold a folder for this process; a killed process lets go of it by itself.
+
+    On a file system without locks nothing is held: do not start two runs there.
 
     Args:
-        folder: made if it is not there. An empty lock file stays in it.
+        folder: made if it does not exist. An empty lock file stays in it.
+        wait: wait for the other process instead of refusing. The lock file then lies next to the
+            folder, as `NAME.lock`, because the holder usually makes the folder as a whole; the
+            folder itself is not made.
 
     Raises:
         HwpError: another process holds it, or it cannot be written to.
     """
+    from filelock import FileLock, Timeout
+
     folder = Path(folder)
+    file = folder.with_name(f"{folder.name}.lock") if wait else folder / LOCK
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        stream = (folder / LOCK).open("w")
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.open("a").close()
     except OSError as error:
         raise HwpError(
             f"cannot be written ({error.strerror})",
             where=folder,
             remedy="Choose another folder, or change its permissions.",
         ) from error
-    with stream:
+    lock = FileLock(file)
+    with contextlib.ExitStack() as held:
         try:
-            import fcntl
-        except ImportError:  # no file locks on this system: runs must not be doubled by hand
-            yield
-            return
-        try:
-            fcntl.flock(stream, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError as error:
-            raise HwpError(
-                "another run is writing here",
-                where=folder,
-                remedy="Wait until it has ended, or choose another folder.",
-            ) from error
-        except OSError:  # a file system without locks
+            held.enter_context(lock.acquire(timeout=0))
+        except Timeout as error:
+            if not wait:
+                raise HwpError(
+                    "another run is writing here",
+                    where=folder,
+                    remedy="Wait until it has ended, or choose another folder.",
+                ) from error
+            notice(f"Waiting for another process that makes {folder.name.lstrip('.')} ...")
+            held.enter_context(lock.acquire())
+        except (OSError, NotImplementedError):  # a file system or a system without locks
             pass
         yield

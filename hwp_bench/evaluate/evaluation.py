@@ -10,7 +10,7 @@ from typing import Any
 
 from hwp_bench import __version__
 from hwp_bench.base.errors import BadCapture
-from hwp_bench.base.locks import sole_use
+from hwp_bench.base.locks import exclusive
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluate.capture_run import Job, read_result
@@ -95,7 +95,7 @@ def evaluate(
         evaluation_job(job, folder, folder.name, needs or Needs())
         for job, folder in zip(plan.jobs, folders, strict=True)
     ]
-    with sole_use(out):
+    with exclusive(out):
         (engine or LocalEngine()).run(jobs, lambda index: None, on_capture)
         results = plan.results([read_result(folder) for folder in folders])
         write_results(out / "results.json", results)

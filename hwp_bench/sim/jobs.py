@@ -54,12 +54,12 @@ class RenderCapture:
         Raises:
             HwpError: as `render_capture`.
         """
-        from hwp_bench.sim.locks import alone
+        from hwp_bench.base.locks import exclusive
 
         if not self.keep:
             self._render(output)
             return
-        with alone(output.with_name(f"{output.name}.lock")):
+        with exclusive(output, wait=True):
             if not is_capture(output):
                 self._render(output)
 

@@ -20,6 +20,7 @@ import numpy as np
 
 from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.base.files import canonical_json, sha256_json
+from hwp_bench.base.locks import exclusive
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.progress import progress
 from hwp_bench.capture import (
@@ -34,7 +35,6 @@ from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.sim.atlas import skin_atlas
 from hwp_bench.sim.camera import focus_point, intrinsics, viewmat
 from hwp_bench.sim.estimates import estimate_hands, estimate_mask
-from hwp_bench.sim.locks import alone
 from hwp_bench.sim.motion import hand_parameters
 from hwp_bench.sim.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.scene import Scene, load_scene
@@ -101,7 +101,7 @@ def render_capture(
         raise UsageError("exists already", where=out, remedy="Choose another place or overwrite.")
     kind = "-exr" if exr else ""
     waiting = out.absolute().parent / f".{out.name}.{render_key(scene, count, edge)[:16]}{kind}"
-    with alone(waiting.with_name(f"{waiting.name}.lock")):
+    with exclusive(waiting, wait=True):
         try:
             waiting.mkdir(parents=True, exist_ok=True)
         except OSError as error:

@@ -11,7 +11,7 @@ from typing import Any
 
 from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.base.files import sha256_file, sha256_json
-from hwp_bench.base.locks import sole_use
+from hwp_bench.base.locks import exclusive
 from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, contiguous_split
@@ -97,7 +97,7 @@ def fit_capture(
     split = every_frame(capture) if all_frames else _split(capture)
     work = out.with_name(out.name + ".fit")
     run = RunSettings(dict(settings), seed, budget)
-    with sole_use(work) if world.leads else contextlib.nullcontext():
+    with exclusive(work) if world.leads else contextlib.nullcontext():
         if world.leads:
             write_request(work / "request", capture, split, run)
         world.wait_for_leader()

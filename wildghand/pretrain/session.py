@@ -10,7 +10,7 @@ from typing import Any
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_file, sha256_json
-from hwp_bench.base.locks import sole_use
+from hwp_bench.base.locks import exclusive
 from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.methods.contract import REQUEST, Budget, RunSettings
@@ -66,7 +66,7 @@ def pretrain(
     total = chosen.steps * len(captures) if steps is None else steps
     run = RunSettings(dict(settings), seed, Budget(steps=total))
     work = out.with_name(out.name + ".pretrain")
-    with sole_use(work):
+    with exclusive(work):
         joint, done = _fit_in(work, captures, run, chosen, total)
         prior = save_prior(
             out,

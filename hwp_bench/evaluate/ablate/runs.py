@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hwp_bench.analysis.statistics.pairing import MethodRuns
-from hwp_bench.base.locks import sole_use
+from hwp_bench.base.locks import exclusive
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluate.ablate.design import Design, Variant
 from hwp_bench.evaluate.capture_run import read_result
@@ -114,7 +114,7 @@ def run_ablation(
         results = plans[variant.name, seed].results([done[key] for key in sorted(done)])
         write_results(out / result_folder(variant.name, seed) / "results.json", results)
 
-    with sole_use(out):
+    with exclusive(out):
         (engine or LocalEngine()).run(jobs, on_done, on_job)
     return AblationRuns(design, _runs(design, plans, finished, seeds))
 

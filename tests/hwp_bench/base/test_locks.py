@@ -14,15 +14,15 @@ from small_captures import CaptureMaker
 from toy_method import write_toy_method
 
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.locks import sole_use
+from hwp_bench.base.locks import exclusive
 from hwp_bench.cli.main import main
 from hwp_bench.results import read_results
 
 ROOT = Path(__file__).parents[2]
 HOLD = """
 import sys, time
-from hwp_bench.base.locks import sole_use
-with sole_use(sys.argv[1]):
+from hwp_bench.base.locks import exclusive
+with exclusive(sys.argv[1]):
     print("held", flush=True)
     time.sleep(600)
 """
@@ -44,13 +44,45 @@ def test_the_second_is_told_and_a_killed_holder_lets_go(tmp_path: Path) -> None:
     )
     assert holder.stdout is not None
     assert holder.stdout.readline() == b"held\n"
-    with pytest.raises(HwpError, match="another run is writing here"), sole_use(out):
+    with pytest.raises(HwpError, match="another run is writing here"), exclusive(out):
         pass
     holder.kill()
     holder.wait()
     holder.stdout.close()
-    with sole_use(out):
+    with exclusive(out):
         pass
+
+
+def test_whoever_waits_is_told_so_and_goes_on_when_the_holder_is_gone(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "capture"
+    hold = HOLD.replace("sys.argv[1]", "sys.argv[1], wait=True").replace("600", "1")
+    holder = subprocess.Popen(
+        [sys.executable, "-c", hold, str(out)], cwd=ROOT, stdout=subprocess.PIPE
+    )
+    assert holder.stdout is not None
+    assert holder.stdout.readline() == b"held\n"
+    with exclusive(out, wait=True):
+        assert holder.wait() == 0
+    holder.stdout.close()
+    assert "Waiting for another process that makes capture" in capsys.readouterr().err
+    assert {item.name for item in tmp_path.iterdir()} == {"capture.lock"}
+    with exclusive(out, wait=True):
+        assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("code", [errno.EOPNOTSUPP, errno.ENOLCK])
+def test_a_file_system_without_locks_does_not_fail(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, code: int
+) -> None:
+    def refuse(descriptor: int, operation: int) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr("fcntl.flock", refuse)
+    for wait in (False, True):
+        with exclusive(tmp_path / "out", wait=wait):
+            pass
 
 
 def test_two_runs_on_one_output_are_one_message_and_lose_nothing(
@@ -61,7 +93,7 @@ def test_two_runs_on_one_output_are_one_message_and_lose_nothing(
     words = [str(method), "--capture", str(capture.root), "-o", str(out)]
     assert main(["evaluate", *words]) == 0
     before = (out / "results.json").read_bytes()
-    with sole_use(out):
+    with exclusive(out):
         for command in ("evaluate", "ablate"):
             capsys.readouterr()
             assert main([command, *words]) == 1
@@ -120,7 +152,7 @@ def test_two_fits_of_one_avatar_are_one_message(make_capture: CaptureMaker, tmp_
 
     out = tmp_path / "avatar"
     with (
-        sole_use(tmp_path / "avatar.fit"),
+        exclusive(tmp_path / "avatar.fit"),
         pytest.raises(HwpError, match="another run is writing here"),
     ):
         fit_capture(make_capture("tiny").root, out, settings={}, budget=Budget(steps=1))
