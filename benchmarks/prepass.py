@@ -178,7 +178,7 @@ def main() -> None:
 
     print(
         "| capture | frames | px | perturbed | s | Spearman | AUC | clean kept | strong caught "
-        "| gain error (90 %) | pixel AUC (mask alone) |"
+        "| gain error (90 %) | pixel AUC (mask only) |"
     )
     print("| --- |" + " ---: |" * 10)
     levels = []

@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command, alone or with the processes that torchrun started."""
     from wildghand.fit.parallel import run_in_world
-    from wildghand.gaussians.device import choose_device
+    from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings
 
     return run_in_world(

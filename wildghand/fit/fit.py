@@ -17,8 +17,7 @@ from wildghand.fit.objective import Objective
 from wildghand.fit.parallel import ALONE, World, average_gradients, digest_of
 from wildghand.fit.rates import make_optimizer, set_rates
 from wildghand.fit.weighting import Weighting
-from wildghand.gaussians.clip import TrainingClip
-from wildghand.gaussians.frames import load_frames
+from wildghand.gaussians.training import TrainingClip, load_frames
 from wildghand.model.assemble import assemble, make_rigs
 from wildghand.model.model import Drawing
 from wildghand.model.settings import WildGHandSettings

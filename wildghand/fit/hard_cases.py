@@ -19,7 +19,7 @@ from hwp_bench.stability import Case, Context, Measured
 from wildghand.dpd.dpd import DynamicPerturbation, drop
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
-from wildghand.gaussians.perceptual import FilterBank
+from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.model import terms
 from wildghand.pao.pao import PaoSettings, PerturbationAwareWeights, Weights
 from wildghand.pao.regions.frame_regions import FrameRegions, overlapping, partition, stack_regions
@@ -123,7 +123,7 @@ def _gradients() -> Iterator[_Entry]:
     weights = _noise(2, _SIZE, _SIZE, seed=2).double()
     hand = target[..., 0] > 0.5
     image, features = _noise(2, _SIZE, _SIZE, 3).double(), _noise(9, 4).double()
-    bank = FilterBank()
+    bank = FilterBankLoss()
     functions: dict[str, tuple[Callable[[Tensor], Tensor], Tensor]] = {
         "reconstruction": (
             lambda x: terms.reconstruction(x, target.to(x), weights.to(x)),
@@ -237,7 +237,7 @@ def _run_no_weight(context: Context) -> Measured:
     error = image.detach().mean(dim=-1)
     made = module(error, stack_regions([_halves()]), _hand(), torch.zeros(1))
     loss = terms.reconstruction(image, torch.zeros_like(image), made.weights, 0.2)
-    loss = loss + FilterBank()(image, torch.zeros_like(image), made.weights)
+    loss = loss + FilterBankLoss()(image, torch.zeros_like(image), made.weights)
     loss.backward()
     passed = float(loss.detach()) == 0.0 and _gradient(image) == 0.0
     return Measured(
@@ -254,7 +254,7 @@ def _run_frame(frame: Tensor, hand: Tensor, context: Context) -> Measured:
     residual = blended_residual(error, regions, hand)
     robust = residual_weights(residual, running_median(None, residual, hand))
     loss = terms.reconstruction(image, frame, weights * robust, 0.2)
-    loss = loss + terms.weight_reward(weights) + FilterBank()(image, frame, weights)
+    loss = loss + terms.weight_reward(weights) + FilterBankLoss()(image, frame, weights)
     loss.backward()
     bad = ~frame.isfinite().all(dim=-1)
     passed = (

@@ -9,7 +9,7 @@ from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fit.fit import Fit
 from wildghand.fit.optimise import optimise
-from wildghand.gaussians.device import choose_device
+from wildghand.gaussians.fit_loop import choose_device
 from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
 from wildghand.model.settings import read_settings
 from wildghand.splat.warmup import warm_up

@@ -10,7 +10,7 @@ from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fit.weighting import Target
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.laplacian import surface_laplacian
-from wildghand.gaussians.perceptual import FilterBank
+from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.gaussians.rig import HandRig
 from wildghand.model import terms
 from wildghand.model.model import Drawing, WildGHandModel
@@ -43,7 +43,7 @@ class Objective:
         self._laplacians = (
             {side: surface_laplacian(rig) for side, rig in rigs.items()} if any(smooth) else {}
         )
-        self._perceptual = FilterBank() if self.weights.perceptual else None
+        self._perceptual = FilterBankLoss() if self.weights.perceptual else None
 
     def __call__(
         self, model: WildGHandModel, drawing: Drawing, target: Target, rows: Tensor, clean: Tensor

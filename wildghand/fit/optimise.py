@@ -13,8 +13,7 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fit.fit import Fit
 from wildghand.fit.parallel import World
 from wildghand.fit.plateau import Plateau
-from wildghand.gaussians.guard import Guard
-from wildghand.gaussians.schedule import batches, spent
+from wildghand.gaussians.fit_loop import Guard, batches, spent
 
 
 class Watchers:

@@ -23,7 +23,7 @@ from wildghand.fit.fit import Fit
 from wildghand.fit.optimise import Watchers, optimise
 from wildghand.fit.parallel import ALONE, World
 from wildghand.fit.saved import load_state, save_state
-from wildghand.gaussians.device import choose_device
+from wildghand.gaussians.fit_loop import choose_device
 from wildghand.model.settings import WildGHandSettings, read_settings
 
 #: Seconds between two saved states.

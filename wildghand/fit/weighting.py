@@ -10,7 +10,7 @@ from torch import Tensor
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fit.parallel import ALONE, World
-from wildghand.gaussians.frames import TrainingFrames
+from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.model import Drawing
 from wildghand.model.settings import WildGHandSettings
 from wildghand.pao.pao import PerturbationAwareWeights

@@ -48,7 +48,7 @@ class AnchoredGaussians:
             orientations: (B, N, 4) unit quaternions, world, of the anchors' frames.
 
         Returns:
-            What the rasterizer takes, colours apart.
+            The arguments of the rasterizer, except the colours.
 
         Raises:
             ShapeMismatch: not N anchors.

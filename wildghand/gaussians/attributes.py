@@ -23,7 +23,7 @@ CHANNELS = sum(SIZES.values())
 
 @dataclass(frozen=True, eq=False)
 class RawAttributes:
-    """What the network predicts and DPD adds its biases to; `Activation` makes it drawable.
+    """The network's predictions, to which DPD adds its biases; `Activation` makes them drawable.
 
     Leading dimensions are B frames or none. A sum broadcasts them, so that attributes of all
     frames, (N, k), and biases of each frame, (B, N, k), add up to (B, N, k).
@@ -44,7 +44,7 @@ class RawAttributes:
         for name, tensor in self.items():
             if tensor.ndim < 2 or tensor.shape[-1] != SIZES[name]:
                 raise ShapeMismatch(
-                    f"is {tuple(tensor.shape)}, wanted (..., N, {SIZES[name]})", field=name
+                    f"is {tuple(tensor.shape)}, expected (..., N, {SIZES[name]})", field=name
                 )
 
     def __len__(self) -> int:
@@ -84,7 +84,7 @@ class RawAttributes:
         """
         if channels.ndim < 2 or channels.shape[-1] != CHANNELS:
             raise ShapeMismatch(
-                f"are {tuple(channels.shape)}, wanted (..., N, {CHANNELS})", field="channels"
+                f"are {tuple(channels.shape)}, expected (..., N, {CHANNELS})", field="channels"
             )
         parts = channels.split(list(SIZES.values()), dim=-1)
         return cls(**dict(zip(SIZES, parts, strict=True)))

@@ -1,4 +1,4 @@
-"""Roughness of what is spread over the hand's surface: a sparse Laplacian, made once."""
+"""Roughness of values spread over the hand's surface: a sparse Laplacian, made once."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class SurfaceLaplacian:
         count = len(self.matrix)
         if values.ndim < 2 or values.shape[-2] != count:
             raise ShapeMismatch(
-                f"has shape {tuple(values.shape)}, wanted (..., {count}, C)", field="values"
+                f"has shape {tuple(values.shape)}, expected (..., {count}, C)", field="values"
             )
         rows = values.movedim(-2, 0).reshape(count, -1).to(self.matrix.dtype)
         made = _Product.apply(rows, self.matrix, self.transposed)
@@ -112,7 +112,7 @@ def nearest_on_surface(positions: np.ndarray, normals: np.ndarray, count: int) -
     Args:
         positions: (N, 3).
         normals: (N, 3) of length 1.
-        count: neighbours that are wanted.
+        count: neighbours to find.
 
     Returns:
         (N, K) int64, K = count or N - 1 if that is less; -1 where fewer agree.
@@ -120,13 +120,13 @@ def nearest_on_surface(positions: np.ndarray, normals: np.ndarray, count: int) -
     from scipy.spatial import cKDTree
 
     total = len(positions)
-    wanted = min(count, total - 1)
+    found = min(count, total - 1)
     candidates = min(_CANDIDATES * count + 1, total)
     _, near = cKDTree(positions).query(positions, k=candidates)
     near = near.reshape(total, candidates)
     agree = np.einsum("nc,nkc->nk", normals, normals[near]) > 0.0
     agree &= near != np.arange(total)[:, None]
-    order = np.argsort(~agree, axis=1, kind="stable")[:, :wanted]
+    order = np.argsort(~agree, axis=1, kind="stable")[:, :found]
     chosen = np.take_along_axis(near, order, axis=1)
     return np.where(np.take_along_axis(agree, order, axis=1), chosen, -1)
 
@@ -138,8 +138,8 @@ def _difference_matrix(near: np.ndarray) -> Any:
     total = len(near)
     counts = (near >= 0).sum(axis=1)
     rows, places = np.nonzero(near >= 0)
-    alone = np.where(counts > 0, 1.0, 0.0)
-    data = np.concatenate([alone, -1.0 / counts[rows]])
+    own = np.where(counts > 0, 1.0, 0.0)
+    data = np.concatenate([own, -1.0 / counts[rows]])
     index = (
         np.concatenate([np.arange(total), rows]),
         np.concatenate([np.arange(total), near[rows, places]]),

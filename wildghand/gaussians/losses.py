@@ -53,7 +53,7 @@ def photometric_loss(
         prediction: (B, H, W, C) float, sRGB in [0, 1].
         target: (B, H, W, C), as `prediction`.
         weights: (B, H, W) not negative.
-        dssim_weight: lambda in [0, 1]; 0 leaves L1 alone and costs no SSIM.
+        dssim_weight: lambda in [0, 1]; with 0 only L1 is computed.
 
     Returns:
         scalar: the weighted sum divided by the number of values B H W C, so that a pixel counts

@@ -24,8 +24,8 @@ _VGG_WEIGHTS = {5: 1 / 16, 10: 1 / 8, 19: 1 / 4, 28: 1.0}
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
-class FilterBank(nn.Module):
-    """Oriented edges and colours at four scales, compared after pooling; no file is needed.
+class FilterBankLoss(nn.Module):
+    """Oriented edges and colours at four scales, compared after pooling; it needs no file.
 
     At each octave below the full resolution, which the reconstruction sees, the luma is
     differentiated along four directions, split into its bright-dark and dark-bright halves, and
@@ -62,7 +62,7 @@ class FilterBank(nn.Module):
 
 
 class Vgg19(nn.Module):
-    """Features of VGG-19 behind relu2_1 to relu5_1, weighed 1/16, 1/8, 1/4 and 1.
+    """Features of VGG-19 behind relu2_1 to relu5_1, weighted 1/16, 1/8, 1/4 and 1.
 
     Args:
         weights: a file of the user's with torchvision's parameters of VGG-19: .safetensors, or
@@ -72,8 +72,8 @@ class Vgg19(nn.Module):
         BadInput: it is missing, unreadable, or lacks a layer.
 
     Source: Simonyan and Zisserman, "Very deep convolutional networks for large-scale image
-    recognition", configuration E. The paper names no slices; these are the four last of the
-    five that the weights are known from (Wang et al., pix2pixHD).
+    recognition", configuration E. The paper does not name the slices; these are the last four of
+    the five that are usual with these weights (Wang et al., pix2pixHD).
     """
 
     mean: Tensor
@@ -92,7 +92,7 @@ class Vgg19(nn.Module):
         self.register_buffer("std", torch.tensor(_STD)[:, None, None], persistent=False)
 
     def forward(self, prediction: Tensor, target: Tensor, weights: Tensor) -> Tensor:
-        """Sum of the weighed mean differences of features; arguments as in `FilterBank`."""
+        """Sum of the weighted mean differences of features; arguments as in `FilterBankLoss`."""
         features = (_weighted(prediction, target, weights) - self.mean) / self.std
         total = prediction.new_zeros(())
         for place in range(max(_VGG_LAYERS) + 1):
@@ -159,11 +159,11 @@ def _read(path: Path) -> dict[str, Tensor]:
 
             return load_file(path)
         loaded = torch.load(path, map_location="cpu", weights_only=True)
-    # A damaged file raises whatever its reader stumbles over.
+    # A damaged file may raise anything in its reader.
     except Exception as error:
         raise BadInput(f"cannot be read ({type(error).__name__}: {error})", where=path) from error
     if not isinstance(loaded, dict):
-        raise BadInput("is no table of parameters", where=path)
+        raise BadInput("is not a table of parameters", where=path)
     return loaded
 
 

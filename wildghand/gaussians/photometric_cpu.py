@@ -100,7 +100,7 @@ def _one_image(
         window: (11,).
         stabilisers: C1 and C2 of SSIM.
         errors: (H, W), filled.
-        gradient: (H, W, C), filled; None where it is not wanted.
+        gradient: (H, W, C), filled; None if not needed.
     """
     height, width, channels = x.shape
 

@@ -1,4 +1,4 @@
-"""What carries Gaussians along: anchors on one hand, posed frame by frame."""
+"""Anchors on one hand, posed frame by frame; the Gaussians ride on them."""
 
 from __future__ import annotations
 
@@ -64,8 +64,8 @@ class HandRig:
     def follow(self, pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> AnchorPoses:
         """Pose the anchors of a few frames; the positions are differentiable.
 
-        Their frames carry no gradient: it would cost as much again, and what a turned splat
-        changes in the image is little beside what a moved one does.
+        Their frames carry no gradient: it would double the cost, and turning a splat changes the
+        image much less than moving it.
 
         Args:
             pose: (F, 16, 3) axis-angle, rad.

@@ -16,7 +16,7 @@ def sh_count(degree: int) -> int:
     """Number of basis functions up to `degree`: (degree + 1)^2.
 
     Raises:
-        UsageError: no whole number in 0..3.
+        UsageError: not an integer in 0..3.
     """
     if not isinstance(degree, int) or not 0 <= degree <= MAX_DEGREE:
         raise UsageError(f"is {degree!r}", field="degree", remedy=f"Use 0 to {MAX_DEGREE}.")
@@ -35,7 +35,7 @@ def sh_basis(normals: torch.Tensor, degree: int) -> torch.Tensor:
         seven of degree 3. Orthonormal under the mean over the sphere.
 
     Raises:
-        UsageError: no such degree.
+        UsageError: not a degree in 0..3.
 
     Source: the polynomial forms of the real spherical harmonics; light of degree 2 is enough
     for a matte surface (Ramamoorthi and Hanrahan, "An efficient representation for irradiance

@@ -11,9 +11,9 @@ from torch import Tensor, nn
 from wildghand.dpd.dpd import DynamicPerturbation
 from wildghand.dpd.scale_gradients import taught
 from wildghand.gaussians.attributes import RawAttributes
-from wildghand.gaussians.clip import TrainingClip
 from wildghand.gaussians.quaternions import quat_multiply, quat_rotate, quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
+from wildghand.gaussians.training import TrainingClip
 from wildghand.network import Prediction, PredictionNetwork
 from wildghand.splat import rasterize
 

@@ -1,4 +1,4 @@
-"""What the estimated hands say about every pixel: silhouettes, surface cells, normals."""
+"""The estimated hands drawn into the frames: silhouettes, surface cells and normals of pixels."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ class Footprint:
     cells: np.ndarray
     #: (P, 3) float32 unit normals, world axes.
     normals: np.ndarray
-    #: (P,) float32 cosine between normal and the way to the camera.
+    #: (P,) float32 cosine between the normal and the direction to the camera.
     facing: np.ndarray
-    #: Median way of the visible points across the picture since the frame before, px.
+    #: Median path of the visible points across the image since the frame before, px.
     motion: float
 
 
@@ -87,7 +87,7 @@ class HandSurfaces:
             Ks: (F, 3, 3) px.
             viewmats: (F, 4, 4).
             frames: (R,) which frames.
-            size: height and width of the pictures.
+            size: height and width of the images.
         """
         before: tuple[int, np.ndarray] | None = None
         for start in range(0, len(frames), _CHUNK):

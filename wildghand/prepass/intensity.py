@@ -51,7 +51,7 @@ class LightSamples:
 
 @dataclass(frozen=True, eq=False)
 class IntensityModel:
-    """What log light the hands have where; gains are relative to the mode of the gains."""
+    """Log light of the hands at every place; gains are relative to the mode of the gains."""
 
     #: (C, 3) float32 log albedo of every cell.
     albedo: np.ndarray

@@ -1,4 +1,4 @@
-"""Where most frames agree: the densest part of a set of values, whatever the rest does."""
+"""Robust location: the densest part of a set of values, where most frames agree."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def densest(values: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def normal_value(values: np.ndarray, share: float) -> tuple[float, float]:
-    """What is normal among values: median and robust deviation of the shortest part of them.
+    """Median and robust deviation of the shortest part of the values: those that are normal.
 
     Args:
         values: (F,) float; those that are not finite are left out.

@@ -15,7 +15,7 @@ from wildghand.prepass.settings import PrepassSettings
 _WINDOW = 5
 # Least residual of clean frames, log: about what a sensor's noise leaves.
 _LEAST_LEVEL = 0.03
-# What is left of a pixel's weight where the mask sees no hand.
+# Share of a pixel's weight that remains where the mask has no hand.
 _UNMASKED = 0.3
 
 
@@ -28,9 +28,9 @@ def weigh_pixels(
 ) -> np.ndarray:
     """Weigh the pixels of all frames.
 
-    Two doubts, multiplied. The residual under the intensity model asks whether the place looks as
-    it does in other frames. Where only perturbed frames show a place the model has learnt what
-    covers it; the tint asks, whatever the place, whether this is skin at all.
+    Two factors are multiplied. The residual under the intensity model measures whether the place
+    looks as in other frames. If only perturbed frames show a place, the model has learnt the
+    object that covers it; the tint measures, for every place, whether the pixel is skin.
 
     Args:
         masks: (R, H, W) uint8, 255 = visible hand.
@@ -80,11 +80,11 @@ def normal_residuals(
     level: float,
     prior: float,
 ) -> np.ndarray:
-    """What residual each cell of the surface has in clean frames.
+    """Residual of each cell of the surface in clean frames.
 
-    Nails, creases and places in shadow fit worse than the rest in every frame; that says nothing
-    against them. Residuals are clipped at five times the level, so that one frame with an object
-    does not make a place look unruly.
+    Nails, creases and places in shadow fit worse than the rest in every frame, which is not a
+    sign of a perturbation. Residuals are clipped at five times the level, so that one frame with an object
+    does not raise the normal residual of a place.
 
     Args:
         residuals: for each frame (P,) residuals.

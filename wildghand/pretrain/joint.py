@@ -11,7 +11,7 @@ from torch import Tensor
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fit.fit import Fit
 from wildghand.fit.rates import make_optimizer
-from wildghand.gaussians.schedule import batches
+from wildghand.gaussians.fit_loop import batches
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import PredictionNetwork
 from wildghand.prior.prior import MAPS, mean_weights

@@ -18,7 +18,7 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.fit.optimise import Watchers
 from wildghand.fit.saved import load_state, save_state
 from wildghand.fit.session import SAVE_EVERY, STATE, every_frame
-from wildghand.gaussians.device import choose_device
+from wildghand.gaussians.fit_loop import choose_device
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.pretrain.joint import JointFit
 from wildghand.pretrain.loop import take_steps

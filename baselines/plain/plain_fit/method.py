@@ -14,9 +14,9 @@ from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from plain_fit.model import PlainAvatar, make_model
 from plain_fit.optimise import fit_model
 from plain_fit.settings import read_settings
-from wildghand.gaussians.device import choose_device
-from wildghand.gaussians.frames import load_frames
+from wildghand.gaussians.fit_loop import choose_device
 from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
+from wildghand.gaussians.training import load_frames
 from wildghand.splat.warmup import warm_up
 
 

@@ -12,10 +12,10 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import HandTemplate
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.gaussians.anchored import AnchoredGaussians, flat_gaussians
-from wildghand.gaussians.clip import join_hands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig, make_rig
 from wildghand.gaussians.shading import sh_basis, sh_count
+from wildghand.gaussians.training import join_hands
 from wildghand.splat import rasterize
 
 

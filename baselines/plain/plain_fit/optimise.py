@@ -10,11 +10,9 @@ from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from plain_fit.model import PlainAvatar, PlainModel
 from plain_fit.settings import PlainSettings
-from wildghand.gaussians.clip import TrainingClip
-from wildghand.gaussians.frames import TrainingFrames
-from wildghand.gaussians.guard import Guard
+from wildghand.gaussians.fit_loop import Guard, batches, spent
 from wildghand.gaussians.losses import photometric_loss
-from wildghand.gaussians.schedule import batches, spent
+from wildghand.gaussians.training import TrainingClip, TrainingFrames
 
 # Standard deviations stay within these, m: thinner than paper or wider than a finger explains
 # nothing of a hand.

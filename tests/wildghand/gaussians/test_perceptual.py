@@ -9,7 +9,7 @@ import torch
 from safetensors.torch import save_file
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch
-from wildghand.gaussians.perceptual import FilterBank, Vgg19
+from wildghand.gaussians.perceptual import FilterBankLoss, Vgg19
 
 SIZES = (64, 64, 128, 128, 256, 256, 256, 256, 512, 512, 512, 512, 512)
 PLACES = (0, 2, 5, 7, 10, 12, 14, 16, 19, 21, 23, 25, 28)
@@ -26,7 +26,7 @@ def picture(size: int = 64) -> torch.Tensor:
 def test_equal_images_have_no_distance_and_weights_hide() -> None:
     image, other = picture(), picture().flip(1)
     ones = torch.ones(1, 64, 64)
-    bank = FilterBank()
+    bank = FilterBankLoss()
     assert float(bank(image, image, ones)) == 0.0
     assert float(bank(image, other, 0.0 * ones)) == 0.0
     assert float(bank(image, other, ones)) > 0.01
@@ -41,7 +41,7 @@ def test_a_shift_costs_less_than_a_blur_that_l1_prefers() -> None:
     texture = texture.permute(0, 2, 3, 1)
     shifted = texture.roll(1, dims=2)
     ones = torch.ones(1, 64, 64)
-    bank = FilterBank()
+    bank = FilterBankLoss()
     l1 = [(other - texture).abs().mean() for other in (shifted, blurred)]
     distances = [float(bank(other, texture, ones)) for other in (shifted, blurred)]
     assert distances[0] / distances[1] < 0.9 * float(l1[0] / l1[1])
@@ -50,12 +50,12 @@ def test_a_shift_costs_less_than_a_blur_that_l1_prefers() -> None:
 @pytest.mark.parametrize("shape", [(1, 1), (1, 9), (2, 2), (5, 3), (17, 33)])
 def test_any_size_works(shape: tuple[int, int]) -> None:
     image = torch.rand(1, *shape, 3, requires_grad=True)
-    distance = FilterBank()(image, torch.zeros(1, *shape, 3), torch.ones(1, *shape))
+    distance = FilterBankLoss()(image, torch.zeros(1, *shape, 3), torch.ones(1, *shape))
     distance.backward()
     assert distance.isfinite()
     assert image.grad.isfinite().all()
     with pytest.raises(ShapeMismatch, match="weights"):
-        FilterBank()(image, image, torch.ones(2, *shape))
+        FilterBankLoss()(image, image, torch.ones(2, *shape))
 
 
 @pytest.fixture(scope="module")

@@ -10,7 +10,7 @@ import torch
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from wildghand.gaussians.attributes import RawAttributes
-from wildghand.gaussians.perceptual import FilterBank
+from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.model import terms
 
 
@@ -43,7 +43,7 @@ TERMS: dict[str, tuple[Callable[..., torch.Tensor], tuple[torch.Tensor, ...]]] =
     "reward": (terms.weight_reward, (WEIGHTS,)),
     "cross": (terms.cross_hand, (uniform(6, 4), uniform(6, 4, seed=3))),
     "filter bank": (
-        lambda image, weights: FilterBank()(image, TARGET.to(image), weights),
+        lambda image, weights: FilterBankLoss()(image, TARGET.to(image), weights),
         (IMAGE, WEIGHTS),
     ),
 }
@@ -88,7 +88,7 @@ def test_pixels_that_are_not_finite_are_left_out(dtype: torch.dtype, share: floa
     assert image.grad.isfinite().all()
     assert (image.grad[1] == 0.0).all()
     assert share > 0.0 or (image.grad[0, 2, 3] == 0.0).all()
-    assert FilterBank()(image, target, WEIGHTS.to(dtype)).isfinite()
+    assert FilterBankLoss()(image, target, WEIGHTS.to(dtype)).isfinite()
 
 
 def test_no_weight_no_loss() -> None:

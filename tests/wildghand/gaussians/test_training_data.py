@@ -12,9 +12,8 @@ from painted import FRAMES, SIZE, TrainingMaker
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import write_image
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.gaussians.clip import TrainingClip
-from wildghand.gaussians.frames import TrainingFrames, load_frames
 from wildghand.gaussians.rig import make_rig
+from wildghand.gaussians.training import TrainingClip, TrainingFrames, load_frames
 
 
 def invalidate(training: TrainingCapture, side: str, frames: list[int]) -> None:

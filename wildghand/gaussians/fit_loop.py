@@ -1,11 +1,17 @@
-"""Notice that a fit diverges, and keep the best state."""
+"""Parts of the loop of every fit: its device, its budget, its batches, a guard on its loss."""
 
 from __future__ import annotations
 
+import importlib.util
 import math
+from collections.abc import Iterator
 from typing import Any, Generic, Protocol, TypeVar
 
-from hwp_bench.base.errors import DidNotConverge
+import numpy as np
+import torch
+
+from hwp_bench.base.errors import DidNotConverge, MissingDependency
+from hwp_bench.methods.contract import Budget, Report
 
 #: Steps over which the loss is averaged before it is judged.
 WINDOW = 50
@@ -14,6 +20,53 @@ MAX_RISE = 3.0
 
 Snapshot = TypeVar("Snapshot", covariant=True)
 Kept = TypeVar("Kept")
+
+
+def choose_device(name: str) -> torch.device:
+    """Resolve `auto`, `cpu` or `cuda`; `auto` is CUDA where both a GPU and gsplat are available.
+
+    Raises:
+        MissingDependency: CUDA was asked for and is not available.
+    """
+    if name == "cpu":
+        return torch.device("cpu")
+    ready = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+    if name == "cuda" and not ready:
+        raise MissingDependency(
+            "a CUDA GPU and the package gsplat are not both available",
+            field="device",
+            remedy="Use device = auto or cpu, or install the extra `cuda`.",
+        )
+    return torch.device("cuda" if ready else "cpu")
+
+
+def spent(step: int, steps: int, budget: Budget, report: Report) -> float:
+    """Share of the budget that is used up: of the steps or of the seconds, whichever is more."""
+    if budget.seconds is None:
+        return step / steps
+    if budget.seconds <= 0.0:
+        return 1.0
+    return max(step / steps, report.elapsed / budget.seconds)
+
+
+def batches(count: int, batch: int, seed: int) -> Iterator[torch.Tensor]:
+    """Batches of row numbers without end: every row once before any comes again.
+
+    Args:
+        count: rows.
+        batch: rows in a batch.
+        seed: of their order.
+
+    Yields:
+        (batch,) int64.
+    """
+    random = np.random.default_rng(seed)
+    queue = np.empty(0, dtype=np.int64)
+    while True:
+        while len(queue) < batch:
+            queue = np.concatenate((queue, random.permutation(count)))
+        yield torch.from_numpy(queue[:batch])
+        queue = queue[batch:]
 
 
 class Fitted(Protocol[Snapshot]):
@@ -70,7 +123,7 @@ class Guard(Generic[Kept]):
         return self._best
 
     def state_dict(self) -> dict[str, Any]:
-        """What `load_state_dict` takes."""
+        """The state for `load_state_dict`."""
         return {
             "step": self.step,
             "best_loss": self._best_loss,

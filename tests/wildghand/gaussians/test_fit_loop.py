@@ -10,7 +10,7 @@ from painted import painted_avatar
 
 from hwp_bench.base.errors import DidNotConverge
 from plain_fit.model import PlainModel
-from wildghand.gaussians.guard import MAX_RISE, WINDOW, Guard
+from wildghand.gaussians.fit_loop import MAX_RISE, WINDOW, Guard
 
 
 @pytest.fixture(scope="module")
