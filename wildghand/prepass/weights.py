@@ -83,8 +83,8 @@ def normal_residuals(
     """Residual of each cell of the surface in clean frames.
 
     Nails, creases and places in shadow fit worse than the rest in every frame, which is not a
-    sign of a perturbation. Residuals are clipped at five times the level, so that one frame with an object
-    does not raise the normal residual of a place.
+    sign of a perturbation. Residuals are clipped at five times the level, so that one frame with
+    an object does not raise the normal residual of a place.
 
     Args:
         residuals: for each frame (P,) residuals.
