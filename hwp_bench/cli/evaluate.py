@@ -200,7 +200,7 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.cli.overrides import overrides
     from hwp_bench.evaluate.evaluation import EvaluationSettings
-    from hwp_bench.methods.contract import Budget
+    from hwp_bench.methods.contract import Budget, RunSettings
     from hwp_bench.run.sandbox.confinement import Confinement
 
     for name in ("budget", "steps", "time_limit", "memory_limit"):
@@ -210,10 +210,9 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     return EvaluationSettings(
         suite="captures" if args.capture else args.suite,
         preset=args.preset,
-        overrides=overrides(args.set),
-        seed=args.seed,
-        budget=Budget(args.budget, args.steps),
-        frames=args.frames,
+        run=RunSettings(
+            overrides(args.set), args.seed, Budget(args.budget, args.steps), args.frames
+        ),
         time_limit=args.time_limit,
         confinement=Confinement(
             mode=args.isolation,

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from hwp_bench import __version__
 from hwp_bench.base.errors import BadCapture
 from hwp_bench.base.locks import exclusive
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
-from hwp_bench.evaluate.capture_run import Job, read_result
-from hwp_bench.evaluate.jobs import evaluation_job
-from hwp_bench.methods.contract import Budget, RunSettings
+from hwp_bench.evaluate.capture_evaluation import (
+    CaptureEvaluation,
+    evaluation_job,
+    read_result,
+)
+from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
 from hwp_bench.methods.settings import check_plain
 from hwp_bench.metrics import PROTOCOLS
@@ -27,8 +29,8 @@ from hwp_bench.run.engine import Engine, LocalEngine, Needs
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT
 from hwp_bench.run.sandbox.confinement import Confinement
 
-#: Called when a capture's work begins, with (index, count, capture id); returns what is to be
-#: called with (done, total) steps meanwhile.
+#: Called when a capture's work begins, with (index, count, capture id); returns a function that is
+#: then called with (done, total) steps.
 OnCapture = Callable[[int, int, str], Callable[[int, int], None] | None]
 
 
@@ -40,17 +42,11 @@ class EvaluationSettings:
     suite: str = "captures"
     #: Preset of the method; None takes the one named like the suite, else `default`.
     preset: str | None = None
-    #: Single settings that override the preset.
-    overrides: Mapping[str, Any] = field(default_factory=dict)
-    #: Seed of everything random.
-    seed: int = 0
-    #: When to stop fitting.
-    budget: Budget = field(default_factory=Budget)
-    #: Training frames that the method is given, one of `methods.contract.FRAME_CHOICES`.
-    frames: str = "perturbed"
+    #: Single settings that override the preset, seed, budget and training frames.
+    run: RunSettings = field(default_factory=RunSettings)
     #: Seconds after which a method is killed on one capture.
     time_limit: float = DEFAULT_TIME_LIMIT
-    #: How its process is kept apart, and its memory limit.
+    #: How its process is confined, and its memory limit.
     confinement: Confinement = field(default_factory=Confinement)
 
 
@@ -79,7 +75,7 @@ def evaluate(
         splits: splits by capture id; None applies the 80/10/10 rule.
         on_capture: hook for showing progress, where captures are evaluated in turn.
         engine: where captures are evaluated; one after another in this process if None.
-        needs: what one capture takes of a machine.
+        needs: the share of a machine that one capture takes.
 
     Returns:
         The results, which `out/results.json` then holds.
@@ -87,13 +83,13 @@ def evaluate(
     Raises:
         BadMethod: the method directory is wrong.
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
-        HwpError: another evaluation is writing to `out`, or nobody can.
+        HwpError: another evaluation is writing to `out`, or it cannot be written.
     """
     plan = make_plan(read_manifest(find_method(method)), open_captures(captures, splits), settings)
-    folders = [out / "captures" / job.capture.info.id for job in plan.jobs]
+    folders = [out / "captures" / item.capture.info.id for item in plan.evaluations]
     jobs = [
-        evaluation_job(job, folder, folder.name, needs or Needs())
-        for job, folder in zip(plan.jobs, folders, strict=True)
+        evaluation_job(evaluation, folder, folder.name, needs or Needs())
+        for evaluation, folder in zip(plan.evaluations, folders, strict=True)
     ]
     with exclusive(out):
         (engine or LocalEngine()).run(jobs, lambda index: None, on_capture)
@@ -104,32 +100,32 @@ def evaluate(
 
 @dataclass(frozen=True)
 class Plan:
-    """The jobs of an evaluation; `evaluate_capture` runs one."""
+    """A method with its settings on every capture; `evaluate_capture` runs one of them."""
 
     #: The method.
     manifest: MethodManifest
-    #: How it is evaluated.
-    settings: EvaluationSettings
+    #: Name of the suite.
+    suite: str
     #: Name of the preset that is taken.
     preset: str
-    #: The preset with what overrides it.
-    chosen: Mapping[str, Any]
-    #: One job a capture.
-    jobs: tuple[Job, ...]
+    #: The preset with its overrides, seed, budget and training frames.
+    run: RunSettings
+    #: One for each capture.
+    evaluations: tuple[CaptureEvaluation, ...]
     #: When the plan was made, ISO 8601, UTC.
     started: str
 
     def results(self, finished: Sequence[CaptureResult]) -> Results:
         """Return the record of the captures that are finished."""
-        settings, manifest = self.settings, self.manifest
+        manifest, run = self.manifest, self.run
         return Results(
             method=MethodId(
-                manifest.name, manifest.title, manifest.digest, self.preset, dict(self.chosen)
+                manifest.name, manifest.title, manifest.digest, self.preset, dict(run.settings)
             ),
-            suite=settings.suite,
-            seed=settings.seed,
-            budget={"seconds": settings.budget.seconds, "steps": settings.budget.steps},
-            frames=settings.frames,
+            suite=self.suite,
+            seed=run.seed,
+            budget={"seconds": run.budget.seconds, "steps": run.budget.steps},
+            frames=run.frames,
             protocols={protocol.name: protocol.as_dict() for protocol in PROTOCOLS},
             environment=environment(),
             started=self.started,
@@ -150,22 +146,24 @@ def make_plan(
         manifest: the method.
         captures: what `open_captures` returned.
         settings: suite, preset, seed, budget, limits.
-        networks: LPIPS by backbone; None loads those whose weights are at hand.
+        networks: LPIPS by backbone; None loads those whose weights are there.
 
     Raises:
-        BadMethod: there is no such preset, or an override is no plain value.
+        BadMethod: there is no such preset, or an override is not a plain value.
     """
     preset = manifest.preset(settings.preset, settings.suite)
-    chosen = {**manifest.presets.get(preset, {}), **settings.overrides}
-    check_plain(dict(settings.overrides), manifest.name, "settings")
-    run = RunSettings(chosen, settings.seed, settings.budget, settings.frames)
+    check_plain(dict(settings.run.settings), manifest.name, "settings")
+    chosen = {**manifest.presets.get(preset, {}), **settings.run.settings}
+    run = replace(settings.run, settings=chosen)
     known = load_available() if networks is None else networks
-    jobs = tuple(
-        Job(manifest, capture, split, run, settings.time_limit, settings.confinement, known)
+    evaluations = tuple(
+        CaptureEvaluation(
+            manifest, capture, split, run, settings.time_limit, settings.confinement, known
+        )
         for capture, split in captures
     )
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    return Plan(manifest, settings, preset, chosen, jobs, started)
+    return Plan(manifest, settings.suite, preset, run, evaluations, started)
 
 
 def open_captures(

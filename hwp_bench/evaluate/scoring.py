@@ -3,17 +3,14 @@
 from __future__ import annotations
 
 import hashlib
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 
 from hwp_bench.base.errors import BadCapture, BadPrediction
 from hwp_bench.base.images import pixel_digest
 from hwp_bench.capture import Capture
-from hwp_bench.capture.layout import frame_name
 from hwp_bench.methods.predictions import Prediction
 from hwp_bench.metrics.batch import Frame, score_frames
 from hwp_bench.metrics.pixels import scored_pixels
@@ -110,12 +107,3 @@ def predictions_digest(predictions: Sequence[Prediction]) -> str:
         )
         total.update(content.encode())
     return total.hexdigest()
-
-
-def keep_predictions(folder: Path, source: Path, frames: Sequence[int]) -> None:
-    """Copy the predicted frames that exist into a results folder; nothing else is copied."""
-    folder.mkdir(parents=True, exist_ok=True)
-    for frame in frames:
-        path = source / frame_name(frame)
-        if path.is_file() and not path.is_symlink():
-            shutil.copyfile(path, folder / path.name)

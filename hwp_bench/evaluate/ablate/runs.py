@@ -10,9 +10,8 @@ from hwp_bench.analysis.statistics.pairing import MethodRuns
 from hwp_bench.base.locks import exclusive
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluate.ablate.design import Design, Variant
-from hwp_bench.evaluate.capture_run import read_result
+from hwp_bench.evaluate.capture_evaluation import evaluation_job, read_result
 from hwp_bench.evaluate.evaluation import EvaluationSettings, Plan, make_plan, open_captures
-from hwp_bench.evaluate.jobs import evaluation_job
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.results import CaptureResult, Results, write_results
@@ -85,7 +84,7 @@ def run_ablation(
         (variant.name, seed): make_plan(
             replace(manifest, title=_title(manifest, variant)),
             opened,
-            replace(settings, seed=seed, overrides={**settings.overrides, **variant.settings}),
+            _of_variant(settings, variant, seed),
             networks,
         )
         for variant in design.variants
@@ -101,11 +100,11 @@ def run_ablation(
     finished: dict[tuple[str, int], dict[int, CaptureResult]] = {key: {} for key in plans}
     jobs = []
     for seed, number, variant in order:
-        job = plans[variant.name, seed].jobs[number]
-        name = job.capture.info.id
+        evaluation = plans[variant.name, seed].evaluations[number]
+        name = evaluation.capture.info.id
         folder = out / result_folder(variant.name, seed) / "captures" / name
         text = f"{name}, {variant.name}, seed {seed}"
-        jobs.append(evaluation_job(job, folder, text, needs or Needs()))
+        jobs.append(evaluation_job(evaluation, folder, text, needs or Needs()))
 
     def on_done(index: int) -> None:
         seed, number, variant = order[index]
@@ -117,6 +116,11 @@ def run_ablation(
     with exclusive(out):
         (engine or LocalEngine()).run(jobs, on_done, on_job)
     return AblationRuns(design, _runs(design, plans, finished, seeds))
+
+
+def _of_variant(settings: EvaluationSettings, variant: Variant, seed: int) -> EvaluationSettings:
+    overrides = {**settings.run.settings, **variant.settings}
+    return replace(settings, run=replace(settings.run, settings=overrides, seed=seed))
 
 
 def _rotated(variants: Sequence[Variant], by: int) -> list[Variant]:

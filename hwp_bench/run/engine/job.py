@@ -63,7 +63,7 @@ class Job:
     #: What a person is shown.
     text: str
     #: Does the work in this process.
-    here: Callable[[OnProgress], None]
+    here: Callable[[OnProgress], object]
     #: Does the same anywhere else.
     work: Work
     #: Folder of the result.

@@ -15,6 +15,7 @@ from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.evaluate.evaluation import EvaluationSettings, evaluate
+from hwp_bench.methods.contract import RunSettings
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric, penalty
 from hwp_bench.results import Results, read_results
 from hwp_bench.run.sandbox.confinement import Confinement
@@ -202,7 +203,7 @@ def test_a_second_start_takes_what_is_finished_and_redoes_what_changed(
     assert second.captures[0] == first.captures[0]
     assert first.captures[0].steps == 4
     assert first.captures[0].curve[-1].scores["psnr"] > 0
-    changed = replace(SETTINGS, overrides={"level": 0.25})
+    changed = replace(SETTINGS, run=RunSettings({"level": 0.25}))
     third = evaluate(str(method), [captures[0].root], out, changed)
     assert fits.read_text() == "single pair single "
     assert scores(third) != scores(first)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.evaluate import capture_run
+from hwp_bench.evaluate import artifacts
 
 
 def test_named_files_are_kept_and_nothing_else(
@@ -21,9 +21,9 @@ def test_named_files_are_kept_and_nothing_else(
     secret = tmp_path / "secret"
     secret.write_text("secret")
     (source / "left-temporal.json").symlink_to(secret)
-    monkeypatch.setattr(capture_run, "MAX_DIAGNOSTICS", 7)
-    capture_run._keep_diagnostics(source, target)
+    monkeypatch.setattr(artifacts, "MAX_DIAGNOSTICS", 7)
+    artifacts.keep_diagnostics(source, target)
     kept = sorted(str(path.relative_to(target)) for path in target.rglob("*") if path.is_file())
     assert kept == ["right-temporal.json", "weights/000001.png"]
-    capture_run._keep_diagnostics(tmp_path / "absent", target)
+    artifacts.keep_diagnostics(tmp_path / "absent", target)
     assert not target.exists()
