@@ -10,9 +10,9 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hwp_bench.base.errors import BadInput
+from hwp_bench.base.progress import JobsView
 from hwp_bench.run.engine import Folder, Job, Needs
 from hwp_bench.run.engine.job import OnProgress
-from hwp_bench.run.engine.view import NoView
 
 
 @dataclass(frozen=True)
@@ -63,11 +63,11 @@ def write_job(folder: Path, work: Write, *inputs: Path, cpus: float = 1.0) -> Jo
     )
 
 
-class Told(NoView):
+class Told(JobsView):
     """A view that keeps what it is told."""
 
     def __init__(self) -> None:
-        super().__init__()
+        super().__init__(quiet=True)
         self.starts: list[tuple[int, str]] = []
         self.ends: dict[str, str | None] = {}
         self.said: list[str] = []
@@ -84,7 +84,7 @@ class Told(NoView):
         self.ends[text] = problem
         super().end(index, text, problem)
 
-    def _say(self, text: str) -> None:
+    def say(self, text: str) -> None:
         self.said.append(text)
 
 

@@ -80,12 +80,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings
     from hwp_bench.evaluate.ablate.design import make_design
     from hwp_bench.evaluate.ablate.runs import run_ablation
-    from hwp_bench.evaluate.ablate.view import AblationView
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.run.engine.options import engine_for, needs_of
 
@@ -102,7 +101,7 @@ def run(args: argparse.Namespace) -> int:
     notice(f"{len(design.variants)} variants: {names}")
     with engine_for(args) as engine:
         captures = chosen_captures(args, engine)
-        with AblationView() if engine.in_turn else nullcontext() as view:
+        with JobsView() if engine.in_turn else nullcontext() as view:
             ablation = run_ablation(
                 manifest,
                 design,
@@ -111,7 +110,7 @@ def run(args: argparse.Namespace) -> int:
                 settings,
                 range(args.seeds),
                 splits=splits,
-                on_job=view.start if view else None,
+                on_job=view.turn if view else None,
                 engine=engine,
                 needs=needs_of(args),
             )

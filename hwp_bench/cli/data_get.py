@@ -33,11 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.progress import JobProgress, notice
+    from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.importers.official.download import HuggingFaceHub, download_release
 
-    with JobProgress() as jobs:
-        update = jobs.start(0, 1, f"downloading to {args.out}")
+    with JobsView() as jobs:
+        update = jobs.turn(0, 1, f"downloading to {args.out}")
         made = download_release(
             args.out,
             HuggingFaceHub(),

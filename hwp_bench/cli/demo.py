@@ -25,7 +25,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.progress import JobProgress
+    from hwp_bench.base.progress import JobsView
     from hwp_bench.base.tables import Column, Table, print_table, write_tables
     from hwp_bench.cli.evaluate import report_outcome
     from hwp_bench.evaluate.evaluation import EvaluationSettings, evaluate
@@ -36,9 +36,9 @@ def run(args: argparse.Namespace) -> int:
     clock = _Clock()
     captures = ensure_suite("smoke")
     clock.lap("simulated captures (rendered once, then cached)")
-    with JobProgress() as jobs:
+    with JobsView() as jobs:
         results = evaluate(
-            args.method, captures, out, EvaluationSettings("smoke"), on_capture=jobs.start
+            args.method, captures, out, EvaluationSettings("smoke"), on_capture=jobs.turn
         )
     clock.lap(f"{results.method.title}: fit, render, score, pictures")
     tables = all_tables([results])

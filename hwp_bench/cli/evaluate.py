@@ -113,7 +113,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from dataclasses import asdict, replace
 
-    from hwp_bench.base.progress import JobProgress
+    from hwp_bench.base.progress import JobsView
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluate.evaluation import evaluate
@@ -135,14 +135,14 @@ def run(args: argparse.Namespace) -> int:
         splits = sealed.splits
     with engine_for(args) as engine:
         captures = chosen_captures(args, engine) if sealed is None else list(sealed.captures)
-        with JobProgress() if engine.in_turn else nullcontext() as jobs:
+        with JobsView() if engine.in_turn else nullcontext() as jobs:
             results = evaluate(
                 args.method,
                 captures,
                 out,
                 settings,
                 splits=splits,
-                on_capture=jobs.start if jobs else None,
+                on_capture=jobs.turn if jobs else None,
                 engine=engine,
                 needs=needs_of(args),
             )

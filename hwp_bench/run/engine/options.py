@@ -73,13 +73,13 @@ def engine_for(args: argparse.Namespace) -> Engine:
         from hwp_bench.run.engine.ray_connect import import_ray
 
         import_ray()
+        from hwp_bench.base.progress import JobsView
         from hwp_bench.run.engine.ray_engine import RayEngine
-        from hwp_bench.run.engine.view import JobsView
 
         return RayEngine(address or None, JobsView())
     if args.jobs > 1:
+        from hwp_bench.base.progress import JobsView
         from hwp_bench.run.engine.parallel import ParallelEngine
-        from hwp_bench.run.engine.view import JobsView
 
         return ParallelEngine(args.jobs, JobsView())
     from hwp_bench.run.engine.job import LocalEngine

@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.progress import JobsView
 from hwp_bench.run.engine.job import RETRIES, Failures, Job, Needs, OnDone, OnStart, lost
 from hwp_bench.run.engine.process import (
     VISIBLE_GPUS,
@@ -19,7 +20,6 @@ from hwp_bench.run.engine.process import (
     run_in_process,
     thread_environment,
 )
-from hwp_bench.run.engine.view import JobsView, NoView
 
 
 class ParallelEngine:
@@ -37,7 +37,7 @@ class ParallelEngine:
         self, at_once: int, view: JobsView | None = None, *, retries: int = RETRIES
     ) -> None:
         self._at_once = at_once
-        self._view = view or NoView()
+        self._view = view or JobsView(quiet=True)
         self._retries = retries
 
     def __enter__(self) -> ParallelEngine:

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from hwp_bench.base.errors import HwpError
+from hwp_bench.base.progress import JobsView
 from hwp_bench.run.engine.job import (
     RETRIES,
     Failures,
@@ -21,7 +22,6 @@ from hwp_bench.run.engine.parcel import folder_digest, pack, unpack
 from hwp_bench.run.engine.process import parse_error, thread_environment
 from hwp_bench.run.engine.ray_connect import connected, head_address
 from hwp_bench.run.engine.ray_task import Board, Input, Order, Reply, run_order, toolkit_digest
-from hwp_bench.run.engine.view import JobsView, NoView
 
 #: Seconds between two checks of the jobs.
 LOOK_SECONDS = 0.5
@@ -57,7 +57,7 @@ class RayEngine:
         retries: int = RETRIES,
     ) -> None:
         self._address = head_address(address)
-        self._view = view or NoView()
+        self._view = view or JobsView(quiet=True)
         self._shared = shared
         self._retries = retries
         self._stack = contextlib.ExitStack()

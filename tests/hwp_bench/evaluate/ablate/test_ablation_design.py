@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.progress import clock, remaining
 from hwp_bench.evaluate.ablate.design import make_design
-from hwp_bench.evaluate.ablate.view import clock, remaining
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
 
 MANIFEST = """

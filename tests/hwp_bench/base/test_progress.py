@@ -1,0 +1,73 @@
+"""Progress of jobs. Oracle: what a person would read of it."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from hwp_bench.base.progress import JobsView, track
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_jobs_are_told_of_once_each(terminal: bool, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    with JobsView() as view:
+        view.begin(3)
+        view.start(0, "one [bold]", "a")
+        view.start(1, "two", "b")
+        view.steps(0, 3, 4)
+        view.steps(2, 1, 4)
+        view.start(1, "two", "c")
+        view.end(0, "one [bold]")
+        view.end(1, "two", "no luck")
+        view.end(2, "three")
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("[2/3] again, its worker was lost: two, on c") == 1
+    assert captured.err.count("two failed: no luck") == 1
+    if terminal:
+        assert "3/3" in captured.err
+    else:
+        assert captured.err.splitlines()[:2] == ["[1/3] one [bold], on a", "[2/3] two, on b"]
+        assert "[3 of 3 ended, 0:00 elapsed] three" in captured.err
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_jobs_in_turn_are_told_of_once_each(terminal: bool, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    with JobsView() as view:
+        for index, name in enumerate(("one [bold]", "two", "three")):
+            step = view.turn(index, 3, name)
+            step(1, 2)
+            step(2, 2)
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    if terminal:
+        assert "[3] three" in captured.err
+        assert "2/3" in captured.err
+    else:
+        assert captured.err.splitlines() == [
+            "[1/3] one [bold] (0:00 elapsed)",
+            "[2/3] two (0:00 elapsed, about 0:00 left)",
+            "[3/3] three (0:00 elapsed, about 0:00 left)",
+        ]
+
+
+def test_a_quiet_view_shows_nothing(capsys) -> None:
+    with JobsView(quiet=True) as view:
+        view.turn(0, 1, "one")(1, 1)
+        view.say("more")
+    assert capsys.readouterr().err == ""
+
+
+@pytest.mark.parametrize("terminal", [False, True])
+def test_one_piece_of_work_is_a_bar_or_a_line(terminal: bool, capsys, monkeypatch) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
+    assert list(track("abc", "reading [bold]")) == ["a", "b", "c"]
+    shown = capsys.readouterr().err
+    if terminal:
+        assert "reading [bold]" in shown
+        assert "3/3" in shown
+    else:
+        assert shown == "reading [bold]: 3 in 0.0 s\n"
