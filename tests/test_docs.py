@@ -1,8 +1,11 @@
-"""The documentation is true: links lead somewhere, commands exist, examples run."""
+"""The documentation is true: links, commands, names and files in it exist, examples run."""
 
 from __future__ import annotations
 
+import argparse
+import importlib
 import re
+import shlex
 from pathlib import Path
 
 import pytest
@@ -12,15 +15,30 @@ from hwp_bench.cli.main import command_tree
 from wildghand.cli.main import command_tree as wildghand_tree
 
 ROOT = Path(__file__).resolve().parents[1]
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md"))]
+PAGES = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md", "CHANGELOG.md")),
+    *sorted((ROOT / "docs").glob("*.md")),
+]
+#: What may open a path or a dotted name of this repository.
+TOPS = ("baselines", "benchmarks", "docs", "hwp_bench", "splits", "tests", "tools", "wildghand")
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors of a page's headings, as GitHub and the documentation site make them."""
+    text = re.sub(r"```.*?```", "", page.read_text(encoding="utf-8"), flags=re.DOTALL)
+    titles = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", title.lower()).strip().replace(" ", "-") for title in titles}
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_links_and_pictures_lead_somewhere(page: Path) -> None:
+def test_links_and_images_lead_somewhere(page: Path) -> None:
     targets = re.findall(r"\]\(([^)\s]+)\)", page.read_text(encoding="utf-8"))
     for target in targets:
-        if not target.startswith(("http://", "https://", "#")):
-            assert (page.parent / target.split("#")[0]).exists(), target
+        if not target.startswith(("http://", "https://")):
+            file, _, anchor = target.partition("#")
+            place = page.parent / file if file else page
+            assert place.exists(), target
+            assert not anchor or anchor in anchors(place), target
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
@@ -34,6 +52,66 @@ def test_commands_exist(page: Path) -> None:
                 break
             assert word in command.commands, f"{program} {words}"
             command = command.commands[word]
+
+
+def example_commands(page: Path) -> list[list[str]]:
+    """The words of every complete command in a page's blocks of code."""
+    blocks = re.findall(
+        r"^```(?:sh|)\n(.*?)^```", page.read_text("utf-8"), re.DOTALL | re.MULTILINE
+    )
+    lines = "\n".join(blocks).replace("\\\n", " ").splitlines()
+    # Lines with an ellipsis or a variable of a shell's loop are not complete.
+    lines = [line for line in lines if " ... " not in f"{line} " and "$" not in line]
+    programs = ("hwp-bench ", "wildghand ")
+    return [shlex.split(line, comments=True) for line in lines if line.startswith(programs)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_examples_are_accepted_by_their_commands(page: Path) -> None:
+    for words in example_commands(page):
+        command = {"hwp-bench": command_tree(), "wildghand": wildghand_tree()}[words[0]]
+        rest = words[1:]
+        while command.commands:
+            command = command.commands[rest.pop(0)]
+        parser = argparse.ArgumentParser(exit_on_error=False)
+        importlib.import_module(command.module).add_arguments(parser)
+        try:
+            parser.parse_args(rest)
+        except (SystemExit, argparse.ArgumentError) as error:
+            pytest.fail(f"{' '.join(words)}: {error}")
+
+
+def test_the_readme_has_commands_to_check() -> None:
+    assert len(example_commands(ROOT / "README.md")) > 12
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_files_and_modules_exist(page: Path) -> None:
+    words = re.findall(r"`([\w./-]+)`", page.read_text(encoding="utf-8"))
+    for word in words:
+        if word.split("/")[0] in TOPS and "/" in word:
+            # A room may be a module; pages about tests name them from `tests/`.
+            places = (ROOT / word, ROOT / f"{word}.py", ROOT / "tests" / word)
+            assert any(place.exists() for place in places), word
+        elif word.split(".")[0] in (*TOPS, "plain_fit") and not word.endswith((".json", ".md")):
+            assert is_defined(word), word
+
+
+def is_defined(name: str) -> bool:
+    """Whether a dotted name is a module, or is defined or given out by one."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        for folder in (ROOT, ROOT / "baselines" / "plain"):
+            base = folder.joinpath(*parts[:count])
+            file = next(
+                (f for f in (base.with_suffix(".py"), base / "__init__.py") if f.is_file()), base
+            )
+            if file.is_file():
+                text = file.read_text(encoding="utf-8")
+                return all(re.search(rf"\b{part}\b", text) for part in parts[count:])
+            if base.is_dir() and count == len(parts):
+                return True
+    return False
 
 
 def test_the_example_of_the_method_contract_runs(

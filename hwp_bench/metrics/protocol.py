@@ -89,6 +89,7 @@ PAPER_WILDGHAND = Protocol(
     ssim=SsimSettings("uniform", 7, 0.0, sample_covariance=True, data_range=2.0),
 )
 
+#: The protocols that every evaluation scores in, the headline first.
 PROTOCOLS = (HWP_V1, PAPER_WILDGHAND)
 
 

@@ -1,0 +1,104 @@
+"""The documentation site builds without a warning, and stands alone. Oracles: mkdocs, its pages."""
+
+from __future__ import annotations
+
+import importlib
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import yaml
+
+ROOT = Path(__file__).resolve().parents[1]
+PACKAGES = (
+    "hwp_bench",
+    "hwp_bench.capture",
+    "hwp_bench.hands",
+    "hwp_bench.methods",
+    "hwp_bench.metrics",
+    "hwp_bench.results",
+    "wildghand",
+    "wildghand.splat",
+)
+
+pytestmark = pytest.mark.slow
+
+
+@pytest.fixture(scope="module")
+def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built site; in strict mode a link or an anchor that leads nowhere ends the build."""
+    folder = tmp_path_factory.mktemp("site") / "site"
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(folder)],
+        cwd=ROOT,
+        env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    return folder
+
+
+def test_every_page_of_docs_is_there(site: Path) -> None:
+    pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
+    assert len(pages) > 15
+    assert {page for page in pages if not (site / f"{page}.html").is_file()} == set()
+    assert "A first result" in (site / "index.html").read_text(encoding="utf-8")
+    assert "glossary" in (site / "contributing.html").read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_the_reference_has_every_public_name(site: Path, package: str) -> None:
+    page = (site / "api" / f"{package}.html").read_text(encoding="utf-8")
+    names = getattr(importlib.import_module(package), "__all__", [])
+    headings = re.findall(r'<h\d id="([\w.]+)" class="doc', page)
+    listed = {heading.rpartition(".")[2] for heading in headings}
+    assert set(names) - listed - {"__version__"} == set()
+    assert names or package in ("hwp_bench", "wildghand")
+
+
+def test_fields_of_records_are_documented(site: Path) -> None:
+    page = (site / "api" / "hwp_bench.methods.html").read_text(encoding="utf-8")
+    assert "Optimiser steps; None leaves the method" in page
+
+
+def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:
+    pages = list(site.rglob("*.html"))
+    assert len(pages) > 25
+    for page in pages:
+        text = page.read_text(encoding="utf-8")
+        loaded = re.findall(
+            r"<(?:script|img|iframe|source|video)[^>]*\ssrc=[\"']?([^\"' >]+)", text
+        )
+        loaded += re.findall(r"<link[^>]*\shref=[\"']?([^\"' >]+)[^>]*>", text)
+        elsewhere = [url for url in loaded if re.match(r"(https?:)?//", url)]
+        assert elsewhere == [], page.name
+    for sheet in site.rglob("*.css"):
+        assert not re.search(r"(url\(|@import )[\"']?(https?:)?//", sheet.read_text("utf-8")), sheet
+
+
+def test_the_workflow_runs_the_ci_script_and_hooks_are_the_project_s_own() -> None:
+    workflow = yaml.safe_load((ROOT / ".github" / "workflows" / "ci.yml").read_text("utf-8"))
+    runs = [
+        step["run"] for job in workflow["jobs"].values() for step in job["steps"] if "run" in step
+    ]
+    assert runs
+    assert all(run.startswith(".ci/run") for run in runs)
+    assert os.access(ROOT / ".ci" / "run", os.X_OK)
+    hooks = yaml.safe_load((ROOT / ".pre-commit-config.yaml").read_text("utf-8"))
+    assert {repo["repo"] for repo in hooks["repos"]} == {"local"}
+
+
+def test_citation_and_changelog_name_the_version() -> None:
+    from hwp_bench import __version__
+
+    citation = yaml.safe_load((ROOT / "CITATION.cff").read_text("utf-8"))
+    assert citation["version"] == __version__
+    assert citation["license"] == "Apache-2.0"
+    assert {"cff-version", "message", "title", "authors", "references"} <= set(citation)
+    changes = (ROOT / "CHANGELOG.md").read_text("utf-8")
+    assert "## [Unreleased]" in changes
+    assert f"## [{__version__}]" in changes

@@ -1,0 +1,85 @@
+"""Builds the documentation site: `mkdocs build --strict` reads `mkdocs.yml`, which loads this.
+
+It adds pages that are not files below `docs/` (the README as home, the files at the root that
+contributors read, one page of API reference for each public package), and gives the reference the
+`#:` comments that document fields and constants.
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import Any
+
+from griffe import Attribute, Docstring, Extension
+from mkdocs.config.defaults import MkDocsConfig
+from mkdocs.structure.files import File, Files
+from mkdocs.structure.pages import Page
+
+ROOT = Path(__file__).resolve().parents[1]
+
+#: Page of the site by file at the root of the repository.
+ROOT_PAGES = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "CHANGELOG.md": "changelog.md",
+}
+#: Packages with a page of reference; what their `__all__` lists is the public interface.
+API = (
+    "hwp_bench",
+    "hwp_bench.capture",
+    "hwp_bench.hands",
+    "hwp_bench.methods",
+    "hwp_bench.metrics",
+    "hwp_bench.results",
+    "wildghand",
+    "wildghand.splat",
+)
+
+_LINK = re.compile(r"\]\((?!https?://|#)([^)\s#]+)((?:#[^)\s]*)?)\)")
+
+
+def on_files(files: Files, *, config: MkDocsConfig) -> Files:
+    """Add the pages that are not below `docs/`."""
+    for name, page in ROOT_PAGES.items():
+        text = (ROOT / name).read_text(encoding="utf-8")
+        files.append(File.generated(config, page, content=_from_root(text)))
+    for package in API:
+        text = f"# `{package}`\n\n::: {package}\n"
+        files.append(File.generated(config, f"api/{package}.md", content=text))
+    return files
+
+
+def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: Files) -> str:
+    """Lead links from `docs/` to the pages that were added."""
+    if page.file.generated_by:
+        return markdown
+    return _LINK.sub(lambda link: _moved(link, "../"), markdown)
+
+
+def _from_root(text: str) -> str:
+    text = _LINK.sub(lambda link: _moved(link, ""), text)
+    return re.sub(r"\]\(docs/", "](", text)
+
+
+def _moved(link: re.Match[str], prefix: str) -> str:
+    page = ROOT_PAGES.get(link[1].removeprefix(prefix)) if link[1].startswith(prefix) else None
+    return f"]({page}{link[2]})" if page else link[0]
+
+
+class FieldComments(Extension):
+    """Takes the `#:` comments above a field or constant as its docstring."""
+
+    def on_attribute(self, *, attr: Attribute, **_: Any) -> None:
+        """Give one attribute its docstring."""
+        if attr.docstring or attr.lineno is None or not isinstance(attr.filepath, Path):
+            return
+        lines = attr.lines_collection[attr.filepath]
+        first = attr.lineno - 1
+        while first > 0 and lines[first - 1].lstrip().startswith("#:"):
+            first -= 1
+        comments = [
+            line.strip().removeprefix("#:").strip() for line in lines[first : attr.lineno - 1]
+        ]
+        if comments:
+            attr.docstring = Docstring("\n".join(comments), lineno=first + 1, parent=attr)
