@@ -38,7 +38,7 @@ _SWITCH_KEYS = {"title", "description", *SWITCH_KINDS}
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
 _PYTHON = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
 _SWITCH_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
-_SETTING = re.compile(r"[A-Za-z_]\w{0,63}")
+_SETTING = re.compile(r"[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7}")
 
 
 @dataclass(frozen=True)

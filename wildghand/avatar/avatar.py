@@ -21,7 +21,7 @@ from wildghand.model.settings import WildGHandSettings
 
 @dataclass(frozen=True)
 class FitRecord:
-    """What is remembered of a fit, beside the model."""
+    """What is remembered of a fit, besides the model."""
 
     #: Frames of the capture that were fitted.
     frames: list[int] = field(default_factory=list)
@@ -35,8 +35,6 @@ class FitRecord:
     steps: int = 0
     #: Seconds of fitting.
     seconds: float = 0.0
-    #: Mean loss over the last steps.
-    loss: float = 0.0
     #: What the avatar was made of, such as a capture's id.
     source: dict[str, Any] = field(default_factory=dict)
 
@@ -107,7 +105,7 @@ class WildGHandAvatar:
             self._tensor(camera.K)[None],
             camera.width,
             camera.height,
-            refine=self.settings.refines,
+            refine=self.settings.heads.refinement,
         )
         rgba = torch.cat((image, coverage), dim=-1)[0]
         return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
@@ -120,7 +118,7 @@ class WildGHandAvatar:
             UsageError: no hand, or one that was not fitted.
         """
         parts = [
-            self.model.gaussians(side, *given, refine=self.settings.refines)
+            self.model.gaussians(side, *given, refine=self.settings.heads.refinement)
             for side, given in self._tensors(hands).items()
         ]
         count = len(parts[0].means)

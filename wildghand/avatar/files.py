@@ -23,10 +23,12 @@ from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.model.assemble import assemble, make_rigs
-from wildghand.model.settings import read_settings
+from wildghand.model.settings import read_settings, read_version_1
 
 #: Version of the folder.
-SCHEMA = "wildghand-avatar/1"
+SCHEMA = "wildghand-avatar/2"
+#: The version before it, which is read too: settings under their former names.
+VERSION_1 = "wildghand-avatar/1"
 #: Names of its files.
 DESCRIPTION = "avatar.json"
 MODEL = "model.safetensors"
@@ -120,11 +122,15 @@ def load_avatar(
     where = str(root / DESCRIPTION)
     try:
         value = parse_record(_Description, read_json(root / DESCRIPTION), where=where)
-        if value.schema != SCHEMA:
+        if value.schema == VERSION_1:
+            settings = read_version_1(value.settings)
+            value.fit.pop("loss", None)
+        elif value.schema == SCHEMA:
+            settings = read_settings(value.settings)
+        else:
             raise BadInput(f"is {value.schema!r} where {SCHEMA!r} is read", field="schema")
         record = parse_record(FitRecord, value.fit, where=where, field="fit.")
         hand_model = parse_record(HandModelId, value.hand_model, where=where, field="hand_model.")
-        settings = read_settings(value.settings)
         _check_description(value)
     except BadResult as error:
         raise BadInput(str(error)) from error

@@ -15,7 +15,8 @@ _EXAMPLES = """examples:
   wildghand fit my_capture -o my_avatar --seconds 60
   wildghand fit hand.mp4 --landmarks hand.npz -o my_avatar
   wildghand fit my_capture -o paper --set mode=paper --set network.size=paper --set device=cuda
-  torchrun --nproc-per-node 4 -m wildghand.cli.main fit my_capture -o my_avatar --set batch=4
+  torchrun --nproc-per-node 4 -m wildghand.cli.main fit my_capture -o my_avatar \\
+      --set schedule.batch=4
 
 With torchrun each process draws its part of every batch, on a GPU of its own.
 A capture is a folder (`hwp-bench data import-video`, `hwp-bench sim render`). A video becomes one
@@ -46,7 +47,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="NAME=VALUE",
-        help="a setting (wildghand/model/settings.py); may be given again",
+        help="a setting, as schedule.batch=4 (wildghand/model/settings.py); may be repeated",
     )
     parser.add_argument(
         "--prior",

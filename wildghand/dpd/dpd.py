@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.methods.settings import number
 from wildghand.gaussians.attributes import SIZES, RawAttributes
 
 #: K of the paper: the encoding has the octaves 0 to K.
@@ -18,18 +19,34 @@ OCTAVES = 9
 ENCODED = 2 * (OCTAVES + 1) + 1
 
 
+@dataclass(frozen=True)
+class DpdSettings:
+    """Dynamic perturbation disentanglement, and what the pre-pass adds to it."""
+
+    #: Component: explain perturbations as biases of the attributes.
+    enabled: bool = True
+    #: Addition: a gain of each frame's colours, held near that of clean frames.
+    gains: bool = True
+    #: Weight of the square of the log gains, for a frame that is surely clean.
+    gain_weight: float = number(0.1)
+    #: Chance that a frame's biases are left out of a step. With the pre-pass, that of clean frames
+    #: holds instead (`prepass.omega_dropout`).
+    omega_dropout: float = number(0.3, 0.0, 1.0)
+    #: Addition: temporal weight that a frame which the pre-pass finds perturbed starts at and is
+    #: held near. 0: all start at 0, and only those of clean frames are held there.
+    omega_scale: float = number(0.05, 0.0, 0.9)
+    #: Weight of the squared distance of the temporal weights from what the pre-pass says.
+    omega_weight: float = number(1.0)
+
+
 @dataclass(frozen=True, eq=False)
 class Temporal:
-    """What B frames have of their own."""
+    """Embedding and weight of B frames."""
 
     #: (B, width) temporal embedding z_l.
     z: Tensor
     #: (B,) temporal weight omega_l in (-1, 1).
     omega: Tensor
-
-    def with_omega(self, omega: Tensor) -> Temporal:
-        """The same embedding under other weights, after `drop`."""
-        return Temporal(self.z, omega)
 
 
 class DynamicPerturbation(nn.Module):

@@ -66,9 +66,9 @@ class Fit:
         self.clip = TrainingClip(training, self.frames.indices, rigs, device)
         self.weighting = Weighting(training, self.frames, settings, device)
         temporal = None
-        if settings.holds_omega:
+        if settings.dpd.enabled and settings.prepass.enabled:
             clean = self.weighting.clean.to(device)
-            temporal = TemporalTarget.judged(clean, settings.omega_scale)
+            temporal = TemporalTarget.judged(clean, settings.dpd.omega_scale)
             temporal.begin(self.model.biases)
         self.objective = Objective(settings, rigs, temporal)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
@@ -104,8 +104,9 @@ class Fit:
         average_gradients(
             (tensor for group in self.optimizer.param_groups for tensor in group["params"]), world
         )
-        if settings.clip_gradient > 0.0:
-            torch.nn.utils.clip_grad_norm_(self.model.parameters(), settings.clip_gradient)
+        limit = settings.schedule.clip_gradient
+        if limit > 0.0:
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), limit)
         self.optimizer.step()
         return value
 
@@ -172,7 +173,7 @@ class Fit:
                 kept=kept,
                 shares=self.weighting.shares(rows),
                 move=self.weighting.moves(rows) if move is None else move,
-                refine=self.settings.refines,
+                refine=self.settings.heads.refinement,
             )
 
     def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
@@ -207,20 +208,21 @@ class Fit:
     def _weight_masks(self) -> dict[int, np.ndarray]:
         """The weights of pixels within every training frame as pictures, 255 = full weight.
 
-        In the mode `paper`, whose weights have no bound, 255 is the largest of the frame.
+        The paper's equations have no bound: with them 255 is the largest weight of the frame.
         """
         masks = {}
-        if self.settings.pao:
+        unbounded = self.settings.pao.variant == "paper"
+        if self.settings.pao.enabled:
             for row, frame in enumerate(self.frames.indices.tolist()):
                 rows = torch.tensor([row])
                 weights = self.weighting(rows, self.draw(rows), 1.0).weights[0]
-                largest = weights.max().clamp(min=1.0 if self.settings.additions else 1e-12)
+                largest = weights.max().clamp(min=1e-12 if unbounded else 1.0)
                 masks[frame] = (255.0 * weights / largest).byte().cpu().numpy()
         return masks
 
     def _precision(self) -> torch.autocast:
-        wanted = self.settings.mixed_precision and self.device.type == "cuda"
-        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=wanted)
+        enabled = self.settings.mixed_precision and self.device.type == "cuda"
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
 
     @torch.no_grad()
     def _temporal(self) -> dict[str, list[float]]:

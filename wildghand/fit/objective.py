@@ -34,7 +34,7 @@ class Objective:
     ) -> None:
         self.settings = settings
         self.temporal = temporal
-        self.weights = settings.term_weights
+        self.weights = settings.terms
         smooth = (
             self.weights.laplacian_offsets,
             self.weights.laplacian_scales,
@@ -60,7 +60,7 @@ class Objective:
         weights, settings = self.weights, self.settings
         image = drawing.image
         total = weights.reconstruction * terms.reconstruction(
-            image, target.image, target.weights, settings.dssim_weight
+            image, target.image, target.weights, weights.dssim_weight
         )
         if self._perceptual is not None:
             found = self._perceptual(image, target.image, target.weights)
@@ -82,13 +82,13 @@ class Objective:
         if weights.cross_hand and len(drawing.hands) == 2:
             left, right = (drawing.hands[side].prediction.texture for side in ("left", "right"))
             total = total + weights.cross_hand * terms.cross_hand(left, right)
-        if self.temporal is not None and settings.omega_weight:
+        if self.temporal is not None and settings.dpd.omega_weight:
             strayed = self.temporal.strayed(model.biases, int(rows[0]))
-            total = total + settings.omega_weight * strayed
-        if settings.uses_gains:
+            total = total + settings.dpd.omega_weight * strayed
+        if settings.dpd.gains:
             # Clean frames have no gain: without this prior gain and colours could trade places.
             size = model.log_gains[rows].square().mean(dim=-1)
-            total = total + settings.gain_weight * (clean.to(size) * size).mean()
+            total = total + settings.dpd.gain_weight * (clean.to(size) * size).mean()
         return total
 
     def _roughness(self, side: str, raw: RawAttributes, offsets: Tensor) -> Tensor:
@@ -97,7 +97,7 @@ class Objective:
         if not self._laplacians:
             return total
         laplacian = self._laplacians[side]
-        if weights.laplacian_offsets and self.settings.heads:
+        if weights.laplacian_offsets and self.settings.heads.enabled:
             total = total + weights.laplacian_offsets * laplacian.offsets(offsets)
         if weights.laplacian_scales:
             total = total + weights.laplacian_scales * laplacian.roughness(raw.log_scales)

@@ -64,11 +64,11 @@ def optimise(
         DidNotConverge: the fit diverged without ever having been better than its start.
     """
     settings, world = fit.settings, fit.world
-    steps = settings.steps if budget.steps is None else budget.steps
-    order = batches(len(fit.frames), settings.batch, fit.seed)
+    steps = settings.schedule.steps if budget.steps is None else budget.steps
+    order = batches(len(fit.frames), settings.schedule.batch, fit.seed)
     for _ in range(start):
         next(order)
-    watchers = watchers or Watchers(settings.plateau_steps)
+    watchers = watchers or Watchers(settings.schedule.plateau_steps)
     step = start
     report(step, fit.avatar(step))
     while step < steps:
@@ -89,10 +89,8 @@ def optimise(
         if after_step is not None:
             after_step(step, watchers)
         if watchers.plateau.reached(loss):
-            _tell(
-                world,
-                f"The loss has stood still for {settings.plateau_steps} steps; finished early.",
-            )
+            window = settings.schedule.plateau_steps
+            _tell(world, f"The loss has stood still for {window} steps; finished early.")
             break
     return fit.avatar(step, report.elapsed, final=world.leads)
 

@@ -67,8 +67,8 @@ class World:
         if count % self.size:
             raise UsageError(
                 f"is {count}, which {self.size} processes cannot share evenly",
-                field="batch",
-                remedy=f"Give --set batch={self.size}, or another multiple of {self.size}.",
+                field="schedule.batch",
+                remedy=f"Give --set schedule.batch={self.size}, or a multiple of it.",
             )
         each = count // self.size
         return slice(self.rank * each, (self.rank + 1) * each)

@@ -18,7 +18,7 @@ def make_optimizer(
     model: WildGHandModel, weights: PerturbationAwareWeights, settings: WildGHandSettings
 ) -> torch.optim.Adam:
     """Adam over everything that is fitted; each group keeps its first rate as `start`."""
-    rates = settings.rates
+    rates = settings.schedule.rates
     groups = {name: list(group) for name, group in parameter_groups(model.network).items()}
     groups["dpd"] = list(model.perturbation.parameters())
     groups["thresholds"] = list(weights.parameters())
@@ -39,9 +39,10 @@ def make_optimizer(
 
 def set_rates(optimizer: torch.optim.Adam, settings: WildGHandSettings, fraction: float) -> None:
     """Set the steps for a share of the budget that is used up."""
-    if settings.decay == "halving":
-        factor = 0.5 ** int(fraction * settings.halvings)
+    schedule = settings.schedule
+    if schedule.decay == "halving":
+        factor = 0.5 ** int(fraction * schedule.halvings)
     else:
-        factor = settings.final_rate**fraction
+        factor = schedule.final_rate**fraction
     for group in optimizer.param_groups:
         group["lr"] = group["start"] * factor

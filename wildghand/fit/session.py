@@ -92,7 +92,7 @@ def fit_capture(
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
     chosen = read_settings(settings)
-    world.part(chosen.batch)
+    world.part(chosen.schedule.batch)
     capture = open_capture(source)
     split = every_frame(capture) if all_frames else _split(capture)
     work = out.with_name(out.name + ".fit")
@@ -118,14 +118,14 @@ def _fit_in(
         [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
     )
     fit = Fit(training, chosen, run.seed, choose_device(chosen.device), world)
-    watchers, start, before = Watchers(chosen.plateau_steps), 0, 0.0
+    watchers, start, before = Watchers(chosen.schedule.plateau_steps), 0, 0.0
     state = work / STATE
     if state.is_file():
         start, before = load_state(state, fit, watchers, digest)
         if world.leads:
             notice(f"Going on after {start} steps.")
     fit.require_same(start)
-    steps = chosen.steps if run.budget.steps is None else run.budget.steps
+    steps = chosen.schedule.steps if run.budget.steps is None else run.budget.steps
     with _shown(capture, steps, world) as show:
         clock = _Clock(before, show)
         saved = time.perf_counter()

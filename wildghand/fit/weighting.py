@@ -1,4 +1,4 @@
-"""How much each frame and each pixel of it counts, and what a rendering is compared with."""
+"""Weights of frames and pixels, and the images that a drawing is compared with."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from wildghand.fit.parallel import ALONE, World
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.model import Drawing
 from wildghand.model.settings import WildGHandSettings
-from wildghand.pao.pao import PerturbationAwareWeights
+from wildghand.pao.pao import PerturbationAwareWeights, binary_weights
 from wildghand.pao.regions import FrameRegions, Regions, stack_regions
 from wildghand.pao.regions.cache import RegionCache
 from wildghand.pao.regions.superpixels import Superpixels
@@ -23,7 +23,7 @@ from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """What the drawing of B frames is compared with."""
+    """The images that the drawing of B frames is compared with, and how much each pixel counts."""
 
     #: (B, H, W, 3) sRGB over black outside the mask.
     image: Tensor
@@ -34,12 +34,12 @@ class Target:
 
 
 class Weighting:
-    """Weights of pixels, by the settings' components.
+    """Weights of frames and pixels, by the settings' components.
 
-    Without PAO a pixel counts as the estimated mask says. With it, the canonical hand learns
-    less from frames that the pre-pass finds perturbed (`shares`), and pixels that it finds
-    covered count less; in the mode `paper` the regions' weights of the paper take the place of
-    both.
+    Without PAO a pixel counts as the estimated mask says. The variants of PAO: with `judged` the
+    canonical hand learns less from frames that the pre-pass finds perturbed (`shares`), and pixels
+    that it finds covered count less, or, later in a `robust` fit, pixels with large residuals;
+    with `paper` the paper's equations weigh regions; with `binary` the mask is cut at a half.
 
     Args:
         training: what may be seen of the capture.
@@ -48,12 +48,12 @@ class Weighting:
         device: where the tensors live.
 
     Attributes:
-        judgement: of the pre-pass; None without it.
         clean: (R,) probability that a frame is clean; ones without the pre-pass.
         drop_probability: (R,) chance that a frame's biases are left out.
         frame_weights: (R,) how much the canonical hand learns from each frame; ones without the
             pre-pass or without PAO.
         pao: the paper's weights, whose thresholds are learnt.
+        median: running median of the residuals in a robust fit; None before the first.
     """
 
     def __init__(
@@ -63,42 +63,34 @@ class Weighting:
         settings: WildGHandSettings,
         device: torch.device,
     ) -> None:
-        count = len(frames)
+        count, pao = len(frames), settings.pao
         self.frames, self.settings, self.device = frames, settings, device
-        self.judgement = judge(training, frames, settings) if settings.judges else None
         self.clean = torch.ones(count)
-        self.drop_probability = torch.full((count,), settings.omega_dropout)
-        self._move = torch.zeros(count, dtype=torch.bool)
+        self.drop_probability = torch.full((count,), settings.dpd.omega_dropout)
         self.frame_weights = torch.ones(count, device=device)
-        self._initial: Tensor | None = None
-        if self.judgement is not None:
-            self.clean = torch.from_numpy(self.judgement.clean).float()
-            self.drop_probability = torch.from_numpy(self.judgement.omega_dropout).float()
-            self._move = torch.from_numpy(self.judgement.refine_pose)
-            if settings.weighs_frames:
-                weights = torch.from_numpy(self.judgement.frame_weights).float()
-                self.frame_weights = weights.to(device)
-                self._initial = torch.from_numpy(self.judgement.pixel_weights)
-        self.pao = PerturbationAwareWeights(settings.weights_of(len(training.sides))).to(device)
-        self._regions: list[FrameRegions] | None = None
-        if settings.uses_regions:
-            self._regions = RegionCache().clip(frames.images.numpy(), Superpixels())
+        self.pao = PerturbationAwareWeights(pao, len(training.sides)).to(device)
         self.median: float | None = None
+        self._refine_pose = torch.zeros(count, dtype=torch.bool)
+        self._weighs_frames = False
+        self._pixel_weights: Tensor | None = None
+        self._regions: list[FrameRegions] | None = None
+        if settings.prepass.enabled:
+            self._follow(_judge(training, frames, settings))
+        if pao.robust or (pao.enabled and pao.variant == "paper"):
+            self._regions = RegionCache().clip(frames.images.numpy(), Superpixels())
 
     def moves(self, rows: Tensor) -> bool:
         """Whether the pose of any frame of a batch is refined."""
-        return self.settings.moves_poses and bool(self._move[rows].any())
+        return self.settings.heads.frame_poses and bool(self._refine_pose[rows].any())
 
     def shares(self, rows: Tensor) -> Tensor | None:
         """How much the canonical hand learns from each frame of a batch, (B,); None: all."""
-        if self.judgement is None or not self.settings.weighs_frames:
-            return None
-        return self.frame_weights[rows]
+        return self.frame_weights[rows] if self._weighs_frames else None
 
     def __call__(
         self, rows: Tensor, drawing: Drawing, fraction: float, world: World = ALONE
     ) -> Target:
-        """Say what a batch, or this process's part of it, is compared with.
+        """Return what a batch, or this process's part of it, is compared with.
 
         Where weights compare the frames of a batch, all processes weigh all of it.
 
@@ -108,35 +100,69 @@ class Weighting:
             fraction: share of the budget that is used up.
             world: the processes.
         """
-        settings = self.settings
-        part = world.part(len(rows))
-        whole = self.frames.masks[rows].to(self.device).float() / 255.0
-        hand, mine = whole[part], rows[part]
+        mine = rows[world.part(len(rows))]
+        hand = self._coverage(mine)
         image = self.frames.images[mine].to(self.device).float() / 255.0 * hand[..., None]
-        outside = settings.outside_weight
-        plain = outside + (1.0 - outside) * hand
-        if not settings.pao or settings.binary_mask:
-            return Target(image, hand, (hand > 0.5).float() if settings.binary_mask else plain)
-        error = (drawing.image.detach() - image).abs().mean(dim=-1)
-        if not settings.additions:
-            omega = world.gather(drawing.omega)
-            found = self.pao(world.gather(error), self._batch_regions(rows), whole, omega)
-            return Target(image, hand, found.weights[part])
-        weights = plain
-        if settings.robust and fraction >= settings.robust_start:
-            residual = blended_residual(world.gather(error), self._batch_regions(rows), whole)
-            self.median = running_median(self.median, residual, whole)
-            weights = weights * residual_weights(residual[part], self.median)
-        elif self._initial is not None:
-            weights = weights * self._initial[mine].to(self.device).float() / 255.0
+        pao, outside = self.settings.pao, self.settings.terms.outside_weight
+        soft = outside + (1.0 - outside) * hand
+        if not pao.enabled:
+            weights = soft
+        elif pao.variant == "binary":
+            weights = binary_weights(hand, pao.binary_outside)
+        elif pao.variant == "paper":
+            weights = self._paper_weights(rows, image, drawing, world)
+        elif pao.robust and fraction >= pao.robust_start:
+            weights = soft * self._robust_weights(rows, image, drawing, world)
+        elif self._pixel_weights is not None:
+            weights = soft * self._pixel_weights[mine].to(self.device).float() / 255.0
+        else:
+            weights = soft
         return Target(image, hand, weights)
+
+    def _follow(self, assessment: FrameAssessment) -> None:
+        """Take from the pre-pass what the components use."""
+        self.clean = torch.from_numpy(assessment.clean).float()
+        self.drop_probability = torch.from_numpy(assessment.omega_dropout).float()
+        self._refine_pose = torch.from_numpy(assessment.refine_pose)
+        if self.settings.pao.enabled and self.settings.pao.variant == "judged":
+            self._weighs_frames = True
+            weights = torch.from_numpy(assessment.frame_weights).float()
+            self.frame_weights = weights.to(self.device)
+            self._pixel_weights = torch.from_numpy(assessment.pixel_weights)
+
+    def _coverage(self, rows: Tensor) -> Tensor:
+        """(B, H, W) estimated coverage of the visible hand, 0-1."""
+        return self.frames.masks[rows].to(self.device).float() / 255.0
+
+    def _paper_weights(self, rows: Tensor, image: Tensor, drawing: Drawing, world: World) -> Tensor:
+        """The paper's equations on all frames of the batch; this process's part of the weights."""
+        error, omega = _error(image, drawing), world.gather(drawing.omega)
+        found = self.pao(
+            world.gather(error), self._batch_regions(rows), self._coverage(rows), omega
+        )
+        return found.weights[world.part(len(rows))]
+
+    def _robust_weights(
+        self, rows: Tensor, image: Tensor, drawing: Drawing, world: World
+    ) -> Tensor:
+        """Weights from the residuals of all frames of the batch; this process's part of them."""
+        hands = self._coverage(rows)
+        error = world.gather(_error(image, drawing))
+        residual = blended_residual(error, self._batch_regions(rows), hands)
+        self.median = running_median(self.median, residual, hands)
+        return residual_weights(residual[world.part(len(rows))], self.median)
 
     def _batch_regions(self, rows: Tensor) -> Regions:
         assert self._regions is not None
         return stack_regions([self._regions[row] for row in rows.tolist()], self.device)
 
 
-def judge(
+def _error(image: Tensor, drawing: Drawing) -> Tensor:
+    """(B, H, W) mean over channels of |drawing - image|, without gradient."""
+    return (drawing.image.detach() - image).abs().mean(dim=-1)
+
+
+def _judge(
     training: TrainingCapture, frames: TrainingFrames, settings: WildGHandSettings
 ) -> FrameAssessment:
     """Run the pre-pass on the frames that are fitted."""
@@ -149,5 +175,5 @@ def judge(
             cameras=training.cameras,
             templates={side: training.template(side) for side in training.sides},
         ),
-        settings.judge,
+        settings.prepass,
     )

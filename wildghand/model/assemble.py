@@ -60,4 +60,4 @@ def assemble(
     network = PredictionNetwork(settings.network, surfaces, seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        return WildGHandModel(rigs, network, frame_count, dpd=settings.dpd)
+        return WildGHandModel(rigs, network, frame_count, dpd=settings.dpd.enabled)

@@ -1,14 +1,22 @@
-"""Settings of WildGHand: what is fitted, how, and for how long."""
+"""Settings of WildGHand: what is fitted, how, and for how long.
+
+One table for each component. `read_settings` makes the settings of a mode with some of them
+changed. What it returns says plainly what runs: no setting overrules another one.
+"""
 
 from __future__ import annotations
 
 import dataclasses
+import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from types import MappingProxyType
 from typing import Any
 
-from hwp_bench.base.errors import BadMethod, HwpError
+from hwp_bench.base.errors import BadMethod
 from hwp_bench.methods.settings import choice, number, settings_from
+from wildghand.dpd.dpd import DpdSettings
+from wildghand.model.former_settings import current_names, flattened
 from wildghand.model.terms import PAPER_TERMS, TermWeights
 from wildghand.network.settings import NetworkSettings, network_settings
 from wildghand.pao.pao import PaoSettings
@@ -16,6 +24,18 @@ from wildghand.prepass import PrepassSettings
 
 #: Where messages place a wrong setting.
 WHERE = "wildghand"
+
+
+@dataclass(frozen=True)
+class HeadSettings:
+    """Heads iii and iv of the network, and the corrections of single frames."""
+
+    #: Component: template offsets (head iii) and refinement of the hand parameters (head iv).
+    enabled: bool = True
+    #: Head iv acts; without it the given hand parameters stand.
+    refinement: bool = True
+    #: Addition: refine the pose of frames whose mask disagrees with it (needs the pre-pass).
+    frame_poses: bool = True
 
 
 @dataclass(frozen=True)
@@ -45,161 +65,193 @@ class Rates:
 
 
 @dataclass(frozen=True)
-class WildGHandSettings:
-    """How an avatar is fitted; the defaults are those of the preset `default`."""
+class ScheduleSettings:
+    """Steps of the optimizer."""
 
-    #: `default`: what measurements keep. `paper`: the formulas as printed, made well-posed; the
-    #: additions below are then off whatever they say.
-    mode: str = choice("default", "paper")
-    #: The prior over subjects that the network starts from. `shipped`: that of this package, where
-    #: it is of the fit's network and hand model, and in the mode `default` alone. Empty: random
-    #: weights. Else a folder made by `wildghand pretrain`, in either mode: a relative path is one
-    #: within this package.
-    prior: str = "shipped"
-    #: Gaussians on each hand.
-    gaussians: int = number(12_337, 1, 1_000_000)
-    #: Optimiser steps unless the budget says otherwise.
+    #: Optimizer steps unless the budget says otherwise.
     steps: int = number(2_000, 1, 10_000_000)
     #: Frames in each step.
     batch: int = number(1, 1, 64)
-    #: Component: dynamic perturbation disentanglement.
-    dpd: bool = True
-    #: Component: perturbation-aware optimization.
-    pao: bool = True
-    #: Component: heads iii and iv, template offsets and refinement of the hand parameters.
-    heads: bool = True
-    #: Part of the heads: head iv acts; without it the given hand parameters stand.
-    refinement: bool = True
-    #: Alternative to PAO's weights: the hand's binary mask.
-    binary_mask: bool = False
-    #: Addition: judge the frames before the fit.
-    prepass: bool = True
-    #: Addition to DPD: a gain of each frame's colours, held near that of clean frames.
-    gains: bool = True
-    #: Addition to PAO: robust weights of residuals later in the fit, in place of the pre-pass's
-    #: pixel weights. Off: where it was measured it cost more than it brought (docs/wildghand.md).
-    robust: bool = False
-    #: Addition to the heads: refine the pose of frames whose mask disagrees with it.
-    frame_poses: bool = True
-    #: Chance that a frame's biases are left out of a step (of a clean frame's, with `prepass`).
-    omega_dropout: float = number(0.3, 0.0, 1.0)
-    #: Addition to DPD: temporal weight that a frame which the pre-pass finds perturbed starts at
-    #: and is held near. 0: all start at 0, and only those of clean frames are held there.
-    omega_scale: float = number(0.05, 0.0, 0.9)
-    #: Weight of the squared distance of the temporal weights from what the pre-pass says.
-    omega_weight: float = number(1.0)
-    #: Share of D-SSIM in the reconstruction loss; the rest is L1.
-    dssim_weight: float = number(0.2, 0.0, 1.0)
-    #: Weight of a pixel outside the visible-hand mask, beside 1 inside.
-    outside_weight: float = number(0.03, 0.0, 1.0)
-    #: Share of the budget after which residuals decide the weights.
-    robust_start: float = number(0.25, 0.0, 1.0)
-    #: Weight of the square of the log gains, for a frame that is surely clean.
-    gain_weight: float = number(0.1)
     #: Norm that the gradient is clipped to; 0 leaves it as it is.
     clip_gradient: float = number(1.0)
-    #: `geometric`: steps fall smoothly to `final_rate`; `halving`: by half, `halvings` times.
+    #: `geometric`: rates fall smoothly to `final_rate`; `halving`: by half, `halvings` times.
     decay: str = choice("geometric", "halving")
-    #: Size of the steps at the end of the budget, as a share of that at its start.
+    #: Rates at the end of the budget, as a share of those at its start.
     final_rate: float = number(0.05, 1e-6, 1.0)
     #: How often `halving` halves.
     halvings: int = number(10, 0, 100)
     #: Stop when the loss has not fallen by 0.1 % over this many steps; 0 never stops early.
     plateau_steps: int = number(0, 0, 10_000_000)
-    #: Mixed precision of the network; CUDA only.
-    mixed_precision: bool = False
-    #: `auto` (CUDA where both a GPU and gsplat are there), `cpu` or `cuda`.
-    device: str = choice("auto", "cpu", "cuda")
     #: Adam's steps.
     rates: Rates = field(default_factory=Rates)
-    #: The network.
-    network: NetworkSettings = field(default_factory=NetworkSettings)
-    #: Weights of PAO.
-    weights: PaoSettings = field(default_factory=PaoSettings)
-    #: Weights of the regularisers.
-    terms: TermWeights = field(default_factory=TermWeights)
-    #: The judge of the frames. It leaves the biases out of every clean frame, not out of three in
-    #: ten: what little they took from these, the avatar lacked (docs/wildghand.md).
-    judge: PrepassSettings = field(
+
+
+@dataclass(frozen=True)
+class WildGHandSettings:
+    """How an avatar is fitted; the defaults are those of the mode `default`."""
+
+    #: The prior over subjects that the network starts from. `shipped`: that of this package, where
+    #: it is of the fit's network and hand model. Empty: random weights. Else a folder made by
+    #: `wildghand pretrain`; a relative path is one within this package.
+    prior: str = "shipped"
+    #: Gaussians on each hand.
+    gaussians: int = number(12_337, 1, 1_000_000)
+    #: `auto` (CUDA where both a GPU and gsplat are there), `cpu` or `cuda`.
+    device: str = choice("auto", "cpu", "cuda")
+    #: Mixed precision of the network; CUDA only.
+    mixed_precision: bool = False
+    #: Component: dynamic perturbation disentanglement.
+    dpd: DpdSettings = field(default_factory=DpdSettings)
+    #: Component: perturbation-aware optimization.
+    pao: PaoSettings = field(default_factory=PaoSettings)
+    #: Component: heads iii and iv.
+    heads: HeadSettings = field(default_factory=HeadSettings)
+    #: Addition: the judge of the frames, for DPD and PAO. It leaves the biases out of every clean
+    #: frame, not out of three in ten: what little they took from these, the avatar lacked
+    #: (docs/wildghand.md).
+    prepass: PrepassSettings = field(
         default_factory=lambda: PrepassSettings(weight_floor=0.02, omega_dropout=1.0)
     )
+    #: The network.
+    network: NetworkSettings = field(default_factory=NetworkSettings)
+    #: Weights of the terms of the loss.
+    terms: TermWeights = field(default_factory=TermWeights)
+    #: Steps of the optimizer.
+    schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
 
-    @property
-    def additions(self) -> bool:
-        """Whether anything beyond the paper may be on."""
-        return self.mode == "default"
 
-    @property
-    def judges(self) -> bool:
-        """Whether the frames are judged before the fit."""
-        return self.additions and self.prepass and (self.dpd or self.pao)
-
-    @property
-    def weighs_frames(self) -> bool:
-        """Whether the judgement lowers the weights of frames and pixels."""
-        return self.pao and not self.binary_mask
-
-    @property
-    def uses_regions(self) -> bool:
-        """Whether frames are cut into regions."""
-        return self.pao and not self.binary_mask and (self.robust or not self.additions)
-
-    @property
-    def uses_gains(self) -> bool:
-        """Whether each frame has a gain of its colours."""
-        return self.additions and self.dpd and self.gains
-
-    @property
-    def holds_omega(self) -> bool:
-        """Whether temporal weights are held near what the pre-pass says."""
-        return self.judges and self.dpd
-
-    @property
-    def moves_poses(self) -> bool:
-        """Whether frames have corrections of their pose."""
-        return self.additions and self.heads and self.frame_poses
-
-    @property
-    def refines(self) -> bool:
-        """Whether head (iv) acts."""
-        return self.heads and self.refinement
-
-    @property
-    def term_weights(self) -> TermWeights:
-        """The terms' weights of the mode."""
-        return self.terms if self.additions else PAPER_TERMS
-
-    def weights_of(self, hands: int) -> PaoSettings:
-        """PAO's settings for one hand or two: the paper's background threshold differs."""
-        if hands > 1 and self.weights == PaoSettings():
-            return dataclasses.replace(self.weights, background_threshold=10.0)
-        return self.weights
+#: The modes: settings by name, in place of the defaults. `default`: what measurements keep.
+#: `paper`: the formulas as printed, made well-posed, without the additions.
+MODES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
+    {
+        "default": {},
+        "paper": {
+            "prior": "",
+            "dpd": {"gains": False},
+            "pao": {"variant": "paper"},
+            "heads": {"frame_poses": False},
+            "prepass": {"enabled": False},
+            "terms": {
+                item.name: getattr(PAPER_TERMS, item.name)
+                for item in dataclasses.fields(TermWeights)
+                if item.name not in ("dssim_weight", "outside_weight")
+            },
+        },
+    }
+)
 
 
 def read_settings(values: Mapping[str, Any]) -> WildGHandSettings:
-    """Check a preset's table with its overrides.
+    """Make the settings of a mode with some of them changed.
+
+    A setting that is given wins over the mode's. Parts of a component that is off are off in what
+    is returned, and so is a pre-pass that neither DPD nor PAO reads.
 
     Args:
-        values: any of the fields of `WildGHandSettings`; tables for those that are tables, or
-            `name.field`. `network.size` chooses the network, its other fields change it.
+        values: `mode`, a name of `MODES` (without it `default`); and any of the fields of
+            `WildGHandSettings`, as tables or as `table.field`. `network.size` chooses the network,
+            its other fields change it. Names that settings had before
+            (`wildghand.model.former_settings`) are read too.
 
     Raises:
-        BadMethod: an unknown name, a wrong type, or a value outside its range.
+        BadMethod: an unknown name (the message says which one is close), a wrong type, or a value
+            outside its range.
     """
-    rest, changes = {}, {}
-    for name, value in values.items():
-        head, dot, tail = name.partition(".")
-        if head != "network":
-            rest[name] = value
-        elif dot:
-            changes[tail] = value
-        elif isinstance(value, Mapping):
-            changes.update(value)
-        else:
-            raise BadMethod("must be a table", where=WHERE, field="network")
-    settings = settings_from(WildGHandSettings, rest, WHERE)
-    try:
-        network = network_settings(**changes)
-    except HwpError as error:
-        raise BadMethod(str(error), where=WHERE, field="network") from error
-    return dataclasses.replace(settings, network=network)
+    changes = current_names(values)
+    mode = _mode_of(changes)
+    start = dataclasses.asdict(WildGHandSettings())
+    _check_names(changes, start)
+    network = changes.get("network")
+    if isinstance(network, Mapping) and network.get("size") == "paper":
+        start["network"] = network_settings("paper").to_json()
+    chosen = _merged(_merged(start, MODES[mode]), changes)
+    return _without_idle_parts(settings_from(WildGHandSettings, chosen, WHERE))
+
+
+def read_version_1(values: Mapping[str, Any]) -> WildGHandSettings:
+    """Read the settings that an avatar of version 1 stores.
+
+    They are complete and have their former names. Their mode overruled them: with `paper` the
+    additions were off, whatever they said.
+
+    Raises:
+        BadMethod: as for `read_settings`.
+    """
+    tree = current_names(values)
+    paper = _mode_of(tree) == "paper"
+    if paper:
+        named = tree.get("prior")
+        tree = _merged(tree, MODES["paper"])
+        tree["prior"] = "" if named in (None, "shipped") else named
+    # In the mode `default`, `weights.variant` had no effect.
+    weights = values.get("weights")
+    printed = weights.get("variant") if isinstance(weights, Mapping) else None
+    binary = values.get("binary_mask") is True or (paper and printed == "binary")
+    variant = "binary" if binary else "paper" if paper else "judged"
+    return read_settings(_merged(tree, {"pao": {"variant": variant}}))
+
+
+def _mode_of(changes: dict[str, Any]) -> str:
+    """Take the mode out of what is given, and check it."""
+    mode = changes.pop("mode", "default")
+    if not isinstance(mode, str) or mode not in MODES:
+        raise BadMethod(
+            f"is {str(mode)[:100]!r}",
+            where=WHERE,
+            field="mode",
+            remedy=f"Use one of {', '.join(MODES)}.",
+        )
+    return mode
+
+
+def _merged(tables: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Tables within tables, some values changed."""
+    merged = dict(tables)
+    for name, value in changes.items():
+        before = merged.get(name)
+        if isinstance(before, Mapping) and isinstance(value, Mapping):
+            value = _merged(before, value)
+        merged[name] = value
+    return merged
+
+
+def _check_names(changes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    """Refuse a name that is not a setting, and say which one is meant."""
+    names = [name for name, _ in flattened(known)]
+    tables = {name.rpartition(".")[0] for name in names} - {""}
+    for name, _ in flattened(changes):
+        if name in names or name in tables:
+            continue
+        table, _, word = name.rpartition(".")
+        fields = [other for other in names if other.rpartition(".")[0] == table]
+        close = difflib.get_close_matches(name, [*names, *tables, "mode"], n=1, cutoff=0.75)
+        if not close and not (table and fields):
+            # The name may be that of a field without its table.
+            lasts = {other.rpartition(".")[2]: other for other in names}
+            close = [lasts[last] for last in difflib.get_close_matches(word, lasts, n=1)]
+        everything = ["mode", *known] if not table else fields or [*known]
+        raise BadMethod(
+            "is not a setting of this method",
+            where=WHERE,
+            field=name[:100],
+            remedy=f"Did you mean {close[0]!r}?" if close else f"Known: {', '.join(everything)}.",
+        )
+
+
+def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
+    """The same settings; what could not act is off."""
+    dpd, pao, heads = settings.dpd, settings.pao, settings.heads
+    robust = pao.enabled and pao.variant == "judged" and pao.robust
+    return dataclasses.replace(
+        settings,
+        dpd=dataclasses.replace(dpd, gains=dpd.enabled and dpd.gains),
+        pao=dataclasses.replace(pao, robust=robust),
+        heads=HeadSettings(
+            enabled=heads.enabled,
+            refinement=heads.enabled and heads.refinement,
+            frame_poses=heads.enabled and heads.frame_poses,
+        ),
+        prepass=dataclasses.replace(
+            settings.prepass, enabled=settings.prepass.enabled and (dpd.enabled or pao.enabled)
+        ),
+    )

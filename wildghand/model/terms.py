@@ -9,13 +9,14 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.methods.settings import number
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.losses import photometric_loss
 
 
 @dataclass(frozen=True)
 class TermWeights:
-    """Weight of each term.
+    """Weight of each term of the loss, and of what it is made of.
 
     The defaults are the authors' weights divided by their 100 for the reconstruction, but for
     the two terms that cost the clean fit several dB: opacity and silhouette.
@@ -23,6 +24,10 @@ class TermWeights:
 
     #: Weighted reconstruction.
     reconstruction: float = 1.0
+    #: Share of D-SSIM in the reconstruction; the rest is L1.
+    dssim_weight: float = number(0.2, 0.0, 1.0)
+    #: Weight in the reconstruction of a pixel outside the visible-hand mask; inside it is 1.
+    outside_weight: float = number(0.03, 0.0, 1.0)
     #: `bias_size`: biases of the perturbation module.
     bias: float = 1e-3
     #: `distance_to_one` of the shadow coefficients.

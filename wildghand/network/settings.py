@@ -10,7 +10,7 @@ from typing import Any
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.hands.skeleton import SIDES
-from hwp_bench.methods.settings import choice, number
+from hwp_bench.methods.settings import choice, number, settings_from
 from wildghand.gaussians.attributes import CHANNELS
 
 #: The sizes by name.
@@ -65,19 +65,7 @@ class NetworkSettings:
     max_transl: float = number(0.005, 0.0, 1.0)
 
     def __post_init__(self) -> None:
-        if self.size not in SIZES:
-            raise UsageError(
-                f"is {self.size!r}"[:200], field="size", remedy=f"Use {' or '.join(SIZES)}."
-            )
-        if not isinstance(self.direct, bool):
-            raise UsageError(f"is {self.direct!r}", field="direct", remedy="Use true or false.")
-        for item in dataclasses.fields(self):
-            if "range" in item.metadata:
-                whole = item.type == "int"
-                _check_number(item.name, getattr(self, item.name), whole, *item.metadata["range"])
-        self._check_together()
-
-    def _check_together(self) -> None:
+        """Check what no single field shows; `network_settings` checks each of them."""
         if self.plane_resolution % 4:
             raise UsageError(
                 f"is {self.plane_resolution}", field="plane_resolution", remedy="Use 4, 8, 12, ..."
@@ -102,16 +90,6 @@ class NetworkSettings:
     def to_json(self) -> dict[str, Any]:
         """The fields by name."""
         return dataclasses.asdict(self)
-
-
-def _check_number(name: str, value: Any, whole: bool, low: float, high: float) -> None:
-    kinds = (int,) if whole else (int, float)
-    if isinstance(value, bool) or not isinstance(value, kinds) or not low <= value <= high:
-        raise UsageError(
-            f"is {value!r}"[:200],
-            field=name,
-            remedy=f"Use a {'whole ' if whole else ''}number from {low:g} to {high:g}.",
-        )
 
 
 # What `paper` changes; where the paper is silent, what the authors' public code does.
@@ -147,16 +125,10 @@ def network_settings(size: str = "compact", **changes: Any) -> NetworkSettings:
         changes: any other fields of `NetworkSettings`.
 
     Raises:
-        UsageError: no such size or field, or a value out of its range.
+        BadMethod: no such size or field, a wrong type, or a value out of its range.
     """
-    known = {item.name for item in dataclasses.fields(NetworkSettings)}
-    for name in changes:
-        if name not in known:
-            raise UsageError(
-                "is no setting of the network", field=name[:100], remedy=f"Known: {sorted(known)}."
-            )
     base = dict(_PAPER) if size == "paper" else {"size": size}
-    return NetworkSettings(**{**base, **changes})
+    return settings_from(NetworkSettings, {**base, **changes}, "network")
 
 
 def check_sides(sides: Mapping[str, Any]) -> None:

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.methods.settings import number
 from wildghand.pao.regions.frame_regions import Regions
 
 #: Colour channels: the paper's background error is their sum, its region error their mean.
@@ -20,10 +21,19 @@ _EQUAL = 1e-4
 
 @dataclass(frozen=True)
 class PaoSettings:
-    """Perturbation-aware weights; the defaults are the paper's for a single hand."""
+    """Perturbation-aware weights; the numbers are the paper's."""
 
-    #: "weights" is the paper's W; "binary" puts the hand's mask in its place (the paper's table).
-    variant: Literal["weights", "binary"] = "weights"
+    #: Component: weigh frames and pixels. Without it a pixel counts as the estimated mask says.
+    enabled: bool = True
+    #: Where the weights come from. `judged`: the pre-pass, for frames and pixels. `paper`: the
+    #: paper's equations, region by region. `binary`: the hand's mask (the paper's table).
+    variant: Literal["judged", "paper", "binary"] = "judged"
+    #: Addition to `judged`: robust weights of residuals later in the fit, in place of the
+    #: pre-pass's pixel weights. Off: where it was measured it cost more than it brought
+    #: (docs/wildghand.md).
+    robust: bool = False
+    #: Share of the budget after which residuals decide the weights.
+    robust_start: float = number(0.25, 0.0, 1.0)
     #: Factor of every region's weight.
     alpha: float = 100.0
     #: How strongly the temporal weight of a frame lowers its regions' weights; 0 = not at all.
@@ -33,8 +43,10 @@ class PaoSettings:
     #: T_mu at the start: regions with a smaller share of hand have weight 0.
     share_threshold: float = 0.3
     #: T_b at the start: background pixels whose error, summed over channels, is above it have
-    #: weight 0. The paper uses 3 for a single hand and 10 for interacting hands.
+    #: weight 0. For a single hand.
     background_threshold: float = 3.0
+    #: The same for two hands.
+    background_threshold_both: float = 10.0
     #: What mu is a share of: "hand" = |region and hand| / |hand|, the paper's formula, which
     #: wants regions as large as a hand; "region" = |region and hand| / |region|, the paper's
     #: sentence, which superpixels can reach too. "auto" takes the formula where regions may
@@ -42,7 +54,7 @@ class PaoSettings:
     share_of: Literal["auto", "hand", "region"] = "auto"
     #: Stretch the errors of a batch's regions to [0, 1], as the authors do; equal ones become 0.
     normalise_errors: bool = True
-    #: Weight outside the hand in the variant "binary".
+    #: Weight outside the hand in the variant `binary`.
     binary_outside: float = 0.0
 
     def __post_init__(self) -> None:
@@ -53,7 +65,7 @@ class PaoSettings:
                     f"is {value}", field=item.name, remedy="Use a finite number, 0 or more."
                 )
         for name, known in (
-            ("variant", ("weights", "binary")),
+            ("variant", ("judged", "paper", "binary")),
             ("share_of", ("auto", "hand", "region")),
         ):
             if getattr(self, name) not in known:
@@ -64,7 +76,7 @@ class PaoSettings:
 
 @dataclass(frozen=True, eq=False)
 class Weights:
-    """What the pixels of B frames count."""
+    """Weights of the pixels of B frames, and what they are made of."""
 
     #: (B, H, W) W, not negative.
     weights: Tensor
@@ -83,7 +95,11 @@ class Weights:
 class PerturbationAwareWeights(nn.Module):
     """lambda_u and W from the error of the current rendering, with learnable thresholds.
 
-    The thresholds want their own learning rate (the paper's is 1e-6). Gradients reach nothing
+    Args:
+        settings: factors, and the thresholds at the start.
+        hands: one or two; the background threshold differs.
+
+    The thresholds need their own learning rate (the paper's is 1e-6). Gradients reach nothing
     but them: a gradient through the errors would reward errors that lower a weight, and omega
     is detached because a larger one would buy a lower loss.
 
@@ -91,12 +107,15 @@ class PerturbationAwareWeights(nn.Module):
     read so that they are defined everywhere; `docs/dpd_pao.md` lists the differences.
     """
 
-    def __init__(self, settings: PaoSettings = PaoSettings()) -> None:
+    def __init__(self, settings: PaoSettings = PaoSettings(), hands: int = 1) -> None:
         super().__init__()
         self.settings = settings
         self.T_E = nn.Parameter(torch.tensor(settings.error_threshold))
         self.T_mu = nn.Parameter(torch.tensor(settings.share_threshold))
-        self.T_b = nn.Parameter(torch.tensor(settings.background_threshold))
+        background = settings.background_threshold
+        if hands > 1:
+            background = settings.background_threshold_both
+        self.T_b = nn.Parameter(torch.tensor(background))
 
     def forward(self, error: Tensor, regions: Regions, hand: Tensor, omega: Tensor) -> Weights:
         """Weigh B frames.
@@ -119,16 +138,11 @@ class PerturbationAwareWeights(nn.Module):
         errors, shares = self._measure(error, regions, on_hand & finite, on_hand)
         temporal = 1.0 / (1.0 + self.settings.beta * omega.detach().abs())
         outside = (finite & ~on_hand).to(error)
-        if self.settings.variant == "binary":
-            lambdas = torch.zeros_like(errors)
-            background = self.settings.binary_outside * outside
-            weights = (on_hand & finite).to(error) + background
-        else:
-            gates = torch.relu(self.T_E - errors) * torch.relu(shares - self.T_mu)
-            # A region without hand has no error; it must stay out even if T_mu learns to be < 0.
-            lambdas = self.settings.alpha * gates * (shares > 0.0) * temporal[:, None]
-            background = outside * torch.relu(self.T_b - _CHANNELS * error)
-            weights = regions.spread(lambdas) * finite + background
+        gates = torch.relu(self.T_E - errors) * torch.relu(shares - self.T_mu)
+        # A region without hand has no error; it must stay out even if T_mu learns to be < 0.
+        lambdas = self.settings.alpha * gates * (shares > 0.0) * temporal[:, None]
+        background = outside * torch.relu(self.T_b - _CHANNELS * error)
+        weights = regions.spread(lambdas) * finite + background
         return Weights(weights, background, lambdas, errors, shares, temporal)
 
     @torch.no_grad()
@@ -150,6 +164,20 @@ class PerturbationAwareWeights(nn.Module):
         return errors, pixels / whole.clamp(min=1.0)
 
 
+def binary_weights(hand: Tensor, outside: float = 0.0) -> Tensor:
+    """The hand's mask as weights.
+
+    Args:
+        hand: (B, H, W) y_h: bool, or coverage in [0, 1], hand where above a half.
+        outside: weight of the other pixels.
+
+    Returns:
+        (B, H, W) float32, 1 on the hand.
+    """
+    on_hand = hand if hand.dtype == torch.bool else hand > 0.5
+    return on_hand.float() + outside * (~on_hand).float()
+
+
 def _stretch(errors: Tensor, present: Tensor) -> Tensor:
     """Errors of the regions that are present, from their smallest to their largest, on [0, 1]."""
     if not bool(present.any()):
@@ -164,7 +192,6 @@ def _check_shapes(error: Tensor, regions: Regions, hand: Tensor, omega: Tensor) 
     shapes = [tuple(tensor.shape) for tensor in (error, regions.index, hand)]
     if error.ndim != 3 or len(set(shapes)) > 1 or tuple(omega.shape) != shapes[0][:1]:
         raise ShapeMismatch(
-            f"have the shapes {shapes} and {tuple(omega.shape)}; (B, H, W) thrice and (B,) "
-            "are wanted",
+            f"have the shapes {shapes} and {tuple(omega.shape)}, not (B, H, W) each and (B,)",
             field="error, regions, hand, omega",
         )

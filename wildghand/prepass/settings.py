@@ -9,6 +9,8 @@ from dataclasses import dataclass
 class PrepassSettings:
     """How training frames are judged; the defaults suit every capture."""
 
+    #: Judge the frames before the fit.
+    enabled: bool = True
     #: Edge of the cells that share one albedo, m on the rest surface.
     patch_size: float = 0.004
     #: Pixels of all frames together from which the intensity model is fitted.

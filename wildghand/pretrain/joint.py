@@ -57,7 +57,7 @@ class JointFit:
             fit.optimizer = self.optimizer
         self._captures = batches(len(self.fits), 1, seed)
         self._rows = [
-            batches(len(fit.frames), settings.batch, seed + 1 + index)
+            batches(len(fit.frames), settings.schedule.batch, seed + 1 + index)
             for index, fit in enumerate(self.fits)
         ]
 

@@ -63,7 +63,7 @@ def pretrain(
     chosen = read_settings(settings)
     captures = [open_capture(source) for source in sources]
     _check_captures(captures)
-    total = chosen.steps * len(captures) if steps is None else steps
+    total = chosen.schedule.steps * len(captures) if steps is None else steps
     run = RunSettings(dict(settings), seed, Budget(steps=total))
     work = out.with_name(out.name + ".pretrain")
     with exclusive(work):
@@ -106,7 +106,7 @@ def _fit_in(
         run.seed,
         choose_device(chosen.device),
     )
-    watchers, start, before, state = Watchers(chosen.plateau_steps), 0, 0.0, work / STATE
+    watchers, start, before, state = Watchers(chosen.schedule.plateau_steps), 0, 0.0, work / STATE
     if state.is_file():
         start, before = load_state(state, joint, watchers, digest)
         notice(f"Going on after {start} steps.")

@@ -33,7 +33,9 @@ from wildghand.prior.prior import (
 )
 
 #: Version of the folder.
-SCHEMA = "wildghand-prior/1"
+SCHEMA = "wildghand-prior/2"
+#: Versions that are read. In the first the fit's settings have their former names.
+READ = ("wildghand-prior/1", SCHEMA)
 #: Names of its files.
 DESCRIPTION = "prior.json"
 WEIGHTS = "weights.safetensors"
@@ -68,8 +70,6 @@ def choose_prior(
     if settings.prior != SHIPPED:
         path = find_prior(settings.prior)
         return load_prior(path, settings.network, hand_model, network)
-    if not settings.additions:
-        return None
     root = find_prior(_SHIPPED_FOLDER)
     record = _read_record(root)
     try:
@@ -197,7 +197,7 @@ def _read_record(root: Path) -> PriorRecord:
 
 
 def _check_record(record: PriorRecord) -> None:
-    if record.schema != SCHEMA:
+    if record.schema not in READ:
         raise BadInput(f"is {record.schema[:40]!r} where {SCHEMA!r} is read", field="schema")
     if not record.sides or record.sides != [side for side in _SIDES if side in record.sides]:
         raise BadInput(f"are {record.sides}"[:200], field="sides")

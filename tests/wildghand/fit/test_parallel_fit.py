@@ -33,18 +33,18 @@ from wildghand.model.settings import read_settings
 
 TINY: dict[str, Any] = {
     "gaussians": 300,
-    "steps": 4,
-    "batch": 2,
+    "schedule.steps": 4,
+    "schedule.batch": 2,
     "device": "cpu",
     "network.identity_resolution": 24,
     "network.plane_resolution": 12,
 }
 VARIANTS: dict[str, dict[str, Any]] = {
     # Every other frame keeps its biases: processes must draw the same chances.
-    "default": {"omega_dropout": 0.5},
+    "default": {"dpd.omega_dropout": 0.5},
     # The weights compare the frames of a batch.
-    "robust": {"robust": True, "robust_start": 0.0},
-    "paper": {"mode": "paper", "omega_dropout": 0.5},
+    "robust": {"pao.robust": True, "pao.robust_start": 0.0},
+    "paper": {"mode": "paper", "dpd.omega_dropout": 0.5},
 }
 TrainingMaker = Callable[..., TrainingCapture]
 State = dict[str, torch.Tensor]
@@ -191,9 +191,9 @@ def test_torchrun_makes_one_avatar_and_one_message(
     assert made.stdout.count("2 steps") == 1
     assert made.stderr.count("Fitting painted-right") == 1
     assert load_avatar(avatar).steps == 2
-    refused = torchrun([*command, "--overwrite", "--set", "batch=3"])
+    refused = torchrun([*command, "--overwrite", "--set", "schedule.batch=3"])
     assert refused.returncode != 0
-    assert refused.stderr.count("wildghand: error: batch: is 3, which 2 processes") == 1
+    assert refused.stderr.count("wildghand: error: schedule.batch: is 3, which 2 processes") == 1
     assert refused.stderr.count("wildghand: ") == 1
     assert sorted(path.name for path in tmp_path.iterdir()) == ["avatar"]
 
@@ -202,7 +202,7 @@ def test_a_batch_is_split_evenly_or_refused() -> None:
     parts = [World(rank, 3).part(6) for rank in range(3)]
     assert [list(range(6))[part] for part in parts] == [[0, 1], [2, 3], [4, 5]]
     assert ALONE.part(5) == slice(0, 5)
-    with pytest.raises(UsageError, match=r"batch: is 4, .*batch=3"):
+    with pytest.raises(UsageError, match=r"schedule\.batch: is 4, .*schedule\.batch=3"):
         World(0, 3).part(4)
 
 
@@ -266,7 +266,7 @@ def test_an_evaluation_is_one_process_whatever_torchrun_says(
 ) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.setenv("RANK", "1")
-    avatar = WildGHandMethod({**TINY, "steps": 1, "batch": 1}).fit(
+    avatar = WildGHandMethod({**TINY, "schedule.steps": 1, "schedule.batch": 1}).fit(
         make_training(), Budget(), SilentReport()
     )
     assert avatar.steps == 1

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from hwp_bench.base.errors import BadMethod, UsageError
+from hwp_bench.base.errors import BadMethod
 from hwp_bench.methods.settings import settings_from
 from wildghand.network import NetworkSettings, network_settings
 
@@ -34,7 +34,7 @@ def test_settings_survive_json(size: str) -> None:
 def test_numbers_beyond_their_range_are_refused(item: dataclasses.Field[Any]) -> None:
     low, high = item.metadata["range"]
     for bad in (low - 1, high + 1, float("nan"), "1", True, None):
-        with pytest.raises(UsageError, match=item.name):
+        with pytest.raises(BadMethod, match=item.name):
             network_settings("compact", **{item.name: bad})
 
 
@@ -53,7 +53,7 @@ def test_numbers_beyond_their_range_are_refused(item: dataclasses.Field[Any]) ->
 def test_settings_that_do_not_fit_together_are_refused(
     size: str, changes: dict[str, Any], field: str
 ) -> None:
-    with pytest.raises(UsageError, match=field):
+    with pytest.raises(BadMethod, match=field):
         network_settings(size, **changes)
 
 

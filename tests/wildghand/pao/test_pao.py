@@ -11,7 +11,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
-from wildghand.pao.pao import PaoSettings, PerturbationAwareWeights
+from wildghand.pao.pao import PaoSettings, PerturbationAwareWeights, binary_weights
 from wildghand.pao.regions import FrameRegions, Regions, overlapping, partition, stack_regions
 
 PRINTED = PaoSettings(normalise_errors=False, share_of="hand")
@@ -115,14 +115,16 @@ def test_the_reward_of_weight_moves_the_thresholds_apart() -> None:
 
 
 def test_binary_variant_is_the_hand() -> None:
-    error, masks, hand = scene()
-    regions = regions_of(masks)
-    chosen = PaoSettings(variant="binary")
-    made = PerturbationAwareWeights(chosen)(error, regions, hand, torch.ones(2))
-    assert torch.equal(made.weights, hand.to(error))
-    soft = PerturbationAwareWeights(replace(chosen, binary_outside=0.03))
-    weights = soft(error, regions, hand, torch.ones(2)).weights
-    torch.testing.assert_close(weights, torch.where(hand, 1.0, 0.03).to(error))
+    _, _, hand = scene()
+    assert torch.equal(binary_weights(hand), hand.float())
+    assert torch.equal(binary_weights(0.6 * hand), hand.float())
+    soft = binary_weights(hand, 0.03)
+    torch.testing.assert_close(soft, torch.where(hand, 1.0, 0.03))
+
+
+def test_two_hands_have_a_background_threshold_of_their_own() -> None:
+    single, both = (float(PerturbationAwareWeights(hands=hands).T_b) for hands in (1, 2))
+    assert (single, both) == (3.0, 10.0)
 
 
 def test_superpixels_qualify_unless_the_formula_is_asked_for() -> None:

@@ -38,7 +38,7 @@ from wildghand.prior.files import DESCRIPTION, WEIGHTS, choose_prior, find_prior
 
 QUICK: dict[str, Any] = {
     "gaussians": 400,
-    "steps": 40,
+    "schedule.steps": 40,
     "device": "cpu",
     "network.identity_resolution": 24,
     "network.plane_resolution": 12,
