@@ -123,7 +123,7 @@ def test_binary_variant_is_the_hand() -> None:
 
 
 def test_two_hands_have_a_background_threshold_of_their_own() -> None:
-    single, both = (float(PerturbationAwareWeights(hands=hands).T_b) for hands in (1, 2))
+    single, both = (PerturbationAwareWeights(hands=hands).T_b.item() for hands in (1, 2))
     assert (single, both) == (3.0, 10.0)
 
 
