@@ -158,9 +158,10 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
 
 
 def _draw(ablation: AblationRuns, out: Path) -> None:
-    from hwp_bench.analysis.cost.analysis import analyse_cost, write_cost
+    from hwp_bench.analysis.cost.analysis import analyse_cost
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.progress import notice
+    from hwp_bench.report.figures import write_cost
 
     try:
         analysis = analyse_cost(list(ablation.runs.values()), "psnr")

@@ -50,12 +50,13 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from pathlib import Path
 
-    from hwp_bench.analysis.cost.analysis import analyse_cost, write_cost
+    from hwp_bench.analysis.cost.analysis import analyse_cost
     from hwp_bench.analysis.statistics.pairing import group_runs
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table
     from hwp_bench.metrics import metric
+    from hwp_bench.report.figures import write_cost
     from hwp_bench.results import read_all
 
     metric(args.metric)

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 from hwp_bench.analysis.cost.cost_tables import cost_tables, machine_notes, seconds_table
 from hwp_bench.analysis.cost.curves import FrontPart, MeanCurve, mean_curve, pareto_front
-from hwp_bench.analysis.cost.figure import draw_pareto, write_figure
 from hwp_bench.analysis.cost.method_cost import (
     BUDGETS,
     MethodCost,
@@ -19,7 +17,7 @@ from hwp_bench.analysis.cost.method_cost import (
 )
 from hwp_bench.analysis.statistics.pairing import MethodRuns, refuse_unlike
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.tables import Table, write_tables
+from hwp_bench.base.tables import Table
 from hwp_bench.metrics import metric as metric_facts
 
 #: Name of the plain baseline, the reference where it is among the methods.
@@ -113,10 +111,3 @@ def analyse_cost(
     if seconds is not None:
         tables["seconds"] = seconds
     return CostAnalysis(metric, tuple(costs), tuple(curves), tuple(front), tables)
-
-
-def write_cost(folder: Path, analysis: CostAnalysis) -> list[Path]:
-    """Write the tables in every spelling, and the picture; returns the pictures."""
-    write_tables(folder / "tables", analysis.tables)
-    figure = draw_pareto(analysis.curves, analysis.front, analysis.metric)
-    return write_figure(folder, "pareto", figure)

@@ -18,10 +18,11 @@ from hwp_bench.base.tables import Table
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.evaluation_tables import all_tables, same_data
+from hwp_bench.report.figures import Bar, draw_bars, draw_pareto
+from hwp_bench.report.page.html_tables import to_html
+from hwp_bench.report.page.inline_svg import inline_svg
 from hwp_bench.report.page.pictures import Album, frame_sheets, mask_sheet
-from hwp_bench.report.page.plots import Bar, bar_plot, pareto_plot
 from hwp_bench.report.page.strips import StripMethod, strip_plot
-from hwp_bench.report.page.tables import to_html
 from hwp_bench.report.sources import Source, find_captures, temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
 from hwp_bench.results import Results
@@ -52,7 +53,7 @@ class CaptureSection:
 
 
 @dataclass(frozen=True)
-class Report:
+class ReportPage:
     """Everything on the page."""
 
     #: One or two sentences that say what the results say.
@@ -85,7 +86,7 @@ def gather(
     *,
     base: str | None = None,
     picture_bytes: int | None = None,
-) -> Report:
+) -> ReportPage:
     """Gather a report.
 
     Args:
@@ -119,11 +120,11 @@ def gather(
         lambda: bias_table(chosen, infos),
         lambda: _seeds(chosen, runs),
     )
-    return Report(
+    return ReportPage(
         summary=summary_sentence(runs),
         methods=list(order),
         tables=[to_html(table) for table in shown if len(table.columns) > 1],
-        pareto=pareto_plot(cost.curves, cost.front, HEADLINE, order) if cost else None,
+        pareto=_pareto(cost, order) if cost else None,
         cost_tables=[to_html(table) for table in cost.tables.values()] if cost else [],
         bars=_bars(runs),
         differences=[to_html(table) for table in _differences(runs)],
@@ -181,6 +182,11 @@ def _seeds(chosen: Sequence[Source], runs: Sequence[MethodRuns]) -> Table | None
     return seeds_table(chosen) if any(len(run.seeds) > 1 for run in runs) else None
 
 
+def _pareto(cost: CostAnalysis, order: Mapping[str, int]) -> Markup:
+    figure = draw_pareto(cost.curves, cost.front, HEADLINE, order)
+    return inline_svg(figure, f"{metric_facts(HEADLINE).label} over seconds of fitting")
+
+
 def _bars(runs: Sequence[MethodRuns]) -> Markup | None:
     groups = {}
     for name, weights in scopes(runs[0].first).items():
@@ -196,7 +202,10 @@ def _bars(runs: Sequence[MethodRuns]) -> Markup | None:
                 )
                 for index, run in enumerate(runs)
             ]
-    return bar_plot(groups, HEADLINE) if groups else None
+    if not groups:
+        return None
+    title = f"{metric_facts(HEADLINE).label} by perturbation with 95 % intervals"
+    return inline_svg(draw_bars(groups, HEADLINE), title)
 
 
 def _differences(runs: Sequence[MethodRuns]) -> list[Table]:

@@ -11,7 +11,7 @@ from typing import Any
 from markupsafe import Markup
 
 from hwp_bench.base.files import atomic_write
-from hwp_bench.report.page.content import Report, gather
+from hwp_bench.report.page.content import ReportPage, gather
 from hwp_bench.report.sources import Source
 
 #: Name of the page.
@@ -44,7 +44,7 @@ def render_template(package: str, name: str, **values: Any) -> str:
     return environment.get_template(name).render(**values)
 
 
-def render_report(report: Report, title: str) -> str:
+def render_report(report: ReportPage, title: str) -> str:
     """Return the page of a report."""
     return render_template(
         "hwp_bench.report.page",

@@ -2,30 +2,42 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import groupby
+from typing import TYPE_CHECKING
 
 from markupsafe import Markup
 
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.report.page.svg import (
+from hwp_bench.report.figures import (
+    MARK,
+    PALETTE,
     WIDTH,
-    drawing,
-    label,
-    line,
-    polyline,
-    series,
-    tag,
-    ticks,
+    add_axes,
+    figure_style,
+    heading,
+    new_figure,
+    scale_up,
+    series_style,
 )
+from hwp_bench.report.page.inline_svg import inline_svg
 from hwp_bench.report.sources import TemporalWeights
 from hwp_bench.results import CaptureResult
 from hwp_bench.taxonomy import MAX_SEVERITY, perturbation
 
-_LEFT, _RIGHT, _TOP, _BOTTOM = 44.0, WIDTH - 10.0, 16.0, 104.0
-#: Height of a row of severities, and of the plot of temporal weights.
-_ROW, _WEIGHTS = 13.0, 44.0
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+#: Place of every panel, px: its left side and its width.
+_LEFT, _ACROSS = 44.0, WIDTH - 54.0
+#: Heights, px: the scores with their labels, the rail of the whole capture, a row of severities
+#: and one of unknown ones, a plot of temporal weights, and the labels under the last of them.
+_SCORES, _RAIL, _SEVERITY, _UNKNOWN, _WEIGHTS, _FOOT = 122.0, 30.0, 28.0, 16.0, 62.0, 16.0
+#: Most test frames that get a dot each.
+_DOTS = 60
 
 
 @dataclass(frozen=True)
@@ -51,138 +63,135 @@ def strip_plot(methods: Sequence[StripMethod], info: CaptureInfo | None, metric:
         metric: of the scores.
     """
     frames = [frame.frame for frame in methods[0].result.frames]
-    parts = _scores(methods, frames, metric)
-    height = _BOTTOM + 18
-    known = max(
-        [max(item.frames) for m in methods for item in m.weights.values()] + [max(frames)],
-        default=0,
-    )
-    count = info.frame_count if info else known + 1
+    weights = [(method, side) for method in methods for side in method.weights]
+    severities = dict(info.perturbations) if info else {}
+    rows = {name: _UNKNOWN if v is None else _SEVERITY for name, v in severities.items()}
+    seen = [max(method.weights[side].frames) for method, side in weights]
+    count = info.frame_count if info else max([*frames, *seen], default=0) + 1
+    below = info is not None or bool(weights)
+    height = _SCORES
+    if below:
+        height += _RAIL + sum(rows.values()) + _WEIGHTS * len(weights) + _FOOT
+    with figure_style():
+        figure = new_figure(height)
+        _draw_scores(figure, methods, frames, metric)
+        top, axes = _SCORES, None
+        if below:
+            axes = _draw_rail(figure, top, count, min(frames), max(frames) + 1)
+            top += _RAIL
+        for name, values in severities.items():
+            axes = _draw_severity(figure, top, name, values, count)
+            top += rows[name]
+        for method, side in weights:
+            axes = _draw_weights(figure, top, method, side, count)
+            top += _WEIGHTS
+        if axes is not None:
+            _number_frames(axes)
+        title = f"{metric_facts(metric).label} of the test frames of {methods[0].result.id}"
+        return inline_svg(figure, title)
 
-    def x(frame: float) -> float:
-        return _LEFT + (_RIGHT - _LEFT) * min(max(frame / count, 0.0), 1.0)
 
-    if info is not None or any(method.weights for method in methods):
-        # The test clip is drawn large above; this shows where in the capture it lies.
-        low, high = x(min(frames)), x(max(frames) + 1)
-        wedge = [(_LEFT, height), (_RIGHT, height), (high, height + 22), (low, height + 22)]
-        parts.append(polyline(wedge, "wedge", "polygon"))
-        height += 22
-        parts.append(
-            tag("rect", x=_LEFT, y=height, width=_RIGHT - _LEFT, height=4.0, class_="rail")
-        )
-        parts.append(tag("rect", x=low, y=height, width=high - low, height=4.0, class_="test"))
-        height += 8
-    if info is not None:
-        rows, height = _severities(info, x, height)
-        parts += rows
-    for method in methods:
-        for side, weights in method.weights.items():
-            rows, height = _weights(method, side, weights, x, height)
-            parts += rows
-    if info is not None or any(method.weights for method in methods):
-        parts += [
-            label(x(tick), height + 10, f"{tick:g}", "middle") for tick in ticks(0, count - 1)[1:]
-        ]
-        parts.append(label(2, height + 10, "frame"))
-        height += 16
+def _draw_scores(
+    figure: Figure, methods: Sequence[StripMethod], frames: Sequence[int], metric: str
+) -> None:
     facts = metric_facts(metric)
-    return drawing(height, f"{facts.label} of the test frames of {methods[0].result.id}", parts)
-
-
-def _scores(methods: Sequence[StripMethod], frames: Sequence[int], metric: str) -> list[Markup]:
-    facts = metric_facts(metric)
-    values = [frame.scores[metric] for m in methods for frame in m.result.frames]
+    axes = add_axes(figure, _LEFT, 16, _ACROSS, 88)
+    values = [frame.scores[metric] for method in methods for frame in method.result.frames]
     span = max(max(values) - min(values), 10.0**-facts.digits)
-    low, high = min(values) - 0.1 * span, max(values) + 0.1 * span
-
-    def x(index: float) -> float:
-        return _LEFT + (_RIGHT - _LEFT) * (index + 0.5) / len(frames)
-
-    def y(score: float) -> float:
-        return _BOTTOM - (_BOTTOM - _TOP) * (score - low) / (high - low)
-
-    unit = f" [{facts.unit}]" if facts.unit else ""
-    parts = [label(_LEFT, 10, f"{facts.label}{unit}, test frames", class_="axis")]
-    for value in ticks(low, high, 4):
-        parts += [line(_LEFT, y(value), _RIGHT, y(value), "grid")]
-        parts += [label(_LEFT - 5, y(value) + 4, f"{value:.5g}", "end")]
+    scale_up(axes, min(values) - 0.1 * span, max(values) + 0.1 * span, 4)
     for method in methods:
-        name = series(method.method)
-        scored = method.result.frames
-        points = [(x(i), y(frame.scores[metric])) for i, frame in enumerate(scored)]
-        parts.append(polyline(points, f"curve {name}"))
-        for (cx, cy), frame in zip(points, scored, strict=True):
-            if frame.failure:
-                parts.append(label(cx, cy + 4, "✕", "middle", "failed"))
-            elif len(points) <= 60:
-                parts.append(tag("circle", cx=cx, cy=cy, r=2.2, class_=f"dot {name}"))
+        scores = [frame.scores[metric] for frame in method.result.frames]
+        style = series_style(method.method)
+        axes.plot(scores, **style)
+        failed = [bool(frame.failure) for frame in method.result.frames]
+        sound = [place for place, lost in enumerate(failed) if not lost]
+        if sound and len(scores) <= _DOTS:
+            heights = [scores[place] for place in sound]
+            axes.plot(sound, heights, "o", markersize=4.4, color=style["color"])
+        for place, lost in enumerate(failed):
+            if lost:
+                axes.text(place, scores[place], "✕", ha="center", va="center", size=13)
+    axes.set_xlim(-0.5, len(frames) - 0.5)
     step = max(1, len(frames) // 6)
-    for index in range(0, len(frames), step):
-        parts.append(label(x(index), _BOTTOM + 13, str(frames[index]), "middle"))
-    return [*parts, line(_LEFT, _BOTTOM, _RIGHT, _BOTTOM, "rule")]
+    axes.set_xticks(range(0, len(frames), step), [str(frame) for frame in frames[::step]])
+    axes.tick_params(axis="x", labelbottom=True)
+    unit = f" [{facts.unit}]" if facts.unit else ""
+    heading(axes, f"{facts.label}{unit}, test frames")
 
 
-def _severities(
-    info: CaptureInfo, x: Callable[[float], float], height: float
-) -> tuple[list[Markup], float]:
-    parts: list[Markup] = []
-    for name, values in info.perturbations.items():
-        title = perturbation(name).title
-        if values is None:
-            parts.append(label(_LEFT, height + 10, f"{title}: severity unknown", class_="tick"))
-            height += _ROW + 2
-            continue
-        parts.append(label(_LEFT, height + 9, f"{title}, severity 0 to {MAX_SEVERITY}"))
-        height += 12
-        for start, stop, severity in _runs(values):
-            if severity:
-                left, right = x(start), x(stop)
-                parts.append(
-                    tag(
-                        "rect",
-                        x=left,
-                        y=height,
-                        width=right - left,
-                        height=_ROW - 3,
-                        class_="severity",
-                        fill_opacity=0.15 + 0.17 * severity,
-                    )
+def _draw_rail(figure: Figure, top: float, count: int, low: int, high: int) -> Axes:
+    """Show where in the capture the test clip lies that is drawn large above."""
+    from matplotlib.patches import Polygon, Rectangle
+
+    axes = add_axes(figure, _LEFT, top, _ACROSS, 26)
+    axes.spines[:].set_visible(False)
+    axes.set(xlim=(0, count), ylim=(26, 0))
+    corners = [(0, 0), (count, 0), (high, 22), (low, 22)]
+    axes.add_patch(
+        Polygon(
+            corners, facecolor=PALETTE["shade"], edgecolor=PALETTE["line"], linewidth=0.7,
+            gid=f"{MARK}wedge",
+        )
+    )  # fmt: skip
+    for start, stop, name in ((0, count, "line"), (low, high, "test")):
+        patch = Rectangle((start, 22), stop - start, 4, linewidth=0, facecolor=PALETTE[name])
+        patch.set_gid(MARK + ("test" if name == "test" else "rail"))
+        axes.add_patch(patch)
+    return axes
+
+
+def _draw_severity(
+    figure: Figure, top: float, name: str, values: Sequence[int] | None, count: int
+) -> Axes:
+    from matplotlib.patches import Rectangle
+
+    axes = add_axes(figure, _LEFT, top + 14, _ACROSS, 2 if values is None else 10)
+    axes.spines["bottom"].set(color=PALETTE["line"], linewidth=0 if values is None else 0.7)
+    axes.set(xlim=(0, count), ylim=(0, 1))
+    known = f"severity 0 to {MAX_SEVERITY}" if values is not None else "severity unknown"
+    _caption(axes, f"{perturbation(name).title}, {known}")
+    start = 0
+    for severity, group in groupby(values or ()):
+        width = len(list(group))
+        if severity:
+            axes.add_patch(
+                Rectangle(
+                    (start, 0), width, 1, linewidth=0, facecolor=PALETTE["severity"],
+                    alpha=min(0.15 + 0.17 * severity, 1.0), gid=f"{MARK}severity",
                 )
-        parts.append(line(_LEFT, height + _ROW - 3, _RIGHT, height + _ROW - 3, "grid"))
-        height += _ROW + 3
-    return parts, height
+            )  # fmt: skip
+        start += width
+    return axes
 
 
-def _runs(values: Sequence[int]) -> list[tuple[int, int, int]]:
-    """Return (start, stop, value) of stretches of equal values."""
-    runs: list[tuple[int, int, int]] = []
-    for frame, value in enumerate(values):
-        if runs and runs[-1][2] == value:
-            runs[-1] = (runs[-1][0], frame + 1, value)
-        else:
-            runs.append((frame, frame + 1, value))
-    return runs
-
-
-def _weights(
-    method: StripMethod,
-    side: str,
-    weights: TemporalWeights,
-    x: Callable[[float], float],
-    height: float,
-) -> tuple[list[Markup], float]:
-    top = max(weights.weights) or 1.0
-    bottom = height + 12 + _WEIGHTS
-    points = [
-        (x(frame + 0.5), bottom - _WEIGHTS * value / top)
-        for frame, value in zip(weights.frames, weights.weights, strict=True)
-    ]
+def _draw_weights(figure: Figure, top: float, method: StripMethod, side: str, count: int) -> Axes:
+    weights = method.weights[side]
+    axes = add_axes(figure, _LEFT, top + 14, _ACROSS, 44)
+    axes.spines["bottom"].set(color=PALETTE["line"], linewidth=0.7)
+    largest = max(weights.weights)
+    axes.set(xlim=(0, count), ylim=(0, largest or 1.0))
+    moments = [frame + 0.5 for frame in weights.frames]
+    axes.plot(moments, weights.weights, clip_on=False, **series_style(method.method))
     where = f", {side} hand" if side else ""
-    text = f"Temporal weight{where}, {method.label}: up to {top:.3g}"
-    parts = [
-        label(_LEFT, height + 9, text),
-        polyline(points, f"curve {series(method.method)}"),
-        line(_LEFT, bottom, _RIGHT, bottom, "grid"),
-    ]
-    return parts, bottom + 6
+    _caption(axes, f"Temporal weight{where}, {method.label}: up to {largest:.3g}")
+    return axes
+
+
+def _caption(axes: Axes, text: str) -> None:
+    """Put a small line over axes."""
+    axes.annotate(
+        text, (0, 1), (0, 4), xycoords="axes fraction", textcoords="offset points",
+        color=PALETTE["faint"], annotation_clip=False,
+    )  # fmt: skip
+
+
+def _number_frames(axes: Axes) -> None:
+    """Put the numbers of the frames under the lowest panel."""
+    from matplotlib.ticker import MaxNLocator
+
+    axes.xaxis.set_major_locator(MaxNLocator(5, steps=[1, 2, 5, 10], integer=True, prune="lower"))
+    axes.tick_params(axis="x", labelbottom=True)
+    axes.annotate(
+        "frame", (0, 0), (-42, -3), xycoords="axes fraction", textcoords="offset points", va="top",
+        color=PALETTE["faint"], annotation_clip=False,
+    )  # fmt: skip

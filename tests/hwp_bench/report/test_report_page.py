@@ -16,10 +16,9 @@ from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.report.page.content import gather, summary_sentence
+from hwp_bench.report.page.html_tables import tag, to_html
 from hwp_bench.report.page.pictures import Album
 from hwp_bench.report.page.render import write_report
-from hwp_bench.report.page.svg import log_ticks, tag, ticks
-from hwp_bench.report.page.tables import to_html
 from hwp_bench.report.sources import Source
 from hwp_bench.results import CurvePoint
 
@@ -183,10 +182,7 @@ def test_tables_mark_ranks_blocks_and_groups() -> None:
     assert ">G</th>" in html
 
 
-def test_ticks_are_round_and_inside() -> None:
-    assert ticks(0, 10) == [0, 2, 4, 6, 8, 10]
-    assert ticks(19.7, 21.1) == pytest.approx([20, 20.5, 21])
-    assert ticks(1, 1) == [1]
-    assert log_ticks(1, 100) == [1, 2, 5, 10, 20, 50, 100]
-    assert log_ticks(1.1, 1.9) == [1.1, 1.9]
-    assert tag("text", "<&", x=1.0, class_='"') == '<text x="1" class="&#34;">&lt;&amp;</text>'
+def test_elements_are_escaped() -> None:
+    assert tag("td", "<&", class_='"', tabindex=0) == (
+        '<td class="&#34;" tabindex="0">&lt;&amp;</td>'
+    )

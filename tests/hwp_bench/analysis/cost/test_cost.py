@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from made_results import made_results
 
-from hwp_bench.analysis.cost.analysis import analyse_cost, write_cost
+from hwp_bench.analysis.cost.analysis import analyse_cost
 from hwp_bench.analysis.cost.cost_tables import run_seconds, seconds_table
 from hwp_bench.analysis.cost.curves import Curve, curve_of, mean_curve, pareto_front
 from hwp_bench.analysis.cost.method_cost import method_costs
@@ -150,18 +150,6 @@ def test_the_band_is_students_interval_over_captures() -> None:
     assert (curve.low[-1], curve.high[-1]) == (pytest.approx(low), pytest.approx(high))
     assert mean_curve("mine", {"c": [CURVE]}).low is None
     assert mean_curve("mine", {}) is None
-
-
-def test_the_picture_repeats_byte_for_byte(tmp_path: Path) -> None:
-    analysis = analyse_cost(group_runs([doubling("mine"), doubling("plain", 19.0, 4)]), "psnr")
-    for folder in ("a", "b"):
-        written = write_cost(tmp_path / folder, analysis)
-        assert [path.name for path in written] == ["pareto.png", "pareto.svg"]
-    for name in ("pareto.png", "pareto.svg"):
-        first, second = (tmp_path / folder / name for folder in ("a", "b"))
-        assert first.read_bytes() == second.read_bytes()
-        assert first.stat().st_size > 10_000
-    assert (tmp_path / "a" / "tables" / "cost.tex").is_file()
 
 
 def test_the_plain_baseline_is_the_reference_where_it_is_there() -> None:

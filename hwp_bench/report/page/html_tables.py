@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from markupsafe import Markup
+from collections.abc import Iterable
+
+from markupsafe import Markup, escape
 
 from hwp_bench.base.tables import Table
-from hwp_bench.report.page.svg import join, tag
 
 _RANKS = {0: "b", 1: "u"}
 
@@ -44,7 +45,7 @@ def _groups(table: Table) -> list[Markup]:
     return [
         tag("th", group, colspan=width, scope="colgroup", class_="group")
         if group
-        else join([Markup(f'<td colspan="{width}"></td>')])
+        else tag("td", colspan=width)
         for group, width in cells
     ]
 
@@ -61,4 +62,21 @@ def _cell(table: Table, row: int, column: int) -> Markup:
     content: str | Markup = text if rank is None else tag(_RANKS[rank], text)
     if isinstance(value, int | float) or text == "–":
         return tag("td", content, class_="number")
-    return tag("td", content) if text else Markup("<td></td>")
+    return tag("td", content)
+
+
+def tag(name: str, content: str | Markup = "", **attributes: object) -> Markup:
+    """Return one element; attributes, and content that is not `Markup`, are escaped.
+
+    Underscores of attribute names become hyphens, `class_` becomes `class`.
+    """
+    parts = [
+        f' {key.rstrip("_").replace("_", "-")}="{escape(str(value))}"'
+        for key, value in attributes.items()
+    ]
+    return Markup(f"<{name}{''.join(parts)}>{escape(content)}</{name}>")
+
+
+def join(parts: Iterable[Markup]) -> Markup:
+    """Return parts one after the other."""
+    return Markup("").join(parts)

@@ -1,0 +1,139 @@
+"""Figures. Oracles: the XML parser, values that are put in, the style sheet's own colours."""
+
+from __future__ import annotations
+
+import re
+import xml.etree.ElementTree as ET
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_results import made_results
+
+from hwp_bench.analysis.cost.analysis import analyse_cost
+from hwp_bench.analysis.statistics.bootstrap import Estimate
+from hwp_bench.analysis.statistics.pairing import group_runs
+from hwp_bench.report.figures import (
+    PALETTE,
+    Bar,
+    draw_bars,
+    draw_pareto,
+    write_cost,
+    write_figure,
+)
+from hwp_bench.report.page.inline_svg import inline_svg
+from hwp_bench.report.page.render import style_sheet
+
+HOSTILE = 'a $x^2$ </title><script>"&'
+
+
+def analysis(*names: str):
+    """Methods that gain 1 dB at 1, 2, 4, 8 s; each starts 1 dB above the one before."""
+    curves = [[(2.0**k, 15.0 + n + k) for k in range(4)] for n in range(len(names))]
+    made = [
+        made_results(name, lambda c, f, s: 20.0, curve=curve, seconds=8.0)
+        for name, curve in zip(names, curves, strict=True)
+    ]
+    return analyse_cost(group_runs(made), "psnr")
+
+
+def estimate(value: float, low: float | None = None, high: float | None = None) -> Estimate:
+    return Estimate(value, low, high, None, None, None, 4)
+
+
+def drawn(svg: str) -> ET.Element:
+    return ET.fromstring(svg)
+
+
+def words(root: ET.Element) -> list[str]:
+    return [item.text or "" for item in root.iter("text")]
+
+
+def of_class(root: ET.Element, name: str) -> list[ET.Element]:
+    return [item for item in root.iter() if item.get("class") == name]
+
+
+def test_the_palette_is_that_of_the_style_sheet() -> None:
+    style = style_sheet()
+    light = style[: style.index("@media")]
+    assert dict(PALETTE).items() <= dict(re.findall(r"--(\w+): (#\w+)", light)).items()
+    dark = style[style.index("@media") : style.index("img {")]
+    assert set(PALETTE) <= set(re.findall(r"--(\w+):", dark))
+
+
+def test_a_figure_in_a_page_has_words_a_title_and_the_colours_of_the_page() -> None:
+    found = analysis("mine", "plain")
+    figure = draw_pareto(found.curves, found.front, "psnr", {"Mine": 0, "Plain": 1})
+    svg = inline_svg(figure, HOSTILE)
+    root = drawn(svg)
+    assert root.tag == "svg"
+    assert root.get("role") == "img"
+    assert root.get("aria-label") == root.find("title").text == HOSTILE
+    assert "PSNR [dB], validation frames" in words(root)
+    assert "seconds of fitting (log)" in words(root)
+    assert {"1", "2", "5"} <= set(words(root))
+    # Nothing is loaded, nothing rules the page around it, no colour is fixed.
+    assert not re.search(r"url\(|https?:|<style|<script|clip-path", svg)
+    assert not re.search(r"#[0-9a-f]{6}\b(?!-)", re.sub(r'(id|href)="[^"]*"', "", svg))
+    assert {"var(--s0)", "var(--s1)", "var(--front)"} <= set(re.findall(r"var\(--\w+\)", svg))
+    assert len(of_class(root, "front")) == len(found.front)
+    assert len(of_class(root, "band")) == 2
+
+
+def test_names_of_two_figures_on_a_page_differ_and_every_reference_is_there() -> None:
+    found = analysis("mine")
+    figure = draw_pareto(found.curves, found.front, "psnr", {"Mine": 0})
+    first, second = (drawn(inline_svg(figure, title)) for title in ("a", "b"))
+    names = [{item.get("id") for item in root.iter()} - {None} for root in (first, second)]
+    assert names[0]
+    assert not names[0] & names[1]
+    for root, own in zip((first, second), names, strict=True):
+        used = {item.get("href") for item in root.iter()} - {None}
+        assert used == {f"#{name}" for name in own}
+    assert inline_svg(figure, "a") == inline_svg(figure, "a")
+
+
+def test_bars_are_as_long_as_their_values_and_long_intervals_are_cut() -> None:
+    bars = [Bar(0, estimate(10.0, 5.0, 12.0)), Bar(1, estimate(20.0, -40.0, 90.0))]
+    root = drawn(
+        inline_svg(draw_bars({"Motion Blur": bars, "Light": [Bar(0, estimate(5))]}, "psnr"), "t")
+    )
+    assert words(root) == ["Motion Blur", "10.00", "20.00", "Light", "5.00"]
+    lengths = []
+    for bar in of_class(root, "bar"):
+        points = np.array(re.findall(r"[ML] (\S+) (\S+)", bar.find("path").get("d")), float)
+        lengths.append(np.ptp(points[:, 0]))
+    assert lengths == pytest.approx([lengths[1] / 2, lengths[1], lengths[1] / 4], abs=0.02)
+    # The axis ends at 1.35 times the longest bar.
+    assert lengths[1] == pytest.approx(390 / 1.35, abs=0.02)
+    ends = [
+        float(x)
+        for item in of_class(root, "whisker")
+        for x, _ in re.findall(r"[ML] (\S+) (\S+)", item.find("path").get("d"))
+    ]
+    assert (min(ends), max(ends)) == (8.0, 398.0)
+
+
+def test_lower_is_better_downwards() -> None:
+    curves = analysis("mine").curves
+    up, down = (
+        draw_pareto(curves, (), metric).axes[0].get_ylim() for metric in ("psnr", "lpips_alex")
+    )
+    assert up == down[::-1]
+    assert up[0] < up[1]
+
+
+def test_files_have_a_legend_and_repeat_byte_for_byte(tmp_path: Path) -> None:
+    found = analysis("mine", "plain")
+    for folder in ("a", "b"):
+        written = write_cost(tmp_path / folder, found)
+        assert [path.name for path in written] == ["pareto.png", "pareto.svg"]
+    for name in ("pareto.png", "pareto.svg"):
+        first, second = (tmp_path / folder / name for folder in ("a", "b"))
+        assert first.read_bytes() == second.read_bytes()
+        assert first.stat().st_size > 10_000
+    assert (tmp_path / "a" / "tables" / "cost.tex").is_file()
+    figure = draw_pareto(found.curves, found.front, "psnr")
+    legend = [text.get_text() for text in figure.legends[0].get_texts()]
+    assert legend == ["Pareto front", "Mine", "Plain"]
+    assert write_figure(tmp_path, "again", figure)[1].read_bytes() == first.read_bytes()
