@@ -17,7 +17,8 @@ _EXAMPLES = """examples:
   hwp-bench verify runs/ablation --json          # every result of an ablation
 
 Recomputes the digests of captures, splits and predictions, and every score, from the predictions
-that lie beside the result. Exit status 0: all is as the result says; 1: something differs.
+that lie next to the result. PSNR and SSIM of some frames of each capture are also computed with
+scikit-image. Exit status 0: everything is as the result says; 1: something differs.
 """
 #: Discrepancies that are printed for one result.
 _SHOWN = 20
@@ -80,10 +81,10 @@ def _captures(args: argparse.Namespace, file: Path) -> list[Path]:
     suite = read_results(file).suite
     if suite not in suite_names():
         raise UsageError(
-            f"was made on captures of its own ({suite})",
+            f"was not made on a suite ({suite})",
             where=file,
             field="suite",
-            remedy="Say where they lie with --captures.",
+            remedy="Say where its captures lie with --captures.",
         )
     return ensure_suite(suite)
 
@@ -101,5 +102,7 @@ def _print(outcome: Verification) -> None:
             print(f"and {rest} more")
     verdict = f"{len(outcome.discrepancies)} differences" if shown else "holds"
     print(f"{outcome.file}: {verdict} ({outcome.captures} captures, {outcome.frames} frames)")
+    if outcome.cross_checked and not shown:
+        print(f"  scikit-image agrees on PSNR and SSIM of {outcome.cross_checked} frames")
     for note in outcome.notes:
         print(f"  {note}")

@@ -14,6 +14,7 @@ from toy_method import write_toy_method
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.cli.main import main
+from hwp_bench.metrics import score
 
 
 @pytest.fixture
@@ -46,7 +47,24 @@ def test_an_untouched_result_holds(result: Path, capture: Capture, capsys) -> No
     assert (status, found["discrepancies"]) == (0, [])
     assert (found["captures"], found["frames"], found["notes"]) == (1, 2, [])
     assert main(["verify", str(result), "--captures", str(capture.root)]) == 0
-    assert "holds (1 captures, 2 frames)" in capsys.readouterr().out
+    out = capsys.readouterr().out
+    assert "holds (1 captures, 2 frames)" in out
+    assert "scikit-image agrees on PSNR and SSIM of 2 frames" in out
+    assert found["cross_checked"] == 2
+
+
+@pytest.mark.parametrize(("formula", "metric"), [("ssim_map", "ssim"), ("squared_error", "psnr")])
+def test_a_fault_of_our_own_formula_is_found_out(
+    capture: Capture, tmp_path: Path, capsys, monkeypatch, formula: str, metric: str
+) -> None:
+    right = getattr(score, formula)
+    monkeypatch.setattr(score, formula, lambda *args, **named: right(*args, **named) * 0.999)
+    method, out = write_toy_method(tmp_path / "toy"), tmp_path / "out"
+    assert main(["evaluate", str(method), "--capture", str(capture.root), "-o", str(out)]) == 0
+    status, found = verify(out, capture, capsys)
+    assert status == 1
+    whats = [item["what"] for item in found["discrepancies"]]
+    assert whats == [f"frame {frame}, {metric} by scikit-image" for frame in (18, 19)]
 
 
 @pytest.mark.parametrize(
@@ -97,7 +115,7 @@ def test_other_code_protocols_and_missing_captures_are_named(result, capture, ca
     assert "other code" in found["notes"][0]
     assert "numpy 0.1" in found["notes"][1]
     assert main(["verify", str(result)]) == 2
-    assert "Say where they lie with --captures" in capsys.readouterr().err
+    assert "Say where its captures lie with --captures" in capsys.readouterr().err
     shutil.rmtree(capture.root)
     assert main(["verify", str(result), "--captures", str(capture.root.parent)]) == 2
 
