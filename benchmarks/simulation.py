@@ -28,9 +28,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from hwp_bench.sim.frame import render_frame
-from hwp_bench.sim.plan import plan
-from hwp_bench.sim.scene import Scene, load_scene, scene_names
+from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.render.frame import render_frame
+from hwp_bench.sim.scene.reader import load_scene, scene_names
+from hwp_bench.sim.scene.schema import Scene
 
 #: Frames over which a scene is spread where frames of a kind are looked for.
 SPREAD = 240
@@ -155,11 +156,11 @@ def memory_table(size: int, workers: int) -> str:
 
 def penetration_table(frames: int) -> str:
     """A Markdown table of the deepest places, over gestures and over frames of the scenes, mm."""
-    from hwp_bench.sim.gestures import gestures
-    from hwp_bench.sim.motion import moment_of_key
-    from hwp_bench.sim.penetration import hand_penetration, scene_penetration
-    from hwp_bench.sim.scene import HandKey
-    from hwp_bench.sim.subject import MOVING, scene_hands
+    from benchmarks.penetration import hand_penetration, scene_penetration
+    from hwp_bench.sim.scene.gestures import gestures
+    from hwp_bench.sim.scene.motion import moment_of_key
+    from hwp_bench.sim.scene.schema import HandKey
+    from hwp_bench.sim.subject.hand import MOVING, scene_hands
 
     hand = scene_hands(load_scene("capture1"), MOVING)["right"]
     lines = ["| gesture | deepest, mm |", "| --- | ---: |"]

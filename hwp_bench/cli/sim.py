@@ -35,7 +35,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.sim import commands
+    from hwp_bench.sim.produce import commands
 
     action = {
         "list": commands.list_scenes,

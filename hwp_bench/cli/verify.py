@@ -71,7 +71,7 @@ def _captures(args: argparse.Namespace, file: Path) -> list[Path]:
     from hwp_bench.evaluate.verify import capture_folders
     from hwp_bench.results import read_results
     from hwp_bench.sim import ensure_suite
-    from hwp_bench.sim.suites import suite_names
+    from hwp_bench.sim.produce.suites import suite_names
 
     if args.captures:
         folders = capture_folders([Path(place) for place in args.captures])

@@ -9,14 +9,14 @@ import importlib
 from typing import Any
 
 _HOMES = {
-    "Scene": "scene",
-    "SuiteItem": "suites",
-    "ensure_suite": "suites",
-    "load_scene": "scene",
-    "render_capture": "production",
-    "render_frame": "frame",
-    "scene_names": "scene",
-    "suite": "suites",
+    "Scene": "scene.schema",
+    "SuiteItem": "produce.suites",
+    "ensure_suite": "produce.suites",
+    "load_scene": "scene.reader",
+    "render_capture": "produce.production",
+    "render_frame": "render.frame",
+    "scene_names": "scene.reader",
+    "suite": "produce.suites",
 }
 
 __all__ = sorted(_HOMES)

@@ -1,15 +1,43 @@
-"""What an effect is: a set of hooks, each of which changes one part of a frame's recipe."""
+"""What an effect is, and the effects by name: the four perturbations and the sensor.
+
+An effect is a set of hooks, each of which changes one part of a frame's recipe. Effects compose
+in a stated order: first the perturbations in the order of `ORDER` (pose, objects, light,
+shutter), last the `SENSOR`. The sensor is not a perturbation: it has no episodes and no severity,
+and every frame and its clean version pass it alike.
+"""
 
 from __future__ import annotations
 
+import importlib
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
-from hwp_bench.sim.motion import HandMoment
-from hwp_bench.sim.objects import ObjectRequest
-from hwp_bench.sim.scene import EffectCall, Scene
-from hwp_bench.sim.shade import Lights
+from hwp_bench.base.errors import BadInput
+from hwp_bench.sim.props.objects import ObjectRequest
+from hwp_bench.sim.scene.motion import HandMoment
+from hwp_bench.sim.scene.optics import Lights
+from hwp_bench.sim.scene.schema import EffectCall, Scene
+
+#: Order in which the perturbations act on a frame.
+ORDER = ("complex_poses", "hand_object_interaction", "illumination", "motion_blur")
+#: The effect that follows them in every frame.
+SENSOR = "sensor"
+
+
+@cache
+def registered(kind: str) -> Effect:
+    """Return the effect of a name; its module is imported on the first request.
+
+    Raises:
+        BadInput: there is none of that name.
+    """
+    known = (*ORDER, SENSOR)
+    if kind not in known:
+        raise BadInput(f"there is no effect {kind!r}", remedy=f"Known: {', '.join(known)}.")
+    effect: Effect = importlib.import_module(f"hwp_bench.sim.effects.{kind}").EFFECT
+    return effect
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,13 +84,6 @@ class Effect:
     def passes(self, scene: Scene) -> tuple[str, ...]:
         """Names of the passes that a frame needs because the effect acts in it."""
         return ()
-
-    def check(self, scene: Scene, call: EffectCall, where: str) -> None:
-        """Check the settings.
-
-        Raises:
-            BadInput: a setting is missing, unknown or out of range; it is named.
-        """
 
     def stage(
         self, scene: Scene, call: EffectCall, seconds: float, hands: dict[str, HandMoment]

@@ -8,24 +8,10 @@ import numpy as np
 
 from hwp_bench.base.colors import lamp_color
 from hwp_bench.sim.effects.base import Effect
-from hwp_bench.sim.fields import Fields
-from hwp_bench.sim.mesh import unit
-from hwp_bench.sim.scene import EffectCall, Episode, Scene
-from hwp_bench.sim.shade import CastShadow, Lights
-
-#: What an episode can do to the light.
-MODES = ("dim", "bright", "warm", "cool", "move", "flicker", "shadow")
-
-
-def _modes(call: EffectCall, where: str) -> tuple[str, ...]:
-    fields = Fields(call.settings, where, "effects(illumination).")
-    modes = fields.rest().get("modes", ["dim", "warm", "move", "bright", "cool", "shadow"])
-    unknown = set(call.settings) - {"modes"}
-    if unknown:
-        raise fields.wrong(sorted(unknown)[0], "is unknown")
-    if not isinstance(modes, list) or not modes or not set(modes) <= set(MODES):
-        raise fields.wrong("modes", f"is {modes!r}", remedy=f"Known: {', '.join(MODES)}.")
-    return tuple(modes)
+from hwp_bench.sim.geometry.mesh import unit
+from hwp_bench.sim.scene.effect_settings import light_modes
+from hwp_bench.sim.scene.optics import CastShadow, Lights
+from hwp_bench.sim.scene.schema import EffectCall, Episode, Scene
 
 
 class _Illumination(Effect):
@@ -37,13 +23,10 @@ class _Illumination(Effect):
     def passes(self, scene: Scene) -> tuple[str, ...]:
         return ("light",)
 
-    def check(self, scene: Scene, call: EffectCall, where: str) -> None:
-        _modes(call, where)
-
     def light(
         self, scene: Scene, call: EffectCall, seconds: float, strength: float, lights: Lights
     ) -> Lights:
-        modes = _modes(call, scene.id)
+        modes = light_modes(call, scene.id)
         moment = seconds / scene.duration
         number = next((i for i, e in enumerate(call.episodes) if e.start <= moment <= e.end), 0)
         mode = modes[number % len(modes)]

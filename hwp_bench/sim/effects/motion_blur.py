@@ -5,17 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.sim.effects.base import Effect, Shutter
-from hwp_bench.sim.fields import Fields
-from hwp_bench.sim.scene import EffectCall, Scene
-from hwp_bench.sim.seeds import generator
-
-
-def _read(call: EffectCall, where: str) -> tuple[float, float]:
-    fields = Fields(call.settings, where, "effects(motion_blur).")
-    shutter = fields.number("shutter", 0.001, 0.5, default=0.02)
-    camera = fields.number("camera_share", 0.0, 1.0, default=0.0)
-    fields.finish()
-    return shutter, camera
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.scene.effect_settings import motion_blur
+from hwp_bench.sim.scene.schema import EffectCall, Scene
 
 
 class _MotionBlur(Effect):
@@ -27,18 +19,19 @@ class _MotionBlur(Effect):
     def passes(self, scene: Scene) -> tuple[str, ...]:
         return ("shutter",)
 
-    def check(self, scene: Scene, call: EffectCall, where: str) -> None:
-        _read(call, where)
-
     def shutter(
         self, scene: Scene, call: EffectCall, seconds: float, strength: float
     ) -> Shutter | None:
-        seconds_open, share = _read(call, scene.id)
+        settings = motion_blur(call, scene.id)
         angle = _slow_angle(scene, seconds)
         way = strength * np.array([np.cos(angle), np.sin(angle)])
-        camera = share * strength * np.array([np.cos(1.7 * angle + 1.0), np.sin(1.7 * angle + 1.0)])
+        camera = (
+            settings.camera_share
+            * strength
+            * np.array([np.cos(1.7 * angle + 1.0), np.sin(1.7 * angle + 1.0)])
+        )
         return Shutter(
-            seconds=seconds_open,
+            seconds=settings.shutter,
             hand=(float(way[0]), float(way[1])),
             camera=(float(camera[0]), float(camera[1])),
             twist=150.0 * strength * float(np.sin(2.3 * angle)),

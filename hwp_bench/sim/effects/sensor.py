@@ -8,8 +8,8 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.sim.effects.base import Effect
-from hwp_bench.sim.scene import Scene
-from hwp_bench.sim.seeds import generator
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.scene.schema import Scene
 
 
 class _Sensor(Effect):

@@ -11,9 +11,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from hwp_bench.sim.gestures import gestures
-from hwp_bench.sim.motion import moment_of_key
-from hwp_bench.sim.penetration import (
+from benchmarks.penetration import (
     Segments,
     hand_penetration,
     mutual_penetration,
@@ -21,8 +19,11 @@ from hwp_bench.sim.penetration import (
     segments,
     self_penetration,
 )
-from hwp_bench.sim.scene import HandKey, load_scene, scene_names
-from hwp_bench.sim.subject import MOVING, SubjectHand, scene_hands
+from hwp_bench.sim.scene.gestures import gestures
+from hwp_bench.sim.scene.motion import moment_of_key
+from hwp_bench.sim.scene.reader import load_scene, scene_names
+from hwp_bench.sim.scene.schema import HandKey
+from hwp_bench.sim.subject.hand import MOVING, SubjectHand, scene_hands
 
 #: Deepest that any gesture presses a hand into itself, m: finger tips give way by a few
 #: millimetres where a real palm does.
@@ -38,7 +39,7 @@ FRAMES = 10
 
 def _sphere(cut: float = 2.0) -> tuple[Segments, np.ndarray]:
     """A sphere of 10 mm as a hand of one segment, open above `cut` radii."""
-    from hwp_bench.sim.penetration import _cuts
+    from benchmarks.penetration import _cuts
 
     ball = trimesh.creation.icosphere(subdivisions=3, radius=0.01)
     below = (ball.vertices[ball.faces][..., 2] < cut * 0.01).all(axis=1)

@@ -2,12 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
-import pytest
-
-from hwp_bench.sim.scene import Scene, parse_scene
-
 SINGLE = """
 id = "tiny"
 title = "A small scene"
@@ -62,17 +56,3 @@ episodes = [[0.5, 0.6, 3]]
 
 #: Frames of the 40 in which nothing, the object, the light, the shutter acts.
 CLEAN, OBJECT, LIGHT, BLUR = 36, 5, 14, 22
-
-
-@pytest.fixture(name="make_scene")
-def scene_maker() -> Callable[..., Scene]:
-    """Return a function that parses the scene with some of its text replaced."""
-
-    def make(*changes: tuple[str, str]) -> Scene:
-        text = SINGLE
-        for old, new in changes:
-            assert old in text
-            text = text.replace(old, new)
-        return parse_scene(text, where="tiny.toml")
-
-    return make

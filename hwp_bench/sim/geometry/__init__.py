@@ -1,0 +1,1 @@
+"""Meshes, surfaces, rays and noise, without knowledge of scenes."""

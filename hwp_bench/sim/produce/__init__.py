@@ -1,0 +1,1 @@
+"""From scenes to captures, previews and calibrated strengths."""

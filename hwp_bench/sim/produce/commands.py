@@ -1,0 +1,204 @@
+"""What `hwp-bench sim` does, action by action."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.sim.scene.reader import load_scene, scene_names, scene_path
+from hwp_bench.sim.scene.schema import Scene
+
+if TYPE_CHECKING:
+    from hwp_bench.run.engine import Engine
+
+
+def list_scenes(args: argparse.Namespace) -> int:
+    """Print the scenes, and what scenes can be made of."""
+    from hwp_bench.sim.effects.base import ORDER
+    from hwp_bench.sim.produce.suites import suite, suite_names
+    from hwp_bench.sim.props.backdrop import backdrop_names
+    from hwp_bench.sim.props.objects import object_names
+    from hwp_bench.sim.scene.gestures import gestures
+
+    scenes = [load_scene(name) for name in scene_names()]
+    suites = {name: [item.scene.id for item in suite(name)] for name in suite_names()}
+    parts = {
+        "suites": suites,
+        "effects": list(ORDER),
+        "objects": list(object_names()),
+        "gestures": list(gestures()),
+        "backgrounds": list(backdrop_names()),
+    }
+    if args.json:
+        rows = [
+            {
+                "id": scene.id,
+                "title": scene.title,
+                "hands": scene.hands,
+                "action": scene.action,
+                "device": scene.device,
+                "frame_count": scene.frame_count,
+                "effects": [call.kind for call in scene.effects],
+                "digest": scene.digest,
+            }
+            for scene in scenes
+        ]
+        print(json.dumps({"scenes": rows, **parts}, indent=1))
+        return 0
+    for scene in scenes:
+        effects = ", ".join(call.kind for call in scene.effects)
+        print(f"{scene.id:<10} {scene.frame_count:>5} frames  {scene.title} ({effects})")
+    for name, ids in suites.items():
+        print(f"suite {name}: {', '.join(ids)}")
+    for name in ("objects", "gestures", "backgrounds"):
+        print(f"{name}: {', '.join(parts[name])}")
+    return 0
+
+
+def print_plan(args: argparse.Namespace) -> int:
+    """Print passes and predicted cost."""
+    from hwp_bench.sim.produce.forecast import forecast, plan_table, share_table
+
+    reports = [
+        forecast(scene, args.frames, args.size, probe=not args.no_probe)
+        for scene in _scenes(args.scene)
+    ]
+    if args.json:
+        print(json.dumps([report.to_json() for report in reports], indent=1))
+    else:
+        print(plan_table(reports))
+        if not args.no_probe:
+            print()
+            print(share_table(reports))
+    return 0
+
+
+def render(args: argparse.Namespace) -> int:
+    """Render captures and print their folders."""
+    from hwp_bench.run.engine.options import engine_for, needs_of
+    from hwp_bench.sim.produce.suites import ensure_suite
+
+    if (args.suite is None) == (args.scene is None):
+        raise UsageError("name a scene, all, or a suite with --suite")
+    changes = (args.frames, args.size, args.severity, args.subject, args.seed)
+    if args.suite is not None:
+        if any(change is not None for change in changes) or args.exr:
+            raise UsageError("a suite is rendered as it is", field="--suite")
+        with engine_for(args) as engine:
+            folders = ensure_suite(
+                args.suite, args.out, args.workers, engine=engine, needs=needs_of(args)
+            )
+        for folder in folders:
+            print(folder)
+        return 0
+    if args.out is None:
+        raise UsageError("says not where to", field="-o", remedy="Give a folder with -o.")
+    scenes = [_changed(scene, args.severity, args.subject) for scene in _scenes([args.scene])]
+    with engine_for(args) as engine:
+        folders = _render_scenes(args, scenes, engine)
+    for folder in folders:
+        print(folder)
+    return 0
+
+
+def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine) -> list[Path]:
+    from hwp_bench.run.engine.options import needs_of
+    from hwp_bench.sim.produce.suites import RenderCapture, render_job, workers_each
+
+    needs = needs_of(args)
+    jobs = []
+    for scene in scenes:
+        out = Path(args.out) / scene.id if args.scene == "all" else Path(args.out)
+        if not args.overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
+            raise UsageError(
+                "exists already", where=out, remedy="Choose another place or --overwrite."
+            )
+        work = RenderCapture(
+            scene,
+            args.frames,
+            args.size,
+            args.seed,
+            workers=workers_each(args.workers, engine, needs),
+            exr=args.exr,
+            overwrite=args.overwrite,
+        )
+        jobs.append(render_job(work, out, needs))
+    engine.run(jobs, lambda index: None)
+    return [job.output for job in jobs]
+
+
+def preview(args: argparse.Namespace) -> int:
+    """Write a contact sheet and an animation, or the stage in 3D."""
+    scene = _changed(load_scene(args.scene), args.severity, args.subject)
+    if args.stage:
+        from hwp_bench.sim.produce.stage_view import draw_stage
+
+        print(draw_stage(scene, Path(args.out)))
+        return 0
+    from hwp_bench.sim.produce.strips import write_preview
+
+    for path in write_preview(scene, Path(args.out), frame_count=args.frames, size=args.size):
+        print(path)
+    return 0
+
+
+def gallery(args: argparse.Namespace) -> int:
+    """Write the documentation's strips."""
+    from hwp_bench.sim.produce.strips import write_gallery
+
+    for path in write_gallery(Path(args.out)):
+        print(path)
+    return 0
+
+
+def calibrate_scenes(args: argparse.Namespace) -> int:
+    """Solve strengths, print them with what was measured, and write them if asked."""
+    from hwp_bench.sim.produce.calibration import calibrate, write_strengths
+
+    rows: list[dict[str, Any]] = []
+    for name in _names(args.scene):
+        scene = load_scene(name)
+        calls = [call for call in scene.effects if args.effect in (None, call.kind)]
+        results = [calibrate(scene, call) for call in calls]
+        if args.write:
+            write_strengths(scene_path(name) if name in scene_names() else Path(name), results)
+        for item in results:
+            rows.append(
+                {
+                    "scene": scene.id,
+                    "digest": load_scene(name).digest if args.write else scene.digest,
+                    "effect": item.kind,
+                    "measure": item.measure,
+                    "strengths": item.strengths,
+                    "measured": item.measured,
+                    "targets": item.targets,
+                }
+            )
+            if not args.json:
+                measured = " ".join(f"{value:7.3f}" for value in item.measured)
+                wanted = " ".join(f"{value:7.3f}" for value in item.targets)
+                print(f"{scene.id} {item.kind} ({item.measure}): {measured}  wanted {wanted}")
+    if args.json:
+        print(json.dumps(rows, indent=1))
+    return 0
+
+
+def _names(names: list[str]) -> list[str]:
+    return list(scene_names()) if names == ["all"] else names
+
+
+def _scenes(names: list[str]) -> list[Scene]:
+    return [load_scene(name) for name in _names(names)]
+
+
+def _changed(scene: Scene, severity: float | None, subject: int | None) -> Scene:
+    from hwp_bench.sim.scene.variants import with_severity, with_subject
+
+    if severity is not None:
+        scene = with_severity(scene, severity)
+    if subject is not None:
+        scene = with_subject(scene, subject)
+    return scene

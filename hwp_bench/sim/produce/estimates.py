@@ -1,0 +1,147 @@
+"""What a method is given instead of the truth: hands and masks as estimators deliver them."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.sim.effects.base import registered
+from hwp_bench.sim.effects.plan import FramePlan
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.scene.schema import Scene
+
+#: Error of a good estimator on an easy frame: rad and m.
+EASY_ERROR = (0.003, 0.00025)
+#: How much of a frame's error is the last frame's.
+CORRELATION = 0.85
+#: Share of the error's variance that is the estimator's habit: the same in every hard frame of a
+#: capture, as a regressor leans towards the poses it knows.
+HABIT = 0.5
+#: Chance of a gross failure in a frame of severity 4 or 5 of an effect that moves the hand.
+FAILURE_CHANCE = 0.06
+#: Least and largest share of an occluder over the hand that a segmenter takes for hand.
+OCCLUDER_TAKEN = (0.35, 1.0)
+#: Share of hand from which a segmenter takes a pixel for hand: in sharp pictures, and where the
+#: shutter smears hand and background into each other.
+TAKEN_FROM = (0.5, 0.2)
+_MOVING = ("complex_poses", "motion_blur")
+
+
+def estimate_hands(
+    scene: Scene, truth: dict[str, HandParameters], plans: list[FramePlan]
+) -> dict[str, HandParameters]:
+    """Hand parameters as an estimator gives them.
+
+    The error grows with the effects that act. One part of it wanders in time, the other is the
+    estimator's habit, which no averaging over frames removes. A gross failure keeps finite
+    parameters, far off, and is flagged by `valid`.
+
+    Args:
+        scene: the scene.
+        truth: the true parameters by side.
+        plans: the recipe of every frame.
+    """
+    angle, length = np.array([_errors(plan) for plan in plans]).T
+    hard = np.array(
+        [any(plan.severity.get(kind, 0) >= 4 for kind in _MOVING) for plan in plans], dtype=bool
+    )
+    estimates = {}
+    for side, exact in truth.items():
+        rng = generator(scene.seed, "estimator", side, len(plans))
+        wander = _correlated(rng.normal(size=(len(plans), 17, 3)))
+        habit = generator(scene.seed, "habit", side).normal(size=(17, 3))
+        noise = np.sqrt(1.0 - HABIT) * wander + np.sqrt(HABIT) * habit
+        failed = hard & (rng.uniform(size=len(plans)) < FAILURE_CHANCE)
+        gross = np.where(failed, 5.0, 1.0)
+        turn = (angle * gross)[:, None, None] * noise[:, :16]
+        # The wrist is found more easily than the finger joints, depth worse than place.
+        turn[:, 0] *= 0.6
+        shift = (length * gross)[:, None] * noise[:, 16] * np.array([1.0, 1.0, 2.0])
+        estimates[side] = HandParameters(
+            pose=exact.pose + turn,
+            betas=exact.betas + 0.05 * rng.normal(size=10),
+            transl=exact.transl + shift,
+            valid=~failed,
+        )
+    return estimates
+
+
+def estimate_mask(
+    scene: Scene, plan: FramePlan, coverage: np.ndarray, clean_coverage: np.ndarray
+) -> np.ndarray:
+    """Visible-hand mask as a segmenter gives it.
+
+    Soft and slightly displaced borders, bites around occluders, parts of occluders taken for
+    hand, smeared borders taken for hand, and now and then a missed part.
+
+    Args:
+        scene: the scene.
+        plan: the frame's recipe.
+        coverage: (S, S) exact share of visible hand, 0-1.
+        clean_coverage: (S, S) the same without the occluders.
+
+    Returns:
+        (S, S) uint8, 255 = hand.
+    """
+    from scipy.ndimage import gaussian_filter
+
+    size = len(coverage)
+    rng = generator(scene.seed, "segmenter", plan.frame, size)
+    unit = size / 256.0
+    soft = gaussian_filter(coverage, 0.9 * max(unit, 0.5))
+    # A smooth random threshold moves the border in and out by about a pixel.
+    wobble = gaussian_filter(rng.normal(size=(size, size)), 6.0 * unit)
+    wobble *= 0.10 / max(float(wobble.std()), 1e-9)
+    covered = np.clip(clean_coverage - coverage, 0.0, 1.0)
+    if "objects" in plan.passes and covered.max() > 0.5:
+        bite = gaussian_filter(covered, 2.5 * unit)
+        bites = gaussian_filter(rng.normal(size=(size, size)), 4.0 * unit)
+        bites /= max(float(bites.std()), 1e-9)
+        soft = soft - 0.9 * bite * np.clip(bites + 0.3, 0.0, 1.0)
+        soft = np.maximum(soft, gaussian_filter(covered * _taken(covered, rng), unit))
+    if rng.uniform() < (0.10 if plan.strength else 0.02) and coverage.sum() > 10:
+        soft = soft * _missed_part(coverage, rng)
+    taken_from = TAKEN_FROM["shutter" in plan.passes]
+    # Borders wander, background stays background: the threshold moves only where there is hand.
+    wobble *= np.clip(soft / taken_from, 0.0, 1.0)
+    mask = np.clip((soft - taken_from + wobble) / 0.35 + 0.5, 0.0, 1.0)
+    return np.round(255.0 * mask).astype(np.uint8)
+
+
+def _errors(plan: FramePlan) -> tuple[float, float]:
+    angle, length = (error**2 for error in EASY_ERROR)
+    for kind, strength in plan.strength.items():
+        more = registered(kind).estimate_error(strength)
+        angle += more[0] ** 2
+        length += more[1] ** 2
+    return float(np.sqrt(angle)), float(np.sqrt(length))
+
+
+def _correlated(noise: np.ndarray) -> np.ndarray:
+    """A first-order autoregressive walk of unit variance along the first axis."""
+    keep, add = CORRELATION, np.sqrt(1.0 - CORRELATION**2)
+    walk = noise.copy()
+    for frame in range(1, len(walk)):
+        walk[frame] = keep * walk[frame - 1] + add * noise[frame]
+    return walk
+
+
+def _taken(covered: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Where a segmenter takes the occluder for hand: blobs over a part of it, (S, S) 0 or 1."""
+    from scipy.ndimage import gaussian_filter
+
+    field = gaussian_filter(rng.normal(size=covered.shape), len(covered) / 20.0)
+    share = rng.uniform(*OCCLUDER_TAKEN)
+    return field > np.quantile(field[covered > 0.5], 1.0 - share)
+
+
+def _missed_part(coverage: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A soft disc of zeros somewhere on the hand, about a finger tip in size."""
+    size = len(coverage)
+    rows, columns = np.nonzero(coverage > 0.5)
+    pick = int(rng.integers(max(len(rows), 1)))
+    y, x = (rows[pick], columns[pick]) if len(rows) else (0, 0)
+    radius = size * rng.uniform(0.03, 0.06)
+    grid_y, grid_x = np.mgrid[0:size, 0:size]
+    distance = np.hypot(grid_y - y, grid_x - x)
+    return np.clip((distance - radius) / 3.0 + 0.5, 0.0, 1.0)

@@ -1,0 +1,154 @@
+"""What rendering a scene will need: passes counted from its plan, cost from a few probes."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from hwp_bench.sim.effects.base import ORDER
+from hwp_bench.sim.effects.plan import FramePlan, plan
+from hwp_bench.sim.render.frame import carry_out
+from hwp_bench.sim.scene.schema import Scene
+
+# Joins the names of effects that act in the same frame.
+_PLUS = " + "
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """The passes of a capture and what they are expected to cost on this machine."""
+
+    #: Name of the scene.
+    scene: str
+    #: Number of frames.
+    frame_count: int
+    #: Edge of the picture in pixels.
+    size: int
+    #: Frames that need each pass.
+    passes: Mapping[str, int]
+    #: Sub-frames over all frames, one for each frame without motion blur.
+    subframes: int
+    #: Frames of each group: frames with the same set of effects acting.
+    groups: Mapping[str, int]
+    #: Processor seconds by group, or None without probing.
+    seconds: Mapping[str, float] | None
+    #: Rays by group, or None without probing.
+    rays: Mapping[str, int] | None
+
+    def shares(self) -> dict[str, float] | None:
+        """Seconds by what calls for them: `clean`, then each effect on top; they add up to all.
+
+        Where effects meet in a frame the extra cost is split by what each costs alone.
+        """
+        if self.seconds is None:
+            return None
+        base = self.seconds.get("clean", 0.0) / max(self.groups.get("clean", 0), 1)
+        shares = {"clean": base * self.frame_count}
+        alone = {
+            name: max(self.seconds[name] / count - base, 1e-6)
+            for name, count in self.groups.items()
+            if name != "clean" and _PLUS not in name
+        }
+        for name, count in self.groups.items():
+            kinds = [] if name == "clean" else name.split(_PLUS)
+            weights = [alone.get(kind, 1e-6) for kind in kinds]
+            extra = self.seconds[name] - base * count
+            for kind, weight in zip(kinds, weights, strict=True):
+                shares[kind] = shares.get(kind, 0.0) + extra * weight / sum(weights)
+        return shares
+
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON values."""
+        return asdict(self)
+
+
+def forecast(
+    scene: Scene, frame_count: int | None = None, size: int | None = None, *, probe: bool = True
+) -> Forecast:
+    """Plan all frames and predict their cost.
+
+    Frames are grouped by the effects that act in them. Of each group the frame with the median
+    number of sub-frames is rendered once and its cost multiplied.
+
+    Args:
+        scene: the scene.
+        frame_count: frames over which it is spread; its own if None.
+        size: edge of the picture in pixels; 256 if None.
+        probe: render the probes; without them nothing is predicted.
+    """
+    count = scene.frame_count if frame_count is None else frame_count
+    edge = 256 if size is None else size
+    plans = [plan(scene, frame, count, edge) for frame in range(count)]
+    groups: dict[str, list[FramePlan]] = {}
+    for item in plans:
+        groups.setdefault(group_name(item), []).append(item)
+    seconds, rays = _probed(scene, groups, edge) if probe else (None, None)
+    return Forecast(
+        scene=scene.id,
+        frame_count=count,
+        size=edge,
+        passes=dict(Counter(name for item in plans for name in item.passes)),
+        subframes=sum(item.subframes for item in plans),
+        groups={name: len(items) for name, items in groups.items()},
+        seconds=seconds,
+        rays=rays,
+    )
+
+
+def group_name(item: FramePlan) -> str:
+    """Name of the group of a frame: the effects that act in it, or `clean`."""
+    return _PLUS.join(item.strength) or "clean"
+
+
+def _probed(
+    scene: Scene, groups: Mapping[str, list[FramePlan]], size: int
+) -> tuple[dict[str, float], dict[str, int]]:
+    seconds, rays = {}, {}
+    warm = next(iter(groups.values()))[0]
+    carry_out(scene, warm, size)  # loads the hand and paints the skin, once for a capture
+    for name, items in groups.items():
+        typical = sorted(items, key=lambda item: item.subframes)[len(items) // 2]
+        cost = carry_out(scene, typical, size).cost
+        scale = sum(item.subframes for item in items) / typical.subframes
+        seconds[name] = round(scale * sum(cost.seconds.values()), 3)
+        rays[name] = round(scale * sum(cost.rays.values()))
+    return seconds, rays
+
+
+def share_table(forecasts: list[Forecast]) -> str:
+    """A Markdown table: what each effect of each scene costs, in processor seconds."""
+    lines = [
+        f"| scene | frames | clean | {' | '.join(ORDER)} | all | s a frame |",
+        "| --- | ---: | ---: | " + "---: | " * len(ORDER) + "---: | ---: |",
+    ]
+    for item in forecasts:
+        shares = item.shares() or {}
+        total = sum(shares.values())
+        cells = [f"{shares[name]:.0f}" if name in shares else "" for name in ("clean", *ORDER)]
+        row = [item.scene, str(item.frame_count), *cells, f"{total:.0f}"]
+        lines.append("| " + " | ".join([*row, f"{total / item.frame_count:.2f}"]) + " |")
+    return "\n".join(lines)
+
+
+def plan_table(forecasts: list[Forecast]) -> str:
+    """A Markdown table: per scene and group of frames, passes and predicted cost."""
+    lines = [
+        "| scene | frames with | frames | s a frame | s in all | rays (millions) |",
+        "| --- | --- | ---: | ---: | ---: | ---: |",
+    ]
+    for item in forecasts:
+        for name, count in item.groups.items():
+            cells = [item.scene, name, str(count)]
+            if item.seconds is None or item.rays is None:
+                cells += ["", "", ""]
+            else:
+                spent = item.seconds[name]
+                cells += [f"{spent / count:.2f}", f"{spent:.0f}", f"{item.rays[name] / 1e6:.1f}"]
+            lines.append("| " + " | ".join(cells) + " |")
+        passes = ", ".join(f"{name} {count}" for name, count in item.passes.items())
+        total = "" if item.seconds is None else f"{sum(item.seconds.values()):.0f}"
+        cells = [item.scene, f"all ({passes}; {item.subframes} sub-frames)"]
+        lines.append("| " + " | ".join([*cells, str(item.frame_count), "", total, ""]) + " |")
+    return "\n".join(lines)

@@ -1,0 +1,294 @@
+"""From a scene to a capture folder: frames in parallel, resumable, the same on any machine."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import pickle
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.files import canonical_json, sha256_json
+from hwp_bench.base.locks import exclusive
+from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.progress import progress
+from hwp_bench.capture import (
+    Cameras,
+    Capture,
+    CaptureInfo,
+    CaptureWriter,
+    HandModelId,
+    open_capture,
+)
+from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.sim.effects.plan import FramePlan, hands_at, plan
+from hwp_bench.sim.produce.estimates import estimate_hands, estimate_mask
+from hwp_bench.sim.produce.frames import exr_file, frame_file, read_frame, render_frames
+from hwp_bench.sim.scene.motion import hand_parameters
+from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
+from hwp_bench.sim.scene.reader import load_scene
+from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.subject.atlas import skin_atlas
+from hwp_bench.sim.subject.hand import scene_hands
+
+#: Version of the renderer's look; part of every render key.
+RENDERER = 9
+#: Smallest and largest edge of a picture.
+SIZES = (32, 1024)
+#: Edge of a picture where nobody says otherwise.
+DEFAULT_SIZE = 256
+#: Terms under which simulated captures may be used.
+LICENCE = "CC0-1.0"
+# Frames below which a second process costs more than it brings.
+_FRAMES_PER_WORKER = 10
+
+
+def render_key(scene: Scene, frame_count: int, size: int) -> str:
+    """Digest of everything that decides the pixels of a capture."""
+    return sha256_json([RENDERER, scene.digest, frame_count, size])
+
+
+def render_capture(
+    scene: Scene | str | Path,
+    out: str | os.PathLike[str],
+    *,
+    frame_count: int | None = None,
+    size: int | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+    overwrite: bool = False,
+    exr: bool = False,
+) -> Capture:
+    """Render a capture.
+
+    A render that was interrupted goes on where it stopped: finished frames wait beside `out`
+    until the capture is whole.
+
+    Args:
+        scene: a scene, its name, or its file.
+        out: the capture folder to make.
+        frame_count: frames over which the scene is spread; the scene's own if None.
+        size: edge of the square picture in pixels.
+        seed: replaces the scene's seed.
+        workers: processes; as many as pay if None.
+        overwrite: replace an existing folder.
+        exr: also store linear light, depth, normals, object ids and motion of every frame as
+            OpenEXR, under `extra/`.
+
+    Raises:
+        UsageError: `out` exists, or a number is out of range.
+        BadInput: the scene file is at fault.
+        HwpError: rendering failed, or `out` cannot be written.
+    """
+    scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    if seed is not None:
+        scene = replace(scene, seed=seed)
+    count = scene.frame_count if frame_count is None else frame_count
+    edge = DEFAULT_SIZE if size is None else size
+    _check(count, edge, workers)
+    out = Path(out)
+    if out.exists() and not overwrite and (out.is_file() or any(out.iterdir())):
+        raise UsageError("exists already", where=out, remedy="Choose another place or overwrite.")
+    kind = "-exr" if exr else ""
+    waiting = out.absolute().parent / f".{out.name}.{render_key(scene, count, edge)[:16]}{kind}"
+    with exclusive(waiting, wait=True):
+        try:
+            waiting.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise HwpError(f"cannot be made ({error.strerror})", where=waiting) from error
+        start = time.perf_counter()
+        _render_missing(scene, count, edge, waiting, workers, exr)
+        _assemble(scene, count, edge, waiting, out, overwrite, time.perf_counter() - start)
+        shutil.rmtree(waiting, ignore_errors=True)
+    waiting.with_name(f"{waiting.name}.lock").unlink(missing_ok=True)
+    return open_capture(out)
+
+
+def _check(frame_count: int, size: int, workers: int | None) -> None:
+    for name, value, low, high in (
+        ("frame_count", frame_count, 10, 100_000),
+        ("size", size, *SIZES),
+        ("workers", 1 if workers is None else workers, 1, 1024),
+    ):
+        if not low <= value <= high:
+            raise UsageError(f"{value} is not in {low}..{high}", field=name)
+
+
+def _render_missing(
+    scene: Scene, count: int, size: int, waiting: Path, workers: int | None, exr: bool
+) -> None:
+    missing = [frame for frame in range(count) if read_frame(waiting, frame) is None]
+    if not missing:
+        return
+    # Built once here, so that no two processes paint the same skin.
+    scene_hands(scene)
+    skin_atlas(scene.subject)
+    if workers is None:
+        workers = max(1, min(os.cpu_count() or 1, len(missing) // _FRAMES_PER_WORKER))
+    with progress(f"Rendering {scene.id}", len(missing)) as update:
+        if workers == 1:
+            for done, frame in enumerate(missing, start=1):
+                render_frames(scene, [frame], count, size, waiting, exr)
+                update(done)
+            return
+        jobs = [missing[first::workers] for first in range(workers)]
+        with contextlib.ExitStack() as stack:
+            logs = [stack.enter_context(tempfile.TemporaryFile()) for _ in jobs]
+            processes = [
+                _start((scene, job, count, size, os.fspath(waiting), exr), log)
+                for job, log in zip(jobs, logs, strict=True)
+            ]
+            stack.callback(_stop, processes)
+            while any(process.poll() is None for process in processes):
+                time.sleep(0.2)
+                update(sum(frame_file(waiting, frame).exists() for frame in missing))
+                _raise_if_failed(scene, processes, logs)
+            _raise_if_failed(scene, processes, logs)
+            update(len(missing))
+
+
+def _start(job: tuple[Any, ...], log: IO[bytes]) -> subprocess.Popen[bytes]:
+    root = os.fspath(PACKAGES)
+    known = os.environ.get("PYTHONPATH")
+    environment = {
+        **os.environ,
+        "PYTHONPATH": root if not known else os.pathsep.join([root, known]),
+        "OMP_NUM_THREADS": "1",
+    }
+    process = subprocess.Popen(
+        [sys.executable, "-m", "hwp_bench.sim.produce.frames"],
+        stdin=subprocess.PIPE,
+        stdout=log,
+        stderr=log,
+        env=environment,
+    )
+    assert process.stdin is not None
+    with contextlib.suppress(BrokenPipeError):
+        process.stdin.write(pickle.dumps(job))
+        process.stdin.close()
+    return process
+
+
+def _stop(processes: list[subprocess.Popen[bytes]]) -> None:
+    for process in processes:
+        if process.poll() is None:
+            process.terminate()
+        process.wait()
+
+
+def _raise_if_failed(
+    scene: Scene, processes: list[subprocess.Popen[bytes]], logs: Sequence[IO[bytes]]
+) -> None:
+    for process, log in zip(processes, logs, strict=True):
+        if process.poll():
+            log.seek(0)
+            lines = log.read().decode(errors="replace").strip().splitlines()
+            reason = lines[-1] if lines else "it said nothing"
+            raise HwpError(
+                f"a rendering process ended with status {process.returncode}: {reason}",
+                where=scene.id,
+                remedy="Finished frames are kept; the same command goes on from there.",
+            )
+
+
+def _assemble(
+    scene: Scene, count: int, size: int, waiting: Path, out: Path, overwrite: bool, seconds: float
+) -> None:
+    plans = [plan(scene, frame, count, size) for frame in range(count)]
+    truth = true_hands(scene, plans)
+    cameras = Cameras(
+        Ks=np.repeat(intrinsics(scene, size)[None], count, axis=0),
+        viewmats=np.stack([viewmat(scene, item.seconds) for item in plans]),
+    )
+    info = _info(scene, plans, size)
+    costs = []
+    with CaptureWriter(
+        out, info, estimate_hands(scene, truth, plans), cameras, overwrite=overwrite
+    ) as writer:
+        for item in plans:
+            arrays = read_frame(waiting, item.frame)
+            if arrays is None:
+                frame_file(waiting, item.frame).unlink(missing_ok=True)
+                raise HwpError(
+                    f"frame {item.frame} was damaged while it waited",
+                    where=waiting,
+                    remedy="Run the same command again; only this frame is rendered anew.",
+                )
+            coverage = arrays["coverage"].astype(np.float64)
+            writer.frame(item.frame, arrays["rgb"])
+            writer.clean(item.frame, arrays["clean"])
+            writer.true_mask(item.frame, _eight_bits(coverage))
+            clean_coverage = arrays["clean_coverage"].astype(np.float64)
+            writer.clean_mask(item.frame, _eight_bits(clean_coverage))
+            writer.mask(item.frame, estimate_mask(scene, item, coverage, clean_coverage))
+            layers = exr_file(waiting, item.frame)
+            if layers.exists():
+                writer.extra(f"exr/{layers.name}", layers.read_bytes())
+            costs.append(json.loads(arrays["cost"].tobytes()))
+        writer.true_hands(truth)
+        writer.extra("scene.json", canonical_json(scene.to_json()))
+        writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
+
+
+def _eight_bits(coverage: np.ndarray) -> np.ndarray:
+    """Coverage in 8 bits, rounded down: 255 means that the hand covers the pixel fully."""
+    return np.floor(255.0 * coverage + 1e-3).astype(np.uint8)
+
+
+def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters]:
+    """The true hand parameters of every frame, by side."""
+    subjects = scene_hands(scene)
+    focus = focus_point()
+    truth = {}
+    staged = [hands_at(scene, item.seconds) for item in plans]
+    for side in scene.sides:
+        rows = [
+            hand_parameters(hands[side], side, subjects[side].model_joints, focus)
+            for hands in staged
+        ]
+        truth[side] = HandParameters(
+            pose=np.stack([pose for pose, _ in rows]),
+            betas=subjects[side].betas,
+            transl=np.stack([transl for _, transl in rows]),
+            valid=np.ones(len(plans), dtype=bool),
+        )
+    return truth
+
+
+def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
+    model = scene_hands(scene)[scene.sides[0]].model
+    known = "anny" if scene.subject.model.startswith("gltf:") else scene.subject.model
+    return CaptureInfo(
+        id=scene.id,
+        hands=scene.hands,
+        action=scene.action,
+        device=scene.device,
+        fps=scene.fps * len(plans) / scene.frame_count,
+        width=size,
+        height=size,
+        frame_count=len(plans),
+        hand_model=HandModelId(name=model.name, digest=model.digest, source=known),
+        perturbations={
+            call.kind: tuple(item.severity[call.kind] for item in plans) for call in scene.effects
+        },
+        source={
+            "kind": "simulated",
+            "scene": scene.id,
+            "title": scene.title,
+            "scene_digest": scene.digest,
+            "seed": scene.seed,
+            "renderer": RENDERER,
+        },
+        licence=LICENCE,
+    )

@@ -1,0 +1,201 @@
+"""Images of a scene for people: contact sheet and animation, and the documentation's gallery."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import atomic_write
+from hwp_bench.base.images import write_image
+from hwp_bench.base.progress import track
+from hwp_bench.sim.effects.base import registered
+from hwp_bench.sim.effects.plan import hands_at
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.render.frame import FrameResult, render_frame
+from hwp_bench.sim.scene.motion import hand_parameters
+from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
+from hwp_bench.sim.scene.reader import load_scene, scene_names
+from hwp_bench.sim.scene.schema import EffectCall, Scene
+from hwp_bench.sim.scene.variants import with_effects, with_severity
+from hwp_bench.sim.subject.hand import scene_hands
+from hwp_bench.taxonomy import MAX_SEVERITY
+
+#: Frames in a row of the sheet.
+COLUMNS = 8
+#: Duration of a frame of the animation, ms.
+FRAME_MS = 140
+_SHORT = {
+    "hand_object_interaction": "hoi",
+    "complex_poses": "cp",
+    "illumination": "il",
+    "motion_blur": "mb",
+}
+#: Edge of a picture in pixels.
+GALLERY_SIZE = 176
+#: Pictures in the strip of a capture.
+PICTURES = 8
+#: Scene in which each perturbation is shown.
+SHOWN_IN = (
+    ("hand_object_interaction", "capture0"),
+    ("complex_poses", "capture1"),
+    ("illumination", "capture2"),
+    ("motion_blur", "capture3"),
+)
+_QUALITY = 88
+
+
+def write_preview(
+    scene: Scene, folder: Path, *, frame_count: int = 48, size: int = 160
+) -> tuple[Path, Path]:
+    """Write `ID-sheet.png` and `ID.gif`, each frame beside its clean version.
+
+    Args:
+        scene: the scene.
+        folder: where to.
+        frame_count: 10 to 400 frames over the whole capture.
+        size: edge of a frame in pixels, 32 to 512.
+
+    Raises:
+        UsageError: a number is out of range.
+    """
+    if not 10 <= frame_count <= 400 or not 32 <= size <= 512:
+        raise UsageError("10 to 400 frames of 32 to 512 px are drawn", field="--frames, --size")
+    results = [
+        render_frame(scene, frame, frame_count, size)
+        for frame in track(range(frame_count), f"Rendering {scene.id}")
+    ]
+    sheet = write_image(folder / f"{scene.id}-sheet.png", strip(results, COLUMNS))
+    return sheet, atomic_write(folder / f"{scene.id}.gif", _animation(results))
+
+
+def write_gallery(folder: Path) -> list[Path]:
+    """Write `captureN.jpg` for every scene and `severity-KIND.jpg` for every perturbation.
+
+    Args:
+        folder: where to.
+    """
+    paths = []
+    for name in track(scene_names(), "Strips of the captures"):
+        scene = load_scene(name)
+        paths.append(_write(folder / f"{name}.jpg", strip(_capture_strip(scene), PICTURES)))
+    for kind, name in track(SHOWN_IN, "Strips of the severities"):
+        picture = strip(_severity_strip(load_scene(name), kind), MAX_SEVERITY + 1)
+        paths.append(_write(folder / f"severity-{kind}.jpg", picture))
+    return paths
+
+
+def _capture_strip(scene: Scene) -> list[FrameResult]:
+    """The middle of the first episodes of each effect in turn, between clean frames."""
+    busy = [
+        0.5 * (part.start + part.end)
+        for step in range(3)
+        for call in scene.effects
+        for part in call.episodes[step : step + 1]
+    ][: PICTURES - 3]
+    moments = sorted([0.0, *busy, 0.87, 0.96])
+    moments += [0.8, 0.83, 0.99, 0.9]
+    frames = [int(moment * scene.frame_count) for moment in sorted(moments[:PICTURES])]
+    return [render_frame(scene, frame, scene.frame_count, GALLERY_SIZE) for frame in frames]
+
+
+def _severity_strip(scene: Scene, kind: str) -> list[FrameResult]:
+    """One frame at severity 0 to 5, with nothing else acting."""
+    call = scene.effect(kind)
+    assert call is not None
+    part = call.episodes[0]
+    frame = int(0.5 * (part.start + part.end) * scene.frame_count)
+    results: list[FrameResult] = []
+    for severity in range(1, MAX_SEVERITY + 1):
+        alone = with_severity(with_effects(scene, [kind]), severity)
+        result = render_frame(alone, frame, scene.frame_count, GALLERY_SIZE)
+        if not results:
+            results.append(_clean_twin(result))
+        results.append(_with_estimate(alone, call, result) if kind == "complex_poses" else result)
+    return results
+
+
+def _clean_twin(result: FrameResult) -> FrameResult:
+    none = dict.fromkeys(result.plan.severity, 0)
+    return replace(result, rgb=result.clean, plan=replace(result.plan, severity=none))
+
+
+def _with_estimate(scene: Scene, call: EffectCall, result: FrameResult) -> FrameResult:
+    """The frame with the joints where an estimator of this severity sees them."""
+    import cv2
+    import torch
+
+    from hwp_bench.hands import pose_hand, project
+
+    seconds = result.plan.seconds
+    angle, length = registered(call.kind).estimate_error(result.plan.strength[call.kind])
+    rng = generator(scene.seed, "gallery")
+    image = result.rgb.copy()
+    for side, moment in hands_at(scene, seconds).items():
+        hand = scene_hands(scene)[side]
+        pose, transl = hand_parameters(moment, side, hand.joints, focus_point())
+        pose = pose + angle * rng.normal(size=pose.shape)
+        transl = transl + length * rng.normal(size=3)
+        arrays = (pose[None], hand.betas, transl[None])
+        posed = pose_hand(hand.tensors, *(torch.as_tensor(array) for array in arrays))
+        view = torch.as_tensor(viewmat(scene, seconds))[None]
+        K = torch.as_tensor(intrinsics(scene, len(image)))[None]
+        pixels = project(posed.landmarks, view, K)[0][0].numpy()
+        for first in range(1, 21, 4):
+            chain = np.vstack([pixels[:1], pixels[first : first + 4]])
+            cv2.polylines(
+                image, [np.round(chain).astype(np.int32)], False, (255, 140, 0), 1, cv2.LINE_AA
+            )
+    return replace(result, rgb=image)
+
+
+def strip(results: list[FrameResult], columns: int) -> np.ndarray:
+    """Frames in rows, left to right, each with its number and what perturbs it."""
+    cells = [_captioned(result) for result in results]
+    blank = np.zeros_like(cells[0])
+    cells += [blank] * (-len(cells) % columns)
+    rows = [
+        np.concatenate(cells[start : start + columns], axis=1)
+        for start in range(0, len(cells), columns)
+    ]
+    return np.concatenate(rows, axis=0)
+
+
+def _captioned(result: FrameResult) -> np.ndarray:
+    import cv2
+
+    image = result.rgb.copy()
+    severity = [
+        f"{_SHORT.get(name, name)}{value}" for name, value in result.plan.severity.items() if value
+    ]
+    text = " ".join([str(result.plan.frame), *severity])
+    scale = len(image) / 420.0
+    for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        place = (4, int(36 * scale))
+        cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, color, width, cv2.LINE_AA)
+    return image
+
+
+def _animation(results: list[FrameResult]) -> bytes:
+    from PIL import Image
+
+    frames = [
+        Image.fromarray(np.concatenate([result.rgb, result.clean], axis=1)).quantize(128)
+        for result in results
+    ]
+    buffer = io.BytesIO()
+    frames[0].save(
+        buffer, format="GIF", save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0
+    )
+    return buffer.getvalue()
+
+
+def _write(path: Path, picture: np.ndarray) -> Path:
+    import cv2
+
+    settings = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), settings)
+    return atomic_write(path, data.tobytes())

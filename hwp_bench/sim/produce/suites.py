@@ -1,0 +1,217 @@
+"""Suites: which scenes, how many frames, how large; rendered once, as jobs, into the cache."""
+
+from __future__ import annotations
+
+import os
+import threading
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from types import MappingProxyType
+
+from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.files import cache_root
+from hwp_bench.base.locks import exclusive
+from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
+from hwp_bench.run.engine.job import OnProgress
+from hwp_bench.sim.scene.reader import load_scene, scene_names
+from hwp_bench.sim.scene.schema import Scene
+
+#: Seconds between two counts of the frames that wait.
+_COUNT_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class SuiteItem:
+    """One capture of a suite."""
+
+    #: The scene.
+    scene: Scene
+    #: Frames over which it is spread.
+    frame_count: int
+    #: Edge of the picture in pixels.
+    size: int
+    #: Seed of the scene.
+    seed: int
+
+
+# One single-hand and one interacting capture for each perturbation: interaction 0 and 5,
+# complex poses 1 and 6, illumination 2 and 7, motion blur 3 and 4.
+_MINI = tuple(f"capture{number}" for number in range(8))
+# Captures, frames (None: the paper's) and size of each suite.
+_SUITES: Mapping[str, tuple[tuple[str, ...] | None, int | None, int]] = MappingProxyType(
+    {
+        "smoke": (("capture0", "capture4"), 30, 112),
+        "mini": (_MINI, 60, 176),
+        "full": (None, None, 256),
+    }
+)
+
+
+def suite_names() -> tuple[str, ...]:
+    """Names of the suites, smallest first."""
+    return tuple(_SUITES)
+
+
+def suite(name: str) -> tuple[SuiteItem, ...]:
+    """Return the captures of a suite.
+
+    Args:
+        name: `smoke` (seconds), `mini` (minutes) or `full` (hours).
+
+    Raises:
+        UsageError: there is no such suite.
+    """
+    if name not in _SUITES:
+        raise UsageError(f"there is no suite {name!r}", remedy=f"Known: {', '.join(_SUITES)}.")
+    captures, frame_count, size = _SUITES[name]
+    scenes = [load_scene(capture) for capture in captures or scene_names()]
+    return tuple(
+        SuiteItem(scene, frame_count or scene.frame_count, size, scene.seed) for scene in scenes
+    )
+
+
+def ensure_suite(
+    name: str,
+    cache: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    *,
+    engine: Engine | None = None,
+    needs: Needs | None = None,
+) -> list[Path]:
+    """Render the captures of a suite that are not in the cache yet.
+
+    Args:
+        name: a suite.
+        cache: folder of captures; the toolkit's cache if None.
+        workers: processes for each render.
+        engine: where captures are rendered; one after another in this process if None.
+        needs: what one render takes of a machine.
+
+    Returns:
+        The capture folders, in the suite's order.
+
+    Raises:
+        UsageError: there is no such suite.
+        HwpError: a render failed; captures that were finished stay.
+    """
+    from hwp_bench.sim.produce.production import render_key
+
+    engine, needs = engine or LocalEngine(), needs or Needs()
+    root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
+    each = workers_each(workers, engine, needs)
+    jobs = []
+    for item in suite(name):
+        key = render_key(item.scene, item.frame_count, item.size)
+        folder = root / f"{item.scene.id}-{item.frame_count}x{item.size}-{key[:12]}"
+        work = RenderCapture(
+            item.scene, item.frame_count, item.size, item.seed, workers=each, keep=True
+        )
+        jobs.append(render_job(work, folder, needs))
+    if not all(job.finished() for job in jobs):
+        engine.run(jobs, lambda index: None)
+    return [job.output for job in jobs]
+
+
+@dataclass(frozen=True)
+class RenderCapture:
+    """Renders a capture, in any process on any machine; the fields are `render_capture`'s."""
+
+    #: The scene.
+    scene: Scene
+    #: Frames over which it is spread.
+    frame_count: int | None = None
+    #: Edge of the picture in pixels.
+    size: int | None = None
+    #: Seed; the scene's own if None.
+    seed: int | None = None
+    #: Processes of one render; as many as pay if None.
+    workers: int | None = None
+    #: Whether linear layers are stored too.
+    exr: bool = False
+    #: Whether a capture that is there already is taken as it is.
+    keep: bool = False
+    #: Whether one that is there is replaced.
+    overwrite: bool = False
+
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
+        """Render; see `hwp_bench.run.engine.job.Work`."""
+        ended = threading.Event()
+        watch = threading.Thread(target=self._count, args=(output, on_progress, ended), daemon=True)
+        watch.start()
+        try:
+            self.render(output)
+        finally:
+            ended.set()
+            watch.join()
+
+    def render(self, output: Path) -> None:
+        """Render into a folder, or take what is there where that is wanted.
+
+        Raises:
+            HwpError: as `render_capture`.
+        """
+        if not self.keep:
+            self._render(output)
+            return
+        with exclusive(output, wait=True):
+            if not is_capture(output):
+                self._render(output)
+
+    def _render(self, output: Path) -> None:
+        from hwp_bench.sim.produce.production import render_capture
+
+        render_capture(
+            self.scene,
+            output,
+            frame_count=self.frame_count,
+            size=self.size,
+            seed=self.seed,
+            workers=self.workers,
+            overwrite=self.keep or self.overwrite,
+            exr=self.exr,
+        )
+
+    def _count(self, output: Path, on_progress: OnProgress, ended: threading.Event) -> None:
+        """Tell how many frames wait beside the capture to be."""
+        total = self.frame_count or self.scene.frame_count
+        while not ended.wait(_COUNT_SECONDS):
+            on_progress(sum(1 for _ in output.parent.glob(f".{output.name}.*/*.npz")), total)
+
+
+def render_job(work: RenderCapture, output: Path, needs: Needs) -> Job:
+    """Return a render as a job of an engine.
+
+    Args:
+        work: what to render.
+        output: the capture folder to make.
+        needs: what it takes of a machine.
+    """
+    return Job(
+        text=work.scene.id,
+        # In turn, a render shows its own progress.
+        here=lambda on_progress: work.render(output),
+        work=work,
+        output=output,
+        finished=lambda: work.keep and is_capture(output),
+        needs=needs,
+    )
+
+
+def is_capture(folder: Path) -> bool:
+    """Whether a folder holds a capture that can be opened."""
+    from hwp_bench.capture import open_capture
+
+    try:
+        open_capture(folder)
+    except HwpError:
+        return False
+    return True
+
+
+def workers_each(workers: int | None, engine: Engine, needs: Needs) -> int | None:
+    """Return the processes of one render: what was asked for, else what an engine leaves it.
+
+    In turn each render takes as many as pay; where several run at once, the processors of a job.
+    """
+    return workers if workers is not None or engine.in_turn else max(1, int(needs.cpus))

@@ -1,0 +1,114 @@
+"""Backdrops: a room out of focus behind the hands, as a function of the viewing direction."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import lru_cache
+from types import MappingProxyType
+
+import numpy as np
+
+from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.base.errors import BadInput
+from hwp_bench.sim.geometry.noise import fractal_noise, generator
+
+_TEXTURE = 384
+
+
+@dataclass(frozen=True)
+class Backdrop:
+    """A wall and a table, both blurred by the distance."""
+
+    #: sRGB of the wall.
+    wall: tuple[float, float, float]
+    #: sRGB of the table.
+    table: tuple[float, float, float]
+    #: How far below the centre of the picture the table's edge is, as a slope.
+    edge: float
+    #: Number of things that stand around.
+    clutter: int
+
+
+_BACKDROPS: Mapping[str, Backdrop] = MappingProxyType(
+    {
+        "office": Backdrop((0.72, 0.74, 0.76), (0.55, 0.42, 0.30), 0.10, 9),
+        "kitchen": Backdrop((0.84, 0.80, 0.72), (0.80, 0.79, 0.77), 0.06, 12),
+        "study": Backdrop((0.42, 0.45, 0.42), (0.36, 0.24, 0.16), 0.12, 14),
+        "studio": Backdrop((0.58, 0.62, 0.68), (0.64, 0.66, 0.70), 0.16, 3),
+        "living": Backdrop((0.66, 0.56, 0.48), (0.48, 0.36, 0.28), 0.08, 11),
+    }
+)
+
+
+def backdrop_names() -> tuple[str, ...]:
+    """Names of the backdrops that a scene can name."""
+    return tuple(_BACKDROPS)
+
+
+def check_backdrop(name: str, where: str) -> None:
+    """Refuse an unknown backdrop.
+
+    Raises:
+        BadInput: it lists the known ones.
+    """
+    if name not in _BACKDROPS:
+        raise BadInput(
+            f"is {name!r}",
+            where=where,
+            field="background",
+            remedy=f"Known: {', '.join(_BACKDROPS)}.",
+        )
+
+
+@lru_cache(maxsize=2)
+def _texture(name: str, seed: int) -> np.ndarray:
+    """(T, T, 3) float32 linear, over slopes -1..1 in both directions."""
+    import cv2
+
+    backdrop = _BACKDROPS[name]
+    rng = generator(seed, "backdrop", name)
+    ticks = np.linspace(-1.0, 1.0, _TEXTURE)
+    x, y = np.meshgrid(ticks, ticks)
+    points = np.stack([x.ravel(), 3.0 * y.ravel(), np.zeros(x.size)], axis=1)
+    grain = fractal_noise(points * [1.0, 4.0, 1.0], 0.25, rng).reshape(x.shape)
+    stain = fractal_noise(points, 0.5, rng).reshape(x.shape)
+    wall = np.array(backdrop.wall) * (1.0 + 0.04 * stain + 0.1 * x)[..., None]
+    table = np.array(backdrop.table) * (1.0 + 0.08 * grain)[..., None]
+    image = np.clip(wall, 0.02, 1.0)
+    for _ in range(backdrop.clutter):
+        left, width = rng.uniform(-0.6, 0.55), rng.uniform(0.04, 0.2)
+        bottom = backdrop.edge + rng.uniform(-0.02, 0.03)
+        top = bottom - rng.uniform(0.06, 0.4)
+        color = np.clip(rng.uniform(0.1, 0.85, 3) * 0.6 + 0.2 * rng.uniform(), 0.05, 0.9)
+        inside = (x > left) & (x < left + width) & (y > top) & (y < bottom)
+        shade = 1.0 + 0.25 * (x - left) / width
+        image = np.where(inside[..., None], np.clip(color * shade[..., None], 0, 1), image)
+    on_table = (y > backdrop.edge + 0.03 * x)[..., None]
+    image = np.where(on_table, np.clip(table, 0.02, 1.0), image)
+    linear = srgb_to_linear(image).astype(np.float32)
+    return cv2.GaussianBlur(linear, (0, 0), 4.0)
+
+
+def look(name: str, seed: int, directions: np.ndarray) -> np.ndarray:
+    """What the camera sees past the hands under white light.
+
+    Args:
+        name: a backdrop.
+        seed: seed of the scene.
+        directions: (H, W, 3) world, z away from the camera.
+
+    Returns:
+        (H, W, 3) linear reflectance.
+    """
+    import cv2
+
+    slope = directions[..., :2] / np.maximum(directions[..., 2:], 1e-3)
+    place = ((slope + 1.0) / 2.0 * (_TEXTURE - 1)).astype(np.float32)
+    return cv2.remap(
+        _texture(name, seed),
+        np.ascontiguousarray(place[..., 0]),
+        np.ascontiguousarray(place[..., 1]),
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )

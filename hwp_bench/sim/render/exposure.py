@@ -1,0 +1,212 @@
+"""The time around a frame's middle: what moves while the shutter is open or rows are read.
+
+Rolling shutter: a point is seen in the row that is read when the point is there. So each vertex
+is put where it stands, relative to the camera, when its own row is read; one image of that
+surface then shows every row at its own time, whatever hands, objects and camera do.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from hwp_bench.sim.effects.base import Shutter
+from hwp_bench.sim.effects.plan import FramePlan, hands_at, lights_at, objects_at
+from hwp_bench.sim.geometry.surface import Surface, transformed
+from hwp_bench.sim.render.instant import Lens, LinearImage, render_instant
+from hwp_bench.sim.render.stage import Body, Stage, between
+from hwp_bench.sim.scene.motion import HandMoment
+from hwp_bench.sim.scene.optics import FOCUS_DISTANCE, viewmat
+from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.subject.hand import FINE, MOVING
+
+# The golden ratio's powers spread the sub-frames' rays evenly inside the pixel.
+_SPREAD = (0.7548776662466927, 0.5698402909980532)
+# Rounds in which place and time of a vertex find each other. Each shrinks the error by the way
+# that the vertex moves down the picture during the readout, in heights of the picture.
+_ROUNDS = 4
+
+#: A surface at three instants, in the camera's axes at each: opening, middle, closing.
+Knots = tuple[Surface, Surface, Surface]
+
+
+def exposed(stage: Stage, window: Window, sky: dict[str, np.ndarray], lens: Lens) -> LinearImage:
+    """The mean of the sub-frames: the shutter's integral in linear light.
+
+    Hands are posed at the opening, the middle and the closing of the shutter and move on
+    parabolas between; each sub-frame casts one ray a pixel, at another place inside it.
+
+    Args:
+        stage: builds hands and objects.
+        window: the time that the shutter is open.
+        sky: what `Stage.seen_sky` says of the hands in the frame's middle.
+        lens: the camera in the frame's middle.
+    """
+    scene, recipe = window.scene, window.recipe
+    lights = lights_at(scene, recipe)
+    rows = Rows(stage, window, sky) if recipe.readout else None
+    if rows is None:
+        with stage.cost.time("shutter"):
+            first, middle, last = (stage.surface(window.hands(s), MOVING) for s in (-0.5, 0.0, 0.5))
+            middle = stage.under_sky(middle, sky, MOVING)
+    color = np.zeros((lens.size, lens.size, 3))
+    coverage = np.zeros((lens.size, lens.size))
+    for step in range(recipe.subframes):
+        s = (step + 0.5) / recipe.subframes - 0.5
+        place = ((step + 1) * np.array(_SPREAD)) % 1.0 - 0.5
+        moved = replace(
+            lens, view=window.view(s), grid=1, shift=(float(place[0]), float(place[1])), turn=step
+        )
+        if rows is not None:
+            moved = rows.lens(s, moved)
+            body, things = rows.body(s, moved), rows.things(s, moved)
+        else:
+            with stage.cost.time("hands"):
+                body = stage.traced(between((first, middle, last), s))
+            things = stage.things(objects_at(scene, recipe, window.seconds(s)), window.hands(s))
+        picture = render_instant(scene, moved, body, things, lights, stage.cost)
+        color += picture.color / recipe.subframes
+        coverage += picture.coverage / recipe.subframes
+    return LinearImage(color, coverage)
+
+
+@dataclass(frozen=True, eq=False)
+class Window:
+    """Hands and camera around the middle of a frame.
+
+    Times `s` count lengths of the window from the middle of the frame: -0.5 is the opening of
+    the shutter, 0.5 its closing. Without a shutter the window is the sensor's readout.
+    """
+
+    #: The scene.
+    scene: Scene
+    #: The frame's recipe.
+    recipe: FramePlan
+    #: What shakes while the window is open, or None.
+    shutter: Shutter | None = None
+
+    @property
+    def length(self) -> float:
+        """Length of the window, s."""
+        return self.recipe.readout if self.shutter is None else self.shutter.seconds
+
+    def seconds(self, s: float) -> float:
+        """Time of the capture."""
+        return self.recipe.seconds + s * self.length
+
+    def hands(self, s: float) -> dict[str, HandMoment]:
+        """What the hands do."""
+        hands = hands_at(self.scene, self.seconds(s))
+        if self.shutter is None:
+            return hands
+        way = np.array([*self.shutter.hand, 0.0])
+        twist = np.array([0.0, 0.0, self.shutter.twist])
+        return {
+            side: replace(
+                hand, place=hand.place + s * self._width * way, heading=hand.heading + s * twist
+            )
+            for side, hand in hands.items()
+        }
+
+    def view(self, s: float) -> np.ndarray:
+        """(4, 4) world to camera."""
+        view = viewmat(self.scene, self.seconds(s))
+        if self.shutter is not None:
+            view[:2, 3] += s * self._width * np.array(self.shutter.camera)
+        return view
+
+    @property
+    def _width(self) -> float:
+        """Width of the picture at the point looked at, m."""
+        return 2.0 * FOCUS_DISTANCE * np.tan(np.radians(self.scene.camera.field_of_view) / 2.0)
+
+
+class Rows:
+    """Hands, sleeves and objects for a sensor that reads its rows in turn.
+
+    Args:
+        stage: builds them.
+        window: the time around the frame.
+        sky: what `Stage.seen_sky` says of the hands in the frame's middle.
+    """
+
+    def __init__(self, stage: Stage, window: Window, sky: dict[str, np.ndarray]) -> None:
+        self._stage = stage
+        self._window = window
+        self._readout = window.recipe.readout / window.length
+        self._reach = self._readout if window.shutter is None else self._readout + 1.0
+        detail = FINE if window.shutter is None else MOVING
+
+        def surface(s: float) -> Surface:
+            return stage.under_sky(stage.surface(window.hands(s), detail), sky, detail)
+
+        with stage.cost.time("rolling"):
+            self._knots = knots(surface, window.view, self._reach)
+
+    def lens(self, s: float, lens: Lens) -> Lens:
+        """The lens with the views of the rows, the middle one read at `s`."""
+        half = self._readout / 2.0
+        return replace(lens, rows=(self._window.view(s - half), self._window.view(s + half)))
+
+    def body(self, s: float, lens: Lens) -> Body:
+        """Hands and sleeves, the middle row read at `s`."""
+        with self._stage.cost.time("rolling"):
+            surface = row_by_row(self._knots, self._reach, s, self._readout, lens)
+            return self._stage.traced(surface)
+
+    def things(self, s: float, lens: Lens) -> Body | None:
+        """Objects, the middle row read at `s`, or None."""
+        window, stage = self._window, self._stage
+        if not objects_at(window.scene, window.recipe, window.seconds(s)):
+            return None
+
+        def surface(later: float) -> Surface:
+            seconds = window.seconds(s + later)
+            placements = objects_at(window.scene, window.recipe, seconds)
+            return stage.objects(placements, window.hands(s + later))
+
+        def view(later: float) -> np.ndarray:
+            return window.view(s + later)
+
+        with stage.cost.time("objects"):
+            at = knots(surface, view, self._readout)
+            return stage.traced(row_by_row(at, self._readout, 0.0, self._readout, lens))
+
+
+def knots(
+    surface_at: Callable[[float], Surface], view_at: Callable[[float], np.ndarray], reach: float
+) -> Knots:
+    """Take a surface at three instants, in the camera's axes.
+
+    Args:
+        surface_at: the surface at a time, world.
+        view_at: (4, 4) world to camera at a time.
+        reach: the times are -reach / 2, 0 and reach / 2.
+    """
+    first, middle, last = (
+        transformed(surface_at(time), view_at(time)) for time in (-reach / 2.0, 0.0, reach / 2.0)
+    )
+    return first, middle, last
+
+
+def row_by_row(at: Knots, reach: float, time: float, readout: float, lens: Lens) -> Surface:
+    """A surface with every vertex where it stands when its row is read.
+
+    Args:
+        at: the surface at three instants; it moves on parabolas between.
+        reach: time from the first of them to the last.
+        time: when the middle row is read, 0 at the second instant.
+        readout: time from the first row to the last, in the unit of the others.
+        lens: the camera, whose view is that of `time`.
+
+    Returns:
+        The surface in the world, to be seen through `lens` as if all rows were read at once.
+    """
+    moments = np.full((len(at[0].vertices), 1), time)
+    for _ in range(_ROUNDS):
+        places = between(at, moments / reach).vertices
+        row = lens.K[1, 1] * places[:, 1] / places[:, 2] + lens.K[1, 2]
+        moments[:, 0] = time + (np.clip(row / lens.size, 0.0, 1.0) - 0.5) * readout
+    return transformed(between(at, moments / reach), np.linalg.inv(lens.view))

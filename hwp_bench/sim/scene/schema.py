@@ -1,0 +1,193 @@
+"""A scene: what a simulated capture shows, as checked data.
+
+World and camera share OpenCV axes at the start: x right, y down, z away from the camera.
+Times inside a capture are fractions of it (0 = first frame, 1 = last), so that the same scene
+renders at any number of frames.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from hwp_bench.base.files import sha256_json
+
+#: Version of the scene format; part of every scene digest.
+SCHEMA = "hwp-scene/1"
+#: Where the clean part of a capture begins, as a fraction: nothing is perturbed from here on.
+CLEAN_FROM = 0.8
+#: Share of the training frames that must stay unperturbed.
+MIN_CLEAN_SHARE = 0.35
+
+
+@dataclass(frozen=True)
+class Subject:
+    """Whose hands they are."""
+
+    #: Identity: shape parameters, surface detail, mottling.
+    seed: int
+    #: Skin tone, 0 (light) to 1 (dark).
+    tone: float
+    #: Years; deepens creases, veins and tendons.
+    age: float
+    #: sRGB colour of the sleeve, 0-1 each.
+    sleeve: tuple[float, float, float] = (0.25, 0.3, 0.4)
+    #: Surface: `anny` (the free hand), `mano:PATH` or `mano-hd:PATH` where the user has it, or
+    #: `gltf:PATH`, a rigged hand.
+    model: str = "anny"
+
+
+@dataclass(frozen=True)
+class Camera:
+    """How the picture is taken."""
+
+    #: Held in a hand (sways and drifts) or standing still.
+    handheld: bool
+    #: Horizontal and vertical field of view, degrees.
+    field_of_view: float
+    #: Amplitude of the sway of a handheld camera, m.
+    sway: float = 0.004
+
+
+@dataclass(frozen=True)
+class Light:
+    """A key light and the sky, constant unless an effect changes them."""
+
+    #: Direction towards the key light, world axes; need not be normalised.
+    direction: tuple[float, float, float]
+    #: Irradiance of the key light relative to white.
+    key: float
+    #: Radiance of the sky relative to white.
+    sky: float
+    #: Colour temperature of the key light, kelvin.
+    kelvin: float
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """How light becomes a stored picture; the same for a frame and its clean version."""
+
+    #: Standard deviation of the noise at mid grey, of 1.
+    noise: float
+    #: Quality of the JPEG that the device stores, 1-100; 0 stores without loss.
+    jpeg_quality: int = 0
+    #: Rolling shutter: s from the reading of the first row to that of the last; 0 reads all at
+    #: once.
+    rolling_shutter: float = 0.0
+
+
+@dataclass(frozen=True)
+class HandKey:
+    """One hand at one moment of the track."""
+
+    #: Name in `gestures.toml`.
+    gesture: str
+    #: Centre of the hand, m, relative to the point that the camera looks at.
+    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    #: About the fingers' direction, degrees: 0 shows the back of the hand, 180 the palm.
+    turn: float = 0.0
+    #: Fingers away from the camera (positive) or towards it, degrees.
+    tilt: float = 0.0
+    #: In the picture plane, degrees, clockwise; 0 points the fingers up.
+    roll: float = 0.0
+
+
+@dataclass(frozen=True)
+class Track:
+    """What the hands do: keys that repeat, never twice the same."""
+
+    #: Length of one round, s.
+    period: float
+    #: Keys of each side, spread evenly over the period.
+    keys: Mapping[str, tuple[HandKey, ...]]
+    #: Spread of the angles between rounds, degrees; makes test poses partly unseen.
+    variation: float = 6.0
+
+
+@dataclass(frozen=True)
+class Episode:
+    """A stretch of a capture in which an effect acts."""
+
+    #: First moment, fraction of the capture.
+    start: float
+    #: Last moment, fraction of the capture.
+    end: float
+    #: Severity in its middle, 1-5; it rises and falls at the ends.
+    severity: float
+
+
+@dataclass(frozen=True)
+class EffectCall:
+    """An effect that the scene calls for."""
+
+    #: Name of a registered effect.
+    kind: str
+    #: When it acts.
+    episodes: tuple[Episode, ...]
+    #: Calibrated strengths at severity 1 to 5, or None for the effect's own.
+    strengths: tuple[float, ...] | None = None
+    #: Settings of this effect; each effect checks its own.
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One simulated capture."""
+
+    #: Name of the capture.
+    id: str
+    #: One line for people.
+    title: str
+    #: `right`, `left` or `both`.
+    hands: str
+    #: What the hands do, as the catalogue says it.
+    action: str
+    #: What records it, as the catalogue says it.
+    device: str
+    #: Frames of the whole capture.
+    frame_count: int
+    #: Frames per second of the whole capture.
+    fps: float
+    #: Seed of everything that is random.
+    seed: int
+    #: Whose hands.
+    subject: Subject
+    #: The camera.
+    camera: Camera
+    #: The light where no effect changes it.
+    light: Light
+    #: Name of a backdrop.
+    background: str
+    #: The sensor.
+    sensor: Sensor
+    #: What the hands do.
+    track: Track
+    #: Perturbations.
+    effects: tuple[EffectCall, ...]
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """The hands in the picture, right first."""
+        return ("right", "left") if self.hands == "both" else (self.hands,)
+
+    @property
+    def duration(self) -> float:
+        """Length of the capture, s."""
+        return self.frame_count / self.fps
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the whole content as JSON values, laid out as a scene file is."""
+        content = {"schema": SCHEMA, **asdict(self)}
+        if self.sensor == Sensor(self.sensor.noise):
+            content["noise"] = content.pop("sensor")["noise"]
+        return content
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 of the content; two scenes with the same digest render the same pixels."""
+        return sha256_json(self.to_json())
+
+    def effect(self, kind: str) -> EffectCall | None:
+        """Return the call of one effect, or None."""
+        return next((call for call in self.effects if call.kind == kind), None)

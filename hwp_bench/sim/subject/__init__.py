@@ -1,0 +1,1 @@
+"""Whose hands they are: surface, skin and sleeve."""

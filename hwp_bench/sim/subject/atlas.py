@@ -1,0 +1,99 @@
+"""The skin of a subject as textures, painted once and kept in the cache."""
+
+from __future__ import annotations
+
+import io
+from collections import Counter
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.base.arrays import read_npz
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.files import atomic_write, cache_root, sha256_json
+from hwp_bench.sim.geometry.mesh import unit, vertex_normals
+from hwp_bench.sim.geometry.raycast import Tracer
+from hwp_bench.sim.scene.schema import Subject
+from hwp_bench.sim.subject.hand import SubjectHand, anatomy_at, subject_hand
+from hwp_bench.sim.subject.skin import sample_skin
+
+#: Edge of the skin atlas in texels; about 0.25 mm of skin each.
+ATLAS = 1024
+#: Version of the skin painting; part of the cache key.
+SKIN_VERSION = 2
+
+
+@dataclass(frozen=True, eq=False)
+class SkinAtlas:
+    """Skin of one subject as textures, row 0 at the top (v = 1)."""
+
+    #: (ATLAS, ATLAS, 3) float32, linear reflectance.
+    albedo: np.ndarray
+    #: (ATLAS, ATLAS) float32, m.
+    height: np.ndarray
+    #: (ATLAS, ATLAS) float32, 0-1.
+    roughness: np.ndarray
+
+
+@lru_cache(maxsize=2)
+def skin_atlas(subject: Subject) -> SkinAtlas:
+    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored."""
+    hand = subject_hand(subject, "right")
+    person = [subject.seed, subject.tone, subject.age]
+    key = sha256_json([SKIN_VERSION, ATLAS, hand.template.digest, hand.betas.tolist(), person])
+    path = cache_root() / "sim" / "skin" / f"{key}.npz"
+    if path.exists():
+        try:
+            arrays = read_npz(path)
+            return SkinAtlas(*(arrays[name] for name in ("albedo", "height", "roughness")))
+        except (BadInput, KeyError):
+            path.unlink(missing_ok=True)
+    atlas = _paint(hand, subject)
+    _store(path, atlas)
+    return atlas
+
+
+def _store(path: Path, atlas: SkinAtlas) -> None:
+    buffer = io.BytesIO()
+    np.savez(buffer, albedo=atlas.albedo, height=atlas.height, roughness=atlas.roughness)
+    atomic_write(path, buffer.getvalue())
+
+
+def _paint(hand: SubjectHand, subject: Subject) -> SkinAtlas:
+    from scipy.ndimage import distance_transform_edt
+
+    flat = np.concatenate([hand.corner_uv, np.zeros((*hand.corner_uv.shape[:2], 1))], axis=2)
+    tracer = Tracer(flat.reshape(-1, 3), np.arange(flat.shape[0] * 3).reshape(-1, 3), Counter())
+    ticks = (np.arange(ATLAS) + 0.5) / ATLAS
+    u, v = np.meshgrid(ticks, 1.0 - ticks)
+    origins = np.stack([u.ravel(), v.ravel(), np.ones(ATLAS * ATLAS)], axis=1)
+    down = np.broadcast_to(np.array([0.0, 0.0, -1.0]), origins.shape)
+    hits = tracer.first_hits(origins, down, "atlas")
+    corners = hand.faces[hits.face]
+    template = hand.template
+
+    rest = hand.lift @ (template.vertices + template.shape_basis @ hand.betas)
+    normals = vertex_normals(rest, hand.faces, hand.normal_sum)
+
+    def spread(values: np.ndarray) -> np.ndarray:
+        return np.einsum("nk,nkc->nc", hits.weights, values[corners])
+
+    weights = spread(hand.lift @ template.weights)
+    anatomy = anatomy_at(template, hand.betas, spread(rest), unit(spread(normals)), weights)
+    skin = sample_skin(anatomy, subject)
+    layers = np.zeros((ATLAS * ATLAS, 5), dtype=np.float32)
+    layers[hits.ray] = np.column_stack([skin.albedo, skin.height, skin.roughness])
+    empty = np.ones(ATLAS * ATLAS, dtype=bool)
+    empty[hits.ray] = False
+    # Texels outside the atlas's islands repeat the nearest one inside, so that no seam shows.
+    nearest = distance_transform_edt(
+        empty.reshape(ATLAS, ATLAS), return_distances=False, return_indices=True
+    )
+    layers = layers.reshape(ATLAS, ATLAS, 5)[nearest[0], nearest[1]]
+    return SkinAtlas(
+        np.ascontiguousarray(layers[..., :3]),
+        np.ascontiguousarray(layers[..., 3]),
+        np.ascontiguousarray(layers[..., 4]),
+    )

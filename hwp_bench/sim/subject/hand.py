@@ -1,0 +1,194 @@
+"""A subject: hands with a surface finer than the hand model's, and skin of their own."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hwp_bench.sim.geometry.mesh import normal_operator, smoothing, subdivision, vertex_normals
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.scene.schema import Scene, Subject
+from hwp_bench.sim.subject.anatomy import Anatomy
+from hwp_bench.sim.subject.skin import sample_skin
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+    from hwp_bench.hands import HandTemplate, TemplateTensors
+
+#: Midpoint subdivisions on top of the template: 1,609 vertices become 25,609.
+FINE = 2
+#: Subdivisions of what moves during an exposure: finer detail would be blurred away.
+MOVING = 1
+
+
+@dataclass(frozen=True, eq=False)
+class SubjectHand:
+    """One hand of a subject, ready to be posed."""
+
+    #: The surface before it is refined: the hand model, or another rig of the same joints.
+    template: HandTemplate
+    #: The hand model that parameters refer to.
+    model: HandTemplate
+    #: The same as tensors, float64.
+    tensors: TemplateTensors
+    #: (10,) shape; zeros for a rig without a shape space.
+    betas: np.ndarray
+    #: (16, 3) rest joints of the surface with this shape, m.
+    joints: np.ndarray
+    #: (16, 3) rest joints of the hand model with this shape, m.
+    model_joints: np.ndarray
+    #: (V, T) turns template vertices into those of the fine mesh.
+    lift: csr_matrix
+    #: (F, 3) faces of the fine mesh.
+    faces: np.ndarray
+    #: (F, 3, 2) texture coordinates of the face corners.
+    corner_uv: np.ndarray
+    #: (V, F) sums the faces' vectors up at their corners.
+    normal_sum: csr_matrix
+    #: (V,) m along the normal that no parameter explains.
+    relief: np.ndarray
+    #: Colour that the rig brings along, (H, W, 3) uint8 sRGB, or None to paint skin.
+    texture: np.ndarray | None
+
+    def pose(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Pose the fine mesh.
+
+        Args:
+            pose: (16, 3) axis-angle rad.
+            transl: (3,) m.
+
+        Returns:
+            vertices (V, 3) m and unit normals (V, 3).
+        """
+        coarse = template_vertices(self.tensors, pose, self.betas, transl)
+        smooth = self.lift @ coarse
+        normals = vertex_normals(smooth, self.faces, self.normal_sum)
+        vertices = smooth + self.relief[:, None] * normals
+        return vertices, vertex_normals(vertices, self.faces, self.normal_sum)
+
+
+def template_vertices(
+    tensors: TemplateTensors, pose: np.ndarray, betas: np.ndarray, transl: np.ndarray
+) -> np.ndarray:
+    """Vertices of the hand model itself for one frame: (T, 3) m."""
+    import torch
+
+    from hwp_bench.hands import pose_hand
+
+    kind = tensors.vertices.dtype
+    with torch.no_grad():
+        posed = pose_hand(
+            tensors,
+            torch.as_tensor(pose, dtype=kind)[None],
+            torch.as_tensor(betas, dtype=kind),
+            torch.as_tensor(transl, dtype=kind)[None],
+        )
+    return posed.vertices[0].numpy()
+
+
+def subject_betas(subject: Subject) -> np.ndarray:
+    """Shape parameters of a subject: (10,), within 1.5 standard deviations."""
+    return np.clip(generator(subject.seed, "betas").normal(0.0, 0.7, 10), -1.5, 1.5).round(4)
+
+
+@lru_cache(maxsize=8)
+def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> SubjectHand:
+    """Build one hand of a subject; kept for the next frames.
+
+    Args:
+        subject: whose.
+        side: `right` or `left`.
+        subdivisions: how often each triangle of the template is split in four.
+
+    Raises:
+        UsageError: the subject's model is unknown.
+        BadHandModel: its file is missing or damaged.
+    """
+    import torch
+
+    from hwp_bench.hands import load_template
+
+    texture = None
+    if subject.model.startswith("gltf:"):
+        from hwp_bench.sim.subject.rigs import load_rig
+
+        model = load_template("anny", side)
+        template, texture = load_rig(subject.model.removeprefix("gltf:"), side, model)
+        betas = np.zeros(10)
+    else:
+        template = model = load_template(subject.model, side)
+        betas = subject_betas(subject)
+    faces = template.faces
+    corner_uv = template.uv[template.face_uv]
+    lift = None
+    count = len(template.vertices)
+    for _ in range(subdivisions):
+        step, fine = subdivision(faces, count)
+        corner_uv = _subdivide_corners(corner_uv)
+        lift = step if lift is None else step @ lift
+        faces, count = fine, step.shape[0]
+    lift = (smoothing(faces, count, rounds=2 * subdivisions - 1) @ lift).tocsr()
+    joints = template.joints + template.joint_basis @ betas
+    normal_sum = normal_operator(faces, count)
+    rest = lift @ (template.vertices + template.shape_basis @ betas)
+    normals = vertex_normals(rest, faces, normal_sum)
+    anatomy = anatomy_at(template, betas, rest, normals, lift @ template.weights)
+    return SubjectHand(
+        template=template,
+        model=model,
+        tensors=template.to_torch(dtype=torch.float64),
+        betas=betas,
+        joints=joints,
+        model_joints=model.joints + model.joint_basis @ betas,
+        lift=lift,
+        faces=faces,
+        corner_uv=corner_uv,
+        normal_sum=normal_sum,
+        relief=sample_skin(anatomy, subject).height,
+        texture=texture,
+    )
+
+
+def anatomy_at(
+    template: HandTemplate,
+    betas: np.ndarray,
+    points: np.ndarray,
+    normals: np.ndarray,
+    weights: np.ndarray,
+) -> Anatomy:
+    """The anatomy at places of a rest hand of either side.
+
+    Args:
+        template: the hand.
+        betas: (10,) its shape.
+        points: (N, 3) m.
+        normals: (N, 3) unit.
+        weights: (N, 16) skinning weights.
+    """
+    mirror = np.array([1.0 if template.side == "right" else -1.0, 1.0, 1.0])
+    shaped = template.vertices + template.shape_basis @ betas
+    return Anatomy(
+        points=points * mirror,
+        normals=normals * mirror,
+        weights=weights,
+        joints=(template.joints + template.joint_basis @ betas) * mirror,
+        tips=shaped[template.fingertips] * mirror,
+    )
+
+
+def _subdivide_corners(corners: np.ndarray) -> np.ndarray:
+    """Corner values (F, 3, C) of the four faces that `subdivision` makes of each: (4F, 3, C)."""
+    a, b, c = corners[:, 0], corners[:, 1], corners[:, 2]
+    ab, bc, ca = (a + b) / 2, (b + c) / 2, (c + a) / 2
+    return np.concatenate(
+        [np.stack(face, axis=1) for face in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
+    )
+
+
+def scene_hands(scene: Scene, subdivisions: int = FINE) -> dict[str, SubjectHand]:
+    """The subject's hands that a scene shows, by side."""
+    return {side: subject_hand(scene.subject, side, subdivisions) for side in scene.sides}

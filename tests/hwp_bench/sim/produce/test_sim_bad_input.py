@@ -1,0 +1,135 @@
+"""Bad scenes and killed renders: one clear message, and no half capture taken for a whole one.
+
+Oracle: the contract itself, word for word where a person has to act on it. A disc that fills is
+in `test_sim_disc`.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import psutil
+import pytest
+from tiny_scene import SINGLE
+
+from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.capture import open_capture
+from hwp_bench.cli.main import main
+from hwp_bench.sim.produce.production import render_capture
+from hwp_bench.sim.scene.schema import Scene
+
+FRAMES, SIZE = 24, 32
+
+BAD_SCENES = {
+    "unknown effect": (
+        'kind = "illumination"',
+        'kind = "earthquake"',
+        "effects[1].kind: is 'earthquake'. Known: ",
+        "motion_blur",
+    ),
+    "missing field": ('title = "A small scene"\n', "", "title: is missing", ""),
+    "missing table": ("[camera]\nhandheld = true\nfield_of_view = 24.0\n", "", "camera", "missing"),
+    "object that does not exist": (
+        'object = "block"',
+        'object = "brick"',
+        "effects(hand_object_interaction).items[0].object: there is no object 'brick'. Known: ",
+        "block",
+    ),
+    "severity out of range": (
+        "[[0.3, 0.4, 3]]",
+        "[[0.3, 0.4, 7]]",
+        "effects[1].episodes: severity 7.0 is not in 1..5",
+        "",
+    ),
+    "no TOML": ("[subject]", "[subject", "is not valid TOML", ""),
+}
+
+
+@pytest.mark.parametrize("case", BAD_SCENES)
+@pytest.mark.parametrize("action", ["render", "plan", "preview", "calibrate"])
+def test_a_bad_scene_is_one_line(
+    case: str, action: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    old, new, *words = BAD_SCENES[case]
+    assert old in SINGLE
+    path = tmp_path / "mine.toml"
+    path.write_text(SINGLE.replace(old, new))
+    out = [] if action in ("plan", "calibrate") else ["-o", str(tmp_path / "out")]
+    assert main(["sim", action, str(path), *out]) == BadInput.exit_status
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.count("\n") == 1
+    for word in (str(path), *words):
+        assert word in shown.err
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_severity_out_of_range_names_the_range(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "out"
+    assert main(["sim", "render", "capture0", "-o", str(out), "--severity", "9"]) == 2
+    assert "severity: 9.0 is not in 1..5" in capsys.readouterr().err
+    assert not out.exists()
+
+
+def _finished(folder: Path) -> int:
+    return len(list(folder.glob(".capture.*/*.npz")))
+
+
+def _wait_for(condition: Callable[[], bool]) -> None:
+    # The suite's own time limit ends a wait that never comes true.
+    while not condition():
+        time.sleep(0.02)
+
+
+@pytest.mark.slow
+def test_a_killed_render_leaves_no_capture_and_goes_on(tmp_path: Path) -> None:
+    path, out = tmp_path / "tiny.toml", tmp_path / "capture"
+    path.write_text(SINGLE)
+    extent = ["--frames", str(FRAMES), "--size", str(SIZE), "--workers", "2"]
+    command = ["sim", "render", str(path), "-o", str(out), *extent]
+    with subprocess.Popen([sys.executable, "-m", "hwp_bench.cli.main", *command]) as process:
+        _wait_for(lambda: _finished(tmp_path) >= 2 or process.poll() is not None)
+        workers = psutil.Process(process.pid).children()
+        process.send_signal(signal.SIGKILL)
+    assert process.returncode == -signal.SIGKILL
+    assert not out.exists()
+    with pytest.raises(BadInput):
+        open_capture(out)
+    # The processes that it had started end by themselves.
+    _, left = psutil.wait_procs(workers, timeout=60.0)
+    assert not left
+    assert 2 <= _finished(tmp_path) < FRAMES
+    assert main(command) == 0
+    assert len(open_capture(out)) == FRAMES
+    assert {entry.name for entry in tmp_path.iterdir()} == {"tiny.toml", "capture"}
+
+
+@pytest.mark.slow
+def test_a_killed_worker_is_one_clear_error(
+    make_scene: Callable[..., Scene], tmp_path: Path
+) -> None:
+    out, scene = tmp_path / "capture", make_scene()
+    before = set(psutil.Process().children())
+
+    def kill_one() -> None:
+        _wait_for(lambda: _finished(tmp_path) >= 2)
+        worker = next(iter(set(psutil.Process().children()) - before))
+        os.kill(worker.pid, signal.SIGKILL)
+
+    killer = threading.Thread(target=kill_one, daemon=True)
+    killer.start()
+    with pytest.raises(HwpError, match="status -9") as caught:
+        render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=2)
+    killer.join()
+    assert "the same command goes on" in str(caught.value)
+    assert not out.exists()
+    assert not set(psutil.Process().children()) - before  # the other worker was ended

@@ -1,0 +1,105 @@
+"""`hwp-bench sim`: results on stdout, one clear line for what is asked wrongly."""
+
+from __future__ import annotations
+
+import json
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from tiny_scene import SINGLE
+
+from hwp_bench.cli.main import main
+from hwp_bench.sim.produce.calibration import TARGETS, Calibration, calibrate, write_strengths
+from hwp_bench.sim.scene.reader import load_scene
+from hwp_bench.sim.scene.schema import Scene
+
+SceneMaker = Callable[..., Scene]
+
+
+@pytest.fixture
+def scene_file(tmp_path: Path) -> Path:
+    path = tmp_path / "tiny.toml"
+    path.write_text(SINGLE)
+    return path
+
+
+def test_list_names_scenes_and_parts(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["sim", "list", "--json"]) == 0
+    content = json.loads(capsys.readouterr().out)
+    assert len(content["scenes"]) == 11
+    assert "phone" in content["objects"]
+
+
+def test_plan_counts_without_rendering(
+    scene_file: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    command = ["sim", "plan", str(scene_file), "--frames", "40", "--no-probe", "--json"]
+    assert main(command) == 0
+    (report,) = json.loads(capsys.readouterr().out)
+    assert report["passes"]["hands"] == 40
+    assert report["seconds"] is None
+
+
+def test_render_and_preview(
+    scene_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    out = tmp_path / "capture"
+    extent = ["--frames", "10", "--size", "32", "--severity", "2", "--workers", "1"]
+    assert main(["sim", "render", str(scene_file), "-o", str(out), *extent]) == 0
+    assert (out / "capture.json").is_file()
+    assert main(["sim", "render", str(scene_file), "-o", str(out), *extent]) == 2
+    assert "exists" in capsys.readouterr().err
+    command = ["sim", "preview", str(scene_file), "-o", str(tmp_path), "--frames", "10"]
+    assert main([*command, "--size", "32"]) == 0
+    assert (tmp_path / "tiny-sheet.png").is_file()
+    assert (tmp_path / "tiny.gif").read_bytes()[:4] == b"GIF8"
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["render"],
+        ["render", "capture0"],
+        ["render", "capture99", "-o", "x"],
+        ["render", "capture0", "--suite", "mini"],
+        ["render", "--suite", "mini", "--size", "64"],
+        ["render", "capture0", "-o", "x", "--severity", "9"],
+        ["preview", "capture0", "--frames", "1"],
+    ],
+)
+def test_wrong_requests_end_with_status_2(
+    words: list[str],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert main(["sim", *words]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_calibration_finds_the_stated_loss(make_scene: SceneMaker) -> None:
+    # Dimming has a closed relation of strength and loss, so the solved losses are close.
+    scene = make_scene()
+    call = scene.effect("illumination")
+    assert call is not None
+    result = calibrate(scene, call, size=40)
+    assert list(result.strengths) == sorted(result.strengths)
+    np.testing.assert_allclose(result.measured, TARGETS["illumination"], atol=0.7)
+
+
+def test_strengths_are_written_into_the_file(scene_file: Path) -> None:
+    item = Calibration("illumination", "psnr", (0.1, 0.2, 0.3, 0.4, 0.5), (1.0,) * 5, (1.0,) * 5)
+    write_strengths(scene_file, [item])
+    write_strengths(scene_file, [item])  # a second time replaces
+    assert scene_file.read_text().count("strengths = ") == 1
+    call = load_scene(scene_file).effect("illumination")
+    assert call is not None
+    assert call.strengths == item.strengths
+    rest = {key: value for key, value in tomllib.loads(SINGLE).items() if key != "effects"}
+    assert rest.items() <= tomllib.loads(scene_file.read_text()).items()

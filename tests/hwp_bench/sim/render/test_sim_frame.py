@@ -1,0 +1,176 @@
+"""Frames: only what the recipe calls for is rendered, and it is what the recipe says.
+
+Oracles: the scene without an effect (bit for bit), counts of rays, and energy conservation.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SINGLE
+
+from hwp_bench.sim.effects.plan import SUBFRAME_STEP, plan
+from hwp_bench.sim.produce.forecast import forecast, plan_table
+from hwp_bench.sim.render.frame import FrameResult, render_frame
+from hwp_bench.sim.scene.schema import Scene, Sensor
+from hwp_bench.sim.scene.variants import with_effects
+
+SceneMaker = Callable[..., Scene]
+COUNT, SIZE = 40, 48
+
+
+@pytest.fixture
+def render(make_scene: SceneMaker) -> Callable[[int], FrameResult]:
+    scene = make_scene()
+    return lambda frame: render_frame(scene, frame, COUNT, SIZE)
+
+
+def test_a_frame_shows_a_hand(render: Callable[[int], FrameResult]) -> None:
+    result = render(CLEAN)
+    assert result.rgb.shape == (SIZE, SIZE, 3)
+    assert 0.1 < result.coverage.mean() < 0.6
+    assert result.coverage.max() == 1.0
+    hand = result.rgb[result.coverage == 1.0].astype(float)
+    assert hand[:, 0].mean() > hand[:, 1].mean() > hand[:, 2].mean()
+    assert hand.std() > 5.0
+
+
+def test_an_unperturbed_frame_is_its_clean_version(
+    render: Callable[[int], FrameResult],
+) -> None:
+    result = render(CLEAN)
+    assert result.plan.passes == ("hands", "shadow", "sky", "backdrop", "sensor")
+    assert set(result.cost.rays) == {"hands", "shadow", "sky"}
+    np.testing.assert_array_equal(result.rgb, result.clean)
+
+
+@pytest.mark.parametrize(
+    ("frame", "kind", "extra"),
+    [
+        (OBJECT, "hand_object_interaction", "objects"),
+        (LIGHT, "illumination", "light"),
+        (BLUR, "motion_blur", "shutter"),
+    ],
+)
+def test_an_effect_changes_its_frames_and_no_other(
+    make_scene: SceneMaker, frame: int, kind: str, extra: str
+) -> None:
+    scene = make_scene()
+    with_it = render_frame(scene, frame, COUNT, SIZE)
+    assert extra in with_it.plan.passes
+    assert (with_it.rgb != with_it.clean).mean() > 0.02
+    without = with_effects(scene, [call.kind for call in scene.effects if call.kind != kind])
+    bare = render_frame(without, frame, COUNT, SIZE)
+    np.testing.assert_array_equal(bare.rgb, bare.clean)
+    for other in {CLEAN, OBJECT, LIGHT, BLUR} - {frame}:
+        before = render_frame(scene, other, COUNT, SIZE)
+        after = render_frame(without, other, COUNT, SIZE)
+        np.testing.assert_array_equal(before.rgb, after.rgb)
+        np.testing.assert_array_equal(before.coverage, after.coverage)
+        assert before.cost.rays == after.cost.rays
+
+
+def test_rays_are_those_of_the_passes(render: Callable[[int], FrameResult]) -> None:
+    clean, thing, blurred = (render(frame).cost.rays for frame in (CLEAN, OBJECT, BLUR))
+    assert clean["objects"] == blurred["objects"] == 0 < thing["objects"]
+    assert thing["sky"] == clean["sky"] == blurred["sky"]
+    # A frame with an object is cast twice: once clean, once with it.
+    assert thing["hands"] > 1.5 * thing["objects"] > 0
+    # A sub-frame casts one ray a pixel, the clean instant four.
+    recipe = render(BLUR).plan
+    assert recipe.subframes >= 4
+    assert blurred["hands"] < (4 + 2 * recipe.subframes) * SIZE * SIZE
+
+
+def test_subframes_follow_the_motion_on_the_screen(make_scene: SceneMaker) -> None:
+    scene = make_scene()
+    counts = [
+        plan(scene, BLUR, COUNT, 256, {"motion_blur": strength}).subframes
+        for strength in (0.001, 0.02, 0.04, 0.08)
+    ]
+    assert counts == sorted(counts)
+    assert counts[-1] >= 0.08 * 256 / SUBFRAME_STEP / 1.5
+    assert plan(scene, CLEAN, COUNT, 256).subframes == 1
+
+
+def test_blur_moves_light_but_makes_none(make_scene: SceneMaker) -> None:
+    # Oracle: the exposure is a mean of instants, so the picture's mean hardly changes.
+    scene = replace(make_scene(), sensor=Sensor(noise=0.0))
+    result = render_frame(scene, BLUR, COUNT, SIZE)
+    assert abs(result.rgb.mean() - result.clean.mean()) < 0.04 * result.clean.mean()
+    # A smeared edge has the same step in all, but spread over more pixels: smaller squares.
+    steepness = [
+        sum(float(np.square(np.diff(picture.astype(float), axis=axis)).sum()) for axis in (0, 1))
+        for picture in (result.rgb, result.clean)
+    ]
+    assert steepness[0] < steepness[1]
+    partial = (result.coverage > 0.02) & (result.coverage < 0.98)
+    clean_partial = (result.clean_coverage > 0.02) & (result.clean_coverage < 0.98)
+    assert partial.sum() > clean_partial.sum()
+
+
+def test_an_object_covers_what_the_mask_loses(render: Callable[[int], FrameResult]) -> None:
+    result = render(OBJECT)
+    lost = result.clean_coverage - result.coverage
+    assert lost.min() > -1e-9
+    assert lost.sum() > 5.0
+
+
+def test_dimming_is_a_factor_on_linear_light(make_scene: SceneMaker) -> None:
+    from hwp_bench.base.colors import srgb_to_linear
+
+    scene = replace(make_scene(), sensor=Sensor(noise=0.0))
+    result = render_frame(scene, LIGHT, COUNT, SIZE)
+    bright = srgb_to_linear(result.clean / 255.0)
+    dim = srgb_to_linear(result.rgb / 255.0)
+    ratio = dim[bright > 0.1] / bright[bright > 0.1]
+    expected = 2.0 ** -result.plan.strength["illumination"]
+    np.testing.assert_allclose(np.median(ratio), expected, rtol=0.02)
+
+
+def test_frames_depend_on_the_seed_alone(make_scene: SceneMaker) -> None:
+    first = render_frame(make_scene(), OBJECT, COUNT, SIZE)
+    again = render_frame(make_scene(), OBJECT, COUNT, SIZE)
+    other = render_frame(make_scene(("seed = 5\n", "seed = 6\n")), OBJECT, COUNT, SIZE)
+    np.testing.assert_array_equal(first.rgb, again.rgb)
+    assert (first.rgb != other.rgb).any()
+
+
+def test_a_scene_without_objects_imports_none() -> None:
+    program = f"""
+import sys
+from hwp_bench.sim.scene.reader import parse_scene
+from hwp_bench.sim.scene.variants import with_effects
+from hwp_bench.sim.render.frame import render_frame
+scene = with_effects(parse_scene('''{SINGLE}''', where='tiny'), ['illumination'])
+render_frame(scene, {LIGHT}, {COUNT}, {SIZE})
+print(sorted(name for name in sys.modules if name.startswith('hwp_bench.sim.props.')))
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program], capture_output=True, text=True, check=True
+    )
+    # What gives out objects by name, and the backdrop; no module that builds an object.
+    assert done.stdout.strip() == "['hwp_bench.sim.props.backdrop', 'hwp_bench.sim.props.objects']"
+
+
+def test_the_forecast_is_the_sum_of_what_is_called_for(make_scene: SceneMaker) -> None:
+    scene = make_scene()
+    report = forecast(scene, COUNT, SIZE)
+    assert report.passes["hands"] == COUNT
+    assert report.passes["objects"] == report.groups["hand_object_interaction"]
+    assert sum(report.groups.values()) == COUNT
+    assert report.rays is not None
+    clean = render_frame(scene, CLEAN, COUNT, SIZE).cost.rays.total()
+    # Clean frames differ in pose only; their rays differ by how much of the picture they fill.
+    assert 0.5 < report.rays["clean"] / (report.groups["clean"] * clean) < 2.0
+    assert "| tiny | clean |" in plan_table([report])
+    shares, seconds = report.shares(), report.seconds
+    assert shares is not None
+    assert seconds is not None
+    assert set(shares) == {"clean", *(call.kind for call in scene.effects)}
+    assert sum(shares.values()) == pytest.approx(sum(seconds.values()))

@@ -1,0 +1,125 @@
+"""Scenes: the catalogue is their oracle, and a damaged scene is refused by file and field."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from tiny_scene import SINGLE
+
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.sim.produce.suites import suite, suite_names
+from hwp_bench.sim.scene.episodes import clean_share, level, moments, severity
+from hwp_bench.sim.scene.reader import load_scene, parse_scene, scene_names
+from hwp_bench.sim.scene.schema import CLEAN_FROM, MIN_CLEAN_SHARE, Scene
+from hwp_bench.sim.scene.variants import with_effects, with_severity, with_subject
+from hwp_bench.taxonomy import catalogue
+
+SceneMaker = Callable[..., Scene]
+
+
+def test_every_catalogue_capture_has_its_scene() -> None:
+    assert set(scene_names()) == set(catalogue())
+
+
+@pytest.mark.parametrize("name", sorted(catalogue()))
+def test_scene_says_what_the_catalogue_says(name: str) -> None:
+    scene, entry = load_scene(name), catalogue()[name]
+    assert scene.id == name
+    assert (scene.action, scene.device) == (entry.action, entry.device)
+    assert scene.frame_count == entry.frame_count
+    assert (scene.hands == "both") == (entry.hands == "interacting")
+    assert {call.kind for call in scene.effects} == set(entry.perturbations)
+    assert scene.camera.handheld == (entry.device == "Mobile phone")
+    assert clean_share(scene) >= MIN_CLEAN_SHARE
+
+
+@pytest.mark.parametrize("name", suite_names())
+def test_enough_training_frames_of_every_suite_are_clean(name: str) -> None:
+    # Frames are few in small suites, so that a share of the time is not yet one of the frames.
+    for item in suite(name):
+        split = contiguous_split(item.scene.id, item.frame_count)
+        when = moments(item.frame_count)[split.train]
+        clean = [not any(level(call, moment) for call in item.scene.effects) for moment in when]
+        assert sum(clean) >= MIN_CLEAN_SHARE * len(clean), (item.scene.id, sum(clean), len(clean))
+
+
+@pytest.mark.parametrize("name", sorted(catalogue()))
+def test_nothing_acts_in_validation_and_test(name: str) -> None:
+    scene = load_scene(name)
+    for call in scene.effects:
+        assert all(level(call, m / 1000) == 0.0 for m in range(int(1000 * CLEAN_FROM) + 1, 1001))
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "field"),
+    [
+        ('title = "A small scene"\n', "", "title"),
+        ("seed = 5", "seed = -5", "seed"),
+        ("fps = 20.0", "fps = nan", "fps"),
+        ("tone = 0.22", "tone = 1.5", "subject.tone"),
+        ("tone = 0.22", "tone = true", "subject.tone"),
+        ("handheld = true", "handheld = 1", "camera.handheld"),
+        ("kelvin = 5200.0", "kelvin = 5200.0\nglow = 1", "light.glow"),
+        ("direction = [-0.5, -0.9, -0.8]", "direction = [0, 0, 0]", "light.direction"),
+        ("direction = [-0.5, -0.9, -0.8]", "direction = [0, 0]", "light.direction"),
+        ('gesture = "fist"', 'gesture = "fits"', "track.right[1].gesture"),
+        ('kind = "illumination"', 'kind = "earthquake"', "effects[1].kind"),
+        ("[[0.3, 0.4, 3]]", "[[0.3, 0.4, 7]]", "effects[1].episodes"),
+        ("[[0.3, 0.4, 3]]", "[[0.4, 0.3, 3]]", "effects[1].episodes"),
+        ("[[0.3, 0.4, 3]]", "[[0.3, 0.9, 3]]", "effects[1].episodes"),
+        ("[[0.3, 0.4, 3]]", "[[0.21, 0.79, 3]]", "effects"),
+        ('object = "block"', 'object = "brick"', "object"),
+        ('anchor = "right"', 'anchor = "left"', "anchor"),
+        ('background = "studio"', 'background = "moon"', "background"),
+        ('[[effects]]\nkind = "illumination"', '[[effects]]\nkind = "motion_blur"', "effects"),
+    ],
+)
+def test_damage_is_named(make_scene: SceneMaker, old: str, new: str, field: str) -> None:
+    with pytest.raises(BadInput) as caught:
+        make_scene((old, new))
+    assert caught.value.where == "tiny.toml"
+    assert field in str(caught.value)
+
+
+def test_unknown_scene_lists_the_known_ones() -> None:
+    with pytest.raises(UsageError, match="capture10"):
+        load_scene("capture11")
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_any_damaged_text_is_bad_input_or_a_scene(data: st.DataObject) -> None:
+    start = data.draw(st.integers(0, len(SINGLE) - 1))
+    length = data.draw(st.integers(0, 30))
+    middle = data.draw(st.text(st.characters(codec="utf-8"), max_size=12))
+    try:
+        scene = parse_scene(SINGLE[:start] + middle + SINGLE[start + length :], where="tiny.toml")
+    except BadInput:
+        return
+    assert clean_share(scene) >= MIN_CLEAN_SHARE
+
+
+def test_severity_rises_and_falls_within_an_episode(make_scene: SceneMaker) -> None:
+    call = make_scene().effects[0]
+    inside = [severity(call, 0.05 + 0.15 * step / 40) for step in range(1, 40)]
+    peak = inside.index(max(inside))
+    assert max(inside) == 4
+    assert inside[: peak + 1] == sorted(inside[: peak + 1])
+    assert min(inside) >= 1
+
+
+def test_variants_change_what_they_say(make_scene: SceneMaker) -> None:
+    scene = make_scene()
+    mild = with_severity(scene, 2)
+    assert {part.severity for call in mild.effects for part in call.episodes} == {2.0}
+    other = with_subject(scene, 9)
+    assert other.subject != scene.subject
+    assert with_subject(scene, 9) == other
+    assert [call.kind for call in with_effects(scene, ["motion_blur"]).effects] == ["motion_blur"]
+    assert len({scene.digest, mild.digest, other.digest}) == 3
+    with pytest.raises(UsageError):
+        with_severity(scene, 6)

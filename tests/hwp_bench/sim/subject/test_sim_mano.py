@@ -1,0 +1,100 @@
+"""MANO as a subject, for those who have it: here a made-up file in its format.
+
+Oracle: the hand model itself, posed with the true parameters, projected and filled by OpenCV.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from synthetic_mano import write_mirrored_mano
+
+from hwp_bench.base.errors import BadHandModel
+from hwp_bench.capture import Capture
+from hwp_bench.hands import load_template, pose_hand, project
+from hwp_bench.sim.produce.production import render_capture
+from hwp_bench.sim.scene.schema import Scene
+
+FRAMES, SIZE = 10, 64
+
+
+@pytest.fixture
+def model(tmp_path: Path) -> str:
+    return f"mano:{write_mirrored_mano(tmp_path / 'mano')}"
+
+
+def _silhouette(capture: Capture, frame: int, side: str) -> np.ndarray:
+    """(S, S) bool: the model in the true pose, every face filled."""
+    truth = capture.true_hands
+    assert truth is not None
+    hand = truth[side]
+    template = load_template(capture.info.hand_model.source, side)
+    posed = pose_hand(
+        template.to_torch(dtype=torch.float64),
+        *(torch.as_tensor(array) for array in (hand.pose, hand.betas, hand.transl)),
+    )
+    pixels, _ = project(
+        posed.vertices,
+        torch.as_tensor(capture.cameras.viewmats),
+        torch.as_tensor(capture.cameras.Ks),
+    )
+    corners = pixels[frame].numpy()[template.faces]
+    filled = np.zeros((SIZE, SIZE), dtype=np.uint8)
+    # OpenCV counts from the middle of the first pixel, in sixteenths here.
+    for corner in np.round((corners - 0.5) * 16).astype(np.int32):
+        cv2.fillConvexPoly(filled, corner, 1, shift=4)
+    return filled > 0
+
+
+def test_the_subject_is_the_model_in_the_true_pose(
+    model: str, make_scene: Callable[..., Scene], tmp_path: Path
+) -> None:
+    scene = make_scene()
+    scene = replace(scene, subject=replace(scene.subject, model=model))
+    capture = render_capture(scene, tmp_path / "capture", frame_count=FRAMES, size=SIZE, workers=1)
+    template = load_template(model, "right")
+    assert capture.info.hand_model.digest == template.digest
+    assert capture.info.hand_model.source == model
+    last = FRAMES - 1
+    shown = capture.true_mask(last) > 127
+    expected = _silhouette(capture, last, "right")
+    # The sleeve hides the wrist; smoothing and relief move the rim by less than a pixel.
+    rim = cv2.dilate(expected.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0
+    assert (shown & ~rim).sum() <= 0.01 * shown.sum()
+    assert (shown & expected).sum() / expected.sum() > 0.75
+    assert capture.frame(last)[shown].std() > 3.0  # painted and lit, not flat
+
+
+def test_both_hands_are_the_model(
+    model: str, make_scene: Callable[..., Scene], tmp_path: Path
+) -> None:
+    scene = make_scene(
+        ('hands = "right"', 'hands = "both"'),
+        (
+            '{ gesture = "open" }',
+            '{ gesture = "open", place = [0.07, 0.0, 0.0] }',
+        ),
+        ("right = [", 'left = [{ gesture = "open", place = [-0.07, 0.0, 0.0] }]\nright = ['),
+    )
+    scene = replace(scene, subject=replace(scene.subject, model=model), effects=())
+    capture = render_capture(scene, tmp_path / "capture", frame_count=FRAMES, size=SIZE, workers=1)
+    shown = capture.true_mask(0) > 127
+    for side in ("right", "left"):
+        expected = _silhouette(capture, 0, side)
+        assert (shown & expected).sum() / expected.sum() > 0.7
+
+
+def test_a_missing_model_is_one_clear_error(
+    make_scene: Callable[..., Scene], tmp_path: Path
+) -> None:
+    scene = make_scene()
+    scene = replace(scene, subject=replace(scene.subject, model=f"mano:{tmp_path / 'nowhere'}"))
+    with pytest.raises(BadHandModel, match="nowhere"):
+        render_capture(scene, tmp_path / "capture", frame_count=FRAMES, size=SIZE, workers=1)
+    assert not (tmp_path / "capture").exists()

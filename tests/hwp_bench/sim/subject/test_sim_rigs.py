@@ -1,0 +1,130 @@
+"""Rigged glTF hands: the oracle is the free hand itself, written as glTF in another frame."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from hwp_bench.base.errors import BadHandModel
+from hwp_bench.hands import HandTemplate, load_template
+from hwp_bench.sim.render.frame import render_frame
+from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.subject.rigs import OPENXR, WEBXR, load_rig
+
+pygltflib = pytest.importorskip("pygltflib")
+
+# Another frame and unit: turned, ten times larger, elsewhere.
+_TURN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+_SCALE, _SHIFT = 10.0, np.array([1.0, 2.0, 3.0])
+
+
+def write_gltf(path: Path, template: HandTemplate, names: tuple[str, ...]) -> Path:
+    """Write a template as a binary glTF, its vertices split along the seams."""
+    corners = template.faces.reshape(-1)
+    pairs, faces = np.unique(
+        np.stack([corners, template.face_uv.reshape(-1)], axis=1), axis=0, return_inverse=True
+    )
+
+    def moved(points: np.ndarray) -> np.ndarray:
+        return _SCALE * points @ _TURN.T + _SHIFT
+
+    weights = template.weights[pairs[:, 0]]
+    strongest = np.argsort(-weights, axis=1)[:, :4]
+    inverse = np.tile(np.eye(4), (len(names), 1, 1))
+    inverse[:, :3, 3] = -moved(template.joints)
+    arrays = [
+        (moved(template.vertices)[pairs[:, 0]].astype("<f4"), "VEC3", 5126),
+        ((template.uv[pairs[:, 1]] * [1, -1] + [0, 1]).astype("<f4"), "VEC2", 5126),
+        (strongest.astype("<u2"), "VEC4", 5123),
+        (np.take_along_axis(weights, strongest, axis=1).astype("<f4"), "VEC4", 5126),
+        (faces.reshape(-1).astype("<u4"), "SCALAR", 5125),
+        (inverse.transpose(0, 2, 1).reshape(-1, 16).astype("<f4"), "MAT4", 5126),
+    ]
+    file = pygltflib.GLTF2()
+    blob = b""
+    for array, kind, component in arrays:
+        view = pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=array.nbytes)
+        file.bufferViews.append(view)
+        file.accessors.append(
+            pygltflib.Accessor(
+                bufferView=len(file.accessors), componentType=component, count=len(array), type=kind
+            )
+        )
+        blob += array.tobytes()
+    file.buffers.append(pygltflib.Buffer(byteLength=len(blob)))
+    attributes = pygltflib.Attributes(POSITION=0, TEXCOORD_0=1, JOINTS_0=2, WEIGHTS_0=3)
+    primitive = pygltflib.Primitive(attributes=attributes, indices=4)
+    file.meshes.append(pygltflib.Mesh(primitives=[primitive]))
+    joints = list(range(1, len(names) + 1))
+    file.skins.append(pygltflib.Skin(joints=joints, inverseBindMatrices=5))
+    file.nodes.append(pygltflib.Node(mesh=0, skin=0))
+    file.nodes += [pygltflib.Node(name=name) for name in names]
+    file.set_binary_blob(blob)
+    file.save_binary(str(path))
+    return path
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+@pytest.mark.parametrize("scheme", ["webxr", "openxr"])
+def test_a_rig_becomes_the_hand_that_it_was(tmp_path: Path, scheme: str, side: str) -> None:
+    names = WEBXR if scheme == "webxr" else tuple(f"{name.title()}_R" for name in OPENXR)
+    path = write_gltf(tmp_path / "hand.glb", load_template("anny", "right"), names)
+    model = load_template("anny", side)
+    rig, texture = load_rig(str(path), side, model)
+    assert texture is None
+    assert rig.side == side
+    np.testing.assert_allclose(rig.joints, model.joints, atol=1e-5)
+    # Same vertices in another order: nearest neighbours, and the welded count.
+    from scipy.spatial import cKDTree
+
+    distance, pick = cKDTree(model.vertices).query(rig.vertices)
+    assert len(rig.vertices) == len(model.vertices)
+    assert distance.max() < 1e-5
+    assert np.abs(rig.weights - model.weights[pick]).max() < 0.05
+    np.testing.assert_allclose(
+        rig.vertices[rig.fingertips], model.vertices[model.fingertips], atol=0.006
+    )
+
+
+def test_a_scene_shows_the_rig(tmp_path: Path, make_scene: Callable[..., Scene]) -> None:
+    path = write_gltf(tmp_path / "hand_right.glb", load_template("anny", "right"), WEBXR)
+    scene = make_scene(("age = 31.0", f'age = 31.0\nmodel = "gltf:{path}"'))
+    result = render_frame(scene, 36, 40, 48)
+    own = render_frame(make_scene(), 36, 40, 48)
+    both = (result.coverage > 0.5) & (own.coverage > 0.5)
+    either = (result.coverage > 0.5) | (own.coverage > 0.5)
+    # The subject's shape is not the rig's, but the pose is.
+    assert both.sum() / either.sum() > 0.7
+
+
+def test_missing_joints_are_named(tmp_path: Path) -> None:
+    names = (*WEBXR[:5], "tentacle", *WEBXR[6:])
+    path = write_gltf(tmp_path / "hand.glb", load_template("anny", "right"), names)
+    with pytest.raises(BadHandModel, match=WEBXR[5]):
+        load_rig(str(path), "right", load_template("anny", "right"))
+    with pytest.raises(BadHandModel, match="does not exist"):
+        load_rig(str(tmp_path / "none.glb"), "right", load_template("anny", "right"))
+
+
+@settings(max_examples=25, deadline=None)
+@given(data=st.data())
+def test_damaged_files_are_refused_or_read(
+    data: st.DataObject, tmp_path_factory: pytest.TempPathFactory
+) -> None:
+    folder = tmp_path_factory.mktemp("rig")
+    model = load_template("anny", "right")
+    path = write_gltf(folder / "hand.glb", model, WEBXR)
+    raw = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        raw[data.draw(st.integers(0, 4000))] = data.draw(st.integers(0, 255))
+    path.write_bytes(raw[: data.draw(st.integers(100, len(raw)))])
+    try:
+        rig, _ = load_rig(str(path), "right", model)
+    except BadHandModel:
+        return
+    assert np.isfinite(rig.vertices).all()
