@@ -43,19 +43,24 @@ class _File:
     results: Results
 
 
-def entry_name(results: Results) -> str:
-    """Return the name of an entry: method, suite, what sets it apart, and part of its digest."""
+def entry_name(results: Results, content: str | None = None) -> str:
+    """Return the name of an entry: method, suite, what sets it apart, and part of its digest.
+
+    Args:
+        results: the results.
+        content: their digest; None computes it.
+    """
     parts = [results.method.name, results.suite]
     if results.budget.get("seconds"):
         parts.append(f"{results.budget['seconds']:g}s")
     if results.budget.get("steps"):
         parts.append(f"{results.budget['steps']:g}steps")
-    parts += [f"seed{results.seed}", digest(results)[:8]]
+    parts += [f"seed{results.seed}", (content or digest(results))[:8]]
     return re.sub(r"[^a-z0-9.]+", "-", "-".join(parts).lower()).strip("-.")
 
 
 def digest(results: Results) -> str:
-    """Return the SHA-256 (hex) of a result's canonical spelling."""
+    """Return the SHA-256 (hex) of a result's canonical JSON."""
     return sha256_json(asdict(results))
 
 
@@ -70,10 +75,10 @@ def add_entry(folder: Path, results: Results) -> Path:
     check_entries([*read_entries(folder), entry])
     value = {"schema": SCHEMA, "digest": digest(results), "results": asdict(results)}
     # One line a capture keeps the file small and its changes readable.
-    return atomic_write(folder / f"{entry.name}.json", _spell(value))
+    return atomic_write(folder / f"{entry.name}.json", _file_text(value))
 
 
-def _spell(value: dict[str, Any]) -> str:
+def _file_text(value: dict[str, Any]) -> str:
     results = dict(value["results"])
     captures = results.pop("captures")
     head = json.dumps({**value, "results": results}, allow_nan=False)
@@ -93,18 +98,20 @@ def read_entries(folder: Path) -> list[Entry]:
 
 
 def _read(file: Path) -> Entry:
-    value = read_json(file, max_bytes=MAX_ENTRY_BYTES)
-    entry = parse_record(_File, without_schema(value, SCHEMA, where=file), where=file)
+    value = without_schema(read_json(file, max_bytes=MAX_ENTRY_BYTES), SCHEMA, where=file)
+    entry = parse_record(_File, value, where=file)
     results = entry.results
-    if entry.digest != digest(results):
+    # The digest is of the file's own fields: an old file lacks those that were added later.
+    content = sha256_json(value["results"])
+    if entry.digest != content:
         raise BadResult(
             "is not the digest of the content: the entry was changed by hand",
             where=file,
             field="digest",
             remedy="Make it again with `hwp-bench leaderboard add RESULTS`.",
         )
-    if file.stem != entry_name(results):
-        raise BadResult(f"must be called {entry_name(results)}.json", where=file)
+    if file.stem != entry_name(results, content):
+        raise BadResult(f"must be called {entry_name(results, content)}.json", where=file)
     return Entry(file.stem, results)
 
 

@@ -1,10 +1,13 @@
-"""The result file: its records, how it is found, and reading that checks what it is given."""
+"""The result file: its records, how it is found, and reading that checks what it is given.
+
+A field that was added within a version has a default, which says what files without it mean.
+"""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -131,8 +134,9 @@ class Results:
     seed: int
     #: Limits of the fit: `seconds`, `steps`, either may be None.
     budget: dict[str, Any]
-    #: Training frames that the method was given: `perturbed`, or an oracle's choice.
-    frames: str
+    #: Training frames that the method was given: `perturbed`, or an oracle's choice. The oldest
+    #: files do not say it: there was nothing to choose.
+    frames: str = field(default="perturbed", kw_only=True)
     #: Settings of every protocol that was scored, by name.
     protocols: dict[str, Any]
     #: Versions, processor, system.
@@ -187,9 +191,7 @@ def result_files(path: str | os.PathLike[str]) -> list[Path]:
     record = place / ABLATION if place.is_dir() else place
     if record.name != ABLATION or not record.is_file():
         return [place / "results.json" if place.is_dir() else place]
-    value = read_json(record)
-    if not isinstance(value, dict) or value.get("schema") != ABLATION_SCHEMA:
-        raise BadResult(f"is no ablation of schema {ABLATION_SCHEMA}", where=record)
+    value = without_schema(read_json(record), ABLATION_SCHEMA, where=record)
     try:
         names = [name for variant in value["variants"] for name in variant["results"]]
         return [inside(record.parent, name) for name in names]
