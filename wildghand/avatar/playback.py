@@ -1,4 +1,4 @@
-"""Drawing an avatar along the poses of a capture, to pictures and a video."""
+"""RenderedFrames an avatar along the poses of a capture, to pictures and a video."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def render_clip(
         )
     info, seconds, pictures = capture.info, 0.0, []
     with atomic_folder(out, overwrite=overwrite) as folder:
-        for frame in track(frames, "Drawing"):
+        for frame in track(frames, "RenderedFrames"):
             camera = Camera(
                 capture.cameras.Ks[frame], capture.cameras.viewmats[frame], info.width, info.height
             )

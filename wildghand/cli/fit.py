@@ -92,7 +92,7 @@ def _run(args: argparse.Namespace, world: World) -> int:
         overwrite=args.overwrite,
         world=world,
     )
-    if not world.leads:
+    if not world.is_main:
         return 0
     record = avatar.record
     if args.json:
@@ -118,12 +118,12 @@ def _settings(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def _shared_capture(args: argparse.Namespace, world: World) -> Path:
-    """The capture folder; the leader makes it where there is none yet."""
-    if not world.leads:
-        world.wait_for_leader()
+    """The capture folder; rank 0 makes it where there is none yet."""
+    if not world.is_main:
+        world.wait_for_main()
         return _capture(args)
     folder = _capture(args)
-    world.wait_for_leader()
+    world.wait_for_main()
     return folder
 
 

@@ -57,8 +57,8 @@ def run(args: argparse.Namespace) -> int:
 def _print_network(size: str, as_json: bool) -> None:
     """List the parameters of one size of the network."""
     from hwp_bench.base.tables import Column, Table, print_table
+    from wildghand.network.parameters import blank_network, parameter_table
     from wildghand.network.settings import network_settings
-    from wildghand.network.table import blank_network, parameter_table
 
     settings = network_settings(size)
     rows = parameter_table(blank_network(settings))

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from wildghand.gaussians.attributes import RawAttributes
-from wildghand.network import Prediction
+from wildghand.network import NetworkOutput
 from wildghand.network.network import Refinement
 
 
@@ -27,7 +27,7 @@ class _Share(torch.autograd.Function):
         return gradients[0] * factor, None
 
 
-def taught(prediction: Prediction, shares: Tensor) -> Prediction:
+def scale_gradients(prediction: NetworkOutput, shares: Tensor) -> NetworkOutput:
     """The same prediction, which learns from each of B frames by its share.
 
     What belongs to a frame alone (biases, gain, pose) still learns from all of its gradient: a

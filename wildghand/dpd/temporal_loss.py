@@ -58,13 +58,13 @@ class TemporalTarget:
             for step in range(_STEPS):
                 optimizer.param_groups[0]["lr"] = _RATE * (1.0 - step / _STEPS)
                 optimizer.zero_grad(set_to_none=True)
-                self._strayed(module, slice(None)).backward()
+                self._distance(module, slice(None)).backward()
                 optimizer.step()
             for layer in module.varphi.parameters():
                 nn.init.zeros_(layer)
             module.zero_grad(set_to_none=True)
 
-    def strayed(self, modules: Sequence[DynamicPerturbation], first: int) -> Tensor:
+    def temporal_loss(self, modules: Sequence[DynamicPerturbation], first: int) -> Tensor:
         """Mean over frames of the held square of the distance to the target; a sum over hands.
 
         Args:
@@ -74,9 +74,9 @@ class TemporalTarget:
         """
         stride = math.ceil(len(self.omega) / _LOOKED_AT)
         part = slice(first % stride, None, stride)
-        return torch.stack([self._strayed(module, part) for module in modules]).sum()
+        return torch.stack([self._distance(module, part) for module in modules]).sum()
 
-    def _strayed(self, module: DynamicPerturbation, part: slice) -> Tensor:
+    def _distance(self, module: DynamicPerturbation, part: slice) -> Tensor:
         frames = torch.arange(len(self.omega), device=self.omega.device)[part]
         distance = module.temporal(frames).omega - self.omega[part]
         return (self.hold[part] * distance.square()).mean()

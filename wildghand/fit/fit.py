@@ -1,4 +1,4 @@
-"""A fit: everything that changes from step to step, and one step."""
+"""A fit: how it is made from a capture, everything that changes from step to step, and one step."""
 
 from __future__ import annotations
 
@@ -14,14 +14,19 @@ from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import drop
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fit.objective import Objective
-from wildghand.fit.parallel import ALONE, World, average_gradients, digest_of
-from wildghand.fit.rates import make_optimizer, set_rates
+from wildghand.fit.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
 from wildghand.fit.weighting import Weighting
 from wildghand.gaussians.training import TrainingClip, load_frames
 from wildghand.model.assemble import assemble, make_rigs
-from wildghand.model.model import Drawing
+from wildghand.model.model import RenderedFrames, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
+from wildghand.network import parameter_groups
+from wildghand.pao.pao import PerturbationAwareWeights
 from wildghand.prior.files import choose_prior
+
+# Gradients of a mean over all pixels are small beside Adam's usual 1e-8.
+_EPSILON = 1e-15
+_BETAS = (0.9, 0.99)
 
 
 class Fit:
@@ -44,7 +49,7 @@ class Fit:
         settings: WildGHandSettings,
         seed: int,
         device: torch.device,
-        world: World = ALONE,
+        world: World = SINGLE_PROCESS,
     ) -> None:
         self.training = training
         self.settings = settings
@@ -90,7 +95,7 @@ class Fit:
         """
         settings, weighting, world = self.settings, self.weighting, self.world
         set_rates(self.optimizer, settings, fraction)
-        part = world.part(len(rows))
+        part = world.shard(len(rows))
         mine = rows[part]
         kept = {side: keep[part] for side, keep in self._keep(rows).items()}
         drawing = self.draw(mine, kept, move=weighting.moves(rows))
@@ -156,7 +161,7 @@ class Fit:
         kept: Mapping[str, torch.Tensor] | None = None,
         *,
         move: bool | None = None,
-    ) -> Drawing:
+    ) -> RenderedFrames:
         """Draw training frames with everything that is particular to them.
 
         Args:
@@ -231,3 +236,37 @@ class Fit:
             side: self.model.biases_of(side).temporal(rows).omega.tolist()
             for side in self.model.perturbation
         }
+
+
+def make_optimizer(
+    model: WildGHandModel, weights: PerturbationAwareWeights, settings: WildGHandSettings
+) -> torch.optim.Adam:
+    """Adam over everything that is fitted; each group keeps its first rate as `start`."""
+    rates = settings.schedule.rates
+    groups = {name: list(group) for name, group in parameter_groups(model.network).items()}
+    groups["dpd"] = list(model.perturbation.parameters())
+    groups["thresholds"] = list(weights.parameters())
+    groups["gains"] = [model.log_gains]
+    groups["pose"] = [model.pose_steps]
+    groups["transl"] = [model.transl_steps]
+    return torch.optim.Adam(
+        [
+            {"params": group, "lr": getattr(rates, name), "start": getattr(rates, name)}
+            for name, group in groups.items()
+            if group
+        ],
+        eps=_EPSILON,
+        betas=_BETAS,
+        fused=True,
+    )
+
+
+def set_rates(optimizer: torch.optim.Adam, settings: WildGHandSettings, fraction: float) -> None:
+    """Set the steps for a share of the budget that is used up."""
+    schedule = settings.schedule
+    if schedule.decay == "halving":
+        factor = 0.5 ** int(fraction * schedule.halvings)
+    else:
+        factor = schedule.final_rate**fraction
+    for group in optimizer.param_groups:
+        group["lr"] = group["start"] * factor

@@ -188,7 +188,7 @@ def _run_begun(clean: list[float], context: Context) -> Measured:
     target = TemporalTarget.judged(torch.tensor(clean), scale)
     target.begin([module])
     biases = _biases(module, len(clean))
-    (biases.square().sum() + target.strayed([module], 0)).backward()
+    (biases.square().sum() + target.temporal_loss([module], 0)).backward()
     omega = module.temporal(torch.arange(len(clean))).omega.detach()
     off = float((omega - target.omega).abs().max())
     finite = _finite(*(p.grad for p in module.parameters()))

@@ -7,13 +7,13 @@ from collections.abc import Mapping
 from torch import Tensor
 
 from wildghand.dpd.temporal_loss import TemporalTarget
-from wildghand.fit.weighting import Target
+from wildghand.fit.weighting import FrameTarget
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.laplacian import surface_laplacian
 from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.gaussians.rig import HandRig
 from wildghand.model import terms
-from wildghand.model.model import Drawing, WildGHandModel
+from wildghand.model.model import RenderedFrames, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 
 
@@ -46,7 +46,12 @@ class Objective:
         self._perceptual = FilterBankLoss() if self.weights.perceptual else None
 
     def __call__(
-        self, model: WildGHandModel, drawing: Drawing, target: Target, rows: Tensor, clean: Tensor
+        self,
+        model: WildGHandModel,
+        drawing: RenderedFrames,
+        target: FrameTarget,
+        rows: Tensor,
+        clean: Tensor,
     ) -> Tensor:
         """The loss, a scalar.
 
@@ -83,8 +88,8 @@ class Objective:
             left, right = (drawing.hands[side].prediction.texture for side in ("left", "right"))
             total = total + weights.cross_hand * terms.cross_hand(left, right)
         if self.temporal is not None and settings.dpd.omega_weight:
-            strayed = self.temporal.strayed(model.biases, int(rows[0]))
-            total = total + settings.dpd.omega_weight * strayed
+            held = self.temporal.temporal_loss(model.biases, int(rows[0]))
+            total = total + settings.dpd.omega_weight * held
         if settings.dpd.gains:
             # Clean frames have no gain: without this prior gain and colours could trade places.
             size = model.log_gains[rows].square().mean(dim=-1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,8 +13,10 @@ from hwp_bench.methods.contract import Budget, Report
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fit.fit import Fit
 from wildghand.fit.parallel import World
-from wildghand.fit.plateau import Plateau
 from wildghand.gaussians.fit_loop import Guard, batches, spent
+
+#: Fall of the mean loss from window to window, as a share, that still counts as progress.
+PROGRESS = 1e-3
 
 
 class Watchers:
@@ -57,7 +60,7 @@ def optimise(
         after_step: called with the number of steps after each; saves, for instance.
 
     Returns:
-        The last state; the best one if the fit diverged later. Of several processes, the leader's
+        The last state; the best one if the fit diverged later. Of several processes, rank 0's
         has the record of the weights.
 
     Raises:
@@ -72,8 +75,8 @@ def optimise(
     step = start
     report(step, fit.avatar(step))
     while step < steps:
-        # All processes go by the leader's clock, or some would stop a step before the others.
-        fraction = world.of_leader(spent(step, steps, budget, report))
+        # All processes go by the clock of rank 0, or some would stop a step before the others.
+        fraction = world.broadcast(spent(step, steps, budget, report))
         if fraction >= 1.0:
             break
         loss = fit.step(next(order), fraction)
@@ -92,9 +95,43 @@ def optimise(
             window = settings.schedule.plateau_steps
             _tell(world, f"The loss has stood still for {window} steps; finished early.")
             break
-    return fit.avatar(step, report.elapsed, final=world.leads)
+    return fit.avatar(step, report.elapsed, final=world.is_main)
 
 
 def _tell(world: World, text: str) -> None:
-    if world.leads:
+    if world.is_main:
         notice(text)
+
+
+class Plateau:
+    """Notices that the mean loss of a window is hardly lower than that of the window before.
+
+    Args:
+        window: steps of a window; 0 never notices.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._window = window
+        self._losses: list[float] = []
+        self._before = math.inf
+
+    def reached(self, loss: float) -> bool:
+        """Take note of a loss; True when the fit may stop."""
+        if not self._window:
+            return False
+        self._losses.append(loss)
+        if len(self._losses) < self._window:
+            return False
+        mean = sum(self._losses) / self._window
+        self._losses.clear()
+        before, self._before = self._before, mean
+        return mean > (1.0 - PROGRESS) * before
+
+    def state_dict(self) -> dict[str, Any]:
+        """What `load_state_dict` takes."""
+        return {"losses": list(self._losses), "before": self._before}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self._losses = [float(loss) for loss in state["losses"]]
+        self._before = float(state["before"])

@@ -19,7 +19,7 @@ from torch import Tensor
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 
-#: Longest that a process waits for the others; the leader alone imports videos and writes.
+#: Longest that a process waits for the others; only rank 0 imports videos and writes.
 TIMEOUT = datetime.timedelta(hours=1)
 # Counts, in the store that all processes see, those that have failed.
 _FAILED = "failed"
@@ -32,7 +32,7 @@ class PeerLost(HwpError):
 class World:
     """The processes of a fit, and what they tell each other.
 
-    A process alone is a world as well: nothing is sent, and tensors come back as they are.
+    A single process is a world as well: nothing is sent, and tensors come back as they are.
 
     Args:
         rank: of this process, from 0.
@@ -54,15 +54,15 @@ class World:
         self._store = store
 
     @property
-    def leads(self) -> bool:
-        """Whether this process writes files and speaks to the person."""
+    def is_main(self) -> bool:
+        """Whether this is rank 0, which writes files and prints messages."""
         return self.rank == 0
 
-    def part(self, count: int) -> slice:
-        """The places of a batch of `count` that are this process's.
+    def shard(self, count: int) -> slice:
+        """The places in a batch of `count` that this process works on.
 
         Raises:
-            UsageError: the batch cannot be split evenly; then a mean of means would be no mean.
+            UsageError: the batch cannot be split evenly: a mean of means would not be the mean.
         """
         if count % self.size:
             raise UsageError(
@@ -94,8 +94,8 @@ class World:
             torch.distributed.all_gather(parts, tensor.detach().contiguous())
         return torch.cat(parts)
 
-    def of_leader(self, value: float) -> float:
-        """The leader's value of a number; waits until the leader is here."""
+    def broadcast(self, value: float) -> float:
+        """Rank 0's value of a number; waits until rank 0 is here."""
         if self.size == 1:
             return value
         sent = torch.tensor(value, dtype=torch.float64, device=self.device)
@@ -103,9 +103,9 @@ class World:
             torch.distributed.broadcast(sent, src=0)
             return float(sent)
 
-    def wait_for_leader(self) -> None:
-        """Wait until the leader is here."""
-        self.of_leader(0.0)
+    def wait_for_main(self) -> None:
+        """Wait until rank 0 is here."""
+        self.broadcast(0.0)
 
     def require_same(self, digest: str) -> None:
         """Check that all processes are about to do the same.
@@ -114,7 +114,7 @@ class World:
             digest: hexadecimal.
 
         Raises:
-            HwpError: it differs from the leader's somewhere.
+            HwpError: it differs from that of rank 0 somewhere.
         """
         own = torch.tensor(list(bytes.fromhex(digest)), dtype=torch.uint8, device=self.device)
         found = self.gather(own[None])
@@ -136,7 +136,7 @@ class World:
 
 
 #: One process by itself.
-ALONE = World()
+SINGLE_PROCESS = World()
 
 
 def average_gradients(parameters: Iterable[Tensor], world: World) -> None:
@@ -218,7 +218,7 @@ def join(device: torch.device) -> World:
     """
     size = _number("WORLD_SIZE", 1)
     if size <= 1:
-        return ALONE
+        return SINGLE_PROCESS
     if not torch.distributed.is_available():
         raise MissingDependency(
             "this build of torch lacks torch.distributed, which several processes need",
@@ -256,7 +256,7 @@ def _own_gpu(place: int, processes: int) -> None:
 def _number(name: str, otherwise: int) -> int:
     text = os.environ.get(name, str(otherwise))
     if not text.isdecimal():
-        raise UsageError(f"is {text!r}, no number", field=name, remedy="torchrun sets it.")
+        raise UsageError(f"is {text!r}, not a number", field=name, remedy="torchrun sets it.")
     return int(text)
 
 

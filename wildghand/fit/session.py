@@ -21,8 +21,8 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import save_avatar
 from wildghand.fit.fit import Fit
 from wildghand.fit.optimise import Watchers, optimise
-from wildghand.fit.parallel import ALONE, World
-from wildghand.fit.saved import load_state, save_state
+from wildghand.fit.parallel import SINGLE_PROCESS, World
+from wildghand.fit.saved_state import load_state, save_state
 from wildghand.gaussians.fit_loop import choose_device
 from wildghand.model.settings import WildGHandSettings, read_settings
 
@@ -66,7 +66,7 @@ def fit_capture(
     seed: int = 0,
     all_frames: bool = False,
     overwrite: bool = False,
-    world: World = ALONE,
+    world: World = SINGLE_PROCESS,
 ) -> WildGHandAvatar:
     """Fit an avatar to a capture and write it.
 
@@ -81,7 +81,7 @@ def fit_capture(
         seed: of everything random.
         all_frames: fit the validation and test frames too: for an avatar, not for a score.
         overwrite: replace an avatar that is there.
-        world: the processes that fit together; its leader alone writes.
+        world: the processes that fit together; only rank 0 writes.
 
     Raises:
         UsageError: `out` exists, or the processes cannot share a batch evenly.
@@ -92,20 +92,20 @@ def fit_capture(
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
     chosen = read_settings(settings)
-    world.part(chosen.schedule.batch)
+    world.shard(chosen.schedule.batch)
     capture = open_capture(source)
     split = every_frame(capture) if all_frames else _split(capture)
     work = out.with_name(out.name + ".fit")
     run = RunSettings(dict(settings), seed, budget)
-    with exclusive(work) if world.leads else contextlib.nullcontext():
-        if world.leads:
+    with exclusive(work) if world.is_main else contextlib.nullcontext():
+        if world.is_main:
             write_request(work / "request", capture, split, run)
-        world.wait_for_leader()
+        world.wait_for_main()
         avatar = _fit_in(work, capture, run, chosen, world)
-        if world.leads:
+        if world.is_main:
             save_avatar(avatar, out, overwrite=overwrite)
             shutil.rmtree(work, ignore_errors=True)
-        world.wait_for_leader()
+        world.wait_for_main()
     return avatar
 
 
@@ -122,7 +122,7 @@ def _fit_in(
     state = work / STATE
     if state.is_file():
         start, before = load_state(state, fit, watchers, digest)
-        if world.leads:
+        if world.is_main:
             notice(f"Going on after {start} steps.")
     fit.require_same(start)
     steps = chosen.schedule.steps if run.budget.steps is None else run.budget.steps
@@ -132,7 +132,7 @@ def _fit_in(
 
         def save(step: int, watched: Watchers) -> None:
             nonlocal saved
-            if world.leads and time.perf_counter() - saved >= SAVE_EVERY:
+            if world.is_main and time.perf_counter() - saved >= SAVE_EVERY:
                 save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
                 saved = time.perf_counter()
 
@@ -141,8 +141,8 @@ def _fit_in(
 
 @contextlib.contextmanager
 def _shown(capture: Capture, steps: int, world: World) -> Iterator[Callable[[int], None]]:
-    """The progress bar, which the leader alone has."""
-    if not world.leads:
+    """The progress bar, which only rank 0 shows."""
+    if not world.is_main:
         yield lambda done: None
         return
     with progress(f"Fitting {capture.info.id}", steps) as show:

@@ -9,20 +9,19 @@ import torch
 from torch import Tensor
 
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fit.parallel import ALONE, World
+from wildghand.fit.parallel import SINGLE_PROCESS, World
 from wildghand.gaussians.training import TrainingFrames
-from wildghand.model.model import Drawing
+from wildghand.model.model import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.pao.pao import PerturbationAwareWeights, binary_weights
 from wildghand.pao.regions import FrameRegions, Regions, stack_regions
-from wildghand.pao.regions.cache import RegionCache
-from wildghand.pao.regions.superpixels import Superpixels
+from wildghand.pao.regions.superpixels import RegionCache, Superpixels
 from wildghand.pao.robust import blended_residual, residual_weights, running_median
 from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
 
 
 @dataclass(frozen=True, eq=False)
-class Target:
+class FrameTarget:
     """The images that the drawing of B frames is compared with, and how much each pixel counts."""
 
     #: (B, H, W, 3) sRGB over black outside the mask.
@@ -88,8 +87,8 @@ class Weighting:
         return self.frame_weights[rows] if self._weighs_frames else None
 
     def __call__(
-        self, rows: Tensor, drawing: Drawing, fraction: float, world: World = ALONE
-    ) -> Target:
+        self, rows: Tensor, drawing: RenderedFrames, fraction: float, world: World = SINGLE_PROCESS
+    ) -> FrameTarget:
         """Return what a batch, or this process's part of it, is compared with.
 
         Where weights compare the frames of a batch, all processes weigh all of it.
@@ -100,7 +99,7 @@ class Weighting:
             fraction: share of the budget that is used up.
             world: the processes.
         """
-        mine = rows[world.part(len(rows))]
+        mine = rows[world.shard(len(rows))]
         hand = self._coverage(mine)
         image = self.frames.images[mine].to(self.device).float() / 255.0 * hand[..., None]
         pao, outside = self.settings.pao, self.settings.terms.outside_weight
@@ -117,7 +116,7 @@ class Weighting:
             weights = soft * self._pixel_weights[mine].to(self.device).float() / 255.0
         else:
             weights = soft
-        return Target(image, hand, weights)
+        return FrameTarget(image, hand, weights)
 
     def _follow(self, assessment: FrameAssessment) -> None:
         """Take from the pre-pass what the components use."""
@@ -134,30 +133,32 @@ class Weighting:
         """(B, H, W) estimated coverage of the visible hand, 0-1."""
         return self.frames.masks[rows].to(self.device).float() / 255.0
 
-    def _paper_weights(self, rows: Tensor, image: Tensor, drawing: Drawing, world: World) -> Tensor:
+    def _paper_weights(
+        self, rows: Tensor, image: Tensor, drawing: RenderedFrames, world: World
+    ) -> Tensor:
         """The paper's equations on all frames of the batch; this process's part of the weights."""
         error, omega = _error(image, drawing), world.gather(drawing.omega)
         found = self.pao(
             world.gather(error), self._batch_regions(rows), self._coverage(rows), omega
         )
-        return found.weights[world.part(len(rows))]
+        return found.weights[world.shard(len(rows))]
 
     def _robust_weights(
-        self, rows: Tensor, image: Tensor, drawing: Drawing, world: World
+        self, rows: Tensor, image: Tensor, drawing: RenderedFrames, world: World
     ) -> Tensor:
         """Weights from the residuals of all frames of the batch; this process's part of them."""
         hands = self._coverage(rows)
         error = world.gather(_error(image, drawing))
         residual = blended_residual(error, self._batch_regions(rows), hands)
         self.median = running_median(self.median, residual, hands)
-        return residual_weights(residual[world.part(len(rows))], self.median)
+        return residual_weights(residual[world.shard(len(rows))], self.median)
 
     def _batch_regions(self, rows: Tensor) -> Regions:
         assert self._regions is not None
         return stack_regions([self._regions[row] for row in rows.tolist()], self.device)
 
 
-def _error(image: Tensor, drawing: Drawing) -> Tensor:
+def _error(image: Tensor, drawing: RenderedFrames) -> Tensor:
     """(B, H, W) mean over channels of |drawing - image|, without gradient."""
     return (drawing.image.detach() - image).abs().mean(dim=-1)
 

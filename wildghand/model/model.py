@@ -9,12 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from wildghand.dpd.dpd import DynamicPerturbation
-from wildghand.dpd.scale_gradients import taught
+from wildghand.dpd.scale_gradients import scale_gradients
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.quaternions import quat_multiply, quat_rotate, quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.gaussians.training import TrainingClip
-from wildghand.network import Prediction, PredictionNetwork
+from wildghand.network import NetworkOutput, PredictionNetwork
 from wildghand.splat import rasterize
 
 
@@ -39,7 +39,7 @@ class HandState:
     """What the model says of one hand in B training frames; the regularisers read it."""
 
     #: Output of the network.
-    prediction: Prediction
+    prediction: NetworkOutput
     #: Biases of the attributes before activation; None while perturbations are not modelled.
     biases: RawAttributes | None
     #: (B,) temporal weight before dropout; zeros while perturbations are not modelled.
@@ -49,7 +49,7 @@ class HandState:
 
 
 @dataclass(frozen=True, eq=False)
-class Drawing:
+class RenderedFrames:
     """B training frames as the model explains them."""
 
     #: (B, H, W, 3) sRGB over black, with the frames' gains.
@@ -132,7 +132,7 @@ class WildGHandModel(nn.Module):
         shares: Tensor | None = None,
         move: bool = False,
         refine: bool = False,
-    ) -> Drawing:
+    ) -> RenderedFrames:
         """Draw training frames with everything that is particular to them.
 
         Args:
@@ -153,7 +153,7 @@ class WildGHandModel(nn.Module):
                 pose = pose + self.pose_steps[index, rows]
                 transl = transl + self.transl_steps[index, rows]
             prediction = self._predict(side, anchors, pose.detach())
-            learning = prediction if shares is None else taught(prediction, shares)
+            learning = prediction if shares is None else scale_gradients(prediction, shares)
             if refine:
                 step = learning.refinement
                 pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
@@ -176,7 +176,7 @@ class WildGHandModel(nn.Module):
         image, coverage = _rasterize(parts, clip.viewmats[rows], clip.Ks[rows], width, height)
         # The picture lies over black, so a gain on it is one on every Gaussian.
         image = image * self.log_gains[rows].exp()[:, None, None]
-        return Drawing(image, coverage, states)
+        return RenderedFrames(image, coverage, states)
 
     def draw(
         self,
@@ -225,10 +225,12 @@ class WildGHandModel(nn.Module):
             anchors = rig.follow(pose + step.pose, betas + step.betas, transl + step.transl)
         return self._dress(anchors, prediction, prediction.raw)
 
-    def _predict(self, side: str, anchors: AnchorPoses, pose: Tensor) -> Prediction:
+    def _predict(self, side: str, anchors: AnchorPoses, pose: Tensor) -> NetworkOutput:
         return self.network(side, quat_third_axis(anchors.orientations), pose)
 
-    def _dress(self, anchors: AnchorPoses, prediction: Prediction, raw: RawAttributes) -> Gaussians:
+    def _dress(
+        self, anchors: AnchorPoses, prediction: NetworkOutput, raw: RawAttributes
+    ) -> Gaussians:
         """p' = p_g + v': the predicted offset from the vertex that heads iii and iv moved."""
         attributes = self.network.activation(raw)
         offsets = attributes.offsets + prediction.template_offsets

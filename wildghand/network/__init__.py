@@ -1,13 +1,13 @@
 """The Gaussian prediction network, in two sizes: `compact` and `paper`."""
 
-from wildghand.network.groups import parameter_groups
-from wildghand.network.network import Prediction, PredictionNetwork, Refinement
+from wildghand.network.network import NetworkOutput, PredictionNetwork, Refinement
+from wildghand.network.parameters import parameter_groups
 from wildghand.network.settings import NetworkSettings, network_settings
 from wildghand.network.surface import SurfacePoints, mirrored_anchors, surface_points
 
 __all__ = [
+    "NetworkOutput",
     "NetworkSettings",
-    "Prediction",
     "PredictionNetwork",
     "Refinement",
     "SurfacePoints",

@@ -7,10 +7,10 @@ from torch import Tensor, nn
 from torch.nn.functional import interpolate, silu
 
 from wildghand.gaussians.shading import sh_basis, sh_count
-from wildghand.network.chart import COORDINATES, Chart
 from wildghand.network.encoding import encode_pose
 from wildghand.network.identity import IdentityMap
 from wildghand.network.settings import NetworkSettings
+from wildghand.network.surface import COORDINATES, Chart
 
 
 class PlaneCoder(nn.Module):

@@ -10,7 +10,7 @@ from torch.nn.functional import linear
 
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
 from wildghand.network.encoding import POSITION_CHANNELS
-from wildghand.network.initial import DIRECT_GAINS
+from wildghand.network.identity import DIRECT_GAINS
 from wildghand.network.settings import NetworkSettings
 
 

@@ -10,15 +10,13 @@ from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from wildghand.gaussians.attributes import Activation, RawAttributes
-from wildghand.network.chart import Chart
 from wildghand.network.compact import CompactGeometry, CompactTexture
 from wildghand.network.encoding import POSITION_CHANNELS
 from wildghand.network.heads import AttributeHead, RefinementHead, ShadowHead, TemplateHead
-from wildghand.network.identity import IdentityMap
-from wildghand.network.initial import initial_attributes
+from wildghand.network.identity import IdentityMap, initial_attributes
 from wildghand.network.paper import PaperGeometry, PaperTexture
 from wildghand.network.settings import NetworkSettings, check_sides
-from wildghand.network.surface import SurfacePoints
+from wildghand.network.surface import Chart, SurfacePoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +32,7 @@ class Refinement:
 
 
 @dataclass(frozen=True, eq=False)
-class Prediction:
+class NetworkOutput:
     """What the network says of one hand in B frames."""
 
     #: (B, N, k) attributes before `PredictionNetwork.activation`.
@@ -150,7 +148,7 @@ class PredictionNetwork(nn.Module):
 
     def forward(
         self, side: str, normals: Tensor, pose: Tensor, texture: Tensor | None = None
-    ) -> Prediction:
+    ) -> NetworkOutput:
         """Predict one hand in B frames.
 
         Args:
@@ -166,7 +164,7 @@ class PredictionNetwork(nn.Module):
         x_g = self.geometry(side, normals, pose)
         x_t = self.texture(side) if texture is None else texture
         position = self._chart(side).coordinates[:, -POSITION_CHANNELS:]
-        return Prediction(
+        return NetworkOutput(
             raw=self.attribute_head(x_t, x_g, self.initial(side)),
             shadow=self.shadow_head(x_g),
             template_offsets=self.template_head(x_t, position.to(x_t.dtype)),

@@ -1,4 +1,4 @@
-"""What the network knows of a hand's surface: where its Gaussians lie, and how they start."""
+"""The fixed side of one hand's surface: where its Gaussians lie, and samplers of every plane."""
 
 from __future__ import annotations
 
@@ -6,10 +6,16 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.hands import HandTemplate, SurfaceAnchors, anchor_uv
+from wildghand.network.encoding import POSITION_CHANNELS, encode_positions
+from wildghand.network.sampling import CellPooling, PlaneSampler
+from wildghand.network.settings import NetworkSettings
+
+#: Channels of `Chart.coordinates`: uv and the encoded rest position.
+COORDINATES = 2 + POSITION_CHANNELS
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,3 +91,40 @@ def mirrored_anchors(anchors: SurfaceAnchors) -> SurfaceAnchors:
     mix = anchors.barycentric
     turned = mix.flip(-1) if isinstance(mix, Tensor) else mix[:, ::-1].copy()
     return SurfaceAnchors(anchors.face_index, turned)
+
+
+def plane_resolutions(settings: NetworkSettings) -> tuple[int, ...]:
+    """Edges of the planes that features are read from, in cells."""
+    if settings.size == "compact":
+        return (settings.plane_resolution,)
+    return tuple(settings.plane_resolution * factor for factor in (2, 4, 8, 16))
+
+
+class Chart(nn.Module):
+    """Everything about N anchors that does not change. Nothing here is learned or saved.
+
+    Args:
+        settings: resolutions.
+        surface: the anchors.
+    """
+
+    coordinates: Tensor
+
+    def __init__(self, settings: NetworkSettings, surface: SurfacePoints) -> None:
+        super().__init__()
+        coordinates = torch.cat(
+            (2.0 * surface.uv - 1.0, encode_positions(surface.positions)), dim=-1
+        )
+        self.register_buffer("coordinates", coordinates, persistent=False)
+        self.identity = PlaneSampler(surface.uv, settings.identity_resolution)
+        self.planes = nn.ModuleList(
+            PlaneSampler(surface.uv, resolution) for resolution in plane_resolutions(settings)
+        )
+        self.cells = CellPooling(surface.uv, settings.plane_resolution)
+        cell_coordinates = self.cells(coordinates)
+        self.register_buffer("cell_coordinates", cell_coordinates, persistent=False)
+
+    cell_coordinates: Tensor
+
+    def __len__(self) -> int:
+        return len(self.coordinates)

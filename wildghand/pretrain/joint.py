@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor
 
+from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fit.fit import Fit
-from wildghand.fit.rates import make_optimizer
+from wildghand.fit.fit import Fit, make_optimizer
+from wildghand.fit.optimise import Watchers
 from wildghand.gaussians.fit_loop import batches
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import PredictionNetwork
@@ -155,3 +156,42 @@ def _joint_optimizer(fits: Sequence[Fit]) -> torch.optim.Adam:
             known = {id(parameter) for parameter in group["params"]}
             group["params"] += [p for p in more["params"] if id(p) not in known]
     return joint
+
+
+def take_steps(
+    joint: JointFit,
+    steps: int,
+    watchers: Watchers,
+    *,
+    start: int = 0,
+    after_step: Callable[[int], None] | None = None,
+) -> int:
+    """Take steps until all are taken, the loss stands still, or the fit diverges.
+
+    Args:
+        joint: what is fitted.
+        steps: how many, those before `start` included.
+        watchers: of the loss, so far.
+        start: steps that `joint` has behind it.
+        after_step: called with the number of steps after each; saves, for instance.
+
+    Returns:
+        Steps behind the state of `joint`: the last one, or the best one if the fit diverged.
+
+    Raises:
+        DidNotConverge: the fit diverged without ever having been better than its start.
+    """
+    joint.skip(start)
+    for step in range(start, steps):
+        loss = joint.step(step / steps)
+        if not watchers.guard.watch(step, loss, joint):
+            joint.restore(watchers.guard.best())
+            kept = watchers.guard.step
+            notice(f"The fit diverged at step {step}; the state of step {kept} is kept.")
+            return kept
+        if after_step is not None:
+            after_step(step + 1)
+        if watchers.plateau.reached(loss):
+            notice(f"The loss stands still after {step + 1} steps; finished early.")
+            return step + 1
+    return steps

@@ -16,12 +16,11 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.methods.contract import REQUEST, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.fit.optimise import Watchers
-from wildghand.fit.saved import load_state, save_state
+from wildghand.fit.saved_state import load_state, save_state
 from wildghand.fit.session import SAVE_EVERY, STATE, every_frame
 from wildghand.gaussians.fit_loop import choose_device
 from wildghand.model.settings import WildGHandSettings, read_settings
-from wildghand.pretrain.joint import JointFit
-from wildghand.pretrain.loop import take_steps
+from wildghand.pretrain.joint import JointFit, take_steps
 from wildghand.prior.files import save_prior
 from wildghand.prior.prior import Prior
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from hwp_bench.base.errors import BadInput
 from wildghand.network import NetworkSettings, PredictionNetwork
-from wildghand.network.table import blank_network
+from wildghand.network.parameters import blank_network
 
 #: What the names of identity maps start with in a network's state.
 MAPS = "identity.maps."

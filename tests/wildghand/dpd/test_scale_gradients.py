@@ -7,22 +7,22 @@ import dataclasses
 import pytest
 import torch
 
-from wildghand.dpd.scale_gradients import taught
+from wildghand.dpd.scale_gradients import scale_gradients
 from wildghand.gaussians.attributes import SIZES, RawAttributes
-from wildghand.network import Prediction
+from wildghand.network import NetworkOutput
 from wildghand.network.network import Refinement
 
 FRAMES, GAUSSIANS = 3, 5
 SHARES = torch.tensor([1.0, 0.25, 0.0])
 
 
-def _prediction(seed: int) -> Prediction:
+def _prediction(seed: int) -> NetworkOutput:
     generator = torch.Generator().manual_seed(seed)
 
     def leaf(*shape: int) -> torch.Tensor:
         return torch.randn(*shape, generator=generator).requires_grad_()
 
-    return Prediction(
+    return NetworkOutput(
         raw=RawAttributes(**{name: leaf(FRAMES, GAUSSIANS, k) for name, k in SIZES.items()}),
         shadow=leaf(FRAMES, GAUSSIANS, 1),
         template_offsets=leaf(GAUSSIANS, 3),
@@ -31,7 +31,7 @@ def _prediction(seed: int) -> Prediction:
     )
 
 
-def _gradients(prediction: Prediction, used: Prediction) -> dict[str, torch.Tensor]:
+def _gradients(prediction: NetworkOutput, used: NetworkOutput) -> dict[str, torch.Tensor]:
     """Of the sum of squares of what is used, frame by frame."""
     loss = used.shadow.square().sum() + used.refinement.pose.square().sum()
     loss = loss + used.refinement.transl.square().sum()
@@ -54,7 +54,7 @@ def _gradients(prediction: Prediction, used: Prediction) -> dict[str, torch.Tens
 
 def test_values_stand_and_gradients_are_shares() -> None:
     whole, shared = _prediction(0), _prediction(0)
-    used = taught(shared, SHARES)
+    used = scale_gradients(shared, SHARES)
     for (_, one), (_, other) in zip(whole.raw.items(), used.raw.items(), strict=True):
         assert torch.equal(one, other)
     torch.testing.assert_close(used.template_offsets, whole.template_offsets.expand(FRAMES, -1, -1))
@@ -71,7 +71,7 @@ def test_values_stand_and_gradients_are_shares() -> None:
 def test_a_bias_learns_from_all_of_a_frame() -> None:
     prediction = _prediction(1)
     bias = torch.zeros(FRAMES, GAUSSIANS, 1, requires_grad=True)
-    (taught(prediction, torch.zeros(FRAMES)).shadow + bias).square().sum().backward()
+    (scale_gradients(prediction, torch.zeros(FRAMES)).shadow + bias).square().sum().backward()
     assert prediction.shadow.grad is not None
     assert not prediction.shadow.grad.any()
     assert bias.grad is not None
@@ -81,5 +81,5 @@ def test_a_bias_learns_from_all_of_a_frame() -> None:
 @pytest.mark.parametrize("field", ["texture"])
 def test_what_no_frame_changes_is_left_alone(field: str) -> None:
     prediction = _prediction(2)
-    assert getattr(taught(prediction, SHARES), field) is getattr(prediction, field)
+    assert getattr(scale_gradients(prediction, SHARES), field) is getattr(prediction, field)
     assert {f.name for f in dataclasses.fields(prediction)} >= {field}

@@ -90,13 +90,13 @@ def test_distance_is_the_held_square_summed_over_hands() -> None:
     expected = sum(
         (target.hold * (omega_of(learnt) - target.omega) ** 2).mean() for learnt in (left, right)
     )
-    torch.testing.assert_close(target.strayed([left, right], 3).detach(), expected)
+    torch.testing.assert_close(target.temporal_loss([left, right], 3).detach(), expected)
 
 
 def test_frames_that_are_not_held_pass_no_gradient() -> None:
     learnt = module(10)
     target = TemporalTarget(torch.full((10,), 0.3), torch.zeros(10))
-    target.strayed([learnt], 0).backward()
+    target.temporal_loss([learnt], 0).backward()
     assert all(value.grad.abs().max() == 0.0 for value in learnt.psi.parameters())
 
 
@@ -108,7 +108,7 @@ def test_every_frame_of_a_long_clip_is_looked_at_by_some_step() -> None:
         omega[frame] = 0.5
         target = TemporalTarget(omega, torch.ones(count))
         # Omega is zero everywhere, so that the one frame is all of the distance.
-        seen = [first for first in range(count) if target.strayed([learnt], first) > 0.0]
+        seen = [first for first in range(count) if target.temporal_loss([learnt], first) > 0.0]
         assert frame in seen
         assert len(seen) >= count // 64
 
@@ -123,7 +123,7 @@ def test_holding_keeps_the_weights_and_letting_go_does_not() -> None:
         optimizer = torch.optim.Adam(learnt.parameters(), lr=1e-3)
         for step in range(60):
             loss = -learnt.temporal(torch.tensor([step % 48])).omega.mean()
-            loss = loss + weight * target.strayed([learnt], step % 48)
+            loss = loss + weight * target.temporal_loss([learnt], step % 48)
             optimizer.zero_grad()
             loss.backward()
             optimizer.step()
@@ -140,4 +140,4 @@ def test_any_judgement_gives_weights_in_range(clean: list[float]) -> None:
     omega = omega_of(learnt)
     assert omega.isfinite().all()
     assert (omega.abs() < 0.9).all()
-    assert target.strayed([learnt], 0).isfinite()
+    assert target.temporal_loss([learnt], 0).isfinite()

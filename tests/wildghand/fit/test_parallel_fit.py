@@ -27,8 +27,8 @@ from wildghand.fit.fit import Fit
 from wildghand.fit.method import WildGHandMethod
 from wildghand.fit.objective import Objective
 from wildghand.fit.optimise import Watchers, optimise
-from wildghand.fit.parallel import ALONE, World, average_gradients, join, run_in_world
-from wildghand.fit.saved import load_state, save_state
+from wildghand.fit.parallel import SINGLE_PROCESS, World, average_gradients, join, run_in_world
+from wildghand.fit.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
 
 TINY: dict[str, Any] = {
@@ -64,11 +64,11 @@ def resumed(request: Path, world: World, state: Path) -> State:
     half, watchers = Fit(open_request(request), settings, 0, CPU, world), Watchers(0)
 
     def save(step: int, watched: Watchers) -> None:
-        if step == 2 and world.leads:
+        if step == 2 and world.is_main:
             save_state(state, half, watched, step=step, seconds=0.0, digest="d")
 
     optimise(half, Budget(), SilentReport(), watchers=watchers, after_step=save)
-    world.wait_for_leader()
+    world.wait_for_main()
     rest, watchers = Fit(open_request(request), settings, 0, CPU, world), Watchers(0)
     start, _ = load_state(state, rest, watchers, "d")
     rest.require_same(start)
@@ -153,7 +153,7 @@ def test_two_processes_fit_as_one_with_the_whole_batch(name: str, folder: Path) 
     start = Fit(
         open_request(folder / "request"), read_settings({**TINY, **changes}), 0, CPU
     ).model.snapshot()
-    alone, together = fitted(folder / "request", changes, ALONE), found(folder)[name]
+    alone, together = fitted(folder / "request", changes, SINGLE_PROCESS), found(folder)[name]
     change = max(float((alone[key] - start[key]).abs().max()) for key in start)
     apart = torch.cat([(together[key] - alone[key]).abs().flatten() for key in alone])
     assert float((apart > 1e-4 * change).float().mean()) < 1e-3
@@ -199,22 +199,22 @@ def test_torchrun_makes_one_avatar_and_one_message(
 
 
 def test_a_batch_is_split_evenly_or_refused() -> None:
-    parts = [World(rank, 3).part(6) for rank in range(3)]
+    parts = [World(rank, 3).shard(6) for rank in range(3)]
     assert [list(range(6))[part] for part in parts] == [[0, 1], [2, 3], [4, 5]]
-    assert ALONE.part(5) == slice(0, 5)
+    assert SINGLE_PROCESS.shard(5) == slice(0, 5)
     with pytest.raises(UsageError, match=r"schedule\.batch: is 4, .*schedule\.batch=3"):
-        World(0, 3).part(4)
+        World(0, 3).shard(4)
 
 
 def test_alone_nothing_is_sent_and_nothing_changed() -> None:
     tensor = torch.ones(3, requires_grad=True)
     (2.0 * tensor).sum().backward()
     before = tensor.grad
-    average_gradients([tensor], ALONE)
+    average_gradients([tensor], SINGLE_PROCESS)
     assert tensor.grad is before
-    assert ALONE.gather(tensor) is tensor
-    assert ALONE.average_(tensor) is tensor
-    assert ALONE.of_leader(0.25) == 0.25
+    assert SINGLE_PROCESS.gather(tensor) is tensor
+    assert SINGLE_PROCESS.average_(tensor) is tensor
+    assert SINGLE_PROCESS.broadcast(0.25) == 0.25
 
 
 @pytest.mark.parametrize(

@@ -26,7 +26,7 @@ from wildghand.cli.main import main
 from wildghand.fit.fit import Fit
 from wildghand.fit.method import WildGHandMethod
 from wildghand.fit.optimise import Watchers, optimise
-from wildghand.fit.saved import load_state, save_state
+from wildghand.fit.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
 
 QUICK: dict[str, Any] = {

@@ -15,8 +15,8 @@ from hwp_bench.hands import load_template
 from wildghand.gaussians.anchored import flat_gaussians
 from wildghand.gaussians.rig import make_rig
 from wildghand.network import (
+    NetworkOutput,
     NetworkSettings,
-    Prediction,
     PredictionNetwork,
     SurfacePoints,
     mirrored_anchors,
@@ -77,7 +77,7 @@ def stir(net: PredictionNetwork, seed: int = 5) -> PredictionNetwork:
     return net
 
 
-def loss_of(prediction: Prediction) -> torch.Tensor:
+def loss_of(prediction: NetworkOutput) -> torch.Tensor:
     refinement = prediction.refinement
     parts = [
         prediction.raw.concatenate().square().mean(),

@@ -7,8 +7,8 @@ import json
 import pytest
 
 from wildghand.cli.main import main
+from wildghand.network.parameters import blank_network, parameter_table
 from wildghand.network.settings import network_settings
-from wildghand.network.table import blank_network, parameter_table
 
 
 def linear(inputs: int, outputs: int, bias: bool = True) -> int:

@@ -29,11 +29,10 @@ from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
 from wildghand.fit.fit import Fit
 from wildghand.fit.optimise import Watchers
-from wildghand.fit.saved import load_state, save_state
+from wildghand.fit.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.network import network_settings
-from wildghand.pretrain.joint import JointFit
-from wildghand.pretrain.loop import take_steps
+from wildghand.pretrain.joint import JointFit, take_steps
 from wildghand.prior.files import DESCRIPTION, WEIGHTS, choose_prior, find_prior, load_prior
 
 QUICK: dict[str, Any] = {

@@ -1,6 +1,5 @@
 """The hand y_h and the regions y_u of a frame."""
 
-from wildghand.pao.regions.cache import RegionCache, Segmenter
 from wildghand.pao.regions.frame_regions import (
     FrameRegions,
     Regions,
@@ -10,7 +9,7 @@ from wildghand.pao.regions.frame_regions import (
 )
 from wildghand.pao.regions.hand import graph_cut_hands, hand_of_mask
 from wildghand.pao.regions.sam import SegmentAnything, open_sam
-from wildghand.pao.regions.superpixels import Superpixels
+from wildghand.pao.regions.superpixels import RegionCache, Segmenter, Superpixels
 
 __all__ = [
     "FrameRegions",

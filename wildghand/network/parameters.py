@@ -1,4 +1,4 @@
-"""The network's parameters, layer by layer."""
+"""The network's parameters: in groups with rates of their own, and layer by layer."""
 
 from __future__ import annotations
 
@@ -6,10 +6,38 @@ import re
 from dataclasses import dataclass
 
 import torch
+from torch import nn
 
 from wildghand.network.network import PredictionNetwork
 from wildghand.network.settings import NetworkSettings
 from wildghand.network.surface import SurfacePoints
+
+
+def parameter_groups(network: PredictionNetwork) -> dict[str, list[nn.Parameter]]:
+    """Sort every parameter into one of five groups.
+
+    Returns:
+        `identity`: the identity map; `direct`: the matrix that adds it to the attributes (empty
+        without `direct`); `light`: the linear part of head (ii); `refinement`: head (iv);
+        `network`: all others. Groups and their members are in a fixed order.
+    """
+    groups: dict[str, list[nn.Parameter]] = {
+        "identity": [],
+        "direct": [],
+        "light": [],
+        "refinement": [],
+        "network": [],
+    }
+    prefixes = {
+        "identity.": "identity",
+        "attribute_head.direct.": "direct",
+        "shadow_head.light.": "light",
+        "refinement_head.": "refinement",
+    }
+    for name, parameter in network.named_parameters():
+        group = next((g for prefix, g in prefixes.items() if name.startswith(prefix)), "network")
+        groups[group].append(parameter)
+    return groups
 
 
 @dataclass(frozen=True)
