@@ -22,15 +22,15 @@ from typing import Any, Iterator, Protocol  # noqa: UP035  (trackers run on old 
 
 import numpy as np
 
-#: MediaPipe takes every picture for a selfie, mirrored: on others its labels are swapped.
+#: MediaPipe takes every image for a mirrored selfie: on other images its labels are swapped.
 SWAPPED = {"Right": "left", "Left": "right"}
 
 
 class Landmarker(Protocol):
-    """What is used of `mediapipe.solutions.hands.Hands`."""
+    """The part of `mediapipe.solutions.hands.Hands` that is used."""
 
     def process(self, image: np.ndarray) -> Any:
-        """Find hands in an RGB picture."""
+        """Find hands in an RGB image."""
 
 
 def track(frames: Iterator[np.ndarray], landmarker: Landmarker, hand: str) -> dict[str, np.ndarray]:
@@ -38,17 +38,17 @@ def track(frames: Iterator[np.ndarray], landmarker: Landmarker, hand: str) -> di
 
     Args:
         frames: (H, W, 3) uint8 RGB, not mirrored.
-        landmarker: finds the hands of a picture.
+        landmarker: finds the hands of an image.
         hand: `right`, `left`, or `any` for the one that is seen best.
 
     Returns:
         `image`, `world` and `score`, as the module says.
     """
     image, world, score = [], [], []
-    for picture in frames:
-        height, width = picture.shape[:2]
+    for frame in frames:
+        height, width = frame.shape[:2]
         points, places, seen = np.zeros((21, 3)), np.zeros((21, 3)), 0.0
-        found = landmarker.process(picture)
+        found = landmarker.process(frame)
         index = _choose(found, hand)
         if index is not None:
             seen = float(found.multi_handedness[index].classification[0].score)
@@ -63,7 +63,7 @@ def track(frames: Iterator[np.ndarray], landmarker: Landmarker, hand: str) -> di
 
 
 def _choose(found: Any, hand: str) -> int | None:
-    """Index of the best hand of the wanted side, or None."""
+    """Index of the best hand of the given side, or None."""
     best = None
     for index in range(len(found.multi_hand_landmarks or ())):
         label = found.multi_handedness[index].classification[0]
@@ -80,10 +80,10 @@ def read_frames(path: str) -> Iterator[np.ndarray]:
 
     video = cv2.VideoCapture(path)
     while True:
-        good, picture = video.read()
+        good, frame = video.read()
         if not good:
             return
-        yield np.ascontiguousarray(picture[:, :, ::-1])
+        yield np.ascontiguousarray(frame[:, :, ::-1])
 
 
 def write(path: str, tracked: dict[str, np.ndarray]) -> None:

@@ -153,7 +153,7 @@ def convert_capture(
     from hwp_bench.capture.hand_model import load_matching_template
     from hwp_bench.capture.rewrite import rewrite_capture
     from hwp_bench.capture.schema import HandModelId
-    from hwp_bench.hands.sources import load_template
+    from hwp_bench.hands.template_sources import load_template
 
     info = capture.info
     made, errors = {}, {}

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.sources import load_template
+from hwp_bench.hands.template_sources import load_template
 
 if TYPE_CHECKING:
     from hwp_bench.capture.schema import HandModelId

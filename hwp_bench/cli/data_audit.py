@@ -17,7 +17,7 @@ _EXAMPLES = """examples:
   hwp-bench data audit captures/* --splits splits/hwp-v1.json --json
 
 Exit status 0: parts are disjoint and no test frame is known to be perturbed; 1: otherwise.
-Near-copies across the border are reported, not judged.
+Near-copies across the border are reported and do not change the status.
 """
 
 

@@ -11,8 +11,8 @@ _EXAMPLES = """examples:
   hwp-bench data get hwp -o WildGHand --capture capture0_ capture1_
   hwp-bench data get hwp --revision 0123456789abcdef
 
-Needs huggingface_hub: pip install 'hwp-bench[hub]'. An interrupted download goes on when the same
-command is run again. Checksums are pinned on first use; files that are there are never replaced.
+Needs huggingface_hub: pip install 'hwp-bench[hub]'. Run the same command again to continue an
+interrupted download. Checksums are pinned on first use; existing files are never replaced.
 """
 
 
@@ -25,7 +25,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "-o", "--out", type=Path, default=Path("WildGHand"), metavar="DIR", help="folder to make"
     )
     parser.add_argument(
-        "--capture", nargs="+", default=[], metavar="NAME", help="only folders that begin so"
+        "--capture",
+        nargs="+",
+        default=[],
+        metavar="NAME",
+        help="only folders whose names begin with this",
     )
     parser.add_argument("--revision", help="branch, tag or commit (default: the newest)")
     parser.add_argument("--json", action="store_true", help="print what was downloaded as JSON")
@@ -56,6 +60,6 @@ def run(args: argparse.Namespace) -> int:
         }
         print(json.dumps(value, indent=1))
         return 0
-    print(f"folder: {made.folder}, {len(made.files)} files, {made.kept} of them there before")
+    print(f"folder: {made.folder}, {len(made.files)} files, {made.kept} of them existed before")
     print(f"commit: {made.commit}")
     return 0

@@ -49,6 +49,6 @@ def run(args: argparse.Namespace) -> int:
         return 0
     print(f"captures: {', '.join(made.captures)}")
     print(f"for authors: {made.public}")
-    print(f"to be kept: {made.sealed}")
+    print(f"keep secret: {made.sealed}")
     print(f"commitment: {made.commitment}")
     return 0

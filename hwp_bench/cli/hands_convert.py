@@ -11,8 +11,8 @@ _EXAMPLES = """examples:
   hwp-bench hands convert my_capture as_mano --hand mano:mano_v1_2/models
   hwp-bench hands convert mano_capture as_free --hand anny --json
 
-Writes the capture again with its hands in another hand model, by fitting, and prints what the fit
-misses. True hand parameters are left out: they belong to the old model.
+Writes the capture again with its hands in another hand model, by fitting, and prints the errors
+of the fit. True hand parameters are left out: they belong to the old model.
 """
 
 

@@ -29,13 +29,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mano",
         type=Path,
         metavar="MANO_DIR",
-        help="your MANO files; else the free hand is fitted",
+        help="your MANO files; without them the free hand is fitted",
     )
     parser.add_argument(
         "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
     )
     parser.add_argument(
-        "--fps", type=float, default=5.0, help="of the annotated frames, 5 or 30 (default: 5)"
+        "--fps",
+        type=float,
+        default=5.0,
+        help="frame rate of the annotated frames, 5 or 30 (default: 5)",
     )
     parser.add_argument("--force", action="store_true", help="replace an existing capture")
     parser.add_argument("--json", action="store_true", help="print the facts as JSON")

@@ -18,7 +18,8 @@ _EXAMPLES = """examples:
 
 LANDMARKS.npz comes from a hand tracker such as MediaPipe and holds, for every frame of the
 video, image (F, 21, 2 or 3) in pixels, world (F, 21, 3) in metres and score (F,) in [0, 1];
-score 0 means that no hand was seen. docs/video.md says how to make it and how to read the result.
+score 0 means that no hand was seen. docs/video.md explains how to make it and how to read the
+result.
 """
 
 
@@ -38,12 +39,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--focal", type=float, metavar="PX", help="focal length of the whole frame; else estimated"
     )
     parser.add_argument(
-        "--masks", type=Path, metavar="DIR", help="masks of your own, named by frame number"
+        "--masks", type=Path, metavar="DIR", help="your own masks, named by frame number"
     )
     parser.add_argument(
         "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
     )
-    parser.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
+    parser.add_argument("--frames", metavar="A:B", help="only frames A to B-1")
     parser.add_argument(
         "--stride", type=int, default=1, metavar="K", help="every K-th frame (default: 1)"
     )
@@ -52,12 +53,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         type=float,
         default=0.5,
         metavar="S",
-        help="below this score a hand was not seen (default: 0.5)",
+        help="below this score a frame counts as without a hand (default: 0.5)",
     )
     parser.add_argument(
         "--hand-model", default="anny", metavar="MODEL", help="anny (default) or mano:PATH"
     )
-    parser.add_argument("--sheet", type=Path, metavar="PNG", help="overlay sheet, here as well")
+    parser.add_argument(
+        "--sheet", type=Path, metavar="PNG", help="write the overlay sheet here too"
+    )
     parser.add_argument("--id", metavar="ID", help="capture id (default: the folder's name)")
     parser.add_argument("--action", default="unknown", metavar="TEXT", help="what the hand does")
     parser.add_argument("--device", default="unknown", metavar="TEXT", help="what recorded it")
@@ -66,7 +69,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--perturbations",
         default="",
         metavar="NAMES",
-        help="what disturbs the clip, comma separated; severities stay unknown",
+        help="perturbations in the clip, comma separated; their severities stay unknown",
     )
     parser.add_argument("--force", action="store_true", help="replace an existing capture")
     parser.add_argument("--json", action="store_true", help="print the numbers as JSON")
@@ -74,7 +77,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    # FFmpeg's own remarks on a damaged video would stand beside our one line.
+    # FFmpeg would print its own messages about a damaged video next to our one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from hwp_bench.importers.video import VideoImport, import_video, parse_frame_range
 

@@ -13,8 +13,8 @@ _EXAMPLES = """examples:
   hwp-bench data import wildghand WildGHand -o compat --mano mano_v1_2/models --official-compat
 
 DIR is one folder of the release (with output.pkl), or a folder of them; then OUT gets one capture
-for each. Pickles are read without running anything they ask for. Without --mano the free hand is
-fitted, and what it misses is printed in mm. docs/data.md leads from the download to a table.
+for each. Pickles are read without running code from them. Without --mano the free hand is fitted,
+and its error is printed in mm. docs/data.md describes every step from the download to a table.
 """
 
 
@@ -30,12 +30,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--mano",
         type=Path,
         metavar="MANO_DIR",
-        help="your MANO files; else the free hand is fitted",
+        help="your MANO files; without them the free hand is fitted",
     )
     parser.add_argument(
         "--official-compat",
         action="store_true",
-        help="crop, intrinsics and translations as the released loader has them",
+        help="crop, intrinsics and translations as in the released loader",
     )
     parser.add_argument(
         "--hand", choices=("right", "left"), help="the hand of a single-hand capture"
@@ -45,7 +45,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--size", type=int, default=256, metavar="PX", help="edge of the frames (default: 256)"
     )
     parser.add_argument(
-        "--fps", type=float, default=30.0, help="of the video before thinning out (default: 30)"
+        "--fps",
+        type=float,
+        default=30.0,
+        help="frame rate of the video before subsampling (default: 30)",
     )
     parser.add_argument("--force", action="store_true", help="replace an existing capture")
     parser.add_argument("--json", action="store_true", help="print the facts as JSON")

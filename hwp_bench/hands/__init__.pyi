@@ -5,6 +5,8 @@ from .anchors import anchor_positions as anchor_positions
 from .anchors import anchor_uv as anchor_uv
 from .anchors import anchors_from_vertices as anchors_from_vertices
 from .anchors import sample_surface as sample_surface
+from .anchors import to_trimesh as to_trimesh
+from .anchors import vertex_normals as vertex_normals
 from .articulation import JointLimits as JointLimits
 from .articulation import anatomical_limits as anatomical_limits
 from .articulation import joint_angles as joint_angles
@@ -16,11 +18,9 @@ from .skeleton import landmark_order as landmark_order
 from .skinning import PosedHand as PosedHand
 from .skinning import pose_hand as pose_hand
 from .skinning import project as project
-from .sources import load_template as load_template
-from .surface import to_trimesh as to_trimesh
-from .surface import vertex_normals as vertex_normals
 from .template import HandTemplate as HandTemplate
 from .template import TemplateTensors as TemplateTensors
 from .template import mirror_template as mirror_template
+from .template_sources import load_template as load_template
 from .topology import boundary_vertices as boundary_vertices
 from .topology import subdivide as subdivide

@@ -1,15 +1,18 @@
-"""Points that ride on the surface of a hand: where Gaussians are attached."""
+"""The surface of a posed hand: normals, and anchors, the points that carry Gaussians."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadHandModel, UsageError
-from hwp_bench.hands.surface import unit_or, vertex_normals
 from hwp_bench.hands.template import HandTemplate
+
+if TYPE_CHECKING:
+    import trimesh
 
 #: Number of Gaussians of a hand in the paper: the vertices of MANO-HD.
 DEFAULT_ANCHOR_COUNT = 49281
@@ -17,6 +20,9 @@ DEFAULT_ANCHOR_COUNT = 49281
 # Step of the two-dimensional additive sequence with the best known spread (Roberts, "R2"):
 # powers of the real root of x^3 = x + 1.
 _R2_STEP = 1.0 / 1.32471795724474602596 ** np.array([1.0, 2.0])
+
+# Squared length, m^4 for face normals and m^2 for edges, under which a direction is noise.
+_TINY = 1e-30
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,6 +163,53 @@ def anchor_uv(template: HandTemplate, anchors: SurfaceAnchors) -> np.ndarray:
     """(N, 2) texture coordinates of the anchors, in [0, 1], origin at the bottom left."""
     corners = template.uv[template.face_uv[np.asarray(anchors.face_index)]]
     return (corners * np.asarray(anchors.barycentric, dtype=np.float64)[..., None]).sum(axis=1)
+
+
+def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
+    """Outward unit normals at the vertices: face normals averaged by area.
+
+    Args:
+        vertices: (B, V, 3) or (V, 3) m.
+        faces: (F, 3) int64, counter-clockwise from outside.
+
+    Returns:
+        Normals of the vertices' shape. A vertex without a face of any area gets (0, 0, 1) and
+        no gradient.
+    """
+    corners = vertices[..., faces, :]
+    edges = corners[..., 1:, :] - corners[..., :1, :]
+    crosses = torch.linalg.cross(edges[..., 0, :], edges[..., 1, :])
+    sums = torch.zeros_like(vertices)
+    for corner in faces.unbind(dim=1):
+        sums = sums.index_add(-2, corner, crosses)
+    return unit_or(sums, vertices.new_tensor([0.0, 0.0, 1.0]))
+
+
+def unit_or(vectors: torch.Tensor, fallback: torch.Tensor) -> torch.Tensor:
+    """Vectors of length one; where there is no direction, the fallback with zero gradient.
+
+    Args:
+        vectors: (..., 3).
+        fallback: broadcastable to `vectors`.
+    """
+    squared = (vectors * vectors).sum(dim=-1, keepdim=True)
+    usable = squared > _TINY
+    length = torch.where(usable, squared, torch.ones_like(squared)).sqrt()
+    return torch.where(usable, vectors / length, fallback)
+
+
+def to_trimesh(vertices: torch.Tensor | np.ndarray, faces: Any) -> trimesh.Trimesh:
+    """One mesh for trimesh, vertices kept as they are (no merging).
+
+    Args:
+        vertices: (V, 3) m.
+        faces: (F, 3).
+    """
+    import trimesh
+
+    if isinstance(vertices, torch.Tensor):
+        vertices = vertices.detach().cpu().numpy()
+    return trimesh.Trimesh(np.asarray(vertices), np.asarray(faces), process=False)
 
 
 def _square_to_triangle(square: np.ndarray) -> np.ndarray:

@@ -9,10 +9,10 @@ import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadInput, DidNotConverge
+from hwp_bench.hands.anchors import vertex_normals
 from hwp_bench.hands.articulation import anatomical_limits, joint_limit_penalty
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.hands.skinning import PosedHand, only_fingertips, pose_hand
-from hwp_bench.hands.surface import vertex_normals
 from hwp_bench.hands.template import HandTemplate, TemplateTensors
 from hwp_bench.hands.topology import boundary_vertices
 
@@ -39,7 +39,7 @@ class FitTargets:
 class FittingSettings:
     """How long and how hard is fitted."""
 
-    #: Steps to landmarks and lines of sight alone.
+    #: Steps with landmarks and lines of sight only.
     landmark_steps: int = 150
     #: Steps with the skin.
     skin_steps: int = 60

@@ -34,7 +34,7 @@ _STAND_INS = (
 )
 _REMEDY = "Use MANO_RIGHT.pkl or MANO_LEFT.pkl of mano_v1_2, as downloaded."
 # The left file as published has the right hand's sign in x of its shape basis. Like every
-# MANO layer we tell by the summed difference from the right file (m).
+# MANO layer we detect it by the summed difference from the right file (m).
 _SAME_SHAPES_BELOW = 1.0
 # Space between a chart and the border of its half, in texture units.
 _MARGIN = 0.01
@@ -43,15 +43,15 @@ _MARGIN = 0.01
 def load_mano(path: str | os.PathLike[str], side: str) -> HandTemplate:
     """Read one MANO hand.
 
-    The left file's shape basis has the wrong sign in x as published; it is mended, unless the
-    right file lies beside it and shows that it has been mended already.
+    The left file's shape basis has the wrong sign in x as published. It is corrected, unless the
+    right file in the same folder shows that it has been corrected already.
 
     Args:
         path: the folder that holds MANO_RIGHT.pkl and MANO_LEFT.pkl, or one of the files.
         side: "right" or "left".
 
     Raises:
-        BadHandModel: no such file, or it is no MANO hand; the error names the field.
+        BadHandModel: the file is missing or is not a MANO hand; the error names the field.
         UnsafePickle: the file asks for something that is not plain data.
         BadInput: the file is damaged.
 
@@ -63,9 +63,9 @@ def load_mano(path: str | os.PathLike[str], side: str) -> HandTemplate:
     vertices = _dense(content, "v_template", (VERTEX_COUNT, 3), file)
     faces = _dense(content, "f", (FACE_COUNT, 3), file).astype(np.int64)
     if faces.min() < 0 or faces.max() >= VERTEX_COUNT:
-        raise BadHandModel("a face has a corner that is no vertex", where=file, field="f")
+        raise BadHandModel("a face has a corner that is not a vertex", where=file, field="f")
     shape_basis = _shape_basis(content, file)
-    if side == "left" and _needs_mending(shape_basis, file):
+    if side == "left" and _needs_correction(shape_basis, file):
         shape_basis = shape_basis * np.array([-1.0, 1.0, 1.0])[:, None]
     regressor = _dense(content, "J_regressor", (JOINT_COUNT, VERTEX_COUNT), file)
     _check_tree(content, file)
@@ -127,18 +127,18 @@ def two_chart_uv(
 
 
 def _find(path: Path, side: str) -> Path:
-    """The file of one side in a folder, or beside a file of the other side."""
-    wanted = f"MANO_{side.upper()}.pkl"
+    """Find the file of one side in a folder, or next to the file of the other side."""
+    expected = f"MANO_{side.upper()}.pkl"
     if path.is_file():
         named = re.search("right|left", path.name, re.IGNORECASE)
         if named is None or named.group().lower() == side:
             return path
         path = path.parent
-    for file in (path / wanted, path / "models" / wanted):
+    for file in (path / expected, path / "models" / expected):
         if file.is_file():
             return file
     raise BadHandModel(
-        f"holds no {wanted}",
+        f"does not contain {expected}",
         where=path,
         remedy="Download MANO from its own site (its licence forbids us to pass it on).",
     )
@@ -147,7 +147,7 @@ def _find(path: Path, side: str) -> Path:
 def _read(file: Path) -> dict[str, Any]:
     content = load_pickle(file, stand_ins=_STAND_INS, max_bytes=MAX_FILE_BYTES)
     if not isinstance(content, dict):
-        raise BadHandModel("holds no table of named arrays", where=file, remedy=_REMEDY)
+        raise BadHandModel("does not contain a table of named arrays", where=file, remedy=_REMEDY)
     return content
 
 
@@ -155,7 +155,7 @@ def _shape_basis(content: dict[str, Any], file: Path) -> np.ndarray:
     return _dense(content, "shapedirs", (VERTEX_COUNT, 3, SHAPE_COUNT), file)
 
 
-def _needs_mending(shape_basis: np.ndarray, left: Path) -> bool:
+def _needs_correction(shape_basis: np.ndarray, left: Path) -> bool:
     try:
         right = _find(left.parent, "right")
     except BadHandModel:
@@ -172,7 +172,7 @@ def _check_tree(content: dict[str, Any], file: Path) -> None:
 
 
 def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Path) -> np.ndarray:
-    """A field as a float64 array of the wanted shape, whatever it was stored as."""
+    """A field as a float64 array of the expected shape, whatever it was stored as."""
     if field not in content:
         raise BadHandModel("is missing", where=file, field=field, remedy=_REMEDY)
     try:

@@ -14,7 +14,7 @@ import numpy as np
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.capture.schema import MAX_FRAMES
-from hwp_bench.importers.interhand.sequences import SPLITS, Sequence
+from hwp_bench.importers.interhand.sequences import SPLITS, InterHandSequence
 
 #: Largest annotation file; the training part's `data` file has about 1 GB.
 MAX_BYTES = 3 * 1024 * 1024 * 1024
@@ -26,7 +26,7 @@ FIRST_JOINT = {"right": 0, "left": 21}
 
 
 @dataclass(frozen=True, eq=False)
-class Mano:
+class ManoAnnotation:
     """MANO parameters of one hand in every frame, world frame.
 
     Attributes:
@@ -66,10 +66,10 @@ class InterHandRecords:
     K: np.ndarray
     viewmat: np.ndarray
     joints: Mapping[str, np.ndarray]
-    mano: Mapping[str, Mano]
+    mano: Mapping[str, ManoAnnotation]
 
 
-def read_annotations(root: str | os.PathLike[str], sequence: Sequence) -> InterHandRecords:
+def read_annotations(root: str | os.PathLike[str], sequence: InterHandSequence) -> InterHandRecords:
     """Read what belongs to one camera of one sequence.
 
     Args:
@@ -112,7 +112,7 @@ def _annotation(base: Path, split: str, kind: str) -> Path:
     return base / "annotations" / split / f"InterHand2.6M_{split}_{kind}.json"
 
 
-def _data(base: Path, sequence: Sequence) -> tuple[str, dict[str, Any]]:
+def _data(base: Path, sequence: InterHandSequence) -> tuple[str, dict[str, Any]]:
     splits = (sequence.split,) if sequence.split else SPLITS
     for split in splits:
         folder = base / "images" / split / f"Capture{sequence.capture}" / sequence.name
@@ -121,39 +121,39 @@ def _data(base: Path, sequence: Sequence) -> tuple[str, dict[str, Any]]:
         path = _annotation(base, split, "data")
         value = read_json(path, max_bytes=MAX_BYTES)
         if not isinstance(value, dict):
-            raise BadInput("is no JSON object", where=path)
+            raise BadInput("is not a JSON object", where=path)
         return split, value
     raise BadInput(
-        f"holds no images/*/Capture{sequence.capture}/{sequence.name}",
+        f"does not contain images/*/Capture{sequence.capture}/{sequence.name}",
         where=base,
         remedy="Give the folder with images/ and annotations/ of InterHand2.6M.",
     )
 
 
-def _frames(data: dict[str, Any], sequence: Sequence, where: Path) -> list[dict[str, Any]]:
-    wanted = {}
+def _frames(data: dict[str, Any], sequence: InterHandSequence, where: Path) -> list[dict[str, Any]]:
+    chosen = {}
     for image in _list(data, "images", where):
         if (
             str(image.get("capture")) == str(sequence.capture)
             and image.get("seq_name") == sequence.name
             and str(image.get("camera")) == sequence.camera
         ):
-            wanted[image.get("id")] = image
+            chosen[image.get("id")] = image
     types = {
         item.get("image_id"): item.get("hand_type")
         for item in _list(data, "annotations", where)
-        if item.get("image_id") in wanted
+        if item.get("image_id") in chosen
     }
     rows = []
-    for key, image in wanted.items():
+    for key, image in chosen.items():
         row = {**image, "hand_type": types.get(key)}
         for name in ("frame_idx", "width", "height"):
             try:
                 row[name] = int(row[name])
             except (KeyError, TypeError, ValueError) as error:
-                raise BadInput(f"image {key} has none", where=where, field=name) from error
+                raise BadInput(f"image {key} does not have it", where=where, field=name) from error
         if not isinstance(row.get("file_name"), str):
-            raise BadInput(f"image {key} has none", where=where, field="file_name")
+            raise BadInput(f"image {key} does not have it", where=where, field="file_name")
         if row["hand_type"] in ("right", "left", "interacting"):
             rows.append(row)
     if not 1 <= len(rows) <= MAX_FRAMES:
@@ -171,7 +171,7 @@ def _frames(data: dict[str, Any], sequence: Sequence, where: Path) -> list[dict[
 def _list(data: dict[str, Any], name: str, where: Path) -> list[dict[str, Any]]:
     value = data.get(name)
     if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise BadInput("is no list of objects", where=where, field=name)
+        raise BadInput("is not a list of objects", where=where, field=name)
     return value
 
 
@@ -182,7 +182,9 @@ def _image(folder: Path, name: str) -> Path:
     return path
 
 
-def _of_capture(base: Path, split: str, kind: str, sequence: Sequence) -> tuple[Path, dict]:
+def _of_capture(
+    base: Path, split: str, kind: str, sequence: InterHandSequence
+) -> tuple[Path, dict]:
     path = _annotation(base, split, kind)
     value = read_json(path, max_bytes=MAX_BYTES)
     found = value.get(str(sequence.capture)) if isinstance(value, dict) else None
@@ -191,7 +193,7 @@ def _of_capture(base: Path, split: str, kind: str, sequence: Sequence) -> tuple[
     return path, found
 
 
-def _camera(base: Path, split: str, sequence: Sequence) -> tuple[np.ndarray, np.ndarray]:
+def _camera(base: Path, split: str, sequence: InterHandSequence) -> tuple[np.ndarray, np.ndarray]:
     path, capture = _of_capture(base, split, "camera", sequence)
 
     def numbers(name: str, *shape: int) -> np.ndarray:
@@ -202,7 +204,7 @@ def _camera(base: Path, split: str, sequence: Sequence) -> tuple[np.ndarray, np.
     position, rotation = numbers("campos", 3) / 1000.0, numbers("camrot", 3, 3)
     focal, centre = numbers("focal", 2), numbers("princpt", 2)
     if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or focal.min() <= 0:
-        raise BadInput("is no rotation, or a focal length is not above 0", where=path)
+        raise BadInput("is not a rotation, or a focal length is not above 0", where=path)
     # Written with six digits, it is a rotation only to about 1e-6: take the nearest one.
     left, _, right = np.linalg.svd(rotation)
     viewmat = np.eye(4)
@@ -213,7 +215,7 @@ def _camera(base: Path, split: str, sequence: Sequence) -> tuple[np.ndarray, np.
 
 
 def _joints(
-    base: Path, split: str, sequence: Sequence, keys: list[str], sides: tuple[str, ...]
+    base: Path, split: str, sequence: InterHandSequence, keys: list[str], sides: tuple[str, ...]
 ) -> dict[str, np.ndarray]:
     path, capture = _of_capture(base, split, "joint_3d", sequence)
     found = {side: np.full((len(keys), 21, 3), np.nan) for side in sides}
@@ -232,8 +234,8 @@ def _joints(
 
 
 def _mano(
-    base: Path, split: str, sequence: Sequence, keys: list[str], sides: tuple[str, ...]
-) -> dict[str, Mano]:
+    base: Path, split: str, sequence: InterHandSequence, keys: list[str], sides: tuple[str, ...]
+) -> dict[str, ManoAnnotation]:
     path, capture = _of_capture(base, split, "MANO_NeuralAnnot", sequence)
     made = {}
     for side in sides:
@@ -246,12 +248,12 @@ def _mano(
                 continue
             field = f"{sequence.capture}.{key}.{side}"
             if not isinstance(hand, dict):
-                raise BadInput("is no JSON object", where=path, field=field)
+                raise BadInput("is not a JSON object", where=path, field=field)
             for name, target in (("pose", pose), ("shape", shape), ("trans", transl)):
-                wanted = (target.shape[1],)
-                target[index] = _numbers(hand.get(name), wanted, path, f"{field}.{name}", flat=True)
+                length = (target.shape[1],)
+                target[index] = _numbers(hand.get(name), length, path, f"{field}.{name}", flat=True)
             valid[index] = True
-        made[side] = Mano(pose.reshape(-1, 16, 3), shape, transl, valid)
+        made[side] = ManoAnnotation(pose.reshape(-1, 16, 3), shape, transl, valid)
     return made
 
 
@@ -261,8 +263,8 @@ def _numbers(
     try:
         array = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise BadInput("is no list of numbers", where=where, field=field) from error
+        raise BadInput("is not a list of numbers", where=where, field=field) from error
     array = array.reshape(-1) if flat else array
     if array.shape != shape or not np.isfinite(array).all():
-        raise BadInput(f"is no finite array of shape {shape}", where=where, field=field)
+        raise BadInput(f"is not a finite array of shape {shape}", where=where, field=field)
     return array

@@ -1,7 +1,7 @@
 """Make a capture of one camera of one sequence of InterHand2.6M.
 
-Masks are silhouettes of the annotated hands: the data set has none. What the hands hide of each
-other is inside the one mask of a capture; sleeves and marks on the skin are not told apart.
+Masks are silhouettes of the annotated hands: the data set has none. Parts of a hand that the other
+hand hides are inside the one mask of a capture. Sleeves and marks on the skin are in it too.
 """
 
 from __future__ import annotations
@@ -22,8 +22,12 @@ from hwp_bench.capture.convert import with_one_shape
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
 from hwp_bench.hands.fitting import FitTargets, fit_hand
 from hwp_bench.hands.raster import draw_silhouette
-from hwp_bench.importers.interhand.annotations import InterHandRecords, Mano, read_annotations
-from hwp_bench.importers.interhand.sequences import Sequence
+from hwp_bench.importers.interhand.annotations import (
+    InterHandRecords,
+    ManoAnnotation,
+    read_annotations,
+)
+from hwp_bench.importers.interhand.sequences import InterHandSequence
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.overlay import (
     ProjectedHand,
@@ -69,7 +73,7 @@ class InterHandImport:
 
 def import_interhand(
     root: str | os.PathLike[str],
-    sequence: Sequence,
+    sequence: InterHandSequence,
     out: str | os.PathLike[str],
     options: InterHandImport | None = None,
 ) -> dict[str, Any]:
@@ -82,11 +86,11 @@ def import_interhand(
         options: choices; the defaults where None.
 
     Returns:
-        Facts by which to judge it: mean distance of the hand's joints from the annotated ones,
+        Facts that measure the import: mean distance of the hand's joints from the annotated ones,
         mm, and of the vertices from their place before all frames got one shape, mm.
 
     Raises:
-        BadInput: a file or field is missing or damaged, or a hand is annotated nowhere.
+        BadInput: a file or field is missing or damaged, or a hand has no annotation.
         UsageError: `out` exists.
     """
     options = options or InterHandImport()
@@ -131,11 +135,11 @@ def import_interhand(
 
 
 def _mano_hand(
-    mano: Mano, template: HandTemplate, side: str, root: str | os.PathLike[str]
+    mano: ManoAnnotation, template: HandTemplate, side: str, root: str | os.PathLike[str]
 ) -> tuple[HandParameters, np.ndarray]:
     """MANO as annotated: relative to the mean pose, each hand with its own model."""
     if not mano.valid.any():
-        raise BadInput(f"the {side} hand has MANO parameters in no frame", where=root)
+        raise BadInput(f"the {side} hand has no MANO parameters in any frame", where=root)
     pose = mano.pose.copy()
     pose[:, 1:] += template.mean_pose.reshape(15, 3)
     return with_one_shape(template, pose, mano.shape, mano.transl, mano.valid)
@@ -145,10 +149,10 @@ def _free_hand(
     records: InterHandRecords, template: HandTemplate, side: str, root: str | os.PathLike[str]
 ) -> HandParameters:
     joints = records.joints[side]
-    # The wrist and two knuckles place a hand; without them nothing does.
+    # A hand is placed by its wrist and knuckles; without them it cannot be placed.
     valid = np.isfinite(joints[:, [0, 5, 9, 17]]).all(axis=(1, 2))
     if not valid.any():
-        raise BadInput(f"the {side} hand has joints in no frame", where=root)
+        raise BadInput(f"the {side} hand has no joints in any frame", where=root)
     mano = records.mano[side]
     pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
     zeros = np.zeros((len(pose), 3))
@@ -209,7 +213,7 @@ def _shifted(K: np.ndarray, windows: CropWindows, frame: int) -> np.ndarray:
 
 def _info(
     records: InterHandRecords,
-    sequence: Sequence,
+    sequence: InterHandSequence,
     templates: Mapping[str, HandTemplate],
     facts: Mapping[str, Any],
     options: InterHandImport,
@@ -251,7 +255,7 @@ def _frames(
         for clip in clips.values():
             if clip.valid[frame]:
                 mask |= draw_silhouette(clip.pixels[frame], clip.faces, windows.size)
-        # Beyond the camera's frame there is no hand to be seen.
+        # Outside the camera's frame no hand is visible.
         inside = resample(cut(whole_frame, corner, windows.side), windows.size)
         mask[inside < 255] = 0
         yield resample(cut(whole, corner, windows.side), windows.size), mask

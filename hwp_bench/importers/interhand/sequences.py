@@ -15,7 +15,7 @@ _PATH = re.compile(r"(?:(train|val|test)/)?Capture(\d{1,4})/([A-Za-z0-9_.-]{1,80
 
 
 @dataclass(frozen=True)
-class Sequence:
+class InterHandSequence:
     """One camera of one sequence."""
 
     #: Number of the capture.
@@ -34,17 +34,17 @@ class Sequence:
 
 
 #: The three sequences of the paper.
-PAPER_SEQUENCES: Mapping[str, Sequence] = MappingProxyType(
+PAPER_SEQUENCES: Mapping[str, InterHandSequence] = MappingProxyType(
     {
-        "touchrom-15": Sequence(21, "0390_dh_touchROM", "400015"),
-        "touchrom-16": Sequence(21, "0390_dh_touchROM", "400016"),
-        "handscratch-16": Sequence(21, "0286_handscratch", "400016"),
+        "touchrom-15": InterHandSequence(21, "0390_dh_touchROM", "400015"),
+        "touchrom-16": InterHandSequence(21, "0390_dh_touchROM", "400016"),
+        "handscratch-16": InterHandSequence(21, "0286_handscratch", "400016"),
     }
 )
 
 
-def find_sequence(name: str) -> Sequence:
-    """Look a sequence up.
+def find_sequence(name: str) -> InterHandSequence:
+    """Look up a sequence.
 
     Args:
         name: one of `PAPER_SEQUENCES`, or `[split/]CaptureN/SEQUENCE/camID` as the data set's
@@ -58,8 +58,8 @@ def find_sequence(name: str) -> Sequence:
     match = _PATH.fullmatch(name.strip("/"))
     if match is None or match.group(3).strip(".") == "":
         raise UsageError(
-            f"{name!r} is no sequence",
+            f"{name!r} is not a sequence",
             field="SEQUENCE",
             remedy=f"Use {', '.join(PAPER_SEQUENCES)}, or CaptureN/SEQUENCE/camID.",
         )
-    return Sequence(int(match.group(2)), match.group(3), match.group(4), match.group(1))
+    return InterHandSequence(int(match.group(2)), match.group(3), match.group(4), match.group(1))

@@ -1,13 +1,13 @@
-"""Crop, mask and intrinsics of one frame: computed correctly, or as the released loader does.
+"""Crop, mask and intrinsics of the frames: computed correctly, or as the released loader does.
 
-What the released loader (`wildghand/data_single.py`, `data_multi.py`) does otherwise:
+The released loader (`wildghand/data_single.py`, `data_multi.py`) differs in these points:
 
 - It sends the pair of focal lengths through the crop's affine map as if it were a point. A focal
   length scales and does not shift, so its fx and fy are off by the map's translation
   (-scale * corner) and differ from each other.
-- It makes the box square in the box's own whole numbers, so that centre and corner are cut off.
-- Its affine map takes whole numbers as pixel centres for the picture, while the principal point
-  is half the size, which is a half-pixel convention: picture and camera are apart by up to half
+- It makes the box square in integer arithmetic, which rounds centre and corner down.
+- Its affine map puts the pixel centres of the image at integers, while the principal point
+  is half the size, which is a half-pixel convention: image and camera differ by up to half
   a pixel of the crop.
 - It samples the large frame at single points (bilinear, no low-pass), so crops are aliased.
 - It changes the box in the loaded data in place: a frame that is read twice by one process has
@@ -24,7 +24,7 @@ import numpy as np
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.progress import progress
-from hwp_bench.importers.official.records import OfficialRecords
+from hwp_bench.importers.official.release_records import OfficialRecords
 from hwp_bench.importers.shared.windows import cut, resample
 
 #: A mask pixel above this is hand, as in the released loader.
@@ -38,14 +38,14 @@ class CroppedFrame:
     """One frame of the capture.
 
     Attributes:
-        picture: (S, S, 3) uint8 sRGB.
+        image: (S, S, 3) uint8 sRGB.
         mask: (S, S) uint8, 255 = hand.
         K: (3, 3) px of the crop.
         corner: (2,) px of the whole frame, top left corner of the crop.
         side: edge of the crop, px of the whole frame.
     """
 
-    picture: np.ndarray
+    image: np.ndarray
     mask: np.ndarray
     K: np.ndarray
     corner: np.ndarray
@@ -70,8 +70,8 @@ def crop_frames(
     """
 
     def one(frame: int) -> tuple[CroppedFrame, tuple[float, float]]:
-        picture = read_rgb(records.images[frame])
-        mask = read_gray(records.masks[frame], picture.shape[:2])
+        image = read_rgb(records.images[frame])
+        mask = read_gray(records.masks[frame], image.shape[:2])
         box = records.boxes[frame]
         if box is None and compat:
             # The loader then halves the intrinsics and leaves the frame as it is, which no
@@ -87,8 +87,8 @@ def crop_frames(
                 raise BadInput("has neither a box nor a hand", where=records.images[frame])
             box = box_of_landmarks(np.concatenate(seen))
         crop = official_crop if compat else correct_crop
-        height, width = picture.shape[:2]
-        cropped = crop(picture, mask, box, float(records.focal[frame]), size)
+        height, width = image.shape[:2]
+        cropped = crop(image, mask, box, float(records.focal[frame]), size)
         return cropped, (width / 2.0, height / 2.0)
 
     count = len(records.images)
@@ -130,18 +130,18 @@ def box_of_landmarks(landmarks: np.ndarray) -> np.ndarray:
 
 
 def correct_crop(
-    picture: np.ndarray, mask: np.ndarray, box: np.ndarray, focal: float, size: int
+    image: np.ndarray, mask: np.ndarray, box: np.ndarray, focal: float, size: int
 ) -> CroppedFrame:
-    """Cut the smallest square of whole pixels about a box, black outside the picture.
+    """Cut the smallest square of whole pixels about a box, black outside the image.
 
     Args:
-        picture: (H, W, 3) uint8.
+        image: (H, W, 3) uint8.
         mask: (H, W) uint8 as stored.
         box: (4,) x1, y1, x2, y2, px.
         focal: px of the whole frame; the principal point is its centre.
         size: edge of the crop after resampling (by area), px.
     """
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     box = np.asarray(box, dtype=np.float64)
     side = int(np.ceil(max(box[2] - box[0], box[3] - box[1], 2.0)))
     corner = np.round((box[:2] + box[2:]) / 2 - side / 2).astype(np.int64)
@@ -150,7 +150,7 @@ def correct_crop(
     K[:2, 2] = (np.array([width / 2, height / 2]) - corner) * scale
     binary = np.where(mask > MASK_THRESHOLD, 255, 0).astype(np.uint8)
     return CroppedFrame(
-        resample(cut(picture, corner, side), size),
+        resample(cut(image, corner, side), size),
         resample(cut(binary, corner, side), size),
         K,
         corner,
@@ -159,32 +159,32 @@ def correct_crop(
 
 
 def official_crop(
-    picture: np.ndarray, mask: np.ndarray, box: np.ndarray, focal: float, size: int
+    image: np.ndarray, mask: np.ndarray, box: np.ndarray, focal: float, size: int
 ) -> CroppedFrame:
-    """Crop as the released loader does; what it does wrong is listed at the top of the module.
+    """Crop as the released loader does; the top of the module lists its mistakes.
 
     Args:
         (all): as for `correct_crop`; of `box` the type matters, as in the loader.
     """
     import cv2
 
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     square = np.array(box)
     square[2:] -= square[:2]
     edge = square[2:].max()
     centre = square[:2] + square[2:] / 2.0
     square[2:] = edge
-    square[:2] = centre - edge / 2.0  # whole numbers cut the half off
+    square[:2] = centre - edge / 2.0  # integers drop the half
     corner, side = square[:2].astype(np.float64), float(edge)
     scale = size / side
     shift = -scale * corner
     matrix = np.array([[scale, 0, shift[0]], [0, scale, shift[1]]], dtype=np.float32)
 
-    def warp(image: np.ndarray) -> np.ndarray:
-        return cv2.warpAffine(image, matrix, (size, size), flags=cv2.INTER_LINEAR)
+    def warp(pixels: np.ndarray) -> np.ndarray:
+        return cv2.warpAffine(pixels, matrix, (size, size), flags=cv2.INTER_LINEAR)
 
     hand = warp((mask > MASK_THRESHOLD).astype(np.uint8)) > 0
-    warped = np.round(warp(picture.astype(np.float32))).clip(0, 255).astype(np.uint8)
+    warped = np.round(warp(image.astype(np.float32))).clip(0, 255).astype(np.uint8)
     K = np.eye(3)
     K[0, 0], K[1, 1] = scale * focal + shift
     K[:2, 2] = scale * np.array([width / 2, height / 2]) + shift

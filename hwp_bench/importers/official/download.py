@@ -15,7 +15,7 @@ from hwp_bench.base.files import cache_root, inside, read_json, sha256_file, wri
 
 #: The release, a data set on the hub.
 REPOSITORY = "XuanHuang0/WildGHand"
-#: What a download folder says of itself.
+#: Name of the record in a download folder.
 RECORD = "hwp-download.json"
 #: Version of the record and of the pins.
 SCHEMA = "hwp-download/1"
@@ -47,7 +47,7 @@ class Hub(Protocol):
 
 @dataclass(frozen=True)
 class Download:
-    """What was downloaded."""
+    """The result of a download."""
 
     #: The folder.
     folder: Path
@@ -126,10 +126,10 @@ def download_release(
         captures: beginnings of folder names, such as `capture0_`; empty takes everything.
         revision: branch, tag or commit; None takes the newest, or the one that was begun.
         pins: file of pinned checksums; None takes the toolkit's cache.
-        update: told (done, total) files.
+        update: called with (done, total) files.
 
     Raises:
-        UsageError: `out` holds something that no earlier call put there, or another commit.
+        UsageError: `out` contains something that no earlier call put there, or another commit.
         BadInput: a file is not what was pinned or what the hub states, or its name leads out of
             the folder.
         HwpError: the hub cannot be reached.
@@ -144,22 +144,22 @@ def download_release(
         )
     commit, files = _ask(hub.files, record["commit"] if record else revision)
     if not re.fullmatch(r"[0-9A-Za-z._-]{1,64}", commit):
-        raise BadInput("the hub states no commit", where=REPOSITORY)
-    wanted = [item for item in files if _matches(item.name, captures)]
-    if not wanted:
+        raise BadInput("the hub does not name a commit", where=REPOSITORY)
+    chosen = [item for item in files if _matches(item.name, captures)]
+    if not chosen:
         raise UsageError("no file of the release matches", field="--capture")
-    targets = {item.name: inside(folder, item.name) for item in wanted}
+    targets = {item.name: inside(folder, item.name) for item in chosen}
     path = pins or cache_root() / "pins" / f"{REPOSITORY.replace('/', '--')}@{commit}.json"
     pinned: dict[str, str] = read_json(path)["files"] if path.is_file() else {}
     folder.mkdir(parents=True, exist_ok=True)
-    said = {"schema": SCHEMA, "repository": REPOSITORY, "revision": revision, "commit": commit}
+    header = {"schema": SCHEMA, "repository": REPOSITORY, "revision": revision, "commit": commit}
     if record is None:
-        write_json(folder / RECORD, {**said, "files": {}})
+        write_json(folder / RECORD, {**header, "files": {}})
     else:
-        said["revision"] = record["revision"]
+        header["revision"] = record["revision"]
     done: dict[str, str] = dict(record["files"]) if record else {}
     kept = 0
-    for index, item in enumerate(wanted):
+    for index, item in enumerate(chosen):
         target = targets[item.name]
         if target.is_file():
             kept += 1
@@ -168,10 +168,10 @@ def download_release(
         done[item.name] = _verified(item, target, pinned.get(item.name) or done.get(item.name))
         pinned[item.name] = done[item.name]
         write_json(path, {"schema": SCHEMA, "commit": commit, "files": pinned})
-        write_json(folder / RECORD, {**said, "files": done})
+        write_json(folder / RECORD, {**header, "files": done})
         if update is not None:
-            update(index + 1, len(wanted))
-    packed = tuple(item.name for item in wanted if item.name.lower().endswith(ARCHIVES))
+            update(index + 1, len(chosen))
+    packed = tuple(item.name for item in chosen if item.name.lower().endswith(ARCHIVES))
     return Download(folder, commit, done, kept, packed)
 
 
@@ -181,10 +181,10 @@ def _record(folder: Path) -> dict[str, Any] | None:
         good = isinstance(value, dict) and value.get("schema") == SCHEMA
         if good and isinstance(value.get("commit"), str) and isinstance(value.get("files"), dict):
             return {"revision": None, **value}
-        raise BadInput("is no record of a download", where=folder / RECORD)
+        raise BadInput("is not the record of a download", where=folder / RECORD)
     if folder.exists() and (folder.is_file() or any(folder.iterdir())):
         raise UsageError(
-            "exists already and is no download of ours",
+            "exists already and was not made by this command",
             where=folder,
             remedy="Choose an empty folder.",
         )

@@ -1,4 +1,4 @@
-"""Folders of the release: which capture they hold, how thinned out, and where its files are."""
+"""Folders of the release: their captures, the subsampling, and where the files are."""
 
 from __future__ import annotations
 
@@ -40,18 +40,18 @@ def find_folders(
         identifier: id of the capture where the folder has no name of the release.
 
     Raises:
-        BadInput: no such folder, no pickle, a name that is none of the release, or two folders
-            of one capture.
+        BadInput: the folder is missing, it contains no pickle, a name is not of the release, or
+            two folders are of one capture.
     """
     root = Path(path)
     if not root.is_dir():
-        raise BadInput("is no folder", where=root)
+        raise BadInput("is not a folder", where=root)
     deeper = ("*", "*/*", "*/*/*")
     below = sorted({file.parent for level in deeper for file in root.glob(f"{level}/output*.pkl")})
     candidates = [root] if _pickles(root) else below
     if not candidates:
         raise BadInput(
-            "holds no output.pkl, neither in itself nor in its folders",
+            "contains no output.pkl, also not in its subfolders",
             where=root,
             remedy="Give a folder of the release, such as capture0_subsample3_single.",
         )
@@ -78,7 +78,7 @@ def _folder(path: Path, identifier: str | None) -> OfficialFolder:
     match = _NAME.fullmatch(name)
     if identifier is None and (match is None or match.group(1) not in catalogue()):
         raise BadInput(
-            f"{name!r} is no name of the release (captureN_subsampleK, N from 0 to 10, "
+            f"{name!r} is not a name of the release (captureN_subsampleK, N from 0 to 10, "
             "for one hand with _single)",
             where=path,
             remedy="Say which capture it is with --id.",
@@ -93,13 +93,13 @@ def _folder(path: Path, identifier: str | None) -> OfficialFolder:
 
 
 def find_file(folder: Path, named: str, *, where: Path, field: str) -> Path:
-    """Find a file that a pickle names, in the pickle's own folder and nowhere else.
+    """Find a file that a pickle names, only in the pickle's own folder.
 
-    The release's paths are of its authors' machine. The last parts of the name are looked for
-    below the folder, the bare file name first; nothing of the name can lead out of the folder.
+    The paths in the release belong to its authors' machine. The last parts of the name are
+    searched for below the folder, the bare file name first. No name can lead out of the folder.
 
     Raises:
-        BadInput: there is no such file.
+        BadInput: the file does not exist.
     """
     parts = [part for part in _SEPARATORS.split(named) if part not in ("", ".", "..")]
     for count in range(1, len(parts) + 1):
@@ -110,5 +110,5 @@ def find_file(folder: Path, named: str, *, where: Path, field: str) -> Path:
         f"names {named[-80:]!r}, which is not in {folder}",
         where=where,
         field=field,
-        remedy="Put the images and masks of the release beside its pickle.",
+        remedy="Put the images and masks of the release next to its pickle.",
     )

@@ -18,7 +18,7 @@ from hwp_bench.hands import load_template
 from hwp_bench.importers.official.crop import CroppedFrame, crop_frames, tracked_joints
 from hwp_bench.importers.official.folders import OfficialFolder
 from hwp_bench.importers.official.hands import ImportedHand, import_hands
-from hwp_bench.importers.official.records import OfficialRecords, read_records
+from hwp_bench.importers.official.release_records import OfficialRecords, read_records
 from hwp_bench.importers.official.sides import choose_sides, unexpected
 from hwp_bench.importers.shared.overlay import (
     ProjectedHand,
@@ -29,9 +29,9 @@ from hwp_bench.importers.shared.overlay import (
 from hwp_bench.importers.shared.writing import refuse_existing, write_capture
 from hwp_bench.taxonomy import catalogue
 
-#: Terms of the release; the capture made of it may not be passed on under others.
+#: Terms of the release; the capture made of it may not be given away under other terms.
 LICENCE = "as the official HWP release (its authors' terms)"
-#: Joints that miss the tracker's by more than this share of the frame are told.
+#: Joints that miss the tracker's by more than this share of the frame cause a warning.
 FAR_JOINTS = 0.1
 
 
@@ -88,8 +88,8 @@ def import_official(
         options: choices; the defaults where None.
 
     Returns:
-        Facts by which to judge the import, as the capture's `extra/import.json` holds them;
-        `warnings` lists what was not expected.
+        Facts that measure the import, as the capture's `extra/import.json` holds them;
+        `warnings` lists everything unexpected.
 
     Raises:
         UnsafePickle: a pickle asks for something that is not plain data.
@@ -123,7 +123,7 @@ def import_official(
     shown = sheet_frames(len(crops))
 
     def sheet() -> np.ndarray:
-        images = {frame: crops[frame].picture for frame in shown}
+        images = {frame: crops[frame].image for frame in shown}
         masks = {frame: crops[frame].mask for frame in shown}
         return posed_sheet(clips, images, masks, tracked)
 
@@ -132,7 +132,7 @@ def import_official(
         info,
         {side: made.hand for side, made in hands.items()},
         cameras,
-        ((crop.picture, crop.mask) for crop in crops),
+        ((crop.image, crop.mask) for crop in crops),
         sheet,
         facts,
         overwrite=options.overwrite,
@@ -184,7 +184,7 @@ def import_facts(
     warnings: list[str],
     options: OfficialImport,
 ) -> dict[str, Any]:
-    """Measure the hands against the records; what looks wrong goes to `warnings` too.
+    """Measure the hands against the records; what looks wrong is added to `warnings`.
 
     Returns:
         JSON: mean distance from the tracker's vertices (mm) and joints (px of the crop), share
@@ -219,7 +219,7 @@ def import_facts(
 
 
 def _vertices_on_masks(clip: ProjectedHand, crops: list[CroppedFrame], valid: np.ndarray) -> float:
-    """Mean share of projected vertices that lie on the hand's mask, of those in the picture."""
+    """Mean share of projected vertices that lie on the hand's mask, of those in the image."""
     shares = []
     for frame in np.flatnonzero(valid):
         mask = crops[frame].mask

@@ -4,7 +4,7 @@ The tracker poses the *right* MANO hand with the left hand's parameters, centres
 knuckle, negates x, and adds `root_rel` and the translation. The left parameters are therefore
 those of a mirrored right hand: a rotation vector (x, y, z) becomes (x, -y, -z) in the left hand's
 own frame. The translation is taken from the stored vertices in closed form, so that no convention
-about the centre has to be believed.
+about the centre is assumed.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
 from hwp_bench.hands.fitting import FitTargets, FittingSettings, fit_hand
 from hwp_bench.hands.mano import FINGERTIPS
-from hwp_bench.importers.official.records import OfficialRecords, SideRecords
+from hwp_bench.importers.official.release_records import OfficialRecords, SideRecords
 
 #: Stored vertices that MANO misses by more than this (median frame, mm) mean that the file does
 #: not follow the convention that is assumed, or was made with another hand model.
 MAX_VERTEX_MM = 10.0
-#: Rows of the 21 landmarks that vertices alone tell: the finger tips.
+#: Rows of the 21 landmarks that are vertices: the finger tips.
 _TIP_ROWS = [4, 8, 12, 16, 20]
 
 

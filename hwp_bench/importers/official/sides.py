@@ -1,4 +1,4 @@
-"""Which hands of a record make the capture, and what about the records was not expected."""
+"""Which hands of the records make the capture, and what is unexpected about the records."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import read_gray
 from hwp_bench.importers.official.crop import MASK_THRESHOLD
 from hwp_bench.importers.official.folders import OfficialFolder
-from hwp_bench.importers.official.records import OfficialRecords
+from hwp_bench.importers.official.release_records import OfficialRecords
 from hwp_bench.taxonomy import catalogue
 
-#: Fewest joints on the mask (mean share), and lead over the other hand, to tell the hand.
+#: Fewest joints on the mask (mean share), and lead over the other hand, to decide.
 MIN_SHARE, MIN_LEAD = 0.5, 0.1
-#: Frames that are looked at for it.
+#: Number of frames that are examined.
 LOOKED_AT = 24
 
 
@@ -24,7 +24,7 @@ def unexpected(folder: OfficialFolder, records: OfficialRecords) -> list[str]:
         found.append("records were not in the order of their images; they are now")
     entry = catalogue().get(folder.id)
     if entry is None:
-        found.append(f"{folder.id} is none of the paper's captures: perturbations unknown")
+        found.append(f"{folder.id} is not one of the paper's captures: perturbations unknown")
         return found
     if (entry.hands == "single") != folder.single:
         found.append(f"the folder's name contradicts the paper: {folder.id} is {entry.hands}")
@@ -39,19 +39,19 @@ def choose_sides(
 ) -> tuple[tuple[str, ...], list[str]]:
     """Decide which hands the capture has.
 
-    The tracker writes both hands in every capture. Of a single-hand one the hand is taken whose
-    joints lie on the masks, unless `hand` says it.
+    The tracker writes both hands in every capture. Of a single-hand capture it
+    is the hand whose joints lie on the masks, unless `hand` names it.
 
     Args:
         folder: the folder.
         records: its records.
-        hand: the user's word, or None.
+        hand: the user's choice, or None.
 
     Returns:
-        The sides, and what to tell the user about the choice.
+        The sides, and messages to the user about the choice.
 
     Raises:
-        BadInput: a hand is missing, or finite in no frame; or the masks do not tell.
+        BadInput: a hand is missing or not finite in any frame, or the masks do not decide.
     """
     entry = catalogue().get(folder.id)
     single = entry.hands == "single" if entry else folder.single
@@ -74,21 +74,21 @@ def choose_sides(
         return (side,), []
     shares = {side: _share_on_mask(records, side) for side in records.sides}
     side = max(shares, key=lambda name: shares[name])
-    told = ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
+    listed = ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
     if shares[side] < MIN_SHARE or shares[side] - min(shares.values()) < MIN_LEAD:
         raise BadInput(
-            f"masks do not tell which hand is in the picture (share of joints on them: {told})",
+            f"the masks do not show which hand is in the image (share of joints on them: {listed})",
             where=folder.path,
-            remedy="Say it with --hand.",
+            remedy="Name the hand with --hand.",
         )
     _need_valid(folder, records, (side,))
-    return (side,), [f"{side} hand taken, by the share of joints on the masks: {told}"]
+    return (side,), [f"{side} hand taken, by the share of joints on the masks: {listed}"]
 
 
 def _need_valid(folder: OfficialFolder, records: OfficialRecords, sides: tuple[str, ...]) -> None:
     for side in sides:
         if not records.sides[side].valid.any():
-            raise BadInput(f"the {side} hand is finite in no frame", where=folder.path)
+            raise BadInput(f"the {side} hand is not finite in any frame", where=folder.path)
 
 
 def _share_on_mask(records: OfficialRecords, side: str) -> float:

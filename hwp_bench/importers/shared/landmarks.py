@@ -1,4 +1,4 @@
-"""Tracked hand landmarks of a video: reading them, and telling which frames to trust."""
+"""Tracked hand landmarks of a video: reading them, and deciding which frames to trust."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ LANDMARK_NAMES = (
     "wrist",
     *(f"{finger}_{k}" for finger in ("thumb", "index", "middle", "ring", "little") for k in "1234"),
 )
-#: What a hand can span, m: from a small child's fist to an open large hand, with room.
+#: Range of a hand's extent, m: from a small child's fist to a large open hand, with a margin.
 HAND_METRES = (0.02, 0.5)
 #: Pairs of landmarks that a drawing connects.
 LANDMARK_EDGES = (
@@ -61,7 +61,7 @@ def read_landmarks(path: str | os.PathLike[str], *, min_score: float) -> Landmar
         The landmarks; values of frames that are not detected are zero.
 
     Raises:
-        BadInput: the file is missing, no npz, too large, holds objects or the wrong shapes, has
+        BadInput: the file is missing, not an npz, too large, holds objects or the wrong shapes, has
             no detected frame, is not in metres, or has NaN where the score says that a hand was
             seen.
     """
@@ -111,7 +111,7 @@ def _check_metres(path: Path, world: np.ndarray) -> None:
     low, high = HAND_METRES
     if not low <= extent <= high:
         raise BadInput(
-            f"spans {extent:.3g} in a typical frame, no hand in metres",
+            f"spans {extent:.3g} in a typical frame, which is not a hand in metres",
             where=path,
             field="world",
             remedy=f"World landmarks are metres; a hand spans {low:g} to {high:g}.",
@@ -124,27 +124,27 @@ def check_against_video(
     """Check the landmarks against the video that they were tracked in.
 
     Returns:
-        The landmarks; frames are marked as not detected whose hand lies wholly outside the
-        picture, strays from it by more than its size, or is smaller than 8 pixels.
+        The landmarks; frames are marked as not detected whose hand lies completely outside
+        the image, leaves it by more than the image's size, or is smaller than 8 pixels.
 
     Raises:
-        BadInput: another number of frames, or no frame is left.
+        BadInput: the number of frames differs, or no frame is left.
     """
     if len(landmarks.score) != frame_count:
         raise BadInput(
-            f"holds {len(landmarks.score)} frames where the video has {frame_count}",
+            f"has {len(landmarks.score)} frames, the video has {frame_count}",
             where=where,
             field="score",
-            remedy="Track every frame of this very video.",
+            remedy="Track every frame of exactly this video.",
         )
     low, high = landmarks.image.min(axis=1), landmarks.image.max(axis=1)
-    picture = np.array([width, height])
-    inside = ((high > 0) & (low < picture)).all(axis=1)
-    inside &= ((low > -picture) & (high < 2 * picture)).all(axis=1)
+    size = np.array([width, height])
+    inside = ((high > 0) & (low < size)).all(axis=1)
+    inside &= ((low > -size) & (high < 2 * size)).all(axis=1)
     detected = landmarks.detected & inside & ((high - low).max(axis=1) >= 8)
     if not detected.any():
         raise BadInput(
-            f"no landmark lies inside the {width}x{height} picture",
+            f"no landmark lies inside the {width}x{height} image",
             where=where,
             field="image",
             remedy="Landmarks are in pixels of the whole frame, not in [0, 1].",

@@ -1,4 +1,4 @@
-"""Hands posed over the frames of a clip, and the sheet on which a person judges an import."""
+"""Hands projected into the frames of a clip, and the overlay sheet of an import."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class ProjectedHand:
         pixels: (F, V, 2) px, pixel centres at +0.5.
         landmarks: (F, 21, 2) px, OpenPose order.
         faces: (T, 3) int.
-        valid: (F,) bool, false where there is no such hand.
+        valid: (F,) bool, false where the frame does not show this hand.
     """
 
     vertices: np.ndarray
@@ -68,15 +68,15 @@ def sheet_frames(count: int, most: int = SHEET_FRAMES) -> list[int]:
 
 def posed_sheet(
     clips: Mapping[str, ProjectedHand],
-    pictures: Mapping[int, np.ndarray],
+    images: Mapping[int, np.ndarray],
     masks: Mapping[int, np.ndarray],
     tracked: np.ndarray | None = None,
 ) -> np.ndarray:
-    """Draw frames with the outline of their masks, and beside them the posed meshes.
+    """Draw frames with the outline of their masks, with the posed meshes next to them.
 
     Args:
         clips: the hands by side, at least one; the skeleton of the first is drawn.
-        pictures: (H, W, 3) uint8 by frame.
+        images: (H, W, 3) uint8 by frame.
         masks: (H, W) uint8 by frame.
         tracked: (F, N, 2) px, points of the data set to be drawn as dots, NaN where unknown.
 
@@ -89,14 +89,14 @@ def posed_sheet(
         faces.append(clip.faces + offset)
         offset += clip.vertices.shape[1]
     tiles = []
-    for frame, picture in pictures.items():
+    for frame, image in images.items():
         dots = None if tracked is None else tracked[frame]
         tiles.append(
             OverlayFrame(
                 caption=f"frame {frame}",
-                picture=picture,
+                image=image,
                 mask=masks[frame],
-                # Triangles of no size are not drawn: a hand that is not there stays away.
+                # Triangles of no size are not drawn, so a hand that is not visible does not appear.
                 vertices=np.concatenate(
                     [clip.vertices[frame] * clip.valid[frame] for clip in clips.values()]
                 ),
@@ -114,16 +114,16 @@ class OverlayFrame:
 
     Attributes:
         caption: line over the tile.
-        picture: (S, S, 3) uint8 RGB.
+        image: (S, S, 3) uint8 RGB.
         mask: (S, S) uint8, visible hand.
         vertices: (V, 3) m, camera axes.
-        pixels: (V, 2) px of this picture.
+        pixels: (V, 2) px of this image.
         fitted: (21, 2) px, landmarks of the model.
         tracked: (21, 2) px, landmarks of the tracker, or None where it saw nothing.
     """
 
     caption: str
-    picture: np.ndarray
+    image: np.ndarray
     mask: np.ndarray
     vertices: np.ndarray
     pixels: np.ndarray
@@ -132,7 +132,7 @@ class OverlayFrame:
 
 
 def overlay_sheet(frames: Sequence[OverlayFrame], faces: np.ndarray) -> np.ndarray:
-    """Draw the sheet: for each frame its mask's outline, and beside it the shaded mesh.
+    """Draw the sheet: for each frame its mask's outline, and next to it the shaded mesh.
 
     Args:
         frames: at least one.
@@ -143,20 +143,20 @@ def overlay_sheet(frames: Sequence[OverlayFrame], faces: np.ndarray) -> np.ndarr
     """
     tiles = []
     for frame in frames:
-        mesh = draw_mesh(frame.picture, frame.vertices, frame.pixels, faces)
+        mesh = draw_mesh(frame.image, frame.vertices, frame.pixels, faces)
         joints = _draw_landmarks(mesh, frame.fitted, frame.tracked)
-        pair = np.concatenate([outlined(frame.picture, frame.mask), joints], axis=1)
+        pair = np.concatenate([outlined(frame.image, frame.mask), joints], axis=1)
         tiles.append(labelled(pair, frame.caption))
     return sheet(tiles, columns=4)
 
 
 def draw_mesh(
-    picture: np.ndarray, vertices: np.ndarray, pixels: np.ndarray, faces: np.ndarray
+    image: np.ndarray, vertices: np.ndarray, pixels: np.ndarray, faces: np.ndarray
 ) -> np.ndarray:
-    """Blend a mesh over a picture, far triangles first.
+    """Blend a mesh over an image, far triangles first.
 
     Args:
-        picture: (S, S, 3) uint8.
+        image: (S, S, 3) uint8.
         vertices: (V, 3) m, camera axes.
         pixels: (V, 2) px, centres at +0.5.
         faces: (F, 3) int, counter-clockwise seen from outside.
@@ -169,20 +169,20 @@ def draw_mesh(
     lengths = np.linalg.norm(normals, axis=1) * np.linalg.norm(middles, axis=1)
     facing = -(normals * middles).sum(axis=1) / np.maximum(lengths, 1e-20)
     corners = np.clip((pixels - 0.5) * 2**_SHIFT, -(2**20), 2**20).round().astype(np.int32)
-    layer = picture.copy()
+    layer = image.copy()
     for face in np.argsort(-middles[:, 2]):
         if facing[face] > 0:
             shade = tuple((0.35 + 0.65 * facing[face]) * np.array(MESH))
             cv2.fillConvexPoly(layer, corners[faces[face]], shade, cv2.LINE_8, _SHIFT)
-    return cv2.addWeighted(layer, 0.6, picture, 0.4, 0)
+    return cv2.addWeighted(layer, 0.6, image, 0.4, 0)
 
 
 def _draw_landmarks(
-    picture: np.ndarray, fitted: np.ndarray, tracked: np.ndarray | None
+    image: np.ndarray, fitted: np.ndarray, tracked: np.ndarray | None
 ) -> np.ndarray:
     import cv2
 
-    canvas = picture.copy()
+    canvas = image.copy()
     scale = 2**_SHIFT
     spots = np.clip((fitted - 0.5) * scale, -(2**20), 2**20).round().astype(int).tolist()
     for first, last in LANDMARK_EDGES:

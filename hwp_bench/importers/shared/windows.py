@@ -24,7 +24,7 @@ class CropWindows:
     another, and the focal length of the cropped camera is constant.
 
     Attributes:
-        corners: (F, 2) int64, x and y of the top left corner; may lie outside the picture.
+        corners: (F, 2) int64, x and y of the top left corner; may lie outside the image.
         side: pixels of the whole frame.
         size: pixels of the resampled crop.
     """
@@ -47,7 +47,7 @@ class CropWindows:
             height: px.
 
         Returns:
-            (F, 3, 3) float64. Pixel centres are at +0.5 in both pictures, so cropping is a
+            (F, 3, 3) float64. Pixel centres are at +0.5 in both images, so cropping is a
             shift and resampling a scale, with no half-pixel term.
         """
         matrices = np.zeros((len(self.corners), 3, 3))
@@ -79,29 +79,29 @@ def follow_hand(landmarks: Landmarks, fps: float, size: int) -> CropWindows:
     return CropWindows(np.round(path - side / 2.0).astype(np.int64), side, size)
 
 
-def cut(picture: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
-    """Cut a square out of a picture; what lies outside the picture is black.
+def cut(image: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
+    """Cut a square out of an image; what lies outside the image is black.
 
     Args:
-        picture: (H, W) or (H, W, C).
+        image: (H, W) or (H, W, C).
         corner: (2,) integer x and y.
         side: px.
 
     Returns:
         (side, side) or (side, side, C), a copy.
     """
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     x, y = int(corner[0]), int(corner[1])
-    square = np.zeros((side, side, *picture.shape[2:]), dtype=picture.dtype)
+    square = np.zeros((side, side, *image.shape[2:]), dtype=image.dtype)
     left, right = max(x, 0), min(x + side, width)
     top, bottom = max(y, 0), min(y + side, height)
     if left < right and top < bottom:
-        square[top - y : bottom - y, left - x : right - x] = picture[top:bottom, left:right]
+        square[top - y : bottom - y, left - x : right - x] = image[top:bottom, left:right]
     return square
 
 
 def resample(square: np.ndarray, size: int) -> np.ndarray:
-    """Resample a square picture: by area where it shrinks (no aliasing), linearly where it grows.
+    """Resample a square image: by area where it shrinks (no aliasing), linearly where it grows.
 
     Args:
         square: (S, S) or (S, S, C) uint8.

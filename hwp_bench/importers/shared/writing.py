@@ -56,7 +56,7 @@ def write_capture(
         cameras: one camera a frame.
         frames: for each frame its image (H, W, 3) uint8 sRGB and its mask (H, W) uint8.
         sheet: draws the overlay sheet, (H, W, 3) uint8; called once all frames are written.
-        facts: the numbers by which to judge the import, stored as JSON.
+        facts: the numbers that measure the import, stored as JSON.
         overwrite: replace an existing folder.
     """
     import cv2

@@ -2,7 +2,7 @@
 
 from hwp_bench.importers.video.from_video import import_video
 from hwp_bench.importers.video.imported_clip import ImportedClip
-from hwp_bench.importers.video.settings import (
+from hwp_bench.importers.video.video_settings import (
     FitSettings,
     FrameRange,
     VideoImport,

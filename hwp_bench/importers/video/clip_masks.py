@@ -13,7 +13,7 @@ from hwp_bench.hands.topology import boundary_vertices
 from hwp_bench.importers.shared.windows import CropWindows, resample
 from hwp_bench.importers.video.clip_model import ClipModel, posed_vertices
 from hwp_bench.importers.video.contour import signed_distance
-from hwp_bench.importers.video.decode import Pictures
+from hwp_bench.importers.video.decode import ClipImages
 from hwp_bench.importers.video.segmentation import MaskSettings, Prompt, Segmentation, segment_clip
 
 
@@ -36,20 +36,20 @@ class Masking:
     """Makes the masks of one clip.
 
     Args:
-        pictures: of the clip.
+        images: of the clip.
         detected: (F,) bool, frames whose pose comes from a detection.
-        hand_size: px of the working pictures.
+        hand_size: px of the working images.
         own: (F, S, S) uint8 masks of the user's own at the working resolution, or None.
     """
 
     def __init__(
         self,
-        pictures: Pictures,
+        images: ClipImages,
         detected: np.ndarray,
         hand_size: float,
         own: np.ndarray | None,
     ) -> None:
-        self._pictures = pictures
+        self._images = images
         self._detected = detected
         self._hand_size = hand_size
         self._own = own
@@ -69,10 +69,10 @@ class Masking:
             settings: how far to trust it.
             reduction: work at this fraction of the working resolution: 2 is four times faster
                 and enough for the outline.
-            update: told the number of frames done.
+            update: called with the number of frames done.
         """
         coverage, fields, overlaps = [], [], []
-        size = self._pictures.frames.shape[1]
+        size = self._images.frames.shape[1]
         for prompt, found in self._segmentations(projected, settings, reduction):
             coverage.append(resample(found.hand, size))
             fields.append(signed_distance(found.skin))
@@ -84,7 +84,7 @@ class Masking:
     def _segmentations(
         self, projected: ProjectedClip, settings: MaskSettings, reduction: int
     ) -> Iterator[tuple[Prompt, Segmentation]]:
-        working = self._pictures.working
+        working = self._images.working
         edge = working.shape[1] // reduction
 
         def prompt(frame: int) -> Prompt:
@@ -129,7 +129,7 @@ class ProjectedClip:
         return (pixels - self.windows.corners[frame]) * (edge / self.windows.side)
 
     def prompt(self, frame: int, edge: int, detected: bool) -> Prompt:
-        """Draw what the mesh says about a frame's crop at `edge` px."""
+        """Draw the mesh in a frame's crop at `edge` px."""
         pixels = self.in_crop(self.pixels[frame], frame, edge)
         return Prompt(
             draw_silhouette(pixels, self.faces, edge),
@@ -154,13 +154,13 @@ def beyond_wrist(
     """Pixels on the forearm's side of the wrist.
 
     The open end of the mesh spans a plane; its normal points along the forearm. Seen at the
-    wrist's depth, the plane cuts the picture in a line, and the forearm lies behind the line.
+    wrist's depth, the plane cuts the image in a line, and the forearm lies behind the line.
 
     Args:
         vertices: (V, 3) camera axes, m.
         pixels: (V, 2) px.
         ring: vertices of the open end.
-        size: edge of the picture, px.
+        size: edge of the image, px.
 
     Returns:
         (size, size) bool; all False for a mesh without an open end, or seen straight along

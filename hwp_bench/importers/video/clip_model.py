@@ -20,9 +20,9 @@ _ANCHOR_UNIT = 100.0
 
 @dataclass(frozen=True, eq=False)
 class ClipVariables:
-    """What the fit may change; float32 leaf tensors.
+    """The variables of the fit; float32 leaf tensors.
 
-    The wrist is held as a place in the picture and a log depth, because the picture fixes the
+    The wrist is held as a place in the image and a log depth, because the image fixes the
     first tightly and the second loosely.
     """
 
@@ -30,7 +30,7 @@ class ClipVariables:
     turn: torch.Tensor
     #: (F, 15, 3) rad, finger joints.
     fingers: torch.Tensor
-    #: (F, 2) the wrist in the picture, from the principal point, in hundreds of px.
+    #: (F, 2) the wrist in the image, from the principal point, in hundreds of px.
     anchor: torch.Tensor
     #: (F, 1) log of the wrist's depth in m.
     log_depth: torch.Tensor

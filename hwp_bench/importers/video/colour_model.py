@@ -1,4 +1,4 @@
-"""What colours the hand and its surroundings have, learnt once over the whole clip."""
+"""The colours of the hand and of its surroundings, learnt once over the whole clip."""
 
 from __future__ import annotations
 
@@ -7,13 +7,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-#: Pixels of each kind that the model is learnt from; more change nothing.
+#: Pixels of each kind that the model is learnt from; more do not change it.
 SAMPLES = 40_000
 #: Standard deviation (8-bit levels) that is added to every colour. A plain wall is nearly one
 #: colour: a pixel in which video coding has smeared a trace of skin is then a hundred deviations
 #: from the wall and called skin. With a common spread the border lies half way.
 SPREAD = 4.0
-#: Width of the picture that the samples are laid out in.
+#: Width of the image that the samples are laid out in.
 _STRIP = 400
 # Colours within so many standard deviations are the same.
 _SAME_COLOUR = 2.0
@@ -49,7 +49,7 @@ def learn_colours(
     """Learn the mixtures from labelled pixels of all frames.
 
     Args:
-        samples: for each frame its picture (S, S, 3) uint8 and two (S, S) bool arrays: pixels
+        samples: for each frame its image (S, S, 3) uint8 and two (S, S) bool arrays: pixels
             that are hand, and pixels that are not.
         seed: of the choice of pixels and of the clustering.
 
@@ -60,18 +60,18 @@ def learn_colours(
 
     random = np.random.default_rng(seed)
     kinds: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    for picture, hand, other in samples:
+    for image, hand, other in samples:
         for pixels, where in zip(kinds, (hand, other), strict=True):
-            found = picture[where]
-            # A thousand of each frame: every frame has its say, none fills the memory.
+            found = image[where]
+            # A thousand of each frame, so that every frame counts and memory is bounded.
             pixels.append(found[random.integers(0, len(found), 1000)] if len(found) else found)
     hand, other = (np.concatenate([np.zeros((0, 3), np.uint8), *pixels]) for pixels in kinds)
     if min(len(hand), len(other)) < 100:
         return None
     cv2.setRNGSeed(seed)
     model = _mixtures(hand, other, random)
-    # What the hand holds is drawn over, and would be learnt as hand, if its colour were not
-    # seen beside the hand too. (A hand before skin-coloured things loses nothing by this.)
+    # The silhouette also covers what the hand holds. Colours that also occur next to the hand
+    # are therefore not learnt as hand. (A hand before skin-coloured things is not harmed.)
     elsewhere = _least_distance(hand, model.background) < _SAME_COLOUR**2
     if 0.0 < elsewhere.mean() < 0.5:
         model = _mixtures(hand[~elsewhere], other, random)
@@ -92,25 +92,25 @@ def _mixtures(hand: np.ndarray, other: np.ndarray, random: np.random.Generator) 
     return ColourModel(background, foreground)
 
 
-def evidence(picture: np.ndarray, model: ColourModel) -> np.ndarray:
+def evidence(image: np.ndarray, model: ColourModel) -> np.ndarray:
     """Log of (likelihood as hand / likelihood as surroundings) for every pixel.
 
     Args:
-        picture: (S, S, 3) uint8, in the colour space that the model was learnt in.
+        image: (S, S, 3) uint8, in the colour space that the model was learnt in.
         model: the mixtures.
 
     Returns:
         (S, S) float32.
     """
-    colours, place = np.unique(_packed(picture), return_inverse=True)
+    colours, place = np.unique(_packed(image), return_inverse=True)
     table = np.stack([colours >> 16, (colours >> 8) & 255, colours & 255], axis=1).astype(float)
     value = _log_density(table, model.foreground) - _log_density(table, model.background)
-    return value.astype(np.float32)[place].reshape(picture.shape[:2])
+    return value.astype(np.float32)[place].reshape(image.shape[:2])
 
 
-def _packed(picture: np.ndarray) -> np.ndarray:
+def _packed(image: np.ndarray) -> np.ndarray:
     """Colours as one number each, at half the resolution of each channel."""
-    coarse = picture.astype(np.uint32) | 1
+    coarse = image.astype(np.uint32) | 1
     return (coarse[..., 0] << 16) | (coarse[..., 1] << 8) | coarse[..., 2]
 
 

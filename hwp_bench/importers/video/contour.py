@@ -14,9 +14,9 @@ from hwp_bench.hands.topology import boundary_vertices
 from hwp_bench.importers.shared.windows import CropWindows
 from hwp_bench.importers.video.clip_model import ClipModel, PosedClip, posed_vertices
 from hwp_bench.importers.video.fit_terms import geman_mcclure
-from hwp_bench.importers.video.settings import FitSettings
+from hwp_bench.importers.video.video_settings import FitSettings
 
-#: Edge of the pictures in which outlines are compared, px; distances interpolate well, so less
+#: Edge of the images in which outlines are compared, px; distances interpolate well, so less
 #: than the crop's resolution is enough.
 FIELD_SIZE = 192
 #: Outline vertices of each frame.
@@ -30,13 +30,13 @@ _STEP = 0.5
 class ContourEnergy:
     """Robust distance of outline vertices from the mask's outline, along their normals.
 
-    Which vertices, and where each shall go, is decided by `rematch` between rounds of descent
-    and held within a round (iterated closest points). The wrist's open end is no outline of the
-    hand and never chosen.
+    The vertices and their targets are chosen by `rematch` between rounds of descent
+    and held within a round (iterated closest points). The wrist's open end is not an outline of
+    the hand and never chosen.
 
     Args:
         fields: (F, S, S) signed distances of the masks of hand and forearm, from
-            `signed_distance`; zero fields say nothing.
+            `signed_distance`; zero fields have no effect.
         usable: (F,) bool, frames that count.
         windows: where the fields lie in the whole frame.
         settings: weights and scales.
@@ -209,9 +209,9 @@ def _on_outline(pixels: np.ndarray, own: np.ndarray, candidates: np.ndarray) -> 
     return chosen
 
 
-def _sample(picture: np.ndarray, places: np.ndarray) -> np.ndarray:
+def _sample(image: np.ndarray, places: np.ndarray) -> np.ndarray:
     """Bilinear samples (P,) at (P, 2) px, pixel centres at +0.5, the border repeated."""
     import cv2
 
     x, y = (places[:, axis, None].astype(np.float32) - 0.5 for axis in (0, 1))
-    return cv2.remap(picture, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]
+    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]

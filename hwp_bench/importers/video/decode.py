@@ -16,12 +16,12 @@ from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import MAX_PIXELS, read_gray
 from hwp_bench.importers.shared.windows import CropWindows, cut, resample
 from hwp_bench.importers.video.contour import FIELD_SIZE
-from hwp_bench.importers.video.settings import FrameRange
+from hwp_bench.importers.video.video_settings import FrameRange
 
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """What a video is.
+    """Path, size and rate of a video.
 
     Attributes:
         path: the file.
@@ -42,7 +42,7 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
     """Open a video and decode its first frame.
 
     Raises:
-        BadInput: missing, empty, no video that OpenCV reads, no frame, or frames too large.
+        BadInput: the file is missing or empty, OpenCV cannot read it, or its frames are too large.
     """
     path = Path(path)
     with _opened(path) as capture:
@@ -58,7 +58,7 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
         stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
         found, frame = capture.read()
         if not found or frame is None:
-            raise BadInput("holds no frame that can be decoded", where=path)
+            raise BadInput("contains no frame that can be decoded", where=path)
     return VideoInfo(
         path=path,
         width=frame.shape[1],
@@ -69,12 +69,12 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
 
 
 @dataclass(frozen=True, eq=False)
-class Pictures:
+class ClipImages:
     """The frames of a clip at two resolutions.
 
     Attributes:
-        frames: (F, size, size, 3) uint8 RGB, what the capture stores.
-        working: (F, S, S, 3) uint8 RGB, what masks are cut in: the video's own resolution, at
+        frames: (F, size, size, 3) uint8 RGB, as the capture stores them.
+        working: (F, S, S, 3) uint8 RGB, for cutting masks: the video's own resolution, at
             most twice the stored one.
     """
 
@@ -83,7 +83,7 @@ class Pictures:
 
 
 def working_size(windows: CropWindows) -> int:
-    """Edge of the working pictures, px."""
+    """Edge of the working images, px."""
     return min(windows.side, 2 * windows.size)
 
 
@@ -91,7 +91,7 @@ def check_memory(windows: CropWindows) -> None:
     """Refuse a clip that would not fit into memory, before minutes of work.
 
     Raises:
-        UsageError: the pictures would take more than the free memory.
+        UsageError: the images would take more than the free memory.
     """
     import psutil
 
@@ -108,12 +108,12 @@ def check_memory(windows: CropWindows) -> None:
         )
 
 
-def read_pictures(
+def read_images(
     info: VideoInfo,
     selection: FrameRange,
     windows: CropWindows,
     update: Callable[[int], None] | None = None,
-) -> Pictures:
+) -> ClipImages:
     """Decode the video once and keep the window of every selected frame.
 
     Raises:
@@ -123,9 +123,9 @@ def read_pictures(
     frames = np.zeros((count, windows.size, windows.size, 3), dtype=np.uint8)
     working = np.zeros((count, edge, edge, 3), dtype=np.uint8)
     done = 0
-    for _, picture in read_frames(info, selection):
+    for _, image in read_frames(info, selection):
         if done < count:
-            square = cut(picture, windows.corners[done], windows.side)
+            square = cut(image, windows.corners[done], windows.side)
             frames[done] = resample(square, windows.size)
             working[done] = resample(square, edge)
         done += 1
@@ -133,11 +133,11 @@ def read_pictures(
             update(min(done, count))
     if done != count:
         raise BadInput(
-            f"yields {done} frames where the landmarks have {count}",
+            f"has {done} frames, the landmarks have {count}",
             where=info.path,
             remedy="The video may be truncated, or the landmarks belong to another one.",
         )
-    return Pictures(frames, working)
+    return ClipImages(frames, working)
 
 
 def read_masks(
@@ -164,7 +164,7 @@ def read_masks(
     """
     folder = Path(folder)
     if not folder.is_dir():
-        raise BadInput("is no folder", where=folder, field="--masks")
+        raise BadInput("is not a folder", where=folder, field="--masks")
     numbered: dict[int, Path] = {}
     for path in sorted(folder.iterdir()):
         number = re.search(r"(\d+)$", path.stem)
@@ -198,7 +198,7 @@ def read_frames(info: VideoInfo, selection: FrameRange) -> Iterator[tuple[int, n
         (index in the video, (H, W, 3) uint8 RGB).
 
     Raises:
-        BadInput: the size changes on the way, or the video ends before `selection.stop`.
+        BadInput: the size changes between frames, or the video ends before `selection.stop`.
     """
     import cv2
 
@@ -219,7 +219,7 @@ def read_frames(info: VideoInfo, selection: FrameRange) -> Iterator[tuple[int, n
             index += 1
     if selection.stop is not None and index < selection.stop:
         raise BadInput(
-            f"ends after {index} frames where {selection.stop} are asked for",
+            f"ends after {index} frames, {selection.stop} are selected",
             where=info.path,
             remedy="Choose other frames with --frames; the file may be truncated.",
         )
@@ -236,7 +236,7 @@ def _opened(path: Path) -> Iterator[Any]:
     capture = cv2.VideoCapture(os.fspath(path))
     try:
         if not capture.isOpened():
-            raise BadInput("is no video that can be read", where=path)
+            raise BadInput("is not a video that can be read", where=path)
         yield capture
     finally:
         capture.release()

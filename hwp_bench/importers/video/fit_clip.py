@@ -17,14 +17,14 @@ from hwp_bench.importers.video.clip_model import ClipModel, PosedClip
 from hwp_bench.importers.video.contour import ContourEnergy
 from hwp_bench.importers.video.fit_terms import LandmarkEnergy
 from hwp_bench.importers.video.rigid_start import rigid_start
-from hwp_bench.importers.video.settings import FitSettings
+from hwp_bench.importers.video.video_settings import FitSettings
 
-#: Focal length that is taken for likely where none is given, as a share of the picture's longer
+#: Likely focal length where none is given, as a share of the image's longer
 #: side: a horizontal field of view of 64 degrees, between a webcam and a phone's main camera.
 LIKELY_FOCAL = 0.8
-# Variables that are the same in all frames; they wait until every frame has found its pose.
+# Variables that are the same in all frames; they are held until every frame has found its pose.
 _CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
-# Variables that the outline says nothing reliable about.
+# Variables that the outline does not determine reliably.
 _HELD_BY_LANDMARKS = ("log_focal", "log_size")
 #: First step of each variable, in its own unit; constants move slower than poses.
 LEARNING_RATES = {
@@ -44,7 +44,7 @@ _LAST_RATE = 0.02
 
 @dataclass(frozen=True)
 class Footage:
-    """What the fit knows of the pictures.
+    """Size, rate and focal length of the frames.
 
     Attributes:
         width: whole frame, px.
@@ -71,7 +71,7 @@ class Footage:
 
 @dataclass(frozen=True, eq=False)
 class FittedClip:
-    """A fit in progress: the model with its variables, and the energy without pictures.
+    """A fit in progress: the model with its variables, and the energy without images.
 
     Attributes:
         model: the clip.
@@ -95,7 +95,7 @@ class ReprojectionError:
         worst_landmark: name of the landmark with the largest mean.
         worst_landmark_mean: its mean.
         without_offsets: mean where the model's bare joints and finger tips are compared.
-        by_frame: (F,) mean of each frame; NaN where nothing was detected.
+        by_frame: (F,) mean of each frame; NaN where no hand was detected.
     """
 
     mean: float
@@ -205,7 +205,7 @@ def descend(
         steps: number of steps.
         rate: factor on all learning rates.
         hold: variables that stay.
-        update: told the number of steps done.
+        update: called with the number of steps done.
 
     Returns:
         The last energy.
@@ -231,7 +231,7 @@ def descend(
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Hold torch to one thread: its operations here are too small to share out.
+    """Hold torch to one thread: the operations here are too small to be parallel.
 
     On a busy machine the threads of a small operation wait for each other, and a fit takes
     several times as long.

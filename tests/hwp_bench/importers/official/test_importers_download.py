@@ -165,7 +165,7 @@ def test_the_command_uses_the_hubs_own_client(tmp_path: Path, monkeypatch, capsy
     out = tmp_path / "WildGHand"
     assert main(["data", "get", "hwp", "-o", str(out)]) == 0
     printed = capsys.readouterr().out
-    assert f"{out}, 4 files, 0 of them there before" in printed
+    assert f"{out}, 4 files, 0 of them existed before" in printed
     assert {(call["revision"], call["repo_type"]) for call in calls} == {("c0ffee", "dataset")}
     assert list((tmp_path / "cache" / "pins").iterdir())
     assert main(["data", "get", "hwp", "-o", str(out), "--json"]) == 0

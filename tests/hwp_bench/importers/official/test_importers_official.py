@@ -34,7 +34,7 @@ from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.importers.official import OfficialImport, import_official
 from hwp_bench.importers.official.crop import box_of_landmarks, correct_crop, official_crop
 from hwp_bench.importers.official.folders import find_folders
-from hwp_bench.importers.official.records import read_records
+from hwp_bench.importers.official.release_records import read_records
 from hwp_bench.importers.shared.overlay import project_hand
 
 FRAMES = 12
@@ -156,7 +156,7 @@ def test_a_correct_crop_shows_a_point_where_its_camera_says(x: int, y: int, w: i
     assert crop.K[0, 0] == crop.K[1, 1] == pytest.approx(FOCAL * 256 / crop.side)
     point = (np.array([column + 0.5, row + 0.5]) - [WIDTH / 2, HEIGHT / 2]) / FOCAL
     expected = crop.K[:2, :2] @ point + crop.K[:2, 2]
-    weight = crop.picture[:, :, 0].astype(float)
+    weight = crop.image[:, :, 0].astype(float)
     if not (expected.min() > 12 and expected.max() < 244) or crop.side < 40:
         return
     rows, columns = np.mgrid[:256, :256] + 0.5
@@ -183,7 +183,7 @@ def test_the_loaders_crop_and_its_focal_length_that_shifts() -> None:
     expected = cv2.warpAffine(picture.astype(np.float32), warp, (256, 256), flags=cv2.INTER_LINEAR)
     hand = cv2.warpAffine((mask > 100).astype(np.uint8), warp, (256, 256), flags=cv2.INTER_LINEAR)
     np.testing.assert_array_equal(crop.mask > 0, hand > 0)
-    difference = np.abs(crop.picture.astype(float) - expected * (hand > 0)[:, :, None])
+    difference = np.abs(crop.image.astype(float) - expected * (hand > 0)[:, :, None])
     assert difference.max() <= 1.0
     # The correct camera differs from it by the shift alone.
     right_crop = correct_crop(picture, mask, box, FOCAL, 256)
@@ -253,20 +253,20 @@ def read(folder: Path) -> Any:
         (lambda rows: rows[1].update(cam_aligned_right=np.zeros((3, 1))), "cam_aligned_right"),
         (lambda rows: rows[1].update(mano_shape_right="x"), "is a str, not an array"),
         (lambda rows: rows[1].update(mano_shape_right=np.array([["a"] * 10])), "holds <U1"),
-        (lambda rows: rows[1].update(scaled_focal_length=-2.0), "no focal length"),
-        (lambda rows: rows[1].update(scaled_focal_length=float("nan")), "no focal length"),
-        (lambda rows: rows[1].update(bbox_inter=np.array([9, 9, 3, 20])), "is no box"),
+        (lambda rows: rows[1].update(scaled_focal_length=-2.0), "not a focal length"),
+        (lambda rows: rows[1].update(scaled_focal_length=float("nan")), "not a focal length"),
+        (lambda rows: rows[1].update(bbox_inter=np.array([9, 9, 3, 20])), "is not a box"),
         (lambda rows: rows[1].update(img_path="no number.png"), "has no number"),
         (
             lambda rows: rows[1].update(img_path=rows[0]["img_path"]),
             "two records have the number 0",
         ),
-        (lambda rows: rows[1].update(img_path=7), "is a int, not a text"),
+        (lambda rows: rows[1].update(img_path=7), "is a int, not a string"),
         (lambda rows: rows[1].update(mask_sam1_path="/etc/hostname1"), "which is not in"),
         (lambda rows: rows[1].pop("root_rel"), "root_rel: frame 1: is missing"),
-        (lambda rows: {"frames": rows}, "no list"),
-        (lambda rows: [1, 2], "record 0 is no dict"),
-        (lambda rows: [], "no list"),
+        (lambda rows: {"frames": rows}, "not a list"),
+        (lambda rows: [1, 2], "record 0 is not a dict"),
+        (lambda rows: [], "not a list"),
     ],
 )
 def test_records_that_break_the_format_are_named(
@@ -317,7 +317,7 @@ def test_the_box_of_joints_is_the_releases(right: HandTemplate) -> None:
 
 
 def test_folder_names(tmp_path: Path) -> None:
-    with pytest.raises(BadInput, match="is no folder"):
+    with pytest.raises(BadInput, match="is not a folder"):
         find_folders(tmp_path / "none")
     with pytest.raises(BadInput, match=r"no output\.pkl"):
         find_folders(tmp_path)

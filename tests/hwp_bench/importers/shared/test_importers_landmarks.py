@@ -116,7 +116,7 @@ def test_scores_below_the_limit_are_no_detection(tmp_path: Path) -> None:
 
 
 def test_another_video_is_noticed() -> None:
-    with pytest.raises(BadInput, match="5 frames where the video has 6"):
+    with pytest.raises(BadInput, match="has 5 frames, the video has 6"):
         check_against_video(example(), 6, 320, 240, "a.npz")
     normalised = Landmarks(
         example().image / 320, example().world, example().score, example().detected

@@ -10,7 +10,7 @@ from synthetic_clip import write_video
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.importers.video.decode import probe, read_frames
-from hwp_bench.importers.video.settings import FrameRange, parse_frame_range
+from hwp_bench.importers.video.video_settings import FrameRange, parse_frame_range
 
 COUNT = 12
 
@@ -60,7 +60,7 @@ def test_ranges_that_select_nothing_are_refused(text: str) -> None:
 
 
 def test_a_range_beyond_the_end_is_refused(video: Path) -> None:
-    with pytest.raises(BadInput, match="ends after 12 frames where 20"):
+    with pytest.raises(BadInput, match="ends after 12 frames, 20 are selected"):
         list(read_frames(probe(video), FrameRange(0, 20)))
 
 

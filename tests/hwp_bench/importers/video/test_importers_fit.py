@@ -25,7 +25,7 @@ from hwp_bench.importers.video.fit_clip import (
     reprojection_error,
 )
 from hwp_bench.importers.video.rigid_start import interpolate, rigid_start
-from hwp_bench.importers.video.settings import FitSettings
+from hwp_bench.importers.video.video_settings import FitSettings
 
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
 SETTINGS = FitSettings(start_steps=80, landmark_steps=200)

@@ -20,7 +20,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import overlap
 from hwp_bench.importers.video.from_video import import_video
-from hwp_bench.importers.video.settings import FitSettings, FrameRange, VideoImport
+from hwp_bench.importers.video.video_settings import FitSettings, FrameRange, VideoImport
 
 FRAMES = 16
 QUICK = FitSettings(start_steps=60, landmark_steps=120, contour_steps=30, contour_rounds=1)

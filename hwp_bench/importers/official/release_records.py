@@ -64,7 +64,7 @@ class OfficialRecords:
     """Everything that one capture of the release says.
 
     Attributes:
-        numbers: (F,) the first whole number in each image's name, ascending.
+        numbers: (F,) the first integer in each image's name, ascending.
         images: F image files.
         masks: F mask files.
         focal: (F,) px of the whole frame.
@@ -91,14 +91,14 @@ def read_records(folder: OfficialFolder) -> OfficialRecords:
 
     Raises:
         UnsafePickle: a pickle asks for something that is not plain data; it is named.
-        BadInput: a pickle is no list of records, a key is missing or has another shape, two
+        BadInput: a pickle is not a list of records, a key is missing or has another shape, two
             records have one number, or a file that is named does not exist.
     """
     rows: list[tuple[int, dict[str, Any], Path]] = []
     for pickle in folder.pickles:
         content = load_pickle(pickle, max_bytes=MAX_PICKLE_BYTES)
         if not isinstance(content, list) or not content:
-            raise BadInput("is no list of frame records", where=pickle)
+            raise BadInput("is not a list of frame records", where=pickle)
         rows += [(_number(row, i, pickle), row, pickle) for i, row in enumerate(content)]
     if len(rows) > MAX_FRAMES:
         raise BadInput(f"holds {len(rows)} frames, more than {MAX_FRAMES}", where=folder.path)
@@ -133,10 +133,10 @@ Rows = Sequence[tuple[int, dict[str, Any], Path]]
 
 def _number(row: Any, index: int, pickle: Path) -> int:
     if not isinstance(row, dict):
-        raise BadInput(f"record {index} is no dict", where=pickle)
+        raise BadInput(f"record {index} is not a dict", where=pickle)
     path = row.get("img_path")
     if not isinstance(path, str):
-        problem = "is missing" if path is None else f"is a {type(path).__name__}, not a text"
+        problem = "is missing" if path is None else f"is a {type(path).__name__}, not a string"
         raise BadInput(problem, where=pickle, field=f"record {index}: img_path")
     found = re.search(r"\d{1,15}", re.split(r"[\\/]", path)[-1])
     if found is None:
@@ -149,7 +149,7 @@ def _number(row: Any, index: int, pickle: Path) -> int:
 def _file(row: Mapping[str, Any], key: str, pickle: Path) -> Path:
     named = row[key]
     if not isinstance(named, str):
-        raise BadInput(f"is a {type(named).__name__}, not a text", where=pickle, field=key)
+        raise BadInput(f"is a {type(named).__name__}, not a string", where=pickle, field=key)
     return find_file(pickle.parent, named, where=pickle, field=key)
 
 
@@ -166,7 +166,7 @@ def _focal(rows: Rows) -> np.ndarray:
         value = _array(row, "scaled_focal_length", pickle, number)
         if value.size != 1 or not 0 < float(value.ravel()[0]) < 1e7:
             raise BadInput(
-                f"frame {number}: is no focal length in pixels",
+                f"frame {number}: is not a focal length in pixels",
                 where=pickle,
                 field="scaled_focal_length",
             )
@@ -181,7 +181,7 @@ def _box(row: Mapping[str, Any], pickle: Path, number: int) -> np.ndarray | None
     finite = box.shape == (4,) and np.isfinite(box).all()
     if not finite or not (box[2] > box[0] and box[3] > box[1]) or np.abs(box).max() > 1e6:
         raise BadInput(
-            f"frame {number}: is no box x1, y1, x2, y2", where=pickle, field="bbox_inter"
+            f"frame {number}: is not a box x1, y1, x2, y2", where=pickle, field="bbox_inter"
         )
     return box
 

@@ -45,12 +45,12 @@ class FitSettings:
     """Weights and scales of the energy that `fit_clip` minimises.
 
     Every term is a sum over frames of a robust function of residual / scale, so a scale is the
-    size of an error that is still ordinary.
+    size of an error that is still normal.
     """
 
-    #: Steps of Adam from the rigid start, led by the world landmarks.
+    #: Steps of Adam from the rigid start, with the world landmarks dominant.
     start_steps: int = 150
-    #: Steps of Adam after that, on all landmarks, with outliers let go.
+    #: Steps of Adam after that, on all landmarks, robust against outliers.
     landmark_steps: int = 450
     #: Steps of Adam in each round against the masks.
     contour_steps: int = 120
@@ -58,13 +58,13 @@ class FitSettings:
     contour_rounds: int = 3
     #: Factor on the learning rates in those rounds: only corrections are left.
     contour_rate: float = 0.3
-    #: Landmark error in the picture, as a share of the hand's size in the picture.
+    #: Landmark error in the image, as a share of the hand's size in the image.
     image_scale: float = 0.012
     #: Error of centred world landmarks, m; the tracker's bones change by 5 mm between frames.
     world_scale: float = 0.015
-    #: Weight of the world landmarks; they guide depth, the picture decides the rest.
+    #: Weight of the world landmarks; they guide depth, the image decides the rest.
     world_weight: float = 0.5
-    #: Weight of the image landmarks in the first steps, beside 1 of the world landmarks.
+    #: Weight of the image landmarks in the first steps, relative to 1 of the world landmarks.
     start_image_weight: float = 0.05
     #: Acceleration of landmarks in space, m per (1/30 s)^2.
     motion_scale: float = 0.003
@@ -78,7 +78,7 @@ class FitSettings:
     contact_scale: float = 0.003
     #: Weight of that overlap.
     contact_weight: float = 0.5
-    #: Weight of the finger angles squared: what nothing else decides stays near the rest pose.
+    #: Weight of the finger angles squared: it keeps undetermined angles near the rest pose.
     pose_weight: float = 0.02
     #: Constant distance between the tracker's landmark and the model's joint, m.
     offset_scale: float = 0.004
@@ -89,11 +89,11 @@ class FitSettings:
     size_scale: float = 0.05
     #: Uncertainty of the default focal length (log).
     focal_scale: float = 0.15
-    #: Outline error in the picture, as a share of the hand's size in the picture.
+    #: Outline error in the image, as a share of the hand's size in the image.
     contour_scale: float = 0.007
     #: How far an outline vertex looks for the mask's outline, as a share of the hand's size.
     contour_reach: float = 0.06
-    #: Weight of one outline vertex; neighbours say the same, so each counts little.
+    #: Weight of one outline vertex; neighbours agree, so each counts little.
     contour_weight: float = 0.2
 
 
@@ -105,15 +105,15 @@ class VideoImport:
         UsageError: a choice makes no sense; it names the option.
     """
 
-    #: Which hand is in the picture: `right` or `left`.
+    #: Which hand is in the image: `right` or `left`.
     hand: str = "right"
     #: Focal length in px of the whole frame, or None to estimate it.
     focal: float | None = None
-    #: Folder with masks of the user's own, or None to cut them out.
+    #: Folder with masks of the user's own, or None to compute them.
     masks: Path | None = None
     #: Edge of the stored square frames, px.
     size: int = 256
-    #: Which frames to take.
+    #: The frames that are used.
     frames: FrameRange = field(default_factory=FrameRange)
     #: Id of the capture, or None for the name of the output folder.
     id: str | None = None
@@ -168,5 +168,5 @@ def parse_frame_range(text: str | None, stride: int) -> FrameRange:
         return FrameRange(int(head or 0), int(tail) if tail else None, stride)
     except ValueError as error:
         raise UsageError(
-            f"{text!r} is no range", field="--frames", remedy="Use A:B, A: or :B."
+            f"{text!r} is not a range", field="--frames", remedy="Use A:B, A: or :B."
         ) from error
