@@ -13,8 +13,8 @@ import numpy as np
 
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.images import pixel_digest
-from hwp_bench.capture.layout import IMAGE_FOLDERS, image_path
 from hwp_bench.capture.reader import Capture, open_capture
+from hwp_bench.capture.schema import IMAGE_FOLDERS, image_path
 from hwp_bench.capture.tracks import arrays_digest, hand_arrays
 from hwp_bench.capture.writer import combine
 

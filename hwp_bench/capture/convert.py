@@ -4,19 +4,19 @@ from __future__ import annotations
 
 import os
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.capture.reader import Capture
+from hwp_bench.capture.schema import HandModelId
+from hwp_bench.capture.writer import rewrite_capture
 from hwp_bench.hands.fitting import FitTargets, FittedHand, FittingSettings, fit_hand
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.hands.skinning import pose_hand
 from hwp_bench.hands.template import HandTemplate
-
-if TYPE_CHECKING:
-    from hwp_bench.capture import Capture
+from hwp_bench.hands.template_sources import load_template
 
 #: Points of the source's skin that the target is fitted to.
 SKIN_POINTS = 320
@@ -24,10 +24,10 @@ SKIN_POINTS = 320
 
 @dataclass(frozen=True)
 class ConversionError:
-    """What a conversion costs, over the valid frames of one hand."""
+    """The error of a conversion, over the valid frames of one hand."""
 
     #: Mean distance of the 21 landmarks, mm. Models put joints in different places in the flesh,
-    #: so some of it is no error.
+    #: so some of it is not an error.
     landmark_mm: float
     #: Mean distance of the source's skin from the target's, mm.
     skin_mm: float
@@ -46,18 +46,18 @@ def convert_hand(
     Args:
         hand: parameters that belong to `source`.
         source: the hand model that they are given in.
-        target: the wanted one, of the same side.
+        target: the hand model to convert to, of the same side.
         settings: steps and weights of the fit.
 
     Returns:
-        Parameters that belong to `target`, and what they miss the source's hand by.
+        Parameters that belong to `target`, and how far they are from the source's hand.
 
     Raises:
         UsageError: the templates are of different sides.
         BadInput: no frame is valid.
     """
     if source.side != target.side:
-        raise UsageError(f"a {source.side} hand is no {target.side} hand", field="target")
+        raise UsageError(f"a {source.side} hand is not a {target.side} hand", field="target")
     tensors = source.to_torch(torch.float64)
     with torch.no_grad():
         posed = pose_hand(tensors, *_tensors(hand))
@@ -73,7 +73,7 @@ def convert_hand(
 
 
 def conversion_error(fitted: FittedHand) -> ConversionError:
-    """Sum a fit's errors up."""
+    """Average a fit's errors over the valid frames."""
     return ConversionError(
         landmark_mm=float(np.nanmean(fitted.landmark_mm)),
         skin_mm=float(np.nanmean(fitted.skin_mm)),
@@ -133,34 +133,28 @@ def convert_capture(
     overwrite: bool = False,
     settings: FittingSettings | None = None,
 ) -> dict[str, ConversionError]:
-    """Write a capture again with its hands in another hand model; pictures stay as they are.
+    """Write a capture again with its hands in another hand model; images stay as they are.
 
     Args:
         capture: the capture.
         out: the capture folder to make.
-        source: the wanted model, as `load_template` takes it.
+        source: the model to convert to, as `load_template` takes it.
         overwrite: replace an existing folder.
         settings: steps and weights of the fit.
 
     Returns:
-        What the conversion costs, by side.
+        The error of the conversion, by side.
 
     Raises:
         UsageError: `out` exists, or there is no such hand model.
         BadHandModel: the template that the capture names cannot be loaded.
         BadInput: the template that is loaded is not the capture's.
     """
-    from hwp_bench.capture.hand_model import load_matching_template
-    from hwp_bench.capture.rewrite import rewrite_capture
-    from hwp_bench.capture.schema import HandModelId
-    from hwp_bench.hands.template_sources import load_template
-
     info = capture.info
     made, errors = {}, {}
     for side, hand in capture.hands.items():
         target = load_template(source, side)
-        own = load_matching_template(info.hand_model, info.sides, side, where=capture.root)
-        made[side], errors[side] = convert_hand(hand, own, target, settings)
+        made[side], errors[side] = convert_hand(hand, capture.template(side), target, settings)
     first = load_template(source, info.sides[0])
     note = {side: vars(error) for side, error in errors.items()}
     changed = replace(

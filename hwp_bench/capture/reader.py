@@ -3,25 +3,32 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.base.errors import BadCapture, UsageError
+from hwp_bench.base.errors import BadCapture, BadInput, UsageError
 from hwp_bench.base.files import read_json, sha256_json
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.capture.layout import (
+from hwp_bench.capture.schema import (
     CAMERAS,
     HANDS,
     IMAGE_FOLDERS,
     METADATA,
     TRUE_HANDS,
+    CaptureInfo,
+    HandModelId,
     image_path,
 )
-from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.parameters import Camera, HandParameters, HandPose, hand_poses
+from hwp_bench.hands.template_sources import load_template
+
+if TYPE_CHECKING:
+    from hwp_bench.hands.template import HandTemplate
 
 
 class Capture:
@@ -29,7 +36,7 @@ class Capture:
 
     Attributes:
         root: the folder.
-        info: what the capture says of itself.
+        info: its description, from `capture.json`.
         hands: estimated hand parameters by side.
         cameras: one camera a frame.
     """
@@ -51,7 +58,13 @@ class Capture:
 
     def __repr__(self) -> str:
         info = self.info
-        return f"Capture({info.id!r}, {info.frame_count} frames, {info.width}x{info.height})"
+        hands = "both hands" if info.interacting else f"{info.hands} hand"
+        named = ", ".join(info.perturbations) or "no perturbations"
+        truth = ", clean frames known" if self.has_clean else ""
+        return (
+            f"<Capture {info.id!r}: {info.frame_count} frames of {info.width} x {info.height} px, "
+            f"{hands} ({info.hand_model.name}), {named}{truth}>"
+        )
 
     @property
     def size(self) -> tuple[int, int]:
@@ -106,6 +119,35 @@ class Capture:
         """Read the visible hand of the clean frame: (H, W) uint8, 255 = covered fully."""
         return read_gray(self._path("clean_masks", frame), self.size)
 
+    def hand_poses(self, frame: int) -> dict[str, HandPose]:
+        """Return the estimated parameters of every hand in one frame, by side.
+
+        Raises:
+            UsageError: there is no such frame.
+        """
+        self._check(frame)
+        return hand_poses(self.hands, frame)
+
+    def camera(self, frame: int) -> Camera:
+        """Return the camera of one frame.
+
+        Raises:
+            UsageError: there is no such frame.
+        """
+        self._check(frame)
+        return self.cameras.camera(frame, self.info.width, self.info.height)
+
+    def template(self, side: str) -> HandTemplate:
+        """Load the hand template of one side, to which the parameters belong.
+
+        Raises:
+            UsageError: the capture has no such hand.
+            BadInput: the template that is installed here is another than the capture's.
+        """
+        if side not in self.info.sides:
+            raise UsageError(f"this capture has no {side} hand", where=self.root)
+        return load_matching_template(self.info.hand_model, self.info.sides, side, where=self.root)
+
     def scoring_mask(self, frame: int) -> tuple[np.ndarray, bool]:
         """Read the mask that scores are taken over.
 
@@ -117,11 +159,14 @@ class Capture:
         return self.mask(frame), False
 
     def _path(self, kind: str, frame: int) -> Path:
+        self._check(frame)
+        return image_path(self.root, kind, frame)
+
+    def _check(self, frame: int) -> None:
         if not 0 <= frame < self.info.frame_count:
             raise UsageError(
                 f"there is no frame {frame}, only 0 to {self.info.frame_count - 1}", where=self.root
             )
-        return image_path(self.root, kind, frame)
 
 
 def open_capture(path: str | os.PathLike[str]) -> Capture:
@@ -134,13 +179,13 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
         The capture; images are read (and checked) when they are asked for.
 
     Raises:
-        BadCapture: no capture folder, or its metadata is wrong; file and field are named.
+        BadCapture: not a capture folder, or its metadata is wrong; file and field are named.
         BadInput: hand parameters or cameras are damaged, not finite, or of another length.
     """
     root = Path(path)
     if not (root / METADATA).is_file():
         raise BadCapture(
-            f"is no capture: it has no {METADATA}",
+            f"is not a capture: it has no {METADATA}",
             where=root,
             remedy="Give the folder of one capture.",
         )
@@ -152,3 +197,39 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
         hands=read_hands(root / HANDS, info.sides, info.frame_count),
         cameras=read_cameras(root / CAMERAS, info.frame_count),
     )
+
+
+def load_matching_template(
+    model: HandModelId, sides: Sequence[str], side: str, *, where: str | os.PathLike[str]
+) -> HandTemplate:
+    """Load the template of one side of the model that parameters were made with.
+
+    Args:
+        model: hand model that the capture (or avatar) names; the digest is that of the
+            first of its sides.
+        sides: the hands that it has, in its order.
+        side: the hand to load.
+        where: the capture or avatar, for the message.
+
+    Raises:
+        BadInput: the model that is installed here is another one: by name or by content.
+        UsageError, BadHandModel: it cannot be loaded.
+    """
+    first = load_template(model.source, sides[0])
+    problem = None
+    if first.name != model.name:
+        problem = f"belongs to hand model {model.name}, not {first.name}"
+    elif first.digest != model.digest:
+        problem = (
+            f"belongs to another edition of hand model {model.name} "
+            f"({model.digest[:12]}) than the one here ({first.digest[:12]})"
+        )
+    if problem is not None:
+        raise BadInput(
+            problem,
+            where=where,
+            field="hand_model",
+            remedy=f"Use the model that it was made with, or convert it: hwp-bench hands convert "
+            f"(what is loaded here comes from {model.source!r}).",
+        )
+    return first if side == sides[0] else load_template(model.source, side)

@@ -1,10 +1,11 @@
-"""The content of `capture.json`, which describes a capture, checked field by field."""
+"""A capture folder: where its files lie, and `capture.json`, checked field by field."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Annotated, Any
 
 from msgspec import Meta
@@ -15,6 +16,25 @@ from hwp_bench.taxonomy import check_severity, perturbation
 
 #: Version of the capture format; a reader refuses every other.
 SCHEMA = "hwp-capture/1"
+#: The file that describes the capture.
+METADATA = "capture.json"
+#: Estimated hand parameters, as a method is given them.
+HANDS = "hands.npz"
+#: Intrinsics and view matrices.
+CAMERAS = "cameras.npz"
+#: True hand parameters, where they are known; withheld from methods.
+TRUE_HANDS = "truth/hands.npz"
+#: Further files of the maker (scene, timings, overlays); withheld from methods.
+EXTRA = "extra"
+
+#: Folder of each kind of image. All but `frames` and `masks` are truth, withheld from methods.
+IMAGE_FOLDERS = {
+    "frames": "frames",
+    "masks": "masks",
+    "clean": "truth/clean",
+    "true_masks": "truth/masks",
+    "clean_masks": "truth/clean_masks",
+}
 #: Most frames that a capture may claim.
 MAX_FRAMES = 100_000
 #: Largest edge of a frame, in pixels.
@@ -164,3 +184,13 @@ def _check_severities(info: CaptureInfo, where: str) -> None:
                 f"must be null or a list of {info.frame_count} severities", where=where, field=place
             )
         check_severity(values, where=where, field=place)
+
+
+def image_path(root: Path, kind: str, frame: int) -> Path:
+    """Return the file of one image: `kind` is a key of `IMAGE_FOLDERS`."""
+    return root / IMAGE_FOLDERS[kind] / frame_name(frame)
+
+
+def frame_name(frame: int) -> str:
+    """Return the file name of a frame, as captures and predictions use it."""
+    return f"{frame:06d}.png"

@@ -1,4 +1,4 @@
-"""The numbers of a capture over time: cameras and hand parameters, in and out of `.npz` files."""
+"""The arrays of a capture: cameras and hand parameters of every frame, read and written."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from hwp_bench.base.arrays import read_npz, take, write_npz
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.parameters import Camera, HandParameters
 
 
 @dataclass(frozen=True)
@@ -20,7 +20,7 @@ class Cameras:
 
     Raises:
         BadInput: shapes differ, a value is not finite, a focal length is not positive, or a
-            view matrix is no rigid motion.
+            view matrix is not a rigid motion.
     """
 
     #: (F, 3, 3) intrinsics in pixels; pixel centres lie at +0.5.
@@ -33,6 +33,10 @@ class Cameras:
 
     def __len__(self) -> int:
         return len(self.Ks)
+
+    def camera(self, frame: int, width: int, height: int) -> Camera:
+        """Return the camera of one frame, for images of a size in px."""
+        return Camera(self.Ks[frame], self.viewmats[frame], width, height)
 
 
 def check_cameras(Ks: np.ndarray, viewmats: np.ndarray, *, where: str) -> None:

@@ -15,8 +15,17 @@ import numpy as np
 from hwp_bench.base.errors import BadCapture, ShapeMismatch
 from hwp_bench.base.files import atomic_folder, atomic_write, inside, write_json
 from hwp_bench.base.images import pixel_digest, write_image
-from hwp_bench.capture.layout import CAMERAS, EXTRA, HANDS, METADATA, TRUE_HANDS, image_path
-from hwp_bench.capture.schema import CaptureInfo, check_id
+from hwp_bench.capture.reader import Capture
+from hwp_bench.capture.schema import (
+    CAMERAS,
+    EXTRA,
+    HANDS,
+    METADATA,
+    TRUE_HANDS,
+    CaptureInfo,
+    check_id,
+    image_path,
+)
 from hwp_bench.capture.tracks import (
     Cameras,
     arrays_digest,
@@ -176,6 +185,38 @@ class CaptureWriter:
             digests["true_hands"] = arrays_digest(hand_arrays(self._true_hands))
         info = replace(self.info, digests=dict(sorted(digests.items())))
         write_json(self._root / METADATA, info.to_json())
+
+
+def rewrite_capture(
+    capture: Capture,
+    out: str | os.PathLike[str],
+    info: CaptureInfo,
+    hands: Mapping[str, HandParameters],
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Copy a capture with other hands. True hands are left out: they are of the old model.
+
+    Args:
+        capture: what is copied: frames, masks and known truth images.
+        out: the capture folder to make.
+        info: description of the new capture.
+        hands: its parameters by side.
+        overwrite: replace an existing folder.
+
+    Raises:
+        UsageError: `out` exists.
+        BadImage: an image of the capture is missing or damaged.
+    """
+    with CaptureWriter(out, info, hands, capture.cameras, overwrite=overwrite) as writer:
+        for frame in range(len(capture)):
+            writer.frame(frame, capture.frame(frame))
+            writer.mask(frame, capture.mask(frame))
+            if capture.has_true_masks:
+                writer.true_mask(frame, capture.true_mask(frame))
+            if capture.has_clean:
+                writer.clean(frame, capture.clean(frame))
+                writer.clean_mask(frame, capture.clean_mask(frame))
 
 
 def combine(digests: Iterable[str]) -> str:

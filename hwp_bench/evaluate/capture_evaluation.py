@@ -15,7 +15,7 @@ from hwp_bench.base.files import read_json, sha256_json, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.layout import EXTRA
+from hwp_bench.capture.schema import EXTRA
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluate.artifacts import keep_artifacts
 from hwp_bench.evaluate.scoring import (

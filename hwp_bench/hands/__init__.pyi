@@ -13,7 +13,9 @@ from .articulation import joint_angles as joint_angles
 from .articulation import joint_axes as joint_axes
 from .articulation import joint_limit_penalty as joint_limit_penalty
 from .articulation import pose_from_joint_angles as pose_from_joint_angles
+from .parameters import Camera as Camera
 from .parameters import HandParameters as HandParameters
+from .parameters import HandPose as HandPose
 from .skeleton import landmark_order as landmark_order
 from .skinning import PosedHand as PosedHand
 from .skinning import pose_hand as pose_hand

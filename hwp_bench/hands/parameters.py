@@ -1,7 +1,8 @@
-"""Hand parameters over a clip: pose, shape and translation, frame by frame."""
+"""Hand parameters over a clip, the pose of a hand in one frame, and the camera that sees it."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +13,7 @@ from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT
 
 @dataclass(frozen=True, eq=False)
 class HandParameters:
-    """What poses one hand in F frames; checked when made, and copied.
+    """Pose, shape and translation of one hand in F frames; checked when made, and copied.
 
     In a frame without this hand the values mean nothing: NaN there (as estimators write it)
     becomes zero, so that whole arrays can be computed with.
@@ -65,3 +66,40 @@ class HandParameters:
     def frame_count(self) -> int:
         """Number of frames F."""
         return len(self.valid)
+
+    def at(self, frame: int, side: str) -> HandPose:
+        """Return the parameters in one frame, as those of a `right` or `left` hand."""
+        return HandPose(side, self.pose[frame], self.betas, self.transl[frame])
+
+
+def hand_poses(hands: Mapping[str, HandParameters], frame: int) -> dict[str, HandPose]:
+    """Return the parameters of every hand in one frame, by side, whether it is valid or not."""
+    return {side: hand.at(frame, side) for side, hand in hands.items()}
+
+
+@dataclass(frozen=True, eq=False)
+class HandPose:
+    """The parameters of one hand in one frame."""
+
+    #: `right` or `left`.
+    side: str
+    #: (16, 3) axis-angle, rad.
+    pose: np.ndarray
+    #: (10,) shape.
+    betas: np.ndarray
+    #: (3,) m.
+    transl: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """One pinhole camera, OpenCV axes."""
+
+    #: (3, 3) intrinsics, px; pixel centres lie at +0.5.
+    K: np.ndarray
+    #: (4, 4) world to camera, m.
+    viewmat: np.ndarray
+    #: Image width, px.
+    width: int
+    #: Image height, px.
+    height: int

@@ -12,11 +12,10 @@ import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.capture.layout import CAMERAS, HANDS, image_path
-from hwp_bench.capture.schema import SIDES, HandModelId
+from hwp_bench.capture.schema import CAMERAS, HANDS, SIDES, HandModelId, image_path
 from hwp_bench.capture.splits import Split
 from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.parameters import Camera, HandParameters, HandPose, hand_poses
 
 if TYPE_CHECKING:
     from hwp_bench.hands.template import HandTemplate
@@ -179,14 +178,11 @@ class TrainingCapture:
 
     def hand_poses(self, frame: int) -> dict[str, HandPose]:
         """Return the parameters of every hand in one frame, by side."""
-        return {
-            side: HandPose(side, hand.pose[frame], hand.betas, hand.transl[frame])
-            for side, hand in self.hands.items()
-        }
+        return hand_poses(self.hands, frame)
 
     def camera(self, frame: int) -> Camera:
         """Return the camera of one frame."""
-        return Camera(self.cameras.Ks[frame], self.cameras.viewmats[frame], self.width, self.height)
+        return self.cameras.camera(frame, self.width, self.height)
 
     def template(self, side: str) -> HandTemplate:
         """Load the hand template of one side.
@@ -194,36 +190,8 @@ class TrainingCapture:
         Raises:
             BadInput: the template that is installed here is another than the capture's.
         """
-        from hwp_bench.capture.hand_model import load_matching_template
+        from hwp_bench.capture.reader import load_matching_template
 
         if side not in self.sides:
             raise UsageError(f"this capture has no {side} hand", where=self.root)
         return load_matching_template(self.hand_model, self.sides, side, where=self.root)
-
-
-@dataclass(frozen=True, eq=False)
-class Camera:
-    """One pinhole camera, OpenCV axes."""
-
-    #: (3, 3) intrinsics, px; pixel centres lie at +0.5.
-    K: np.ndarray
-    #: (4, 4) world to camera, m.
-    viewmat: np.ndarray
-    #: Image width, px.
-    width: int
-    #: Image height, px.
-    height: int
-
-
-@dataclass(frozen=True, eq=False)
-class HandPose:
-    """The parameters of one hand in one frame."""
-
-    #: `right` or `left`.
-    side: str
-    #: (16, 3) axis-angle, rad.
-    pose: np.ndarray
-    #: (10,) shape.
-    betas: np.ndarray
-    #: (3,) m.
-    transl: np.ndarray

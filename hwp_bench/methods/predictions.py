@@ -11,7 +11,7 @@ import numpy as np
 
 from hwp_bench.base.errors import BadImage
 from hwp_bench.base.images import read_rgb
-from hwp_bench.capture.layout import frame_name
+from hwp_bench.capture.schema import frame_name
 
 
 @dataclass(frozen=True, eq=False)

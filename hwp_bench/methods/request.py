@@ -22,7 +22,7 @@ import numpy as np
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.capture.layout import CAMERAS, HANDS, IMAGE_FOLDERS, image_path
+from hwp_bench.capture.schema import CAMERAS, HANDS, IMAGE_FOLDERS, image_path
 from hwp_bench.capture.splits import Split
 from hwp_bench.capture.tracks import write_cameras, write_hands
 from hwp_bench.hands.parameters import HandParameters

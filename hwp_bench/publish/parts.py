@@ -14,7 +14,7 @@ from hwp_bench import __version__
 from hwp_bench.base.errors import BadCapture, UsageError
 from hwp_bench.base.files import atomic_folder, write_json
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.layout import CAMERAS, HANDS, IMAGE_FOLDERS, METADATA, TRUE_HANDS
+from hwp_bench.capture.schema import CAMERAS, HANDS, IMAGE_FOLDERS, METADATA, TRUE_HANDS
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.request import write_request

@@ -20,7 +20,7 @@ import numpy as np
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
-from hwp_bench.capture.layout import frame_name
+from hwp_bench.capture.schema import frame_name
 from hwp_bench.methods.contract import Avatar, Budget, MethodFactory, TrainingCapture
 from hwp_bench.methods.request import open_request
 from hwp_bench.run.output import (

@@ -1,8 +1,13 @@
-"""Which frames train, validate and test: contiguous 80/10/10, as data, audited."""
+"""Splits: the frames that train, validate and test (contiguous 80/10/10), and their audit."""
 
 from hwp_bench.capture.splits.audit import AuditReport, audit_split
-from hwp_bench.capture.splits.split import Split, contiguous_split
-from hwp_bench.capture.splits.store import read_splits, split_for, write_splits
+from hwp_bench.capture.splits.split import (
+    Split,
+    contiguous_split,
+    read_splits,
+    split_for,
+    write_splits,
+)
 
 __all__ = [
     "AuditReport",

@@ -1,14 +1,22 @@
-"""A split of one capture into training, validation and test frames."""
+"""Splits of captures into training, validation and test frames, and the files that hold them."""
 
 from __future__ import annotations
 
+import os
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from pathlib import Path
+from typing import Annotated, Any
 
 import numpy as np
+from msgspec import Meta
 
 from hwp_bench.base.errors import BadSplit
-from hwp_bench.base.files import sha256_json
+from hwp_bench.base.files import read_json, sha256_json, write_json
+from hwp_bench.base.records import parse_record, without_schema
+
+#: Version of the split files.
+SCHEMA = "hwp-splits/1"
 
 #: The three parts, in temporal order.
 PARTS = ("train", "validation", "test")
@@ -96,30 +104,39 @@ class Split:
         Raises:
             BadSplit: a field is missing or wrong, or the digest does not match.
         """
-        if not isinstance(value, dict):
-            raise BadSplit("must be a JSON object", where=where)
-        name, count = value.get("capture"), value.get("frame_count")
-        if not isinstance(name, str) or not isinstance(count, int) or not _whole(count):
-            raise BadSplit("needs a capture id and a frame count", where=where)
-        ranges = {}
-        for part in PARTS:
-            pair = value.get(part)
-            if not isinstance(pair, list) or len(pair) != 2 or not all(_whole(n) for n in pair):
-                raise BadSplit("must be [start, stop]", where=where, field=f"{name}.{part}")
-            ranges[f"{part}_range"] = tuple(pair)
-        split = cls(capture=name, frame_count=count, **ranges)
-        if value.get("digest") != split.digest:
+        name = value.get("capture") if isinstance(value, dict) else None
+        item = parse_record(
+            _SplitRecord,
+            value,
+            where=where,
+            field=name[:100] if isinstance(name, str) else "",
+            error=BadSplit,
+            ignore_unknown=True,
+        )
+        split = cls(item.capture, item.frame_count, item.train, item.validation, item.test)
+        if item.digest != split.digest:
             raise BadSplit(
                 "does not match the frames that are listed",
                 where=where,
-                field=f"{name}.digest",
+                field=f"{split.capture}.digest",
                 remedy="The split was edited; get the original file.",
             )
         return split
 
 
-def _whole(value: Any) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= 0
+_Frame = Annotated[int, Meta(ge=0)]
+
+
+@dataclass(frozen=True)
+class _SplitRecord:
+    """A split as files hold it."""
+
+    capture: str
+    frame_count: _Frame
+    train: tuple[_Frame, _Frame]
+    validation: tuple[_Frame, _Frame]
+    test: tuple[_Frame, _Frame]
+    digest: str
 
 
 def contiguous_split(capture: str, frame_count: int, *, guard: int = 0) -> Split:
@@ -143,7 +160,7 @@ def contiguous_split(capture: str, frame_count: int, *, guard: int = 0) -> Split
             where=capture,
             remedy=f"A capture needs at least {MIN_FRAMES} frames.",
         )
-    # Integer arithmetic: 0.8 * n in floating point can land below a whole number.
+    # Integer arithmetic: 0.8 * n in floating point can land below an integer.
     first, second = frame_count * 8 // 10, frame_count * 9 // 10
     return Split(
         capture=capture,
@@ -152,3 +169,63 @@ def contiguous_split(capture: str, frame_count: int, *, guard: int = 0) -> Split
         validation_range=(first, second - guard),
         test_range=(second, frame_count),
     )
+
+
+def read_splits(path: str | os.PathLike[str]) -> Mapping[str, Split]:
+    """Read a split file.
+
+    Returns:
+        The splits by capture id.
+
+    Raises:
+        BadInput: missing or damaged.
+        BadSplit: a split is not sound, or its digest does not match.
+    """
+    value = read_json(path)
+    where = os.fspath(path)
+    listed = without_schema(value, SCHEMA, where=where, error=BadSplit).get("splits")
+    if not isinstance(listed, list):
+        raise BadSplit("must be a list", where=where, field="splits")
+    splits: dict[str, Split] = {}
+    for item in listed:
+        split = Split.from_json(item, where=where)
+        if split.capture in splits:
+            raise BadSplit(f"{split.capture} is listed twice", where=where)
+        splits[split.capture] = split
+    return splits
+
+
+def write_splits(path: str | os.PathLike[str], splits: Iterable[Split]) -> Path:
+    """Write a split file atomically."""
+    return write_json(path, {"schema": SCHEMA, "splits": [split.to_json() for split in splits]})
+
+
+def split_for(
+    capture_id: str, frame_count: int, splits: Mapping[str, Split] | None = None
+) -> Split:
+    """Return the split that a capture is evaluated with.
+
+    Args:
+        capture_id: id of the capture.
+        frame_count: its number of frames.
+        splits: splits by capture id; without them the 80/10/10 rule is applied.
+
+    Raises:
+        BadSplit: the capture is not listed, is listed with another length, or is too short.
+    """
+    if splits is None:
+        return contiguous_split(capture_id, frame_count)
+    if capture_id not in splits:
+        raise BadSplit(
+            "is not in the split file",
+            where=capture_id,
+            remedy=f"The file lists: {', '.join(sorted(splits))}.",
+        )
+    split = splits[capture_id]
+    if split.frame_count != frame_count:
+        raise BadSplit(
+            f"has {frame_count} frames where its split is made for {split.frame_count}",
+            where=capture_id,
+            remedy="Use the capture that the split belongs to.",
+        )
+    return split

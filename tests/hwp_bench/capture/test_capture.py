@@ -34,6 +34,32 @@ def test_a_capture_round_trips(make_capture: CaptureMaker, hands: str) -> None:
     assert report.facts["truth"] == ["clean frames", "exact masks", "hand parameters"]
 
 
+@pytest.mark.parametrize("hands", ["left", "both"])
+def test_one_frame_has_poses_and_a_camera(make_capture: CaptureMaker, hands: str) -> None:
+    capture = make_capture("a", hands=hands, frames=12, size=32, truth=True)
+    poses, camera = capture.hand_poses(7), capture.camera(7)
+    assert list(poses) == list(capture.info.sides)
+    for side, pose in poses.items():
+        given = capture.hands[side]
+        assert pose.side == side
+        np.testing.assert_array_equal(pose.pose, given.pose[7])
+        np.testing.assert_array_equal(pose.betas, given.betas)
+        np.testing.assert_array_equal(pose.transl, given.transl[7])
+    np.testing.assert_array_equal(camera.K, capture.cameras.Ks[7])
+    np.testing.assert_array_equal(camera.viewmat, capture.cameras.viewmats[7])
+    assert (camera.width, camera.height) == (32, 32)
+    for read in (capture.hand_poses, capture.camera, capture.frame):
+        with pytest.raises(UsageError, match="there is no frame 12, only 0 to 11"):
+            read(12)
+
+
+def test_a_capture_describes_itself_in_a_line(make_capture: CaptureMaker) -> None:
+    assert repr(make_capture("a", hands="both", frames=12, size=32, truth=True)) == (
+        "<Capture 'a': 12 frames of 32 x 32 px, both hands (anny-1), motion_blur, "
+        "clean frames known>"
+    )
+
+
 def test_equal_content_has_equal_digest_and_a_changed_pixel_another(
     make_capture: CaptureMaker, tmp_path: Path
 ) -> None:

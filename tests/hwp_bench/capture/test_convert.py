@@ -14,8 +14,8 @@ from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture import HandModelId, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.convert import convert_hand, with_one_shape
-from hwp_bench.capture.hand_model import load_matching_template
-from hwp_bench.capture.rewrite import rewrite_capture
+from hwp_bench.capture.reader import load_matching_template
+from hwp_bench.capture.writer import rewrite_capture
 from hwp_bench.cli.main import main
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
 
@@ -60,7 +60,7 @@ def test_mano_and_the_free_hand_reach_each_other(
 
 
 def test_sides_are_not_mixed(free_right: HandTemplate, free_left: HandTemplate) -> None:
-    with pytest.raises(UsageError, match="right hand is no left hand"):
+    with pytest.raises(UsageError, match="right hand is not a left hand"):
         convert_hand(bent(), free_right, free_left)
 
 

@@ -59,13 +59,13 @@ def test_no_command_and_unknown_commands_are_usage_errors(capsys) -> None:
     ("words", "status", "problem"),
     [
         (["evaluate", "nowhere"], 1, "nowhere: is not a method directory"),
-        (["evaluate", "baselines/plain", "--capture", "nowhere"], 1, "nowhere: is no capture"),
+        (["evaluate", "baselines/plain", "--capture", "nowhere"], 1, "nowhere: is not a capture"),
         (["evaluate", "plain", "--capture", "x", "--budget", "-3"], 2, "--budget: -3.0"),
         (["evaluate", "plain", "--capture", "x", "--set", "a b=1"], 2, "is not NAME=VALUE"),
         (["evaluate", "plain", "--capture", "x", "--set", "a.=1"], 2, "is not NAME=VALUE"),
-        (["evaluate", "plain", "--capture", "x", "--set", "rates.pose=1"], 1, "is no capture"),
+        (["evaluate", "plain", "--capture", "x", "--set", "rates.pose=1"], 1, "is not a capture"),
         (["table", "nowhere"], 1, "does not exist"),
-        (["data", "show", "nowhere"], 1, "is no capture"),
+        (["data", "show", "nowhere"], 1, "is not a capture"),
         (["data", "audit", "x", "--guard", "-1"], 2, "--guard"),
     ],
 )

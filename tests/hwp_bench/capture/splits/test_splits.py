@@ -79,9 +79,13 @@ def test_an_edited_split_file_is_refused(tmp_path: Path) -> None:
     path.write_text(json.dumps(value))
     with pytest.raises(BadSplit, match="does not match"):
         read_splits(path)
+    value["splits"][0]["train"] = [0]
+    path.write_text(json.dumps(value))
+    with pytest.raises(BadSplit, match=r"a\.train: is \[0\], expected a list of 2"):
+        read_splits(path)
     value["splits"][0]["train"] = [0, "x"]
     path.write_text(json.dumps(value))
-    with pytest.raises(BadSplit, match=r"a\.train: must be \[start, stop\]"):
+    with pytest.raises(BadSplit, match=r"a\.train\[1\]: is 'x', expected an integer at least 0"):
         read_splits(path)
 
 
