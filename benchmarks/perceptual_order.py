@@ -1,7 +1,7 @@
-"""How the oriented distance orders known degradations, beside PSNR, SSIM and, if here, LPIPS.
+"""How the oriented distance orders known degradations, next to PSNR, SSIM and, if here, LPIPS.
 
 Run from the repository: `python -m benchmarks.perceptual_order [--picture FILE.png]`.
-The pictures are three photographs that scikit-image carries, seen through a disc as a hand is
+The images are three photographs that scikit-image contains, seen through a disc as a hand is
 seen through its mask. LPIPS columns appear where its weights lie in the usual places.
 """
 
@@ -22,7 +22,7 @@ from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.metrics.score import Network, score_frame
 
-#: Side of the pictures and radius of the disc, px.
+#: Side of the images and radius of the disc, px.
 SIZE, RADIUS = 256, 90
 #: PSNR, dB, at which the kinds are compared with each other.
 EQUAL_PSNR = 28.0
@@ -61,9 +61,9 @@ def jpeg(image: np.ndarray, loss: float) -> np.ndarray:
 class Kind:
     """One kind of degradation."""
 
-    #: What is done: (H, W, 3) uint8 and a strength to (H, W, 3) uint8.
+    #: The degradation: (H, W, 3) uint8 and a strength to (H, W, 3) uint8.
     apply: Callable[[np.ndarray, float], np.ndarray]
-    #: What the strength is.
+    #: Name of the strength.
     strength: str
     #: Four strengths, weakest first.
     levels: tuple[float, float, float, float]
@@ -107,7 +107,7 @@ def score(
 
 
 def at_equal_psnr(kind: Kind, target: np.ndarray) -> tuple[float, np.ndarray]:
-    """The strength at which the PSNR falls to `EQUAL_PSNR`, by bisection, and its picture."""
+    """The strength at which the PSNR falls to `EQUAL_PSNR`, by bisection, and its image."""
     weak, strong = kind.limits
     for _ in range(20):
         middle = float(np.sqrt(weak * strong))
@@ -154,7 +154,7 @@ def _markdown(head: tuple[str, str], rows: list[tuple[str, str, dict[str, float]
     return "\n".join(lines)
 
 
-def save_picture(path: Path) -> None:
+def save_figure(path: Path) -> None:
     """Write the photograph and its five degradations at equal PSNR, and curves over PSNR."""
     import matplotlib
 
@@ -208,7 +208,7 @@ def main() -> None:
     print(f"\nAll at a PSNR of {EQUAL_PSNR:.0f} dB, nearest by oriented distance first\n")
     print(equal_table(networks))
     if args.picture is not None:
-        save_picture(args.picture)
+        save_figure(args.picture)
 
 
 if __name__ == "__main__":

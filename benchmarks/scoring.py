@@ -1,4 +1,4 @@
-"""How long scoring takes: every weight-free metric in both protocols, beside scikit-image.
+"""How long scoring takes: every weight-free metric in both protocols, next to scikit-image.
 
 Run from the repository: `python -m benchmarks.scoring [--frames 1000] [--size 256]`.
 The plain loop computes the PSNR and SSIM of both protocols with scikit-image (not the oriented

@@ -1,1 +1,1 @@
-"""What results say together: `statistics` and `cost`."""
+"""Several results together: `statistics` (how sure a difference is) and `cost` (accuracy, time)."""

@@ -42,7 +42,7 @@ class Column:
 class Table:
     """Rows under columns; a cell is a text, a number, or None for "not measured"."""
 
-    #: What the table shows.
+    #: Its caption.
     caption: str
     #: Its columns.
     columns: tuple[Column, ...]

@@ -26,7 +26,7 @@ _EXAMPLES = """examples:
 Which variants are run:
   no flag         the first two components that the method declares, crossed: 2 x 2
   --only A B ...  the named components, crossed: 2^k
-  other flags     the full method; each named component out of it (alternatives: put in), alone;
+  other flags     the full method; each of the named components out of it (alternatives: put in);
                   and, of two components or more, all of them out
 
 Started again with the same arguments, it takes finished jobs as they are. Exit status 1: the
@@ -166,7 +166,7 @@ def _draw(ablation: AblationRuns, out: Path) -> None:
     try:
         analysis = analyse_cost(list(ablation.runs.values()), "psnr")
     except UsageError as error:
-        notice(f"no picture of accuracy against time: {error.problem}")
+        notice(f"no figure of accuracy against time: {error.problem}")
         return
-    for picture in write_cost(out / "cost", analysis):
-        notice(f"picture: {picture}")
+    for figure in write_cost(out / "cost", analysis):
+        notice(f"figure: {figure}")

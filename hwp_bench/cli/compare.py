@@ -67,11 +67,11 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(
             "there is only one method to compare",
             field="RESULTS",
-            remedy="Results that differ in the seed alone count as one method.",
+            remedy="Results that differ only in the seed count as one method.",
         )
-    wanted = [metric(name).name for name in args.metric] or list(HEADLINE)
-    names = common_metrics(runs, wanted)
-    if not names or (args.metric and len(names) < len(wanted)):
+    asked = [metric(name).name for name in args.metric] or list(HEADLINE)
+    names = common_metrics(runs, asked)
+    if not names or (args.metric and len(names) < len(asked)):
         raise UsageError("not every result has every metric asked for", field="--metric")
     value = {}
     for name in names:

@@ -12,8 +12,9 @@ _EXAMPLES = """examples:
   hwp-bench cost runs/ablation --metric oriented_distance     # every variant of an ablation
   hwp-bench cost runs/* --budgets 10 30 120 --json
 
-Prints scores after fixed times, times to given scores, where the time goes, and who leads when;
-writes the tables and the picture of score against seconds (PNG and SVG) to the output folder.
+Prints scores after fixed times, times to given scores, where the time goes, and which method has
+the best score when; writes the tables and the figure of score against seconds (PNG and SVG) to the
+output folder.
 """
 
 
@@ -81,6 +82,6 @@ def run(args: argparse.Namespace) -> int:
     else:
         for table in analysis.tables.values():
             print_table(table)
-    for picture in write_cost(Path(args.out), analysis):
-        notice(f"picture: {picture}")
+    for figure in write_cost(Path(args.out), analysis):
+        notice(f"figure: {figure}")
     return 0

@@ -8,7 +8,7 @@ _EXAMPLES = """examples:
   hwp-bench leaderboard add runs/mine-mini runs/plain-mini
   hwp-bench leaderboard check
   hwp-bench leaderboard build -o site
-  hwp-bench leaderboard build -o site --with runs/mine-mini    # reports with pictures
+  hwp-bench leaderboard build -o site --with runs/mine-mini    # reports with images
 
 An entry is a whole result file with its digest. Only results of a suite, on perturbed frames and
 in this version's protocols are taken. The site is static: copy the folder anywhere.
@@ -30,7 +30,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="RESULTS",
-        help="results folders of entries, for the pictures of their reports",
+        help="results folders of entries, for the images of their reports",
     )
     for action in (add, check, build):
         action.add_argument(

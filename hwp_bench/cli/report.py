@@ -11,7 +11,7 @@ _EXAMPLES = """examples:
   hwp-bench report runs/mine-captures --captures my_captures/* -o reports/mine
 
 Writes one HTML page, index.html, that needs no network: tables, score against seconds, scores by
-perturbation with intervals, a strip for every capture, pictures, environment and digests.
+perturbation with intervals, a strip for every capture, images, environment and digests.
 """
 
 

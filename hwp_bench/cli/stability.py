@@ -39,7 +39,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="append",
         default=[],
         metavar="MODULE:FUNCTION",
-        help="more cases, beside those of installed packages (may be repeated)",
+        help="more cases, besides those of installed packages (may be repeated)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -63,11 +63,11 @@ def run(args: argparse.Namespace) -> int:
     return 0 if all(outcome.measured.passed for outcome in outcomes) else 1
 
 
-def _check_backends(cases: list[Case], wanted: list[str]) -> None:
+def _check_backends(cases: list[Case], asked: list[str]) -> None:
     from hwp_bench.base.errors import UsageError
 
     known = sorted({name for case in cases for name in case.backends if name})
-    for name in wanted:
+    for name in asked:
         if name not in known:
             raise UsageError(
                 f"no case can run on {name!r} here",

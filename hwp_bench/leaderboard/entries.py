@@ -44,7 +44,7 @@ class _File:
 
 
 def entry_name(results: Results, content: str | None = None) -> str:
-    """Return the name of an entry: method, suite, what sets it apart, and part of its digest.
+    """Return the name of an entry: method, suite, budget, seed, and part of its digest.
 
     Args:
         results: the results.
@@ -147,7 +147,7 @@ def _check_one(entry: Entry) -> None:
             field="frames",
         )
     current = {protocol.name: protocol.as_dict() for protocol in PROTOCOLS}
-    # Spelled and read again, so that tuples and lists do not look different.
+    # Written and read again, so that tuples and lists do not look different.
     if json.loads(json.dumps(current)) != json.loads(json.dumps(results.protocols)):
         raise UsageError(
             "was scored by other protocols than this version's",

@@ -102,14 +102,14 @@ def build_site(
     Args:
         folder: where to.
         entries: the measured rows.
-        results_folders: results with their folders; entries of the same results get pictures.
+        results_folders: results with their folders; entries of the same results get images.
 
     Raises:
-        UsageError: entries do not go together; the folder holds something that is no site.
+        UsageError: entries do not fit together; the folder holds something else than a site.
     """
     check_entries(entries)
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "board.js").is_file():
-        raise UsageError("holds something that is no leaderboard", where=folder, field="-o")
+        raise UsageError("holds something else than a leaderboard", where=folder, field="-o")
     folders = {digest(source.results): source.folder for source in results_folders}
     with atomic_folder(folder, overwrite=True) as temporary:
         (temporary / "index.html").write_text(board_page(entries), encoding="utf-8")
@@ -153,7 +153,7 @@ def _published() -> list[dict[str, Any]]:
     return [
         {
             "method": item.method,
-            # The paper's table by perturbation is of interacting hands alone.
+            # The paper's table by perturbation is only of interacting hands.
             "scope": ("Interacting hands: " if table.number == 5 else "") + SCOPES[item.scope],
             "table": table.number,
             "scores": item.scores,

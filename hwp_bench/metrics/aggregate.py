@@ -24,7 +24,7 @@ class CaptureScores:
     id: str
     #: "right", "left" or "both".
     hands: str
-    #: Perturbations that the capture carries; may be empty.
+    #: Perturbations of the capture; may be empty.
     perturbations: tuple[str, ...]
     #: Frame -> metric -> score: every scored frame, the penalties of failed ones included.
     frames: Mapping[Hashable, Mapping[str, float]]
@@ -41,10 +41,10 @@ class Summary:
 
     #: Mean over the frames of each capture, by capture.
     captures: dict[str, Scores]
-    #: Mean over the captures that carry it, by perturbation.
+    #: Mean over the captures with it, by perturbation.
     perturbations: dict[str, Scores]
     #: Mean over the perturbations: each perturbation counts the same. Empty where no capture
-    #: carries one.
+    #: has one.
     macro: Scores
     #: Mean over the captures: each capture counts the same.
     capture_mean: Scores
@@ -73,7 +73,7 @@ class Aggregate:
 
 
 def aggregate(captures: Iterable[CaptureScores]) -> Aggregate:
-    """Average frame scores; nothing is dropped, and nothing that is no number gets in.
+    """Average frame scores; nothing is dropped, and NaN and infinity are refused.
 
     Args:
         captures: the scored captures; each lists every frame that was scored.
@@ -127,7 +127,7 @@ def _summarize(captures: Sequence[CaptureScores]) -> Summary:
 
 def _check(captures: Sequence[CaptureScores]) -> None:
     if not captures:
-        raise BadResult("there is no capture to average", field="captures")
+        raise BadResult("there are no captures to average", field="captures")
     seen: set[str] = set()
     metrics: frozenset[str] | None = None
     for capture in captures:

@@ -24,7 +24,7 @@ READ_AHEAD = 4
 class Frame:
     """One frame to score."""
 
-    #: (H, W, 3) uint8, or the error that says why there is no such image.
+    #: (H, W, 3) uint8, or the error that says why it is missing.
     prediction: np.ndarray | HwpError
     #: (H, W, 3) uint8.
     target: np.ndarray
@@ -36,7 +36,7 @@ class Frame:
 
 @dataclass(frozen=True)
 class FrameScore:
-    """What one frame got."""
+    """The scores of one frame."""
 
     #: Metric name -> score; the declared penalties where the prediction failed; empty where
     #: the data set shows no hand to score.

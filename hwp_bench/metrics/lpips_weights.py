@@ -33,7 +33,7 @@ LINEAR_DIGESTS: Mapping[str, str] = {
     "alex": "df73285e35b22355a2df87cdb6b70b343713b667eddbda73e1977e0c860835c0",
     "vgg": "a78928a0af1e5f0fcb1f3b9e8f8c3a2a5a3de244d830ad5c1feddc79b8432868",
 }
-#: Packages that carry the linear layers, and the folder inside them.
+#: Packages that contain the linear layers, and the folder inside them.
 LINEAR_PACKAGES = (
     ("lpips", "weights/v0.1"),
     ("torchmetrics", "functional/image/lpips_models"),

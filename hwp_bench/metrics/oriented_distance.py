@@ -86,8 +86,8 @@ def _scale_distance(x: np.ndarray, y: np.ndarray, weight: np.ndarray) -> float:
     """
     x_vector, y_vector = _vector(x), _vector(y)
     x_length, y_length = np.sqrt(_squared_length(x_vector)), np.sqrt(_squared_length(y_vector))
-    apart = _squared_length([a - b for a, b in zip(x_vector, y_vector, strict=True)])
-    angular = (apart - (x_length - y_length) ** 2) / (x_length * y_length)
+    difference = _squared_length([a - b for a, b in zip(x_vector, y_vector, strict=True)])
+    angular = (difference - (x_length - y_length) ** 2) / (x_length * y_length)
     per_pixel = np.maximum(angular, 0.0).astype(np.float64)
     return float(np.sum(per_pixel * weight) / (2.0 * weight.sum(dtype=np.float64)))
 

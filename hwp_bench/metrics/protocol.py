@@ -18,7 +18,7 @@ PSNR_CAP = 100.0
 
 @dataclass(frozen=True)
 class SsimSettings:
-    """What must be said for "SSIM" to be one number (Wang et al., 2004)."""
+    """Every choice that "SSIM" leaves open (Wang et al., 2004)."""
 
     #: Weights of the local window.
     window: Literal["gaussian", "uniform"]
@@ -53,7 +53,7 @@ class Protocol:
     box_padding: int
     #: Smallest side of that box, px; a smaller one is grown evenly.
     smallest_box: int
-    #: Smallest side of the picture that LPIPS is given, px (the networks' strides need it).
+    #: Smallest side of the image that LPIPS is given, px (the networks' strides need it).
     smallest_lpips_box: int
     #: Largest PSNR, dB: the score of identical images.
     psnr_cap: float
@@ -78,7 +78,7 @@ HWP_V1 = Protocol(
 
 #: The released evaluator's settings on the data set's mask. The data range of 2 is what an old
 #: scikit-image assumes for float images when it is told nothing; it inflates the score, and it
-#: is kept here only so that published numbers have something to stand beside.
+#: is kept only so that published numbers can be compared with something.
 PAPER_WILDGHAND = Protocol(
     name="paper-wildghand",
     mask_erosion=0,

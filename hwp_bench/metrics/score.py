@@ -31,7 +31,7 @@ FLOAT_LIMIT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class _Pair:
-    """What the protocols share: a checked pair of images and the error between them."""
+    """Shared by the protocols: a checked pair of images and the error between them."""
 
     #: (H, W, 3) uint8.
     prediction: np.ndarray

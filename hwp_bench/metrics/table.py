@@ -12,7 +12,7 @@ from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, PSNR_
 
 @dataclass(frozen=True)
 class Metric:
-    """What a reader of a number must know."""
+    """The facts of a metric."""
 
     #: Key in results; unique over all protocols.
     name: str
@@ -22,7 +22,7 @@ class Metric:
     protocol: str
     #: Unit; empty for a plain number.
     unit: str
-    #: True where a larger value means a better picture.
+    #: True where a larger value means a better image.
     higher_is_better: bool
     #: Smallest and largest value that a frame can get; None where there is no bound.
     range: tuple[float, float | None]

@@ -1,1 +1,1 @@
-"""What people look at: tables and pictures."""
+"""Result tables, figures and the report page."""

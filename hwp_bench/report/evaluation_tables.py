@@ -85,7 +85,7 @@ def mean_table(
     ]
     scope = f"Every mean is over captures of means over test frames; {_scope(results)}."
     if MACRO in groups:
-        scope += " Macro: the mean over perturbations, each that of the captures that carry it."
+        scope += " Macro: the mean over perturbations, each over the captures with it."
     notes = (note, scope) if note else (scope,)
     return Table("All captures", tuple(columns), tuple(rows), notes)
 
@@ -120,7 +120,7 @@ def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Tab
                     tail = (capture.fit_seconds, capture.failed_frames)
                     rows.append((identifier, hands, label, *scores, *tail))
     # Captures are of unequal difficulty: only methods on one capture are ranked. Lines between
-    # captures are wanted where there are several methods.
+    # captures are drawn where there are several methods.
     separate = tuple(breaks[1:])
     ranked = len(results) > 1
     return Table(
@@ -141,7 +141,7 @@ def perturbation_table(results: Sequence[Results], means: Sequence[Aggregate]) -
         )
         for label, mean in zip(labels(results), means, strict=True)
     ]
-    note = "Mean over the captures that carry the perturbation; a capture may carry several."
+    note = "Mean over the captures with the perturbation; a capture may have several."
     return Table("Per perturbation", tuple(columns), tuple(rows), (note,))
 
 
@@ -180,7 +180,7 @@ def _of_protocol(protocol: Protocol) -> tuple[str, ...]:
 
 
 def labels(results: Sequence[Results]) -> list[str]:
-    """Return a title for each evaluation, told apart by what differs where titles repeat."""
+    """Return a title for each evaluation, with what differs where titles repeat."""
     told = []
     for result, settings in zip(results, differing_settings(results), strict=True):
         twins = [other for other in results if other.method.title == result.method.title]
@@ -192,7 +192,7 @@ def labels(results: Sequence[Results]) -> list[str]:
     return told
 
 
-#: What tells evaluations of one title apart.
+#: The differences between evaluations of one title.
 _TELLING: tuple[Callable[[Results], str], ...] = (
     lambda result: result.method.preset,
     lambda result: f"{result.frames} frames",

@@ -61,7 +61,7 @@ _STYLE: dict[str, Any] = {
     "text.color": PALETTE["ink"],
     "lines.scale_dashes": False,
     "lines.solid_joinstyle": "round",
-    # Names of methods may hold dollar signs, which are no formulas.
+    # Names of methods may hold dollar signs, which are not formulas.
     "text.parse_math": False,
     "svg.hashsalt": "hwp-bench",
 }

@@ -18,7 +18,7 @@ from hwp_bench.taxonomy import PERTURBATIONS, catalogue, perturbation
 METRIC_OF = {"psnr": "paper_psnr", "ssim": "paper_ssim", "lpips": "paper_lpips"}
 #: Digits that the paper prints.
 PAPER_DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
-#: The distance that is there without downloaded weights, under its own name.
+#: The distance that needs no downloaded weights.
 DISTANCE = "oriented_distance"
 
 _PERTURBED = {name: perturbation(name).heading for name in PERTURBATIONS}
@@ -95,7 +95,7 @@ def layout_table(
     """Return one of the tables 3 to 8.
 
     Scores are of protocol paper-wildghand, means over captures and then over seeds. Without
-    LPIPS weights the oriented distance stands beside, in a column under its own name.
+    LPIPS weights the oriented distance is added, in a column under its own name.
 
     Args:
         layout: which.
@@ -168,7 +168,7 @@ def _means(run: MethodRuns) -> dict[str, Scores]:
         for scope, summary in groups.items():
             if summary is not None:
                 found.setdefault(scope, []).append(summary.capture_mean)
-        # The paper's table by perturbation is of interacting hands alone.
+        # The paper's table by perturbation is only of interacting hands.
         for name, scores in (mean.interacting.perturbations if mean.interacting else {}).items():
             found.setdefault(name, []).append(scores)
     return {scope: mean_scores(rows) for scope, rows in found.items()}

@@ -1,4 +1,4 @@
-"""What reports are made of: results with the folder they lie in, and the captures' severities."""
+"""The inputs of reports: results with their folders, temporal weights, severities of captures."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class Source:
     folder: Path | None
 
     def place(self, capture: str, *parts: str) -> Path | None:
-        """Return a place inside the folder of a capture; None where there is no folder.
+        """Return a path inside the folder of a capture; None where the folder is not known.
 
         Raises:
             BadInput: the capture's name leads out of the results folder.
@@ -109,10 +109,10 @@ def find_captures(
     Returns:
         By digest; captures that are nowhere to be found are left out.
     """
-    wanted = {c.digest: c.id for result in results for c in result.captures}
+    digests = {c.digest: c.id for result in results for c in result.captures}
     places = [Path(folder) for folder in folders]
     rendered = cache_root() / "sim" / "captures"
-    for identifier in sorted(set(wanted.values())):
+    for identifier in sorted(set(digests.values())):
         places += sorted(rendered.glob(f"{_literal(identifier)}-*"))
     found = {}
     for place in places:
@@ -122,7 +122,7 @@ def find_captures(
         except HwpError:
             continue
         digest = sha256_json(info.to_json())
-        if digest in wanted:
+        if digest in digests:
             found[digest] = info
     return found
 

@@ -34,7 +34,7 @@ def robustness_table(sources: Sequence[Source], base: str | None = None) -> Tabl
         base: name of the method that the share of the gap is counted from.
 
     Raises:
-        UsageError: no method was evaluated on both; there is no such base.
+        UsageError: no method was evaluated on both, or none is called `base`.
     """
     runs = group_runs([source.results for source in sources])
     perturbed = [run for run in runs if run.first.frames == "perturbed"]
@@ -208,7 +208,7 @@ def bias_table(sources: Sequence[Source], captures: Mapping[str, CaptureInfo]) -
     return Table("Bias strength", columns, tuple(rows), (LEVEL_NOTE,), ranked=False)
 
 
-#: What the levels of the bias table are.
+#: The levels of the bias table.
 LEVEL_NOTE = (
     "Severity: the strongest perturbation's mean over the frames to learn from, 0 to 5; low is "
     "below 1, medium below 2. Weights: mean over sides and training frames."

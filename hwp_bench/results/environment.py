@@ -1,4 +1,4 @@
-"""What a result was made on: versions, processor, system."""
+"""The environment of a result: versions, processor, system."""
 
 from __future__ import annotations
 

@@ -13,9 +13,9 @@ from hwp_bench.base.records import parse_record, without_schema
 
 #: Version of the file.
 SCHEMA = "hwp-published/1"
-#: What stands behind the name of a method wherever a published number is shown.
+#: Follows the name of a method wherever a published number is shown.
 MARK = "published, other data"
-#: What stands under every table that shows published numbers.
+#: Note under every table with published numbers.
 NOTE = (
     "Published rows are the paper's own numbers, on other captures, masks and weights; they show "
     "a table's scale and cannot be compared with measured rows."
@@ -28,7 +28,7 @@ class Measurement:
 
     #: Name of the method.
     method: str
-    #: What of the method, or how strong the perturbation: a variant, a level; empty if neither.
+    #: A variant of the method, or a level of the perturbation; empty if neither.
     detail: str
     #: Which data: `single` and `interacting` (the paper's captures), `interhand2.6m`,
     #: `anchorcrafter`, a perturbation, `captureN`, or `all`.
@@ -49,7 +49,7 @@ class PublishedTable:
     label: str
     #: Its page in the paper, where known; the source file does not tell.
     page: int | None
-    #: What it shows.
+    #: Its caption.
     caption: str
     #: Its numbers, row by row, from left to right.
     measurements: list[Measurement]
@@ -63,7 +63,7 @@ class Dataset:
     name: str
     #: `Lab` or `Wild`.
     environment: str
-    #: What it has: `clean_test`, `single`, `interacting`, and perturbations.
+    #: Its contents: `clean_test`, `single`, `interacting`, and perturbations.
     has: list[str]
 
 

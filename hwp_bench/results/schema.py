@@ -54,7 +54,7 @@ class CurvePoint:
 
 @dataclass(frozen=True)
 class CaptureResult:
-    """What one method did on one capture."""
+    """One method on one capture."""
 
     #: Id of the capture.
     id: str
@@ -66,7 +66,7 @@ class CaptureResult:
     perturbations: list[str]
     #: Digest of the split.
     split_digest: str
-    #: Whether the scoring masks are exact coverage, or estimates.
+    #: True where the scoring masks are exact coverage, False where they are estimates.
     exact_masks: bool
     #: Digest of everything that decides the scores; equal keys need no second run.
     key: str
@@ -94,10 +94,10 @@ class CaptureResult:
     curve: list[CurvePoint]
     #: Seconds that the method's process spent on checkpoints, outside the method's clock.
     curve_seconds: float | None = None
-    #: Seconds of everything: reading, copying, the method's process, scoring, pictures.
+    #: Seconds of everything: reading, copying, the method's process, scoring, images.
     job_seconds: float | None = None
-    #: How the method's process was kept apart: `namespaces`, or `processes` with the reason why
-    #: not more; None for predictions that came as files, and where nobody noted it.
+    #: How the method's process was isolated: `namespaces`, or `processes` with the reason why
+    #: not more; None for predictions that came as files, and where it was not recorded.
     isolation: str | None = None
 
     @property
@@ -228,15 +228,15 @@ def differing_settings(results: Sequence[Results]) -> list[str]:
         Texts such as `prior = "", steps = 300`, with `default` where a result says nothing; empty
         where all settings are the same.
     """
-    spelled = [
+    texts = [
         {name: canonical_json(value) for name, value in result.method.settings.items()}
         for result in results
     ]
     told = []
-    for result, mine in zip(results, spelled, strict=True):
+    for result, mine in zip(results, texts, strict=True):
         twins = [
             table
-            for other, table in zip(results, spelled, strict=True)
+            for other, table in zip(results, texts, strict=True)
             if other.method.title == result.method.title
         ]
         names = sorted({name for table in twins for name in table})

@@ -1,4 +1,4 @@
-"""From results to everything that is said of accuracy against time."""
+"""From results to accuracy against time: costs, curves, the front and their tables."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ class CostAnalysis:
     costs: tuple[MethodCost, ...]
     #: Mean curves of those methods that have any.
     curves: tuple[MeanCurve, ...]
-    #: Who leads when.
+    #: Which method has the best score when.
     front: tuple[FrontPart, ...]
     #: The tables by name.
     tables: Mapping[str, Table]

@@ -17,7 +17,7 @@ PARTS: Mapping[str, str] = {
     "fit": "the method's clock",
     "curve": "checkpoints are rendered, the method's clock stands still",
     "render": "the test frames are rendered",
-    "score": "the benchmark copies the request, checks, scores, draws pictures",
+    "score": "the benchmark copies the request, checks, scores, draws images",
 }
 
 _GB = 1e9
@@ -209,5 +209,5 @@ def seconds_table(runs: Sequence[MethodRuns]) -> Table | None:
     rows.append(("sum", whole / len(known), whole, 100.0, f"{len(known)} runs"))
     notes = ["A run is one fit of one capture; runs that go side by side are added up."]
     if len(known) < len(every):
-        notes.append(f"{len(every) - len(known)} of {len(every)} runs say nothing of it.")
+        notes.append(f"{len(every) - len(known)} of {len(every)} runs do not record it.")
     return Table("Where the seconds go", columns, tuple(rows), tuple(notes), breaks=(len(PARTS),))

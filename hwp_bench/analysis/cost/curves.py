@@ -84,7 +84,7 @@ def curve_of(result: CaptureResult, metric: str) -> Curve | None:
         return None
     seconds = np.maximum.accumulate([max(point.seconds, EARLIEST) for point in points])
     scores = np.array([point.scores[metric] for point in points])
-    # Of several checkpoints at one moment the last counts: log time could not tell them apart.
+    # Of several checkpoints at one moment the last counts: a curve has one score at a time.
     last = np.append(np.diff(seconds) > 0, True)
     return Curve(seconds[last], scores[last])
 
@@ -161,7 +161,7 @@ def mean_curve(label: str, curves: Mapping[str, Sequence[Curve]]) -> MeanCurve |
 
 
 def pareto_front(curves: Sequence[MeanCurve], higher_is_better: bool) -> list[FrontPart]:
-    """Return who has the best score after which time: the points that nothing dominates.
+    """Return which method has the best score after which time: the points that nothing dominates.
 
     A point is on the front when no method has as good a score in less time. A method that has
     ended keeps its score, and so adds nothing to the front any more.
@@ -176,18 +176,18 @@ def pareto_front(curves: Sequence[MeanCurve], higher_is_better: bool) -> list[Fr
     sign = 1 if higher_is_better else -1
     # A method that has no score yet is as bad as can be.
     values = np.stack([np.nan_to_num(sign * _on(c, moments), nan=-np.inf) for c in curves])
-    leaders = values.argmax(axis=0)
+    best_of = values.argmax(axis=0)
     best = values.max(axis=0)
     gains = best > np.concatenate([[-np.inf], np.maximum.accumulate(best)[:-1]])
     points = [
-        (int(leaders[place]), float(moments[place]), float(sign * best[place]))
+        (int(best_of[place]), float(moments[place]), float(sign * best[place]))
         for place in np.flatnonzero(gains)
     ]
     parts = []
-    for leader, group in groupby(points, key=lambda point: point[0]):
+    for index, group in groupby(points, key=lambda point: point[0]):
         stretch = list(group)
         (_, begin, first), (_, end, last) = stretch[0], stretch[-1]
-        parts.append(FrontPart(curves[leader].label, begin, end, first, last))
+        parts.append(FrontPart(curves[index].label, begin, end, first, last))
     return parts
 
 

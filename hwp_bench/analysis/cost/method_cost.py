@@ -1,4 +1,4 @@
-"""What the curves and clocks of a method say."""
+"""The cost of a method, from its curves and clocks."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def window(curves: Sequence[Mapping[str, Sequence[Curve]]]) -> tuple[float, floa
     """Return the seconds over which all methods can be compared.
 
     From the moment when every fit of every method has had a checkpoint to the end of the longest
-    fit (one that ended earlier keeps its score). None where that is no stretch of time.
+    fit (one that ended earlier keeps its score). None where that leaves no time.
     """
     every = [curve for method in curves for fits in method.values() for curve in fits]
     if not every:
@@ -106,7 +106,7 @@ def method_costs(
     budgets: Sequence[float] = BUDGETS,
     reference: MethodRuns | None = None,
 ) -> list[MethodCost]:
-    """Return what every method costs.
+    """Return the cost of every method.
 
     Args:
         runs: the methods.

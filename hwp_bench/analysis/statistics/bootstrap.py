@@ -206,7 +206,7 @@ class Blocks:
             random: where from.
 
         Returns:
-            (draws,) float. Blocks are drawn with replacement; so are seeds, apart from the
+            (draws,) float. Blocks are drawn with replacement; so are seeds, independently of the
             blocks, because every seed is scored on the same frames. Drawing from few loses part
             of the variance, which is put back.
         """
@@ -251,7 +251,7 @@ def skewness_of_mean(values: np.ndarray, share: np.ndarray) -> float:
     """
     deviations = values - share @ values
     spread = share @ deviations**2
-    # Differences that differ by rounding alone have no shape.
+    # Differences that differ only by rounding have no shape.
     if len(values) < FEWEST or spread <= (1e-12 * np.abs(values).max()) ** 2:
         return 0.0
     own = share @ deviations**3 / spread**1.5

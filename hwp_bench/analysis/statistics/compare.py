@@ -13,7 +13,7 @@ from hwp_bench.analysis.statistics.pairing import MACRO, MethodRuns, common_seed
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.taxonomy import PERTURBATIONS
 
-#: Level at which two methods are told apart.
+#: Level at which two methods differ significantly.
 ALPHA = 0.05
 
 
@@ -50,7 +50,7 @@ class Standing:
     seed_deviation: float | None
     #: Number of seeds.
     seeds: int
-    #: Letters; methods that share one are not told apart.
+    #: Letters; two methods that share one do not differ significantly.
     ties: str
 
 
@@ -117,17 +117,17 @@ def standings(
         runs: the methods.
         metric: the metric of `differences`.
         differences: what `compare` found; pairs with an adjusted p below `ALPHA` in the macro
-            scope are told apart.
+            scope differ significantly.
     """
     higher = metric_facts(metric).higher_is_better
     means = {run.label: macro_by_seed(run, metric) for run in runs}
     order = sorted(runs, key=lambda run: float(means[run.label].mean()) * (-1 if higher else 1))
     places = {run.label: place for place, run in enumerate(order)}
-    apart = {}
+    different = {}
     for item in differences:
         if item.scope == MACRO and item.metric == metric:
             low, high = sorted((places[item.first], places[item.second]))
-            apart[low, high] = item.p_adjusted is not None and item.p_adjusted < ALPHA
+            different[low, high] = item.p_adjusted is not None and item.p_adjusted < ALPHA
     return [
         Standing(
             run.label,
@@ -136,7 +136,7 @@ def standings(
             len(run.seeds),
             ties,
         )
-        for run, ties in zip(order, tie_groups(len(order), apart), strict=True)
+        for run, ties in zip(order, tie_groups(len(order), different), strict=True)
     ]
 
 
@@ -173,11 +173,11 @@ def holm(p_values: Sequence[float]) -> list[float]:
 
 
 def tie_groups(count: int, different: Mapping[tuple[int, int], bool]) -> list[str]:
-    """Return letters such that two items share one exactly where they are not told apart.
+    """Return letters such that two items share one exactly where they do not differ.
 
     Args:
         count: number of items, best first.
-        different: for each pair (i, j), i < j, whether the two are told apart.
+        different: for each pair (i, j), i < j, whether the two differ.
 
     Returns:
         The letters of each item: `a`, `ab`, `b`, ...
@@ -186,7 +186,7 @@ def tie_groups(count: int, different: Mapping[tuple[int, int], bool]) -> list[st
     pairwise comparisons, 2004.
     """
     groups = [frozenset(range(count))]
-    for first, second in sorted(pair for pair, apart in different.items() if apart):
+    for first, second in sorted(pair for pair, differs in different.items() if differs):
         split: list[frozenset[int]] = []
         for group in groups:
             both = first in group and second in group

@@ -57,8 +57,8 @@ def standings_table(metric: str, found: Sequence[Standing]) -> Table:
     )
     rows = tuple((s.label, s.mean, s.ties, s.seeds, s.seed_deviation) for s in found)
     note = (
-        "Macro mean. Methods that share a letter are not told apart (Holm over the pairs, 5 %); "
-        "the spread is the standard deviation of the mean over seeds."
+        "Macro mean. Methods that share a letter do not differ significantly (Holm over the "
+        "pairs, 5 %); the spread is the standard deviation of the mean over seeds."
     )
     return Table(f"{facts.label}: methods", columns, rows, (note,))
 

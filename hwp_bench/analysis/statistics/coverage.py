@@ -15,7 +15,7 @@ from hwp_bench.analysis.statistics.bootstrap import bootstrap_mean
 
 @dataclass(frozen=True)
 class Study:
-    """What a simulated comparison looks like; its true mean difference is 0."""
+    """A simulated comparison; its true mean difference is 0."""
 
     #: Captures.
     captures: int
@@ -88,7 +88,7 @@ class Coverage:
 
     #: The interval of `bootstrap_mean`.
     ours: float
-    #: The same without what is done about long tails: Student's t alone.
+    #: The same without the correction for long tails: Student's t only.
     student: float
     #: The textbook's percentile interval over captures.
     percentile: float

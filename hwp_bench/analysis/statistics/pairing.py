@@ -21,7 +21,7 @@ MACRO = "macro"
 class MethodRuns:
     """One method in one state, with one evaluation a seed."""
 
-    #: Name in tables, unlike any other's.
+    #: Name in tables, unique in one comparison.
     label: str
     #: The evaluations by seed.
     seeds: Mapping[int, Results]
@@ -71,7 +71,7 @@ def group_runs(results: Sequence[Results]) -> list[MethodRuns]:
 
 
 def _labels(results: Sequence[Results]) -> list[str]:
-    """Return titles, told apart by what differs, and by a number where nothing readable does."""
+    """Return titles, followed by what differs, or led by a number where nothing readable does."""
     titles = [result.method.title for result in results]
     states = [_state(result) for result in results]
     differences = differing_settings(results)
@@ -189,7 +189,7 @@ def scopes(results: Results) -> dict[str, dict[str, float]]:
 
     Returns:
         By scope, in the order of tables: `macro` (weights as in the mean over perturbations; all
-        captures alike where none carries a perturbation), `single`, `interacting`, and each
+        captures count the same where none has a perturbation), `single`, `interacting`, and each
         perturbation. Scopes without captures are left out.
     """
     captures = results.captures

@@ -1,1 +1,1 @@
-"""Ablations: which variants of a method are run, what its components buy, and what they cost."""
+"""Ablations: variants of a method, the effect of its components, and their cost."""

@@ -1,4 +1,4 @@
-"""What an ablation says: its tables, and its record `ablation.json`."""
+"""The tables of an ablation, and its record `ablation.json`."""
 
 from __future__ import annotations
 

@@ -25,11 +25,11 @@ class Variant:
 
     #: `full`, `no-dpd`, `no-dpd+no-pao`, `binary-mask`.
     name: str
-    #: What it is called in tables, without the method's name; empty for the full method.
+    #: Its name in tables, without the method's name; empty for the full method.
     title: str
     #: Names of the switches that are thrown.
     thrown: tuple[str, ...]
-    #: What overrides the preset.
+    #: Settings that override the preset.
     settings: Mapping[str, Any]
 
 
@@ -49,7 +49,7 @@ class Effect:
 
 @dataclass(frozen=True)
 class Design:
-    """What an ablation runs and answers."""
+    """The variants that an ablation runs and the effects that it measures."""
 
     #: Components that are taken out.
     components: tuple[Switch, ...]
@@ -68,7 +68,7 @@ def make_design(
 
     Without names the first two components that the method declares are crossed: 2 x 2 variants.
     `crossed` crosses the named components instead: 2^k variants. `thrown` asks what each named
-    switch does to the full method: the full method, the method with each of them thrown alone,
+    switch does to the full method: the full method, the method with only one of them thrown,
     and, of two components or more, with all of them out. (With two that is the 2 x 2 again.)
 
     Args:

@@ -1,4 +1,4 @@
-"""What components do to the scores and to the seconds, paired by capture, seed and frame."""
+"""The effect of components on scores and seconds, paired by capture, seed and frame."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from hwp_bench.taxonomy import PERTURBATIONS
 
 @dataclass(frozen=True)
 class ScoreEffect:
-    """What an effect amounts to in one metric and scope."""
+    """An effect in one metric and scope."""
 
     #: Title of the effect.
     effect: str
@@ -31,7 +31,7 @@ class ScoreEffect:
     #: A scope of `statistics.pairing.scopes`.
     scope: str
     #: Score with the component less score without it; for interactions, what both together
-    #: bring beyond the sum of what each brings alone.
+    #: add to the sum of what each adds without the other.
     estimate: Estimate
     #: Probability that it makes the score better, whichever direction that is.
     better: float | None
@@ -41,7 +41,7 @@ class ScoreEffect:
 
 @dataclass(frozen=True)
 class CostEffect:
-    """What a component costs."""
+    """The cost of a component."""
 
     #: Title of the effect.
     effect: str
@@ -126,7 +126,7 @@ def _adjusted(rows: list[ScoreEffect]) -> list[ScoreEffect]:
     return rows
 
 
-#: What is timed, by name of the quantity.
+#: Names of the times that are compared.
 QUANTITIES = ("step", "fit", "render")
 
 
@@ -146,7 +146,7 @@ def seconds(capture: CaptureResult, quantity: str) -> float | None:
 
 
 def cost_effects(ablation: AblationRuns, *, seed: int = 0) -> list[CostEffect]:
-    """Return what every component costs, as ratios paired by capture and seed.
+    """Return the cost of every component, as ratios paired by capture and seed.
 
     Captures on which a variant says nothing of its time are left out.
     """
@@ -180,7 +180,7 @@ def _cost_effect(
     estimate = bootstrap_mean(ratios, seed=seed)
 
     def percent(log: float | None) -> float | None:
-        # A ratio beyond e^50 only says that there is no upper bound.
+        # A ratio beyond e^50 only means that the interval has no upper end.
         return None if log is None or abs(log) > 50 else 100 * math.expm1(log)
 
     return CostEffect(

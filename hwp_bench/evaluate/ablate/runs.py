@@ -26,7 +26,7 @@ OnJob = Callable[[int, int, str], Callable[[int, int], None] | None]
 class AblationRuns:
     """Every evaluation of an ablation."""
 
-    #: What was run.
+    #: The variants that were run.
     design: Design
     #: The evaluations by variant, in the design's order.
     runs: Mapping[str, MethodRuns]

@@ -19,9 +19,9 @@ from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.evaluation_tables import all_tables, same_data
 from hwp_bench.report.figures import Bar, draw_bars, draw_pareto
+from hwp_bench.report.page.album import Album, frame_sheets, mask_sheet
 from hwp_bench.report.page.html_tables import to_html
 from hwp_bench.report.page.inline_svg import inline_svg
-from hwp_bench.report.page.pictures import Album, frame_sheets, mask_sheet
 from hwp_bench.report.page.strips import StripMethod, strip_plot
 from hwp_bench.report.sources import Source, find_captures, temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
@@ -36,11 +36,11 @@ PLAIN = "plain"
 
 @dataclass(frozen=True)
 class CaptureSection:
-    """What is shown of one capture."""
+    """One capture on the page."""
 
     #: Its id.
     id: str
-    #: What is known of it, in words.
+    #: Its facts, in words.
     facts: str
     #: Its strip.
     strip: Markup
@@ -66,7 +66,7 @@ class ReportPage:
     pareto: Markup | None
     #: Tables of accuracy against time.
     cost_tables: Sequence[Markup]
-    #: Bars by perturbation, or None where no capture carries one.
+    #: Bars by perturbation, or None where no capture has one.
     bars: Markup | None
     #: Tables of differences with intervals.
     differences: Sequence[Markup]
@@ -76,16 +76,16 @@ class ReportPage:
     provenance: Sequence[Mapping[str, str]]
     #: Digests of captures, splits and predictions.
     digests: Sequence[Mapping[str, str]]
-    #: Pictures that found no room.
+    #: Images for which the page had no space left.
     left_out: int
 
 
-def gather(
+def gather_report(
     sources: Sequence[Source],
     capture_folders: Sequence[str | os.PathLike[str]] = (),
     *,
     base: str | None = None,
-    picture_bytes: int | None = None,
+    image_bytes: int | None = None,
 ) -> ReportPage:
     """Gather a report.
 
@@ -94,10 +94,10 @@ def gather(
         capture_folders: capture folders, for severities.
         base: name of the method that shares of the gap are counted from; None takes the plain
             baseline where it is among them.
-        picture_bytes: budget of the pictures; None takes the default.
+        image_bytes: budget of the images; None takes the default.
 
     Raises:
-        UsageError: there is no result, or the results are of different data or protocols.
+        UsageError: there are no results, or they are of different data or protocols.
     """
     if not sources:
         raise UsageError("results are needed", field="RESULTS")
@@ -107,7 +107,7 @@ def gather(
     runs = group_runs([source.results for source in chosen])
     refuse_unlike(runs)
     infos = find_captures(results, capture_folders)
-    album = Album() if picture_bytes is None else Album(picture_bytes)
+    album = Album() if image_bytes is None else Album(image_bytes)
     order = {run.label: index for index, run in enumerate(runs)}
     start = base or next((r.first.method.name for r in runs if r.first.method.name == PLAIN), None)
     cost = _cost(runs)
@@ -154,7 +154,7 @@ def summary_sentence(runs: Sequence[MethodRuns]) -> str:
     text += f"{facts.unit} against {order[1]}, the next"
     if macro.low is not None and macro.high is not None:
         text += f" (95 % interval {macro.low:+.2f} to {macro.high:+.2f}"
-        text += ")" if macro.low > 0 or macro.high < 0 else ": not told apart)"
+        text += ")" if macro.low > 0 or macro.high < 0 else ": not significantly different)"
     return f"{text}.{tail}"
 
 

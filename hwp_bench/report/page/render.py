@@ -11,7 +11,7 @@ from typing import Any
 from markupsafe import Markup
 
 from hwp_bench.base.files import atomic_write
-from hwp_bench.report.page.content import ReportPage, gather
+from hwp_bench.report.page.content import ReportPage, gather_report
 from hwp_bench.report.sources import Source
 
 #: Name of the page.
@@ -19,13 +19,13 @@ PAGE = "index.html"
 
 
 def style_sheet() -> Markup:
-    """Return the style sheet of every page; it is ours and goes in as it is."""
+    """Return the style sheet of every page; it is the toolkit's own and is not escaped."""
     folder = resources.files("hwp_bench.report.page").joinpath("templates")
     return Markup(folder.joinpath("style.css").read_text("utf-8"))
 
 
 def render_template(package: str, name: str, **values: Any) -> str:
-    """Return a filled template; every value that is no `Markup` is escaped.
+    """Return a filled template; every value that is not `Markup` is escaped.
 
     Args:
         package: package with a folder `templates`.
@@ -75,7 +75,7 @@ def write_report(
     Raises:
         UsageError: the results cannot stand on one page.
     """
-    report = gather(sources, captures, base=base)
+    report = gather_report(sources, captures, base=base)
     titles = dict.fromkeys(source.results.method.title for source in sources)
     heading = title or "HWP bench: " + ", ".join(titles)
     return atomic_write(folder / PAGE, render_report(report, heading))

@@ -15,9 +15,9 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.tables import Column, Table
-from hwp_bench.report.page.content import gather, summary_sentence
+from hwp_bench.report.page.album import Album
+from hwp_bench.report.page.content import gather_report, summary_sentence
 from hwp_bench.report.page.html_tables import tag, to_html
-from hwp_bench.report.page.pictures import Album
 from hwp_bench.report.page.render import write_report
 from hwp_bench.report.sources import Source
 from hwp_bench.results import CurvePoint
@@ -145,7 +145,7 @@ def test_the_first_sentence_says_what_the_numbers_say(sources) -> None:
 
 
 def test_pictures_stay_within_their_budget(sources) -> None:
-    report = gather(*[sources[0], [sources[1]]], picture_bytes=900)
+    report = gather_report(*[sources[0], [sources[1]]], image_bytes=900)
     assert report.left_out >= 1
     album = Album(10**6)
     uri = album.take(np.zeros((3000, 2000, 3), np.uint8))

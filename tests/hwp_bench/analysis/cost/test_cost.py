@@ -63,7 +63,10 @@ def test_a_score_is_reached_when_the_curve_says_so(moments: list[float], data) -
         assert max(scores) < target
     else:
         assert curve.seconds[0] <= when <= curve.seconds[-1] * (1 + 1e-9)
-        assert curve.at(min(when * (1 + 1e-12), curve.seconds[-1])) >= target - 1e-3
+        # At that moment or, for the rounding of its logarithm, just after it: a curve may fall at
+        # once, to the next checkpoint.
+        just_after = min(when * (1 + 1e-12), curve.seconds[-1])
+        assert curve.at(np.array([when, just_after])).max() >= target - 1e-3
 
 
 def test_checkpoints_at_one_moment_count_once() -> None:
@@ -110,7 +113,7 @@ def test_the_seconds_of_a_run_are_its_parts() -> None:
     found = {row[0]: row[1:4] for row in table.rows}
     assert found["curve"] == pytest.approx((1.5, 3.0, 12.0))
     assert found["sum"] == pytest.approx((12.5, 25.0, 100.0))
-    assert "1 of 3 runs say nothing of it." in table.notes
+    assert "1 of 3 runs do not record it." in table.notes
     assert seconds_table(group_runs([doubling("old")])) is None
 
 

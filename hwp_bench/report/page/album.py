@@ -1,4 +1,4 @@
-"""Pictures inside the page: small JPEGs as data URIs, within a budget of bytes."""
+"""Images inside the page: small JPEGs as data URIs, within a budget of bytes."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from hwp_bench.base.errors import HwpError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.report.sources import Source
 
-#: Bytes of pictures that a page holds at most, as they stand in it.
+#: Largest sum of the images in a page, bytes in base64.
 MAX_BYTES = 8 * 1024 * 1024
 #: Quality of the JPEGs: the sheets are for looking, the results keep the exact pixels.
 QUALITY = 82
-#: Larger edge of a picture in the page, px.
+#: Larger edge of an image in the page, px.
 EDGE = 1056
 #: Weight masks shown of one capture, and their larger edge, px.
 MASKS, MASK_EDGE = 6, 160
 
 
 class Album:
-    """Collects pictures until the budget is spent.
+    """Collects images until the budget is spent.
 
     Attributes:
         left: bytes that are left.
-        left_out: how many pictures found no room.
+        left_out: how many images the budget did not allow.
     """
 
     def __init__(self, budget: int = MAX_BYTES) -> None:
@@ -37,7 +37,7 @@ class Album:
         self.left_out = 0
 
     def take(self, pixels: np.ndarray) -> str | None:
-        """Return a picture as a data URI, or None where it found no room.
+        """Return an image as a data URI, or None where the budget does not allow it.
 
         Args:
             pixels: (H, W, 3) uint8.
@@ -55,7 +55,7 @@ class Album:
         return uri
 
     def take_file(self, path: Path | None) -> str | None:
-        """Return an image file as a data URI; None where there is none, or no room."""
+        """Return an image file as a data URI; None if it is missing or beyond the budget."""
         pixels = _read(path)
         return None if pixels is None else self.take(pixels)
 
@@ -87,7 +87,7 @@ def mask_sheet(source: Source, capture: str, album: Album) -> tuple[str, int] | 
 
 
 def _read(path: Path | None) -> np.ndarray | None:
-    """Return (H, W, 3) uint8; None for what is no picture."""
+    """Return (H, W, 3) uint8; None where the file is missing or not an image."""
     if path is None or not path.is_file():
         return None
     try:
