@@ -8,8 +8,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from hwp_bench import __version__
-from hwp_bench.base.errors import BadCapture
+from hwp_bench.base.errors import BadCapture, BadMethod
 from hwp_bench.base.locks import exclusive
+from hwp_bench.base.records import check_json_values
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluate.capture_evaluation import (
@@ -19,7 +20,6 @@ from hwp_bench.evaluate.capture_evaluation import (
 )
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
-from hwp_bench.methods.settings import check_plain
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
@@ -152,7 +152,9 @@ def make_plan(
         BadMethod: there is no such preset, or an override is not a plain value.
     """
     preset = manifest.preset(settings.preset, settings.suite)
-    check_plain(dict(settings.run.settings), manifest.name, "settings")
+    check_json_values(
+        dict(settings.run.settings), where=manifest.name, field="settings", error=BadMethod
+    )
     chosen = {**manifest.presets.get(preset, {}), **settings.run.settings}
     run = replace(settings.run, settings=chosen)
     known = load_available() if networks is None else networks

@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-import difflib
 import os
-import re
 import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
-from hwp_bench.base.errors import BadMethod
+from msgspec import Meta
+
+from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.base.files import inside
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.base.text import has_odd_characters
+from hwp_bench.base.records import Line, check_json_values, parse_record, without_schema
 from hwp_bench.methods.contents import method_digest
-from hwp_bench.methods.settings import check_plain
 
 #: Version of the method contract.
 SCHEMA = "hwp-method/1"
@@ -29,16 +28,26 @@ DEFAULT_PRESET = "default"
 #: Ways to enter a method; a manifest has exactly one.
 ENTRY_KINDS = ("python", "command", "predictions")
 
-#: Kinds of switch by the key that holds its settings.
-SWITCH_KINDS = ("settings_off", "settings_on")
 
-_LINES = ("name", "title", "description", "authors", "licence", "url")
-_KEYS = {"schema", *_LINES, "entry", "presets", "switches"}
-_SWITCH_KEYS = {"title", "description", *SWITCH_KINDS}
-_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}")
-_PYTHON = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
-_SWITCH_NAME = re.compile(r"[a-z0-9][a-z0-9-]{0,31}")
-_SETTING = re.compile(r"[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7}")
+def _matching(pattern: str, description: str) -> Meta:
+    return Meta(pattern=rf"\A(?:{pattern})\Z", description=description)
+
+
+_MethodName = Annotated[
+    str,
+    _matching(r"[A-Za-z0-9][A-Za-z0-9._-]{0,63}", "a name of letters, digits and . _ -"),
+]
+_PythonEntry = Annotated[str, _matching(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*", "module:callable")]
+_Words = Annotated[list[str], Meta(min_length=1, description="a list of words")]
+_SwitchName = Annotated[
+    str, _matching(r"[a-z0-9][a-z0-9-]{0,31}", "a name of lower-case letters, digits and hyphens")
+]
+_SettingName = Annotated[
+    str, _matching(r"[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7}", "a name of a setting")
+]
+_SwitchSettings = Annotated[
+    dict[_SettingName, Any], Meta(min_length=1, description="a table of at least one setting")
+]
 
 
 @dataclass(frozen=True)
@@ -169,95 +178,39 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         raise BadMethod(f"is not valid TOML ({error})", where=where) from error
     except OSError as error:
         raise BadMethod(f"cannot be read ({error.strerror})", where=where) from error
-    _known_keys(value, _KEYS, where)
-    if value.get("schema") != SCHEMA:
-        raise BadMethod(
-            f"is {value.get('schema')!r} where {SCHEMA!r} is read", where=where, field="schema"
-        )
-    name = _text(value, "name", where)
-    if not _NAME.fullmatch(name):
-        raise BadMethod(f"{name!r} is not a method name", where=where, field="name")
-    kind, entry = _entry(value.get("entry"), root, where)
+    fields = without_schema(value, SCHEMA, where=where, error=BadMethod)
+    authors = fields.get("authors")
+    if isinstance(authors, list) and all(isinstance(name, str) for name in authors):
+        fields["authors"] = ", ".join(authors)
+    table = parse_record(_Manifest, fields, where=where, error=BadMethod)
+    if table.entry.predictions is not None:
+        inside(root, table.entry.predictions)
+    _check_plain(table.presets, where, "presets")
     return MethodManifest(
         root=root,
-        name=name,
-        title=_text(value, "title", where, default=name),
-        description=_text(value, "description", where, default=""),
-        kind=kind,
-        entry=entry,
-        presets=_presets(value.get("presets", {}), where),
-        switches=_switches(value.get("switches", {}), where),
-        authors=_authors(value, where),
-        licence=_text(value, "licence", where, default=""),
-        url=_text(value, "url", where, default=""),
+        name=table.name,
+        title=table.name if table.title is None else table.title,
+        description=table.description,
+        kind=table.entry.kind,
+        entry=table.entry.value,
+        presets=table.presets,
+        switches=_switches(table.switches, where),
+        authors=table.authors,
+        licence=table.licence,
+        url=table.url,
     )
 
 
-def _text(
-    value: Mapping[str, Any], key: str, where: Path, default: str | None = None, prefix: str = ""
-) -> str:
-    text = value.get(key, default)
-    if not isinstance(text, str) or len(text) > 1000 or "\n" in text or has_odd_characters(text):
-        raise BadMethod(
-            "must be one line of at most 1,000 characters", where=where, field=prefix + key
+def _switches(tables: Mapping[str, _SwitchTable], where: Path) -> dict[str, Switch]:
+    switches = {}
+    for name, table in tables.items():
+        kind = "settings_on" if table.settings_off is None else "settings_off"
+        settings = getattr(table, kind)
+        _check_plain(settings, where, f"switches.{name}.{kind}")
+        title = name if table.title is None else table.title
+        switches[name] = Switch(
+            name, title, table.description, settings, alternative=kind == "settings_on"
         )
-    return text
-
-
-def _authors(value: Mapping[str, Any], where: Path) -> str:
-    """One line, or a list of names, which becomes one."""
-    names = value.get("authors", "")
-    if isinstance(names, list) and all(isinstance(name, str) for name in names):
-        names = ", ".join(names)
-    return _text({"authors": names}, "authors", where)
-
-
-def _known_keys(
-    value: Mapping[str, Any], known: set[str], where: Path, prefix: str = "", kind: str = "a method"
-) -> None:
-    for key in value:
-        if key not in known:
-            close = difflib.get_close_matches(key, known, n=1)
-            raise BadMethod(
-                f"is not a field of {kind}",
-                where=where,
-                field=prefix + key,
-                remedy=f"Did you mean {close[0]!r}?" if close else f"Known: {sorted(known)}.",
-            )
-
-
-def _entry(value: Any, root: Path, where: Path) -> tuple[str, str | tuple[str, ...]]:
-    if not isinstance(value, dict) or len(value) != 1:
-        raise BadMethod(
-            f"must have exactly one of {', '.join(ENTRY_KINDS)}", where=where, field="entry"
-        )
-    _known_keys(value, set(ENTRY_KINDS), where, "entry.")
-    kind, entry = next(iter(value.items()))
-    field = f"entry.{kind}"
-    if kind == "command":
-        if not isinstance(entry, list) or not entry or not all(isinstance(w, str) for w in entry):
-            raise BadMethod("must be a list of words", where=where, field=field)
-        return kind, tuple(entry)
-    if not isinstance(entry, str):
-        raise BadMethod("must be text", where=where, field=field)
-    if kind == "python" and not _PYTHON.fullmatch(entry):
-        raise BadMethod(f"{entry!r} is not module:callable", where=where, field=field)
-    if kind == "predictions":
-        inside(root, entry)
-    return kind, entry
-
-
-def _presets(value: Any, where: Path) -> dict[str, dict[str, Any]]:
-    if not isinstance(value, dict) or not all(isinstance(item, dict) for item in value.values()):
-        raise BadMethod("must be tables of settings", where=where, field="presets")
-    check_plain(value, where, "presets")
-    return value
-
-
-def _switches(value: Any, where: Path) -> dict[str, Switch]:
-    if not isinstance(value, dict):
-        raise BadMethod("must be a table of switches", where=where, field="switches")
-    switches = {name: _switch(name, item, where) for name, item in value.items()}
     names = [switch.variant_name for switch in switches.values()]
     for name in names:
         if names.count(name) > 1:
@@ -265,41 +218,59 @@ def _switches(value: Any, where: Path) -> dict[str, Switch]:
     return switches
 
 
-def _switch(name: str, value: Any, where: Path) -> Switch:
-    place = f"switches.{name}"
-    if not _SWITCH_NAME.fullmatch(name):
-        raise BadMethod(
-            "is not a name of a switch",
-            where=where,
-            field=place,
-            remedy="Use lower-case letters, digits and hyphens.",
-        )
-    if not isinstance(value, dict):
-        raise BadMethod("must be a table", where=where, field=place)
-    _known_keys(value, _SWITCH_KEYS, where, f"{place}.", "a switch")
-    kinds = [kind for kind in SWITCH_KINDS if kind in value]
-    if len(kinds) != 1:
-        raise BadMethod(
-            f"must have exactly one of {' and '.join(SWITCH_KINDS)}",
-            where=where,
-            field=place,
-            remedy="settings_off takes a component out; settings_on puts an alternative in.",
-        )
-    settings = value[kinds[0]]
-    if not isinstance(settings, dict) or not settings:
-        raise BadMethod(
-            "must be a table of at least one setting", where=where, field=f"{place}.{kinds[0]}"
-        )
-    for setting in settings:
-        if not _SETTING.fullmatch(setting):
-            raise BadMethod(
-                f"{setting!r} is not a name of a setting", where=where, field=f"{place}.{kinds[0]}"
+def _check_plain(value: Any, where: Path, field: str) -> None:
+    check_json_values(value, where=where, field=field, error=BadMethod)
+
+
+@dataclass(frozen=True)
+class _Entry:
+    """The table `entry` of the file."""
+
+    python: _PythonEntry | None = None
+    command: _Words | None = None
+    predictions: str | None = None
+
+    def __post_init__(self) -> None:
+        if sum(getattr(self, kind) is not None for kind in ENTRY_KINDS) != 1:
+            raise UsageError(f"must have exactly one of {', '.join(ENTRY_KINDS)}")
+
+    @property
+    def kind(self) -> str:
+        return next(kind for kind in ENTRY_KINDS if getattr(self, kind) is not None)
+
+    @property
+    def value(self) -> str | tuple[str, ...]:
+        value = getattr(self, self.kind)
+        return value if isinstance(value, str) else tuple(value)
+
+
+@dataclass(frozen=True)
+class _SwitchTable:
+    """One table of `switches` of the file."""
+
+    title: Line | None = None
+    description: Line = ""
+    settings_off: _SwitchSettings | None = None
+    settings_on: _SwitchSettings | None = None
+
+    def __post_init__(self) -> None:
+        if (self.settings_off is None) == (self.settings_on is None):
+            raise UsageError(
+                "must have exactly one of settings_off and settings_on",
+                remedy="settings_off takes a component out; settings_on puts an alternative in.",
             )
-    check_plain(settings, where, f"{place}.{kinds[0]}")
-    return Switch(
-        name=name,
-        title=_text(value, "title", where, name, f"{place}."),
-        description=_text(value, "description", where, "", f"{place}."),
-        settings=settings,
-        alternative=kinds[0] == "settings_on",
-    )
+
+
+@dataclass(frozen=True)
+class _Manifest:
+    """The fields of the file, but for its schema."""
+
+    name: _MethodName
+    entry: _Entry
+    title: Line | None = None
+    description: Line = ""
+    authors: Line = ""
+    licence: Line = ""
+    url: Line = ""
+    presets: dict[str, dict[str, Any]] = field(default_factory=dict)
+    switches: dict[_SwitchName, _SwitchTable] = field(default_factory=dict)

@@ -24,7 +24,7 @@ def test_whole_numbers_do_for_real_ones() -> None:
 
 
 def test_unknown_setting_is_named_with_a_suggestion() -> None:
-    with pytest.raises(BadMethod, match=r"gausians: is not a setting.*Did you mean 'gaussians'"):
+    with pytest.raises(BadMethod, match=r"gausians: is not known.*Did you mean 'gaussians'"):
         PlainMethod({"gausians": 100}, 0)
 
 
