@@ -1,8 +1,13 @@
-"""Colour: sRGB and linear light, and the colour of a lamp."""
+"""Colour: sRGB and linear light, brightness, and the colour of a lamp."""
 
 from __future__ import annotations
 
 import numpy as np
+
+#: Weights of linear red, green and blue in luminance (ITU-R BT.709, the primaries of sRGB).
+LUMINANCE = (0.2126, 0.7152, 0.0722)
+#: Weights of sRGB-encoded red, green and blue in luma (ITU-R BT.601).
+LUMA = (0.299, 0.587, 0.114)
 
 
 def srgb_to_linear(srgb: np.ndarray) -> np.ndarray:
@@ -23,6 +28,19 @@ def eight_bit_srgb(linear: np.ndarray) -> np.ndarray:
     return np.round(linear_to_srgb(linear) * 255.0).astype(np.uint8)
 
 
+def log_light(srgb: np.ndarray, floor: float) -> np.ndarray:
+    """Return the logarithm of linear light, in which a gain is a sum.
+
+    Args:
+        srgb: sRGB in [0, 1], any shape.
+        floor: added to linear light before the logarithm, so that noise in the dark stays small.
+
+    Returns:
+        float64 of the same shape.
+    """
+    return np.log(srgb_to_linear(srgb) + floor)
+
+
 def lamp_color(kelvin: float) -> np.ndarray:
     """Linear sRGB colour of a black body, scaled to luminance 1 and relative to 5500 K.
 
@@ -33,4 +51,4 @@ def lamp_color(kelvin: float) -> np.ndarray:
     """
     ratio = kelvin / 5500.0
     color = np.array([ratio**-0.55, 1.0, ratio**0.75])
-    return color / float(color @ [0.2126, 0.7152, 0.0722])
+    return color / float(color @ LUMINANCE)

@@ -1,4 +1,4 @@
-"""Pictures made of pictures: labelled tiles on a sheet, error maps, outlines."""
+"""Images made of images: labelled tiles on a sheet, error maps, outlines."""
 
 from __future__ import annotations
 

@@ -4,18 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import os
+import struct
 from pathlib import Path
+from typing import BinaryIO
 
 import numpy as np
 import OpenImageIO as oiio
 
 from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch
-from hwp_bench.base.image_kinds import check_kind
 
 #: Largest image that is decoded, in pixels: a 300 byte PNG can ask for gigabytes.
 MAX_PIXELS = 64 * 1024 * 1024
 #: zlib level of written PNG files: within 10 % of the smallest at a third of the time.
 PNG_LEVEL = 3
+#: First bytes by format. OpenImageIO reads dozens of others, among them film and raw formats,
+#: whatever a file is called; an untrusted file must not choose such a decoder.
+MAGIC = {
+    "PNG": b"\x89PNG\r\n\x1a\n",
+    "JPEG": b"\xff\xd8\xff",
+    "BMP": b"BM",
+}
+#: Most parts of a PNG file that are searched for an animation; writers put it first.
+_MOST_CHUNKS = 1000
 
 
 def read_rgb(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
@@ -52,13 +62,13 @@ def read_gray(path: str | os.PathLike[str], size: tuple[int, int] | None = None)
 
 
 def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
-    check_kind(path)
+    _check_kind(path)
     config = oiio.ImageSpec()
     # Otherwise colours come multiplied by alpha, and a submission's alpha would act as a mask.
     config.attribute("oiio:UnassociatedAlpha", 1)
     source = oiio.ImageInput.open(os.fspath(path), config)
     if source is None:
-        raise BadImage(f"is no image that can be read ({oiio.geterror().strip()})", where=path)
+        raise BadImage(f"is not an image that can be read ({oiio.geterror().strip()})", where=path)
     try:
         spec = source.spec()
         height, width = spec.height, spec.width
@@ -88,6 +98,39 @@ def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
     return np.asarray(pixels, dtype=np.uint8).reshape(height, width, -1)
 
 
+def _check_kind(path: Path) -> None:
+    """Refuse what is not a still PNG, JPEG or BMP, before any decoder sees it."""
+    if not path.is_file():
+        raise BadImage("does not exist", where=path)
+    if path.stat().st_size == 0:
+        raise BadImage("is empty (0 bytes)", where=path)
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(8)
+            kind = next((name for name, magic in MAGIC.items() if head.startswith(magic)), None)
+            if kind is None:
+                raise BadImage(f"is not a {' or '.join(MAGIC)} image", where=path)
+            if kind == "PNG" and _is_animated(stream):
+                raise BadImage(
+                    "is an animated PNG", where=path, remedy="Store each frame as a file."
+                )
+    except OSError as error:
+        raise BadImage(f"cannot be read ({error.strerror})", where=path) from error
+
+
+def _is_animated(stream: BinaryIO) -> bool:
+    """Whether a PNG has an animation's header (acTL) before its first pixels (IDAT)."""
+    for _ in range(_MOST_CHUNKS):
+        head = stream.read(8)
+        if len(head) < 8:
+            return False
+        length, kind = struct.unpack(">I4s", head)
+        if kind in (b"acTL", b"IDAT"):
+            return kind == b"acTL"
+        stream.seek(length + 4, os.SEEK_CUR)
+    return False
+
+
 def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
     """Write an 8-bit image, whole or not at all.
 
@@ -96,7 +139,7 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
         pixels: (H, W) or (H, W, 1 | 3 | 4) uint8.
 
     Raises:
-        ShapeMismatch: the array is no such image.
+        ShapeMismatch: the array is not such an image.
         HwpError: the place cannot be written.
     """
     path = Path(path)
@@ -110,7 +153,7 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
     output = oiio.ImageOutput.create(os.fspath(temporary))
     if output is None:
-        raise HwpError(f"has an ending that is no image format ({oiio.geterror()})", where=path)
+        raise HwpError(f"has an ending that is not an image format ({oiio.geterror()})", where=path)
     spec = oiio.ImageSpec(array.shape[1], array.shape[0], array.shape[2], oiio.UINT8)
     spec.attribute("oiio:ColorSpace", "sRGB")
     spec.attribute("png:compressionLevel", PNG_LEVEL)
@@ -141,6 +184,30 @@ def as_uint8(image: np.ndarray) -> np.ndarray:
     """
     if image.dtype == np.uint8:
         return image
+    _check_float(image)
+    return np.rint(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def as_float(image: np.ndarray) -> np.ndarray:
+    """Return an image with 0 for black and 1 for white.
+
+    Args:
+        image: any shape, sRGB; uint8 is divided by 255; float is returned as it is.
+
+    Returns:
+        Float of the same shape (float64 where uint8 was given); values of a float image outside
+        [0, 1] stay.
+
+    Raises:
+        BadImage: of another type, or a value is NaN or infinite.
+    """
+    if image.dtype == np.uint8:
+        return image / 255.0
+    _check_float(image)
+    return image
+
+
+def _check_float(image: np.ndarray) -> None:
     if not np.issubdtype(image.dtype, np.floating):
         raise BadImage(
             f"an image is uint8 or float, not {image.dtype}",
@@ -149,7 +216,6 @@ def as_uint8(image: np.ndarray) -> np.ndarray:
         )
     if not np.isfinite(image).all():
         raise BadImage("the image holds NaN or infinite values", field="image")
-    return np.rint(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
 def pixel_digest(pixels: np.ndarray) -> str:

@@ -20,6 +20,7 @@ from functools import lru_cache
 import cv2
 import numpy as np
 
+from hwp_bench.base.colors import LUMA
 from hwp_bench.metrics.pixels import bounding_box, check_same_shape, composite, crop
 from hwp_bench.metrics.protocol import HWP_V1
 
@@ -28,8 +29,6 @@ SCALES = 4
 #: Weight of an oriented energy relative to the local means in the vector that is normalised: it
 #: sets how much texture counts against brightness and colour.
 CONTRAST_GAIN = 12.0
-#: Brightness of sRGB values (the luma of ITU-R BT.601).
-LUMA = np.array([[0.299, 0.587, 0.114]], np.float32)
 #: Taps of every one-dimensional filter, and their distance in widths of the Gaussian.
 TAPS, SPACING = 9, 0.67
 #: Directions of the energies: 0, 45, 90 and 135 degrees.
@@ -99,7 +98,8 @@ def _vector(image: np.ndarray) -> list[np.ndarray]:
     """
     share = np.float32(1.0 / np.sqrt(3.0))
     mean = share * local_mean(image)
-    return [mean, share - mean, oriented_energies(cv2.transform(image, CONTRAST_GAIN * LUMA))]
+    luma = CONTRAST_GAIN * np.array([LUMA], np.float32)
+    return [mean, share - mean, oriented_energies(cv2.transform(image, luma))]
 
 
 def _squared_length(groups: list[np.ndarray]) -> np.ndarray:

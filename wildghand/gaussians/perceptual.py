@@ -8,13 +8,13 @@ from pathlib import Path
 import torch
 from torch import Tensor, nn
 
+from hwp_bench.base.colors import LUMA
 from hwp_bench.base.errors import BadInput, ShapeMismatch
 
 #: Octaves of the filter bank.
 SCALES = 4
 # Edges below this are not halved any more.
 _LEAST_EDGE = 8
-_LUMA = (0.299, 0.587, 0.114)
 # Convolutions of VGG-19 up to relu5_1 by place in torchvision's `features`: output channels.
 _VGG_LAYERS = {0: 64, 2: 64, 5: 128, 7: 128, 10: 256, 12: 256, 14: 256, 16: 256,
                19: 512, 21: 512, 23: 512, 25: 512, 28: 512}  # fmt: skip
@@ -124,7 +124,7 @@ def _difference(responses: Tensor) -> Tensor:
 
 def _luma(images: Tensor) -> Tensor:
     red, green, blue = images.unbind(1)
-    return _LUMA[0] * red + _LUMA[1] * green + _LUMA[2] * blue
+    return LUMA[0] * red + LUMA[1] * green + LUMA[2] * blue
 
 
 def _edge_difference(luma: Tensor) -> Tensor:

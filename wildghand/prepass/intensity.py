@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.base.colors import log_light
 from wildghand.gaussians.shading import sh_basis
 from wildghand.prepass.robust_location import densest
 from wildghand.prepass.settings import PrepassSettings
@@ -27,7 +27,7 @@ _SKIN_SCALE = 0.3
 
 def log_light_table() -> np.ndarray:
     """(256,) float32: log of linear light for each 8-bit sRGB value."""
-    return np.log(srgb_to_linear(np.arange(256) / 255.0) + _FOOT).astype(np.float32)
+    return log_light(np.arange(256) / 255.0, _FOOT).astype(np.float32)
 
 
 def shading_basis(normals: np.ndarray) -> np.ndarray:

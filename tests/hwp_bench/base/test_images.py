@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch
-from hwp_bench.base.images import as_uint8, pixel_digest, read_gray, read_rgb, write_image
+from hwp_bench.base.images import as_float, as_uint8, pixel_digest, read_gray, read_rgb, write_image
 
 
 @pytest.fixture
@@ -48,7 +48,7 @@ def test_bad_images_are_named(tmp_path: Path, picture, kind: str) -> None:
     problem = {
         "missing": "does not exist",
         "empty": "is empty",
-        "text": "is no image",
+        "text": "is not a PNG or JPEG or BMP image",
         "truncated": "is damaged or truncated",
         "size": "40x30 pixels where 32x32 is expected",
         "16-bit": "uint16 samples",
@@ -87,7 +87,7 @@ def test_a_header_that_claims_gigabytes_is_refused_before_decoding(tmp_path: Pat
 def test_what_cannot_be_written_is_one_error(tmp_path: Path, picture) -> None:
     with pytest.raises(ShapeMismatch):
         write_image(tmp_path / "float.png", picture / 255.0)
-    with pytest.raises(HwpError, match="no image format"):
+    with pytest.raises(HwpError, match="not an image format"):
         write_image(tmp_path / "file.nothing", picture)
     assert list(tmp_path.iterdir()) == []
 
@@ -135,7 +135,7 @@ def test_an_animated_png_is_refused(tmp_path: Path, picture) -> None:
 @pytest.mark.parametrize("form", ["GIF", "TIFF", "WEBP", "TGA", "PPM", "ICO"])
 def test_other_formats_are_refused_whatever_the_name(tmp_path: Path, picture, form: str) -> None:
     path = _pillow(tmp_path / "000018.png", picture, form)
-    with pytest.raises(BadImage, match="is no image that can be read"):
+    with pytest.raises(BadImage, match="is not a PNG or JPEG or BMP image"):
         read_rgb(path)
 
 
@@ -145,7 +145,7 @@ def test_an_archive_in_place_of_an_image_is_refused(tmp_path: Path, form: str) -
 
     (tmp_path / "content").mkdir()
     archive = Path(shutil.make_archive(str(tmp_path / "archive"), form, tmp_path / "content"))
-    with pytest.raises(BadImage, match="is no image that can be read"):
+    with pytest.raises(BadImage, match="is not a PNG or JPEG or BMP image"):
         read_rgb(archive.rename(tmp_path / "000018.png"))
 
 
@@ -197,3 +197,17 @@ def test_as_uint8_keeps_bytes_and_refuses_other_integers():
     assert as_uint8(pixels) is pixels
     with pytest.raises(BadImage, match="not int16"):
         as_uint8(pixels.astype(np.int16))
+
+
+def test_float_and_uint8_images_are_taken_alike() -> None:
+    levels = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    np.testing.assert_array_equal(as_float(levels), np.arange(256).reshape(16, 16) / 255)
+    np.testing.assert_array_equal(as_uint8(as_float(levels)), levels)
+    given = np.array([-0.5, 0.25, 1.5], np.float32)
+    assert as_float(given) is given
+    np.testing.assert_array_equal(as_uint8(given), [0, 64, 255])
+    for convert in (as_uint8, as_float):
+        with pytest.raises(BadImage, match="uint8 or float, not int64"):
+            convert(np.zeros(3, np.int64))
+        with pytest.raises(BadImage, match="NaN or infinite"):
+            convert(np.array([np.nan]))
