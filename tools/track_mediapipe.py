@@ -1,6 +1,6 @@
-"""Track one hand in a video with MediaPipe; the result is what `data import video` reads.
+"""Track one hand in a video with MediaPipe; `hwp-bench data import-video` reads the result.
 
-Runs in an environment of its own, because MediaPipe pins old packages:
+Runs in its own environment, because MediaPipe pins old packages:
 
     python -m venv tracker && tracker/bin/pip install mediapipe==0.10.21
     tracker/bin/python tools/track_mediapipe.py hand.mp4 hand.npz --hand right
@@ -42,7 +42,7 @@ def track(frames: Iterator[np.ndarray], landmarker: Landmarker, hand: str) -> di
         hand: `right`, `left`, or `any` for the one that is seen best.
 
     Returns:
-        `image`, `world` and `score`, as the module says.
+        `image`, `world` and `score`, as described at the top of this file.
     """
     image, world, score = [], [], []
     for frame in frames:

@@ -43,7 +43,7 @@ class SurfaceAnchors:
     def to_torch(
         self, dtype: torch.dtype = torch.float32, device: torch.device | str | None = None
     ) -> SurfaceAnchors:
-        """The same anchors as tensors, so that no call has to copy them."""
+        """Return the same anchors as tensors, so that later calls copy nothing."""
         return SurfaceAnchors(
             face_index=torch.as_tensor(self.face_index, device=device),
             barycentric=torch.as_tensor(self.barycentric, dtype=dtype, device=device),
@@ -71,7 +71,9 @@ def sample_surface(
     Square" (2019); the sequence is Roberts' R2.
     """
     if count < 1:
-        raise UsageError(f"{count} anchors were asked for", field="count", remedy="Ask for 1.")
+        raise UsageError(
+            f"{count} anchors are not possible", field="count", remedy="Use at least 1."
+        )
     random = np.random.default_rng(seed)
     corners = template.vertices[template.faces]
     areas = np.linalg.norm(
@@ -90,7 +92,7 @@ def sample_surface(
 
 
 def anchors_from_vertices(template: HandTemplate) -> SurfaceAnchors:
-    """One anchor on every vertex, in the vertices' order.
+    """Make one anchor on every vertex, in the order of the vertices.
 
     Raises:
         UsageError: a vertex belongs to no face.
@@ -109,7 +111,7 @@ def anchors_from_vertices(template: HandTemplate) -> SurfaceAnchors:
 def anchor_positions(
     vertices: torch.Tensor, faces: torch.Tensor, anchors: SurfaceAnchors
 ) -> torch.Tensor:
-    """Where the anchors are.
+    """Compute the places of the anchors.
 
     Args:
         vertices: (B, V, 3) or (V, 3) m.
@@ -126,9 +128,9 @@ def anchor_positions(
 def anchor_normals(
     vertices: torch.Tensor, faces: torch.Tensor, anchors: SurfaceAnchors
 ) -> torch.Tensor:
-    """Smooth outward unit normals at the anchors: vertex normals mixed, length one.
+    """Compute smooth outward unit normals at the anchors from the vertex normals.
 
-    Arguments as in `anchor_positions`. Where the mixed normals cancel, (0, 0, 1).
+    Arguments as in `anchor_positions`. Where the vertex normals cancel, the normal is (0, 0, 1).
     """
     corners, mix = _gather(faces, anchors, vertices)
     mixed = _mix(vertex_normals(vertices, faces), corners, mix)
@@ -138,7 +140,7 @@ def anchor_normals(
 def anchor_frames(
     vertices: torch.Tensor, faces: torch.Tensor, anchors: SurfaceAnchors
 ) -> torch.Tensor:
-    """A frame at each anchor that turns with the surface.
+    """Compute a frame at each anchor that turns with the surface.
 
     The columns are tangent, bitangent and smooth normal. The tangent is the first edge of the
     anchor's face, made perpendicular to the normal: a material direction, so that it follows
@@ -160,13 +162,13 @@ def anchor_frames(
 
 
 def anchor_uv(template: HandTemplate, anchors: SurfaceAnchors) -> np.ndarray:
-    """(N, 2) texture coordinates of the anchors, in [0, 1], origin at the bottom left."""
+    """Return the anchors' texture coordinates: (N, 2) in [0, 1], origin at the bottom left."""
     corners = template.uv[template.face_uv[np.asarray(anchors.face_index)]]
     return (corners * np.asarray(anchors.barycentric, dtype=np.float64)[..., None]).sum(axis=1)
 
 
 def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
-    """Outward unit normals at the vertices: face normals averaged by area.
+    """Compute outward unit normals at the vertices: face normals averaged by area.
 
     Args:
         vertices: (B, V, 3) or (V, 3) m.
@@ -186,7 +188,7 @@ def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
 
 
 def unit_or(vectors: torch.Tensor, fallback: torch.Tensor) -> torch.Tensor:
-    """Vectors of length one; where there is no direction, the fallback with zero gradient.
+    """Scale vectors to length one; a zero vector becomes the fallback, with zero gradient.
 
     Args:
         vectors: (..., 3).
@@ -199,7 +201,7 @@ def unit_or(vectors: torch.Tensor, fallback: torch.Tensor) -> torch.Tensor:
 
 
 def to_trimesh(vertices: torch.Tensor | np.ndarray, faces: Any) -> trimesh.Trimesh:
-    """One mesh for trimesh, vertices kept as they are (no merging).
+    """Make a trimesh mesh; the vertices are kept as they are (no merging).
 
     Args:
         vertices: (V, 3) m.

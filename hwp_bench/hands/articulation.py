@@ -62,7 +62,7 @@ def joint_angles(pose: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
 
 
 def pose_from_joint_angles(angles: torch.Tensor, axes: torch.Tensor) -> torch.Tensor:
-    """The inverse of `joint_angles`: axis-angle vectors of the 15 finger joints.
+    """Invert `joint_angles`: compute axis-angle vectors of the 15 finger joints.
 
     Args:
         angles: (B, 15, 3) rad: flexion, abduction, twist.
@@ -76,7 +76,7 @@ def pose_from_joint_angles(angles: torch.Tensor, axes: torch.Tensor) -> torch.Te
 
 
 def joint_axes(template: HandTemplate) -> np.ndarray:
-    """Anatomical axes of the 15 finger joints, in the rest frame that poses are given in.
+    """Find the anatomical axes of the 15 finger joints, in the rest frame of the poses.
 
     Positive flexion brings the tip towards the palm. Positive abduction moves a finger towards
     the thumb's side (the thumb: away from the fingers, out of the palm). Positive twist follows
@@ -114,7 +114,7 @@ class JointLimits:
 
 
 def anatomical_limits(template: HandTemplate) -> JointLimits:
-    """The ranges of a template's joints, as angles of its poses (zero = rest mesh).
+    """Return the ranges of a template's joints, as angles of its poses (zero = rest mesh).
 
     The rest mesh is always inside its limits.
 
@@ -131,7 +131,7 @@ def anatomical_limits(template: HandTemplate) -> JointLimits:
 
 
 def joint_limit_penalty(pose: torch.Tensor, template: HandTemplate | JointLimits) -> torch.Tensor:
-    """Squared angles beyond the anatomical ranges, summed over joints and axes.
+    """Sum the squared angles beyond the anatomical ranges over joints and axes.
 
     Args:
         pose: (B, 16, 3) axis-angle rad; the wrist is free.
@@ -153,7 +153,7 @@ def joint_limit_penalty(pose: torch.Tensor, template: HandTemplate | JointLimits
 
 
 def rest_flexion(template: HandTemplate) -> np.ndarray:
-    """How far each joint is bent in the rest mesh, measured from a straight finger.
+    """Measure how far each joint is bent in the rest mesh, relative to a straight finger.
 
     Returns:
         (15,) rad; zero for the thumb's first joint, which has no straight position.

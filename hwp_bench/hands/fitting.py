@@ -16,15 +16,15 @@ from hwp_bench.hands.skinning import PosedHand, only_fingertips, pose_hand
 from hwp_bench.hands.template import HandTemplate, TemplateTensors
 from hwp_bench.hands.topology import boundary_vertices
 
-#: Points farther from the fitted surface than this are not drawn to it, m.
+#: Points farther from the fitted surface than this have no effect, m.
 REACH = 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class FitTargets:
-    """What is known of one hand in F frames, in the frame that `transl` is given in; metres.
+    """The known points of one hand in F frames, in the coordinate frame of `transl`; metres.
 
-    At least one of the three must be known; NaN marks what is not.
+    At least one of the three must be known; NaN marks unknown values.
     """
 
     #: (F, 21, 3) landmarks, OpenPose order.
@@ -37,15 +37,15 @@ class FitTargets:
 
 @dataclass(frozen=True)
 class FittingSettings:
-    """How long and how hard is fitted."""
+    """Steps and weights of a fit."""
 
     #: Steps with landmarks and lines of sight only.
     landmark_steps: int = 150
     #: Steps with the skin.
     skin_steps: int = 60
-    #: The nearest skin is looked up again after this many steps.
+    #: The nearest vertices are found again after this many steps.
     refresh: int = 15
-    #: Weight of the landmarks once the skin counts: models put joints in different places.
+    #: Weight of the landmarks in the steps with skin: models put joints in different places.
     landmark_weight: float = 0.1
     #: Weight of anatomical joint limits, mm^2 per rad^2.
     limits: float = 30.0
@@ -55,7 +55,7 @@ class FittingSettings:
 
 @dataclass(frozen=True, eq=False)
 class FittedHand:
-    """A hand fitted to targets, and what it misses them by."""
+    """A hand fitted to targets, and its distances from them."""
 
     #: The parameters.
     parameters: HandParameters
@@ -75,7 +75,7 @@ def fit_hand(
 
     Args:
         template: the hand that is fitted.
-        targets: what is known; frames where `start.valid` is false are not fitted.
+        targets: the known points; frames where `start.valid` is false are not fitted.
         start: where the fit begins; its `valid` is kept.
         settings: steps and weights.
 
@@ -83,12 +83,12 @@ def fit_hand(
         The fitted hand with its errors.
 
     Raises:
-        BadInput: no frame is valid, or nothing is known.
+        BadInput: no frame is valid, or no points are known.
         DidNotConverge: the fit left the finite numbers.
     """
     settings = settings or FittingSettings()
     if not start.valid.any() or (targets.landmarks is None and targets.skin is None):
-        raise BadInput("there is nothing to fit a hand to", field="targets")
+        raise BadInput("no frame is valid, or no points are known", field="targets")
     chosen = np.flatnonzero(start.valid)
     fit = _Fit(template, targets, start, chosen)
     fit.run(settings, settings.landmark_steps, skin=False)
@@ -107,7 +107,7 @@ class _Fit:
         self.tips = only_fingertips(self.whole)
         self.limits = anatomical_limits(template)
         self.faces = self.whole.faces
-        # What is nearest to the open wrist may be forearm.
+        # Points nearest to the open wrist may be on the forearm.
         self.border = boundary_vertices(template.faces)
         self.chosen = chosen
 

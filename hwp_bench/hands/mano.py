@@ -1,4 +1,4 @@
-"""Read MANO from the file that the user has, without chumpy and without trusting the file."""
+"""Read MANO from the user's file, without chumpy and without trusting the file."""
 
 from __future__ import annotations
 
@@ -94,9 +94,9 @@ def two_chart_uv(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Flatten the back of a hand into the left half of the atlas, its palm into the right half.
 
-    A face belongs to the side that it looks to; both charts are the same parallel projection
+    A face belongs to the side that it faces; both charts are the same parallel projection
     onto the palm's plane, fingers up, at one scale, so that no face is turned over and lengths
-    in the atlas compare. Faces seen edge-on become thin.
+    in the atlas are comparable. Faces seen edge-on become thin.
 
     Args:
         vertices: (V, 3) rest vertices, m.
@@ -172,7 +172,7 @@ def _check_tree(content: dict[str, Any], file: Path) -> None:
 
 
 def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Path) -> np.ndarray:
-    """A field as a float64 array of the expected shape, whatever it was stored as."""
+    """A field as a float64 array of the expected shape, from any of its stored types."""
     if field not in content:
         raise BadHandModel("is missing", where=file, field=field, remedy=_REMEDY)
     try:

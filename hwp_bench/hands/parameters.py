@@ -15,8 +15,8 @@ from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT
 class HandParameters:
     """Pose, shape and translation of one hand in F frames; checked when made, and copied.
 
-    In a frame without this hand the values mean nothing: NaN there (as estimators write it)
-    becomes zero, so that whole arrays can be computed with.
+    In a frame without this hand the values have no meaning. NaN there (as estimators write it)
+    becomes zero, so that computations on whole arrays work.
 
     Raises:
         BadInput: a field has the wrong shape or type, or is not finite in a valid frame; the
@@ -29,7 +29,7 @@ class HandParameters:
     betas: np.ndarray
     #: (F, 3) m, added after posing.
     transl: np.ndarray
-    #: (F,) bool, false where the frame has no such hand.
+    #: (F,) bool, false where the frame does not show this hand.
     valid: np.ndarray
 
     def __post_init__(self) -> None:

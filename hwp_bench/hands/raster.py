@@ -1,6 +1,6 @@
-"""Which pixels a mesh covers: the nearest face at every pixel, and the silhouette.
+"""Rasterize a mesh: the nearest face at every pixel, and the silhouette.
 
-OpenCV's polygons are no substitute: they also fill pixels that the outline only touches, which
+OpenCV's polygons cannot replace this: they also fill pixels that the outline only touches, which
 makes every hand half a pixel too thick.
 """
 

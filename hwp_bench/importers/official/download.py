@@ -29,14 +29,14 @@ class RemoteFile:
 
     #: Path inside the repository.
     name: str
-    #: Bytes, or None where the hub does not say.
+    #: Bytes, or None where the hub does not state it.
     size: int | None
     #: SHA-256 (hex) that the hub states for large files, or None.
     sha256: str | None
 
 
 class Hub(Protocol):
-    """Where the release comes from."""
+    """A server of the release."""
 
     def files(self, revision: str | None) -> tuple[str, list[RemoteFile]]:
         """Return the commit that a revision names, and its files."""
@@ -55,7 +55,7 @@ class Download:
     commit: str
     #: SHA-256 (hex) by file name.
     files: dict[str, str]
-    #: How many of them were there already.
+    #: How many of them existed already.
     kept: int
     #: Archives among them.
     archives: tuple[str, ...]
@@ -118,11 +118,11 @@ def download_release(
 
     On first use the checksum of every file is pinned for its commit in the user's cache; a later
     download of the same commit must bring the same bytes. An interrupted download goes on where
-    it stopped and stays at its commit. A file that is there and differs is never replaced.
+    it stopped and stays at its commit. An existing file that differs is never replaced.
 
     Args:
         out: folder to make, or one that an earlier call began.
-        hub: where from.
+        hub: the server.
         captures: beginnings of folder names, such as `capture0_`; empty takes everything.
         revision: branch, tag or commit; None takes the newest, or the one that was begun.
         pins: file of pinned checksums; None takes the toolkit's cache.
@@ -130,7 +130,7 @@ def download_release(
 
     Raises:
         UsageError: `out` contains something that no earlier call put there, or another commit.
-        BadInput: a file is not what was pinned or what the hub states, or its name leads out of
+        BadInput: a file differs from the pinned or the stated checksum, or its name leads out of
             the folder.
         HwpError: the hub cannot be reached.
     """

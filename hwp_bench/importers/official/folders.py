@@ -22,11 +22,11 @@ class OfficialFolder:
     path: Path
     #: Its pickles (`output*.pkl`), in the order of their names; together they are one capture.
     pickles: tuple[Path, ...]
-    #: Id of the capture, a key of the catalogue where the folder's name says so.
+    #: Id of the capture, a key of the catalogue where the folder's name contains one.
     id: str
-    #: Every how many-th frame of the video was kept, or None where the name does not say.
+    #: Step between the frames that were kept of the video, or None where the name has none.
     subsample: int | None
-    #: Whether the name says that one hand was tracked.
+    #: Whether one hand was tracked, according to the name.
     single: bool
 
 
@@ -36,7 +36,7 @@ def find_folders(
     """Find the captures of a folder: itself, or its subfolders down to the third level.
 
     Args:
-        path: a folder with `output.pkl`, or one that such folders lie in, as in a download.
+        path: a folder with `output.pkl`, or one that contains such folders, as a download does.
         identifier: id of the capture where the folder has no name of the release.
 
     Raises:
@@ -81,7 +81,7 @@ def _folder(path: Path, identifier: str | None) -> OfficialFolder:
             f"{name!r} is not a name of the release (captureN_subsampleK, N from 0 to 10, "
             "for one hand with _single)",
             where=path,
-            remedy="Say which capture it is with --id.",
+            remedy="Name the capture with --id.",
         )
     return OfficialFolder(
         path=path,

@@ -47,11 +47,11 @@ class OfficialImport:
     mano: Path | None = None
     #: Crop, intrinsics and translations as the released loader has them, mistakes included.
     official_compat: bool = False
-    #: Which hand of a single-hand capture; None asks the masks.
+    #: Which hand of a single-hand capture; None decides by the masks.
     hand: str | None = None
     #: Edge of the stored frames, px.
     size: int = 256
-    #: Frames per second of the video before it was thinned out; the release does not say.
+    #: Frames per second of the video before subsampling; the release does not state it.
     video_fps: float = 30.0
     #: Replace an existing capture.
     overwrite: bool = False
@@ -83,7 +83,7 @@ def import_official(
     """Make a capture of one folder of the release.
 
     Args:
-        folder: what `find_folders` found.
+        folder: from `find_folders`.
         out: the capture folder to make.
         options: choices; the defaults where None.
 
@@ -93,7 +93,7 @@ def import_official(
 
     Raises:
         UnsafePickle: a pickle asks for something that is not plain data.
-        BadInput: a record, an image or a mask is unusable, or contradicts what is assumed.
+        BadInput: a record, an image or a mask is unusable, or contradicts an assumption.
         UsageError: `out` exists, or an option makes no sense.
     """
     options = options or OfficialImport()

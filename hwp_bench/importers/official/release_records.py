@@ -61,7 +61,7 @@ class SideRecords:
 
 @dataclass(frozen=True, eq=False)
 class OfficialRecords:
-    """Everything that one capture of the release says.
+    """All records of one capture of the release.
 
     Attributes:
         numbers: (F,) the first integer in each image's name, ascending.

@@ -1,4 +1,4 @@
-"""Which hands of the records make the capture, and what is unexpected about the records."""
+"""The choice of a capture's hands, and warnings about unexpected records."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ LOOKED_AT = 24
 
 
 def unexpected(folder: OfficialFolder, records: OfficialRecords) -> list[str]:
-    """Say what contradicts the paper or the format, without being wrong enough to refuse."""
+    """List contradictions to the paper or the format that still let the records be used."""
     found = [f"unknown key {key!r} is not read" for key in records.unknown]
     if records.reordered:
         found.append("records were not in the order of their images; they are now")

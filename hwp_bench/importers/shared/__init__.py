@@ -1,1 +1,1 @@
-"""What imports share: landmarks, crop windows, overlays, writing."""
+"""Shared by the importers: landmarks, crop windows, overlay sheets, writing captures."""

@@ -62,8 +62,8 @@ def read_landmarks(path: str | os.PathLike[str], *, min_score: float) -> Landmar
 
     Raises:
         BadInput: the file is missing, not an npz, too large, holds objects or the wrong shapes, has
-            no detected frame, is not in metres, or has NaN where the score says that a hand was
-            seen.
+            no detected frame, is not in metres, or has NaN where the score is that of a visible
+            hand.
     """
     path = Path(path)
     arrays = _load(path)

@@ -80,7 +80,7 @@ def follow_hand(landmarks: Landmarks, fps: float, size: int) -> CropWindows:
 
 
 def cut(image: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
-    """Cut a square out of an image; what lies outside the image is black.
+    """Cut a square out of an image; pixels outside the image are black.
 
     Args:
         image: (H, W) or (H, W, C).

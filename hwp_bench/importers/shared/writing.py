@@ -51,7 +51,7 @@ def write_capture(
 
     Args:
         out: the capture folder to make.
-        info: what the capture says of itself.
+        info: the capture's description.
         hands: parameters by side.
         cameras: one camera a frame.
         frames: for each frame its image (H, W, 3) uint8 sRGB and its mask (H, W) uint8.

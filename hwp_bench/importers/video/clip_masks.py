@@ -106,7 +106,7 @@ class Masking:
 
 @dataclass(frozen=True, eq=False)
 class ProjectedClip:
-    """Where the model is in every frame.
+    """The model projected into every frame.
 
     Attributes:
         vertices: (F, V, 3) float32 m, camera axes.

@@ -70,7 +70,7 @@ def learn_colours(
         return None
     cv2.setRNGSeed(seed)
     model = _mixtures(hand, other, random)
-    # The silhouette also covers what the hand holds. Colours that also occur next to the hand
+    # The silhouette also covers objects in the hand. Colours that also occur next to the hand
     # are therefore not learnt as hand. (A hand before skin-coloured things is not harmed.)
     elsewhere = _least_distance(hand, model.background) < _SAME_COLOUR**2
     if 0.0 < elsewhere.mean() < 0.5:

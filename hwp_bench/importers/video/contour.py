@@ -106,7 +106,7 @@ class ContourEnergy:
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Outline vertices of one frame and the line each is drawn to: normal . pixel = target.
+    """Outline vertices of one frame and the line that each is pulled to: normal . pixel = target.
 
     Attributes:
         index: (OUTLINE_COUNT,) int64 vertices.
@@ -120,7 +120,7 @@ class Outline:
 
     @classmethod
     def nothing(cls) -> Outline:
-        """An outline that draws nothing anywhere."""
+        """Return an outline that pulls nothing."""
         return cls(
             np.zeros(OUTLINE_COUNT, dtype=np.int64),
             np.zeros((OUTLINE_COUNT, 2), dtype=np.float32),
@@ -188,7 +188,7 @@ def match_outline(
     matched = leaves[rows, best] & (length[:, 0] > 1e-6)
     before, after = values[rows, best], values[rows, best + 1]
     crossing = steps[best] + _STEP * before / np.minimum(before - after, -1e-6)
-    # A vertex that lies inside the mesh's own outline shall stay as far inside the mask's.
+    # A vertex that lies inside the mesh's own outline is to stay as far inside the mask's.
     offset = crossing + _sample(own, places)
     outline = Outline.nothing()
     count = len(chosen)

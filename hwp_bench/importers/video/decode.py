@@ -27,8 +27,8 @@ class VideoInfo:
         path: the file.
         width: pixels, after the rotation that the file asks for.
         height: pixels.
-        fps: frames per second; 30 where the file does not say.
-        stated_frames: number of frames that the container states, 0 where it does not.
+        fps: frames per second; 30 where the file does not state it.
+        stated_frames: number of frames that the container states, 0 where it states none.
     """
 
     path: Path
@@ -159,7 +159,7 @@ def read_masks(
         (F, S, S) uint8 at the working resolution, 255 = hand.
 
     Raises:
-        BadInput: no such folder, or a frame has no mask.
+        BadInput: the folder is missing, or a frame has no mask.
         BadImage: a mask is damaged or not of the video's size.
     """
     folder = Path(folder)

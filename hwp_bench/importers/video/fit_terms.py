@@ -32,7 +32,7 @@ class LandmarkEnergy:
         model: the clip.
         settings: weights and scales.
         fps: frames per second; the smoothness scales are per (1/30 s)^2.
-        default_focal: px, what the focal length is drawn to; None = it is known and held.
+        default_focal: px, the focal length that the prior favours; None = it is known.
     """
 
     def __init__(

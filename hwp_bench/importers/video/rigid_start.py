@@ -1,4 +1,4 @@
-"""Where the fit starts: one rigid pose for each frame, in closed form."""
+"""The start of the fit: one rigid pose for each frame, in closed form."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def rigid_start(
 ) -> RigidStart:
     """Estimate the rigid pose of every frame from its world and image landmarks.
 
-    The tracker sees a crop around the hand and believes that the camera looks straight at it,
+    The tracker sees a crop around the hand and assumes that the camera looks straight at it,
     so its world landmarks are first turned by the angle between the optical axis and the ray
     through the hand. The rotation is the orthogonal Procrustes solution on the palm, the place
     the least-squares solution of the pinhole equations, which are linear in it. Frames without
@@ -86,7 +86,7 @@ def _interpolate_rotations(rotations: object, seen: np.ndarray, count: int) -> n
 
 
 def _ray_rotation(pixels: np.ndarray, focal: float, centre: np.ndarray) -> np.ndarray:
-    """The smallest rotation that takes the optical axis to the ray through each pixel."""
+    """The smallest rotation that turns the optical axis to the ray through each pixel."""
     from scipy.spatial.transform import Rotation
 
     slope = (pixels - centre) / focal

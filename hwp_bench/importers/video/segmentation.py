@@ -18,7 +18,7 @@ _COLOUR_FRAMES = 200
 
 @dataclass(frozen=True)
 class MaskSettings:
-    """How far the projected hand is trusted; lengths are shares of the hand's size."""
+    """Trust in the projected hand; lengths are shares of the hand's size."""
 
     #: Pixels deeper than this inside the silhouette are hand, if their colour allows it.
     inside: float = 0.04

