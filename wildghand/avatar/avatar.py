@@ -15,13 +15,13 @@ from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture.schema import HandModelId
 from hwp_bench.methods.contract import Camera, HandPose
-from wildghand.model.model import Gaussians, WildGHandModel
+from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 
 
 @dataclass(frozen=True)
 class FitRecord:
-    """What is remembered of a fit, besides the model."""
+    """How an avatar was fitted."""
 
     #: Frames of the capture that were fitted.
     frames: list[int] = field(default_factory=list)
@@ -39,6 +39,28 @@ class FitRecord:
     source: dict[str, Any] = field(default_factory=dict)
 
 
+@dataclass(frozen=True, eq=False)
+class PosedGaussians:
+    """N Gaussians of an avatar in one pose, as arrays of float32."""
+
+    #: (N, 3) m, world.
+    means: np.ndarray
+    #: (N, 4) of length 1, (w, x, y, z), world.
+    quats: np.ndarray
+    #: (N, 3) m, standard deviations along the axes of the quaternions.
+    scales: np.ndarray
+    #: (N,) in (0, 1).
+    opacities: np.ndarray
+    #: (N, 3) sRGB; a drawing is cut to [0, 1].
+    colors: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    def __repr__(self) -> str:
+        return f"PosedGaussians({len(self)} Gaussians)"
+
+
 class WildGHandAvatar:
     """See `hwp_bench.methods.contract.Avatar`.
 
@@ -50,7 +72,7 @@ class WildGHandAvatar:
         mean_color: (3,) sRGB that the fit started from.
         seed: of the anchors.
         record: what is remembered of the fit.
-        weight_masks: pixel weights by frame of the capture, (H, W) uint8; for pictures.
+        weight_masks: pixel weights by frame of the capture, (H, W) uint8, to look at.
     """
 
     def __init__(
@@ -72,6 +94,13 @@ class WildGHandAvatar:
         self.seed = seed
         self.record = record
         self.weight_masks = dict(weight_masks or {})
+
+    def __repr__(self) -> str:
+        hands, frames = " and ".join(self.sides), len(self.record.frames)
+        return (
+            f"WildGHandAvatar({hands} hand of {self.hand_model.name}, {self.settings.gaussians} "
+            f"Gaussians each, {self.steps} steps on {frames} frames)"
+        )
 
     @property
     def steps(self) -> int:
@@ -111,8 +140,11 @@ class WildGHandAvatar:
         return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
 
     @torch.no_grad()
-    def gaussians(self, hands: Mapping[str, HandPose]) -> Gaussians:
-        """The Gaussians of the given hands in one pose, one hand after the other.
+    def gaussians(self, hands: Mapping[str, HandPose]) -> PosedGaussians:
+        """Pose the Gaussians of the given hands, one hand after the other.
+
+        Args:
+            hands: by side.
 
         Raises:
             UsageError: no hand, or one that was not fitted.
@@ -121,17 +153,22 @@ class WildGHandAvatar:
             self.model.gaussians(side, *given, refine=self.settings.heads.refinement)
             for side, given in self._tensors(hands).items()
         ]
-        count = len(parts[0].means)
-        return Gaussians(
-            means=torch.cat([part.means for part in parts], dim=1),
-            quats=torch.cat([part.quats for part in parts], dim=1),
-            scales=torch.cat([part.scales.expand(count, -1, -1) for part in parts], dim=1),
-            opacities=torch.cat([part.opacities.expand(count, -1) for part in parts], dim=1),
-            colors=torch.cat([part.colors for part in parts], dim=1),
+
+        def array(tensors: list[torch.Tensor], fields: int) -> np.ndarray:
+            """Of one frame of each hand; tensors that all frames share have no frames."""
+            frames = [tensor if tensor.ndim == fields else tensor[0] for tensor in tensors]
+            return torch.cat(frames).cpu().numpy()
+
+        return PosedGaussians(
+            means=array([part.means for part in parts], 2),
+            quats=array([part.quats for part in parts], 2),
+            scales=array([part.scales for part in parts], 2),
+            opacities=array([part.opacities for part in parts], 1),
+            colors=array([part.colors for part in parts], 2),
         )
 
     def write_diagnostics(self, folder: Path) -> None:
-        """Write temporal weights and weight masks for the benchmark's tables and pictures."""
+        """Write temporal weights and weight masks for the benchmark's tables and figures."""
         for side, weights in self.record.temporal.items():
             write_json(
                 folder / f"{side}-temporal.json",

@@ -1,8 +1,8 @@
-"""An avatar as a folder: safetensors, JSON and pictures, without the training data.
+"""An avatar as a folder: safetensors, JSON and images, without the training data.
 
 avatar.json           what it is, of which hand model, how it was fitted
 model.safetensors     every tensor of the model
-weights/000012.png    weight mask of a training frame, for looking at
+weights/000012.png    weight mask of a training frame, to look at
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from hwp_bench.base.records import parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
-from wildghand.model.assemble import assemble, make_rigs
+from wildghand.model.assemble import make_model
 from wildghand.model.settings import read_settings, read_version_1
 
 #: Version of the folder.
@@ -137,15 +137,9 @@ def load_avatar(
     except HwpError as error:
         raise BadInput(str(error), where=where) from error
     templates = _templates(hand_model, value.sides, hand, where)
-    rigs = make_rigs(templates, settings.gaussians, value.seed, torch.device("cpu"))
-    model = assemble(
-        templates,
-        rigs,
-        settings,
-        torch.tensor(value.mean_color),
-        max(1, len(record.frames)),
-        value.seed,
-    )
+    mean_color, frame_count = torch.tensor(value.mean_color), max(1, len(record.frames))
+    device = torch.device(device)
+    model = make_model(templates, settings, mean_color, frame_count, value.seed, device)
     file = root / MODEL
     if not file.is_file() or file.stat().st_size > MAX_MODEL_BYTES:
         raise BadInput(f"is missing or larger than {MAX_MODEL_BYTES} bytes", where=file)
@@ -157,10 +151,9 @@ def load_avatar(
     for name, tensor in model.state_dict().items():
         if not bool(torch.isfinite(tensor).all()):
             raise BadInput("holds NaN or infinity", where=file, field=name)
-    model = model.to(device).eval()
     betas = {side: np.array(given) for side, given in value.betas.items()}
     return WildGHandAvatar(
-        model, settings, hand_model, betas, torch.tensor(value.mean_color), value.seed, record
+        model.eval(), settings, hand_model, betas, mean_color, value.seed, record
     )
 
 

@@ -46,13 +46,7 @@ def run(args: argparse.Namespace) -> int:
             for side, hand in capture.hands.items()
             if side in avatar.sides
         }
-    drawn = avatar.gaussians(hands)
-    write_ply(
-        args.ply,
-        *(
-            getattr(drawn, name)[0].cpu().numpy()
-            for name in ("means", "quats", "scales", "opacities", "colors")
-        ),
-    )
-    print(f"{args.ply}: {drawn.means.shape[1]} Gaussians")
+    posed = avatar.gaussians(hands)
+    write_ply(args.ply, posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
+    print(f"{args.ply}: {len(posed)} Gaussians")
     return 0

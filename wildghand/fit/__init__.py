@@ -1,1 +1,5 @@
-"""Fitting an avatar to a training capture."""
+"""The fit of an avatar to a capture."""
+
+from wildghand.fit.session import fit_capture
+
+__all__ = ["fit_capture"]

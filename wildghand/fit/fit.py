@@ -9,22 +9,23 @@ from typing import Any
 import numpy as np
 import torch
 
+from hwp_bench.capture.schema import HandModelId
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import drop
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fit.objective import Objective
 from wildghand.fit.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
-from wildghand.fit.weighting import Weighting
+from wildghand.fit.weighting import Weighting, assess_frames
 from wildghand.gaussians.training import TrainingClip, load_frames
-from wildghand.model.assemble import assemble, make_rigs
+from wildghand.model.assemble import make_model
 from wildghand.model.model import RenderedFrames, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import parameter_groups
 from wildghand.pao.pao import PerturbationAwareWeights
 from wildghand.prior.files import choose_prior
 
-# Gradients of a mean over all pixels are small beside Adam's usual 1e-8.
+# Gradients of a mean over all pixels are small next to Adam's usual 1e-8.
 _EPSILON = 1e-15
 _BETAS = (0.9, 0.99)
 
@@ -57,25 +58,18 @@ class Fit:
         self.device = device
         self.world = world
         self.frames = load_frames(training)
-        templates = {side: training.template(side) for side in training.sides}
-        rigs = make_rigs(templates, settings.gaussians, seed, device)
         self.mean_color = self.frames.mean_color()
-        self.model = assemble(
-            templates, rigs, settings, self.mean_color, len(self.frames), seed
-        ).to(device)
+        templates = {side: training.template(side) for side in training.sides}
+        self.model = make_model(
+            templates, settings, self.mean_color, len(self.frames), seed, device
+        )
         self.source = {"capture": training.id}
-        prior = choose_prior(settings, training.hand_model, self.model.network)
-        if prior is not None:
-            prior.initialise(self.model.network)
-            self.source["prior"] = prior.record.weights
-        self.clip = TrainingClip(training, self.frames.indices, rigs, device)
-        self.weighting = Weighting(training, self.frames, settings, device)
-        temporal = None
-        if settings.dpd.enabled and settings.prepass.enabled:
-            clean = self.weighting.clean.to(device)
-            temporal = TemporalTarget.judged(clean, settings.dpd.omega_scale)
-            temporal.begin(self.model.biases)
-        self.objective = Objective(settings, rigs, temporal)
+        self.source |= start_from_prior(self.model, settings, training.hand_model)
+        self.clip = TrainingClip(training, self.frames.indices, self.model.rigs, device)
+        assessment = assess_frames(training, self.frames, settings)
+        self.weighting = Weighting(self.frames, len(training.sides), assessment, settings, device)
+        temporal = begin_temporal_weights(self.model, self.weighting.clean, settings)
+        self.objective = Objective(settings, self.model.rigs, temporal)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
         self.generator = torch.Generator().manual_seed(seed)
 
@@ -236,6 +230,42 @@ class Fit:
             side: self.model.biases_of(side).temporal(rows).omega.tolist()
             for side in self.model.perturbation
         }
+
+
+def start_from_prior(
+    model: WildGHandModel, settings: WildGHandSettings, hand_model: HandModelId
+) -> dict[str, str]:
+    """Put the prior's weights in place of the network's, where the settings have one.
+
+    Returns:
+        What an avatar says of it: the digest of the weights as `prior`, or nothing.
+
+    Raises:
+        BadInput: the prior is damaged or of another kind.
+    """
+    prior = choose_prior(settings, hand_model, model.network)
+    if prior is None:
+        return {}
+    prior.initialise(model.network)
+    return {"prior": prior.record.weights}
+
+
+def begin_temporal_weights(
+    model: WildGHandModel, clean: torch.Tensor, settings: WildGHandSettings
+) -> TemporalTarget | None:
+    """Bring temporal weights to what the pre-pass found; None without it or without DPD.
+
+    Args:
+        model: it is changed.
+        clean: (R,) probability that a frame is clean.
+        settings: of the fit.
+    """
+    if not (settings.dpd.enabled and settings.prepass.enabled):
+        return None
+    device = model.log_gains.device
+    temporal = TemporalTarget.judged(clean.to(device), settings.dpd.omega_scale)
+    temporal.begin(model.biases)
+    return temporal
 
 
 def make_optimizer(

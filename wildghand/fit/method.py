@@ -8,11 +8,8 @@ from typing import Any
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fit.fit import Fit
-from wildghand.fit.optimise import optimise
-from wildghand.gaussians.fit_loop import choose_device
-from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
+from wildghand.fit.optimise import optimise, ready_device
 from wildghand.model.settings import read_settings
-from wildghand.splat.warmup import warm_up
 
 
 class WildGHandMethod:
@@ -31,11 +28,7 @@ class WildGHandMethod:
     def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
         self.settings = read_settings(settings)
         self.seed = seed
-        self.device = choose_device(self.settings.device)
-        if self.device.type == "cpu":
-            # Compiling takes some ten seconds once on a machine; it is no part of a fit.
-            warm_up()
-            warm_up_loss()
+        self.device = ready_device(self.settings.device)
 
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> WildGHandAvatar:
         """Fit an avatar to the training frames (the validation frames are left alone).

@@ -1,9 +1,11 @@
-"""A fit from a capture folder to an avatar folder, which can be stopped and goes on."""
+"""A fit from a capture folder to an avatar, which can be stopped and goes on."""
 
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -20,10 +22,9 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import save_avatar
 from wildghand.fit.fit import Fit
-from wildghand.fit.optimise import Watchers, optimise
+from wildghand.fit.optimise import Watchers, optimise, ready_device
 from wildghand.fit.parallel import SINGLE_PROCESS, World
 from wildghand.fit.saved_state import load_state, save_state
-from wildghand.gaussians.fit_loop import choose_device
 from wildghand.model.settings import WildGHandSettings, read_settings
 
 #: Seconds between two saved states.
@@ -45,7 +46,7 @@ class _Clock:
         self._show = show
 
     def __call__(self, step: int, avatar: Avatar) -> None:
-        """No checkpoint is ever due."""
+        """Take a checkpoint: none is ever due."""
 
     def progress(self, done: int, total: int) -> None:
         """Show how far the fit is."""
@@ -58,45 +59,57 @@ class _Clock:
 
 
 def fit_capture(
-    source: Path,
-    out: Path,
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
     *,
-    settings: Mapping[str, Any],
-    budget: Budget,
+    settings: Mapping[str, Any] | None = None,
+    budget: Budget | None = None,
     seed: int = 0,
     all_frames: bool = False,
     overwrite: bool = False,
     world: World = SINGLE_PROCESS,
 ) -> WildGHandAvatar:
-    """Fit an avatar to a capture and write it.
+    """Fit an avatar to a capture, and write it if a folder is named.
 
-    The state is saved beside `out` every 20 seconds. The same call goes on with it after a stop;
-    with a budget in steps the result is that of a fit that was never stopped.
+    With `out` the state is saved next to it every 20 seconds. The same call goes on with it after
+    a stop; with a budget in steps the result is that of a fit that was never stopped.
 
     Args:
         source: the capture folder.
-        out: the avatar folder.
-        settings: overrides of the defaults.
-        budget: when to stop.
+        out: the avatar folder; None: nothing is written (`save_avatar` can do it later).
+        settings: what `wildghand.model.settings.read_settings` takes.
+        budget: when to stop; without steps the settings' number holds.
         seed: of everything random.
         all_frames: fit the validation and test frames too: for an avatar, not for a score.
         overwrite: replace an avatar that is there.
         world: the processes that fit together; only rank 0 writes.
 
     Raises:
-        UsageError: `out` exists, or the processes cannot share a batch evenly.
+        BadMethod: a setting is unknown or out of range.
+        UsageError: `out` exists, the processes cannot share a batch evenly, or there are several
+            and no `out`.
         BadInput: no training frame can be used, or the saved state is of another fit.
         DidNotConverge: the fit diverged at once.
-        HwpError: another fit is writing to `out`, or nobody can, or another process has ended.
+        HwpError: another fit is writing to `out`, or `out` cannot be written to, or another
+            process has ended.
     """
+    chosen = read_settings(settings or {})
+    world.shard(chosen.schedule.batch)
+    run = RunSettings(dict(settings or {}), seed, budget or Budget())
+    if out is None:
+        if world.size > 1:
+            raise UsageError("is missing; several processes share a fit in its folder", field="out")
+        capture = open_capture(source)
+        split = every_frame(capture) if all_frames else _split(capture)
+        with tempfile.TemporaryDirectory() as folder:
+            write_request(Path(folder) / "request", capture, split, run)
+            return _fit_in(Path(folder), capture, run, chosen, world, save=False)
+    out = Path(out)
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
-    chosen = read_settings(settings)
-    world.shard(chosen.schedule.batch)
     capture = open_capture(source)
     split = every_frame(capture) if all_frames else _split(capture)
     work = out.with_name(out.name + ".fit")
-    run = RunSettings(dict(settings), seed, budget)
     with exclusive(work) if world.is_main else contextlib.nullcontext():
         if world.is_main:
             write_request(work / "request", capture, split, run)
@@ -110,14 +123,20 @@ def fit_capture(
 
 
 def _fit_in(
-    work: Path, capture: Capture, run: RunSettings, chosen: WildGHandSettings, world: World
+    work: Path,
+    capture: Capture,
+    run: RunSettings,
+    chosen: WildGHandSettings,
+    world: World,
+    *,
+    save: bool = True,
 ) -> WildGHandAvatar:
     """Fit, from the state that is saved in the work folder if there is one."""
     training = open_request(work / "request")
     digest = sha256_json(
         [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
     )
-    fit = Fit(training, chosen, run.seed, choose_device(chosen.device), world)
+    fit = Fit(training, chosen, run.seed, ready_device(chosen.device), world)
     watchers, start, before = Watchers(chosen.schedule.plateau_steps), 0, 0.0
     state = work / STATE
     if state.is_file():
@@ -130,13 +149,15 @@ def _fit_in(
         clock = _Clock(before, show)
         saved = time.perf_counter()
 
-        def save(step: int, watched: Watchers) -> None:
+        def after_step(step: int, watched: Watchers) -> None:
             nonlocal saved
-            if world.is_main and time.perf_counter() - saved >= SAVE_EVERY:
+            if save and world.is_main and time.perf_counter() - saved >= SAVE_EVERY:
                 save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
                 saved = time.perf_counter()
 
-        return optimise(fit, run.budget, clock, start=start, watchers=watchers, after_step=save)
+        return optimise(
+            fit, run.budget, clock, start=start, watchers=watchers, after_step=after_step
+        )
 
 
 @contextlib.contextmanager

@@ -32,6 +32,25 @@ class FrameTarget:
     weights: Tensor
 
 
+def assess_frames(
+    training: TrainingCapture, frames: TrainingFrames, settings: WildGHandSettings
+) -> FrameAssessment | None:
+    """Run the pre-pass on the frames that are fitted; None where the settings have none."""
+    if not settings.prepass.enabled:
+        return None
+    return judge_frames(
+        PrepassInput(
+            indices=frames.indices,
+            images=np.asarray(frames.images),
+            masks=np.asarray(frames.masks),
+            hands=training.hands,
+            cameras=training.cameras,
+            templates={side: training.template(side) for side in training.sides},
+        ),
+        settings.prepass,
+    )
+
+
 class Weighting:
     """Weights of frames and pixels, by the settings' components.
 
@@ -41,8 +60,9 @@ class Weighting:
     with `paper` the paper's equations weigh regions; with `binary` the mask is cut at a half.
 
     Args:
-        training: what may be seen of the capture.
         frames: the R frames that are fitted.
+        hands: one or two.
+        assessment: of these frames by the pre-pass; None without it.
         settings: which components are on.
         device: where the tensors live.
 
@@ -57,8 +77,9 @@ class Weighting:
 
     def __init__(
         self,
-        training: TrainingCapture,
         frames: TrainingFrames,
+        hands: int,
+        assessment: FrameAssessment | None,
         settings: WildGHandSettings,
         device: torch.device,
     ) -> None:
@@ -67,14 +88,14 @@ class Weighting:
         self.clean = torch.ones(count)
         self.drop_probability = torch.full((count,), settings.dpd.omega_dropout)
         self.frame_weights = torch.ones(count, device=device)
-        self.pao = PerturbationAwareWeights(pao, len(training.sides)).to(device)
+        self.pao = PerturbationAwareWeights(pao, hands).to(device)
         self.median: float | None = None
         self._refine_pose = torch.zeros(count, dtype=torch.bool)
         self._weighs_frames = False
         self._pixel_weights: Tensor | None = None
         self._regions: list[FrameRegions] | None = None
-        if settings.prepass.enabled:
-            self._follow(_judge(training, frames, settings))
+        if assessment is not None:
+            self._follow(assessment)
         if pao.robust or (pao.enabled and pao.variant == "paper"):
             self._regions = RegionCache().clip(frames.images.numpy(), Superpixels())
 
@@ -161,20 +182,3 @@ class Weighting:
 def _error(image: Tensor, drawing: RenderedFrames) -> Tensor:
     """(B, H, W) mean over channels of |drawing - image|, without gradient."""
     return (drawing.image.detach() - image).abs().mean(dim=-1)
-
-
-def _judge(
-    training: TrainingCapture, frames: TrainingFrames, settings: WildGHandSettings
-) -> FrameAssessment:
-    """Run the pre-pass on the frames that are fitted."""
-    return judge_frames(
-        PrepassInput(
-            indices=frames.indices,
-            images=np.asarray(frames.images),
-            masks=np.asarray(frames.masks),
-            hands=training.hands,
-            cameras=training.cameras,
-            templates={side: training.template(side) for side in training.sides},
-        ),
-        settings.prepass,
-    )

@@ -1,4 +1,4 @@
-"""Putting a model together from its settings."""
+"""Making a model from its settings."""
 
 from __future__ import annotations
 
@@ -11,6 +11,36 @@ from wildghand.gaussians.rig import HandRig, rig_of
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import PredictionNetwork, mirrored_anchors, surface_points
+
+
+def make_model(
+    templates: Mapping[str, HandTemplate],
+    settings: WildGHandSettings,
+    mean_color: torch.Tensor,
+    frame_count: int,
+    seed: int,
+    device: torch.device,
+) -> WildGHandModel:
+    """Make the model that a fit starts from; the same arguments make the same model.
+
+    Args:
+        templates: by side.
+        settings: which parts it has.
+        mean_color: (3,) sRGB in [0, 1] of the visible hand.
+        frame_count: training frames that are fitted.
+        seed: of the places of the Gaussians, and of the initial weights.
+        device: where it lives.
+    """
+    rigs = make_rigs(templates, settings.gaussians, seed, device)
+    surfaces = {
+        side: surface_points(templates[side], rig.anchors, rig.spacing, mean_color)
+        for side, rig in rigs.items()
+    }
+    network = PredictionNetwork(settings.network, surfaces, seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        model = WildGHandModel(rigs, network, frame_count, dpd=settings.dpd.enabled)
+    return model.to(device)
 
 
 def make_rigs(
@@ -33,31 +63,3 @@ def make_rigs(
         )
         rigs[side] = rig_of(template, anchors, device)
     return rigs
-
-
-def assemble(
-    templates: Mapping[str, HandTemplate],
-    rigs: Mapping[str, HandRig],
-    settings: WildGHandSettings,
-    mean_color: torch.Tensor,
-    frame_count: int,
-    seed: int,
-) -> WildGHandModel:
-    """Make the model that a fit starts from; the same arguments make the same model.
-
-    Args:
-        templates: by side.
-        rigs: by side, of these templates.
-        settings: which parts it has.
-        mean_color: (3,) sRGB in [0, 1] of the visible hand.
-        frame_count: training frames that are fitted.
-        seed: of the initial weights.
-    """
-    surfaces = {
-        side: surface_points(templates[side], rig.anchors, rig.spacing, mean_color)
-        for side, rig in rigs.items()
-    }
-    network = PredictionNetwork(settings.network, surfaces, seed)
-    with torch.random.fork_rng(devices=[]):
-        torch.manual_seed(seed)
-        return WildGHandModel(rigs, network, frame_count, dpd=settings.dpd.enabled)

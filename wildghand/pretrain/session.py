@@ -15,10 +15,9 @@ from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.methods.contract import REQUEST, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
-from wildghand.fit.optimise import Watchers
+from wildghand.fit.optimise import Watchers, ready_device
 from wildghand.fit.saved_state import load_state, save_state
 from wildghand.fit.session import SAVE_EVERY, STATE, every_frame
-from wildghand.gaussians.fit_loop import choose_device
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.pretrain.joint import JointFit, take_steps
 from wildghand.prior.files import save_prior
@@ -103,7 +102,7 @@ def _fit_in(
         [open_request(request) for request in requests],
         chosen,
         run.seed,
-        choose_device(chosen.device),
+        ready_device(chosen.device),
     )
     watchers, start, before, state = Watchers(chosen.schedule.plateau_steps), 0, 0.0, work / STATE
     if state.is_file():

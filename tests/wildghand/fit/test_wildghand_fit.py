@@ -23,11 +23,14 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.cli.main import main
+from wildghand.fit import fit_capture
 from wildghand.fit.fit import Fit
 from wildghand.fit.method import WildGHandMethod
 from wildghand.fit.optimise import Watchers, optimise
+from wildghand.fit.parallel import World
 from wildghand.fit.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
+from wildghand.splat import rasterize
 
 QUICK: dict[str, Any] = {
     "gaussians": 600,
@@ -207,6 +210,50 @@ def test_the_commands_make_draw_and_export_an_avatar(
     assert (
         main(["render", str(avatar), "--poses", str(capture), "-o", "x", "--frames", "9:99"]) == 2
     )
+
+
+def test_from_python_nothing_is_written(
+    make_painted: Callable[..., Capture], tmp_path: Path
+) -> None:
+    source = make_painted().root
+    before = sorted(path.name for path in source.parent.iterdir())
+    changes = {**QUICK, "schedule.steps": 3}
+    avatar = fit_capture(source, settings=changes)
+    written = fit_capture(str(source), str(tmp_path / "avatar"), settings=changes)
+    assert sorted(path.name for path in source.parent.iterdir()) == before
+    for name, value in avatar.model.snapshot().items():
+        assert torch.equal(value, written.model.snapshot()[name])
+    assert repr(avatar) == (
+        "WildGHandAvatar(right hand of anny-1, 600 Gaussians each, 3 steps on 32 frames)"
+    )
+    with pytest.raises(UsageError, match="several processes"):
+        fit_capture(source, settings={**changes, "schedule.batch": 2}, world=World(0, 2))
+
+
+@pytest.mark.parametrize("hands", ["right", "both"])
+def test_posed_gaussians_are_what_is_drawn(hands: str, make_training: TrainingMaker) -> None:
+    training = make_training(hands)
+    avatar = fitted(training, steps=2)
+    poses, camera = training.hand_poses(3), training.camera(3)
+    posed = avatar.gaussians(poses)
+    count = len(training.sides) * QUICK["gaussians"]
+    assert len(posed) == count
+    shapes = [np.shape(array) for array in (posed.means, posed.quats, posed.scales, posed.colors)]
+    assert shapes == [(count, 3), (count, 4), (count, 3), (count, 3)]
+    assert posed.opacities.shape == (count,)
+    np.testing.assert_allclose(np.linalg.norm(posed.quats, axis=1), 1.0, atol=1e-5)
+    image, coverage, _ = rasterize(
+        *(
+            torch.from_numpy(array)[None]
+            for array in (posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
+        ),
+        torch.from_numpy(camera.viewmat).float()[None],
+        torch.from_numpy(camera.K).float()[None],
+        camera.width,
+        camera.height,
+    )
+    drawn = torch.cat((image, coverage), dim=-1)[0].clamp(0.0, 1.0).numpy()
+    np.testing.assert_allclose(drawn, avatar.render(poses, camera), atol=1e-6)
 
 
 def test_settings_of_presets_and_switches() -> None:
