@@ -122,11 +122,8 @@ def _methods() -> Table:
         )
         for method in shipped_methods()
     )
-    columns = (
-        *("method", "title", "presets", "switches"),
-        *("authors", "licence", "url", "description"),
-    )
-    return Table("Methods that ship with the toolkit", tuple(map(Column, columns)), rows)
+    names = ["method", "title", "presets", "switches", "authors", "licence", "url", "description"]
+    return Table("Methods that ship with the toolkit", tuple(map(Column, names)), rows)
 
 
 def _metrics() -> Table:

@@ -5,8 +5,16 @@ from __future__ import annotations
 import argparse
 
 _TABLES = (
-    *("overall", "captures", "perturbations", "details", "micro", "paper"),
-    *("robustness", "severity", "bias", "seeds"),
+    "overall",
+    "captures",
+    "perturbations",
+    "details",
+    "micro",
+    "paper",
+    "robustness",
+    "severity",
+    "bias",
+    "seeds",
 )
 _EXAMPLES = """examples:
   hwp-bench table runs/plain-mini

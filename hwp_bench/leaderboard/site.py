@@ -16,7 +16,7 @@ from hwp_bench.leaderboard.entries import SUITES, Entry, check_entries, digest
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import aggregate
 from hwp_bench.report.page.render import render_template, style_sheet, write_report
-from hwp_bench.report.sources import Source
+from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results.published import NOTE, read_published
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
@@ -95,7 +95,7 @@ def budget_text(budget: Mapping[str, Any]) -> str:
 
 
 def build_site(
-    folder: Path, entries: Sequence[Entry], results_folders: Sequence[Source] = ()
+    folder: Path, entries: Sequence[Entry], results_folders: Sequence[ResultsSource] = ()
 ) -> Path:
     """Write the site into a folder that it replaces; returns its first page.
 
@@ -115,7 +115,7 @@ def build_site(
         (temporary / "index.html").write_text(board_page(entries), encoding="utf-8")
         (temporary / "board.js").write_text(script(), encoding="utf-8")
         for entry in entries:
-            source = Source(entry.results, folders.get(digest(entry.results)))
+            source = ResultsSource(entry.results, folders.get(digest(entry.results)))
             write_report(temporary / "reports" / entry.name, [source])
     return folder / "index.html"
 

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Hashable, Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, field
-from typing import Any
+from dataclasses import dataclass
 
 from hwp_bench.base.errors import BadResult
 
@@ -50,10 +49,6 @@ class Summary:
     capture_mean: Scores
     #: Mean over all frames: each frame counts the same.
     micro: Scores
-    #: Number of captures.
-    capture_count: int
-    #: Number of frames.
-    frame_count: int
 
 
 @dataclass(frozen=True)
@@ -63,13 +58,9 @@ class Aggregate:
     #: Over all captures.
     overall: Summary
     #: Over the captures of one hand; None if there are none.
-    single: Summary | None = field(default=None)
+    single: Summary | None = None
     #: Over the captures of two hands; None if there are none.
-    interacting: Summary | None = field(default=None)
-
-    def as_dict(self) -> dict[str, Any]:
-        """Plain JSON data."""
-        return asdict(self)
+    interacting: Summary | None = None
 
 
 def aggregate(captures: Iterable[CaptureScores]) -> Aggregate:
@@ -120,8 +111,6 @@ def _summarize(captures: Sequence[CaptureScores]) -> Summary:
         macro=mean_scores(perturbations.values()),
         capture_mean=mean_scores(means.values()),
         micro=mean_scores(frames),
-        capture_count=len(by_id),
-        frame_count=len(frames),
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from hwp_bench.analysis.statistics.pairing import MethodRuns
@@ -21,6 +21,9 @@ PAPER_DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
 #: The distance that needs no downloaded weights.
 DISTANCE = "oriented_distance"
 
+#: For each variant, by its title: component title -> True where the variant has it.
+Marks = Mapping[str, Mapping[str, bool]]
+
 _PERTURBED = {name: perturbation(name).heading for name in PERTURBATIONS}
 _ELSEWHERE = {"interhand2.6m": "InterHand2.6M (Inter.)", "anchorcrafter": "AnchorCrafter (Inter.)"}
 
@@ -35,8 +38,10 @@ class Layout:
     caption: str
     #: Heading of each group of columns by scope.
     scopes: Mapping[str, str]
-    #: Whether it compares variants of one method.
+    #: True where it compares variants of one method.
     variants: bool = False
+    #: Components whose presence the published rows state.
+    components: tuple[str, ...] = ()
 
 
 LAYOUTS: Mapping[int, Layout] = {
@@ -53,14 +58,13 @@ LAYOUTS: Mapping[int, Layout] = {
             6,
             "Ablation of the components",
             {"single": "Single Hand", "interacting": "Interacting Hands"},
-            True,
+            variants=True,
+            components=("DPD", "PAO"),
         ),
-        Layout(7, "Weights and a binary mask", {"all": ""}, True),
-        Layout(8, "Ablation of the prediction heads", {"all": ""}, True),
+        Layout(7, "Weights and a binary mask", {"all": ""}, variants=True),
+        Layout(8, "Ablation of the prediction heads", {"all": ""}, variants=True),
     )
 }
-#: Numbers of the tables that `hwp-bench table --paper` lays out.
-NUMBERS = (1, 2, *LAYOUTS, 9, 10)
 
 
 def fact_table(number: int) -> Table:
@@ -70,7 +74,7 @@ def fact_table(number: int) -> Table:
         keys = ("clean_test", "single", "interacting", *PERTURBATIONS)
         heads = ("Data set", "Environment", "Clean test", "Single", "Interacting", *names)
         rows = tuple(
-            (item.name, item.environment, *("✓" if key in item.has else "" for key in keys))
+            (item.name, item.environment, *_ticks(key in item.has for key in keys))
             for item in read_published().datasets
         )
         note = f"Published in {read_published().title}, table 1."
@@ -78,19 +82,27 @@ def fact_table(number: int) -> Table:
     heads = ("Capture", "Hand", "Action", "Device", "Frames", *names)
     rows = tuple(
         (
-            *(entry.id, entry.hands, entry.action, entry.device, str(entry.frame_count)),
-            *("✓" if name in entry.perturbations else "" for name in PERTURBATIONS),
+            entry.id,
+            entry.hands,
+            entry.action,
+            entry.device,
+            str(entry.frame_count),
+            *_ticks(name in entry.perturbations for name in PERTURBATIONS),
         )
         for entry in catalogue().values()
     )
     return Table("The captures of the HWP data set", tuple(map(Column, heads)), rows)
 
 
+def _ticks(present: Iterable[bool]) -> list[str]:
+    return ["✓" if here else "" for here in present]
+
+
 def layout_table(
     layout: Layout,
     runs: Sequence[MethodRuns],
     published: bool = False,
-    marks: Mapping[str, Mapping[str, bool]] | None = None,
+    marks: Marks | None = None,
 ) -> Table:
     """Return one of the tables 3 to 8.
 
@@ -101,7 +113,7 @@ def layout_table(
         layout: which.
         runs: the methods or variants; may be empty where `published` is set.
         published: append the paper's numbers, marked.
-        marks: for variants by title: component title -> whether it is in; None shows labels.
+        marks: the components of each variant; None shows labels only.
     """
     shown = {
         scope: heading
@@ -110,9 +122,9 @@ def layout_table(
     }
     table = read_published().table(layout.number)
     metrics, columns = _metric_columns(runs, published)
-    components = list(next(iter(marks.values()))) if marks else []
-    if published and layout.number == 6 and not components:
-        components = ["DPD", "PAO"]
+    components = layout.components if published else ()
+    if marks:
+        components = tuple(next(iter(marks.values())))
     heads = [Column("Variant" if layout.variants else "Method"), *map(Column, components)]
     for heading in shown.values():
         heads += [Column(c.title, c.digits, c.higher_is_better, heading) for c in columns]
@@ -120,7 +132,7 @@ def layout_table(
     for run in runs:
         means = _means(run)
         there = (marks or {}).get(run.first.method.title, {})
-        ticks = ["✓" if there.get(name) else "" for name in components]
+        ticks = _ticks(there.get(name, False) for name in components)
         cells = [means.get(scope, {}).get(METRIC_OF.get(m, m)) for scope in shown for m in metrics]
         rows.append((run.label, *ticks, *cells))
     measured = len(rows)
@@ -182,7 +194,7 @@ def _published_rows(
         rows.setdefault((item.method, item.detail), {})[item.scope] = item
     found = []
     for (method, detail), by_scope in rows.items():
-        ticks = ["✓" if name in detail.split(", ") else "" for name in components]
+        ticks = _ticks(name in detail.split(", ") for name in components)
         label = method if components else f"{method} {detail}".strip()
         cells = [
             by_scope[scope].scores.get(name) if scope in by_scope else None

@@ -1,9 +1,9 @@
-"""From what `hwp-bench table` is asked for to the table."""
+"""The table that `hwp-bench table` is asked for."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -16,12 +16,13 @@ from hwp_bench.report.paper_layouts import (
     DISTANCE,
     LAYOUTS,
     METRIC_OF,
+    Marks,
     bias_layout,
     fact_table,
     layout_table,
     seeds_layout,
 )
-from hwp_bench.report.sources import Source, find_captures, read_sources
+from hwp_bench.report.sources import ResultsSource, find_captures, read_sources
 from hwp_bench.report.study_tables import (
     LEVEL_NOTE,
     bias_rows,
@@ -48,7 +49,7 @@ class TableRequest:
     by: str = "overall"
     #: Number of the table of the paper whose layout is asked for, in place of `by`.
     paper: int | None = None
-    #: Whether published rows are appended.
+    #: True appends the published rows.
     published: bool = False
     #: Name of the method that the robustness table counts from.
     base: str | None = None
@@ -114,7 +115,7 @@ def _paper(number: int, request: TableRequest) -> Table:
     return layout_table(LAYOUTS[number], runs, request.published, marks)
 
 
-def _bias_layout(sources: Sequence[Source], request: TableRequest) -> Table:
+def _bias_layout(sources: Sequence[ResultsSource], request: TableRequest) -> Table:
     measured = [set(source.results.metrics) for source in sources]
     names = tuple(
         name
@@ -130,8 +131,8 @@ def _bias_layout(sources: Sequence[Source], request: TableRequest) -> Table:
     return replace(table, notes=(LEVEL_NOTE, *table.notes)) if rows else table
 
 
-def _marks(paths: Sequence[str | os.PathLike[str]]) -> Mapping[str, Mapping[str, bool]]:
-    """Return which components are in each variant of the ablations among some paths, by title."""
+def _marks(paths: Sequence[str | os.PathLike[str]]) -> Marks:
+    """Return the components of each variant of the ablations among some paths."""
     marks: dict[str, dict[str, bool]] = {}
     for path in paths:
         place = Path(path)

@@ -20,7 +20,7 @@ MAX_WEIGHT_BYTES = 16 * 1024 * 1024
 
 
 @dataclass(frozen=True)
-class Source:
+class ResultsSource:
     """One evaluation and where it lies."""
 
     #: The evaluation.
@@ -49,17 +49,17 @@ class TemporalWeights:
     weights: list[float]
 
 
-def read_sources(paths: Iterable[str | os.PathLike[str]]) -> list[Source]:
+def read_sources(paths: Iterable[str | os.PathLike[str]]) -> list[ResultsSource]:
     """Read every evaluation that some paths stand for, in order.
 
     Raises:
         BadInput, BadResult: one is missing or damaged.
     """
     files = [file for path in paths for file in result_files(path)]
-    return [Source(read_results(file), file.parent) for file in files]
+    return [ResultsSource(read_results(file), file.parent) for file in files]
 
 
-def temporal_weights(source: Source, capture: str) -> dict[str, TemporalWeights]:
+def temporal_weights(source: ResultsSource, capture: str) -> dict[str, TemporalWeights]:
     """Return the temporal weights that a method left, by side (`right`, `left`, or empty).
 
     What is returned is their magnitude: a weight times a learned bias is the same with both signs
@@ -88,7 +88,7 @@ def temporal_weights(source: Source, capture: str) -> dict[str, TemporalWeights]
     return found
 
 
-def mean_temporal_weight(source: Source, capture: str) -> float | None:
+def mean_temporal_weight(source: ResultsSource, capture: str) -> float | None:
     """Return the mean temporal weight over sides and frames, or None where none was left."""
     found = temporal_weights(source, capture)
     if not found:

@@ -15,7 +15,7 @@ from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import aggregate
 from hwp_bench.report.evaluation_tables import HEADLINE, labels, score_column
-from hwp_bench.report.sources import Source, mean_severity, mean_temporal_weight
+from hwp_bench.report.sources import ResultsSource, mean_severity, mean_temporal_weight
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
@@ -25,7 +25,7 @@ ROBUST = HEADLINE[:3]
 LEVELS = ((1.0, "Low"), (2.0, "Medium"), (5.1, "High"))
 
 
-def robustness_table(sources: Sequence[Source], base: str | None = None) -> Table:
+def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) -> Table:
     """Return what perturbed frames cost each method, and how much of that it wins back.
 
     Args:
@@ -113,7 +113,7 @@ def _macro(run: MethodRuns, name: str) -> float:
     return float(macro_by_seed(run, name).mean())
 
 
-def severity_table(sources: Sequence[Source], captures: Mapping[str, CaptureInfo]) -> Table:
+def severity_table(sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo]) -> Table:
     """Return one row a perturbation, level of severity and method.
 
     Args:
@@ -162,7 +162,7 @@ def severity_table(sources: Sequence[Source], captures: Mapping[str, CaptureInfo
 
 
 def bias_rows(
-    sources: Sequence[Source], captures: Mapping[str, CaptureInfo], metrics: Sequence[str]
+    sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo], metrics: Sequence[str]
 ) -> list[tuple[Cell, ...]]:
     """Return the rows of the bias table: capture, level, severity, method, scores, mean weight.
 
@@ -190,7 +190,7 @@ def _level(severity: float | None) -> str | None:
     return None if severity is None else next(word for top, word in LEVELS if severity < top)
 
 
-def bias_table(sources: Sequence[Source], captures: Mapping[str, CaptureInfo]) -> Table:
+def bias_table(sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo]) -> Table:
     """Return the mean temporal weight against the perturbation level, a row a capture.
 
     Raises:
@@ -200,12 +200,10 @@ def bias_table(sources: Sequence[Source], captures: Mapping[str, CaptureInfo]) -
     rows = bias_rows(sources, captures, names)
     if not rows:
         raise refused_bias()
-    columns = (
-        *(Column("Capture"), Column("Disturbance"), Column("Severity", 2), Column("Method")),
-        *(score_column(name) for name in names),
-        Column("Mean temporal weight [1e-3]", 3),
-    )
-    return Table("Bias strength", columns, tuple(rows), (LEVEL_NOTE,), ranked=False)
+    columns = [Column("Capture"), Column("Disturbance"), Column("Severity", 2), Column("Method")]
+    columns += [score_column(name) for name in names]
+    columns.append(Column("Mean temporal weight [1e-3]", 3))
+    return Table("Bias strength", tuple(columns), tuple(rows), (LEVEL_NOTE,), ranked=False)
 
 
 #: The levels of the bias table.
@@ -224,7 +222,7 @@ def refused_bias() -> UsageError:
     )
 
 
-def seeds_table(sources: Sequence[Source]) -> Table:
+def seeds_table(sources: Sequence[ResultsSource]) -> Table:
     """Return one row a method: mean and standard deviation over seeds of the macro mean."""
     runs = group_runs([source.results for source in sources])
     names = common_metrics(runs, HEADLINE)

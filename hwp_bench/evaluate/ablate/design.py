@@ -34,7 +34,7 @@ class Variant:
 
 
 @dataclass(frozen=True)
-class Effect:
+class AblationEffect:
     """A difference between variants that answers one question."""
 
     #: In tables: `DPD`, `DPD x PAO`.
@@ -58,7 +58,7 @@ class Design:
     #: Variants, the barest first, the full method last before the alternatives.
     variants: tuple[Variant, ...]
     #: Effects.
-    effects: tuple[Effect, ...]
+    effects: tuple[AblationEffect, ...]
 
 
 def make_design(
@@ -106,7 +106,7 @@ def make_design(
     for alternative in alternatives:
         variants.append(_variant((alternative,)))
         contrast = {FULL: 1.0, alternative.variant_name: -1.0}
-        effects.append(Effect(f"not {alternative.title}", "alternative", contrast))
+        effects.append(AblationEffect(f"not {alternative.title}", "alternative", contrast))
     return Design(components, alternatives, tuple(variants), tuple(effects))
 
 
@@ -147,7 +147,7 @@ def name_of(thrown: Sequence[Switch]) -> str:
     return "+".join(item.variant_name for item in thrown) or FULL
 
 
-def _factorial_effects(components: Sequence[Switch]) -> list[Effect]:
+def _factorial_effects(components: Sequence[Switch]) -> list[AblationEffect]:
     """Main effects and interactions of two; each a mean over the other components in and out."""
     effects = []
     count = len(components)
@@ -161,13 +161,14 @@ def _factorial_effects(components: Sequence[Switch]) -> list[Effect]:
                 out = [c for c, there in zip(components, present, strict=True) if not there]
                 contrast[name_of(out)] = sign / 2.0 ** (count - order)
             title = " x ".join(components[index].title for index in chosen)
-            effects.append(Effect(title, "main" if order == 1 else "interaction", contrast))
+            effects.append(AblationEffect(title, "main" if order == 1 else "interaction", contrast))
     return effects
 
 
-def _out_effects(components: Sequence[Switch]) -> list[Effect]:
+def _out_effects(components: Sequence[Switch]) -> list[AblationEffect]:
     effects = [
-        Effect(item.title, "out", {FULL: 1.0, name_of((item,)): -1.0}) for item in components
+        AblationEffect(item.title, "out", {FULL: 1.0, name_of((item,)): -1.0})
+        for item in components
     ]
     together = {FULL: 1.0, name_of(components): -1.0}
-    return [*effects, Effect("all of them", "out", together)]
+    return [*effects, AblationEffect("all of them", "out", together)]

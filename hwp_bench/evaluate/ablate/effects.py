@@ -11,7 +11,7 @@ import numpy as np
 from hwp_bench.analysis.statistics.bootstrap import RESAMPLES, Estimate, bootstrap_mean
 from hwp_bench.analysis.statistics.compare import holm
 from hwp_bench.analysis.statistics.pairing import MethodRuns, scopes
-from hwp_bench.evaluate.ablate.design import Effect
+from hwp_bench.evaluate.ablate.design import AblationEffect
 from hwp_bench.evaluate.ablate.runs import AblationRuns
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.results import CaptureResult
@@ -24,7 +24,7 @@ class ScoreEffect:
 
     #: Title of the effect.
     effect: str
-    #: Its kind, see `ablate.design.Effect`.
+    #: Its kind, see `ablate.design.AblationEffect`.
     kind: str
     #: Name of the metric.
     metric: str
@@ -90,7 +90,7 @@ def _any_run(ablation: AblationRuns) -> MethodRuns:
 
 def _score_effect(
     ablation: AblationRuns,
-    effect: Effect,
+    effect: AblationEffect,
     metric: str,
     scope: str,
     weights: dict[str, float],
@@ -159,7 +159,7 @@ def cost_effects(ablation: AblationRuns, *, seed: int = 0) -> list[CostEffect]:
 
 
 def _cost_effect(
-    ablation: AblationRuns, effect: Effect, quantity: str, seed: int
+    ablation: AblationRuns, effect: AblationEffect, quantity: str, seed: int
 ) -> CostEffect | None:
     with_it: list[np.ndarray] = []
     without: list[np.ndarray] = []
@@ -195,7 +195,7 @@ def _cost_effect(
     )
 
 
-def _weighted(logs: dict[str, np.ndarray], effect: Effect, sign: int) -> np.ndarray:
+def _weighted(logs: dict[str, np.ndarray], effect: AblationEffect, sign: int) -> np.ndarray:
     """(S,) mean log seconds of the variants whose coefficient has this sign."""
     parts = [abs(f) * logs[name] for name, f in effect.contrast.items() if f * sign > 0]
     return np.sum(np.stack(parts), axis=0)

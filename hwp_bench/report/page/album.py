@@ -12,7 +12,7 @@ import numpy as np
 from hwp_bench.base.drawing import fitted, labelled, sheet
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.images import read_rgb
-from hwp_bench.report.sources import Source
+from hwp_bench.report.sources import ResultsSource
 
 #: Largest sum of the images in a page, bytes in base64.
 MAX_BYTES = 8 * 1024 * 1024
@@ -60,12 +60,12 @@ class Album:
         return None if pixels is None else self.take(pixels)
 
 
-def frame_sheets(source: Source, capture: str, album: Album) -> str | None:
+def frame_sheets(source: ResultsSource, capture: str, album: Album) -> str | None:
     """Return the sheet of worst, median and best frame that the evaluation drew."""
     return album.take_file(source.place(capture, "pictures", "comparison.png"))
 
 
-def mask_sheet(source: Source, capture: str, album: Album) -> tuple[str, int] | None:
+def mask_sheet(source: ResultsSource, capture: str, album: Album) -> tuple[str, int] | None:
     """Return a sheet of a method's weight masks and how many there are, or None.
 
     At most `MASKS` are shown, spread evenly over the frames.

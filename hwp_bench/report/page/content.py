@@ -23,7 +23,7 @@ from hwp_bench.report.page.album import Album, frame_sheets, mask_sheet
 from hwp_bench.report.page.html_tables import to_html
 from hwp_bench.report.page.inline_svg import inline_svg
 from hwp_bench.report.page.strips import StripMethod, strip_plot
-from hwp_bench.report.sources import Source, find_captures, temporal_weights
+from hwp_bench.report.sources import ResultsSource, find_captures, temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
 from hwp_bench.results import Results
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
@@ -81,7 +81,7 @@ class ReportPage:
 
 
 def gather_report(
-    sources: Sequence[Source],
+    sources: Sequence[ResultsSource],
     capture_folders: Sequence[str | os.PathLike[str]] = (),
     *,
     base: str | None = None,
@@ -178,7 +178,7 @@ def _optional(*makers: Callable[[], Table | None]) -> list[Table]:
     return found
 
 
-def _seeds(chosen: Sequence[Source], runs: Sequence[MethodRuns]) -> Table | None:
+def _seeds(chosen: Sequence[ResultsSource], runs: Sequence[MethodRuns]) -> Table | None:
     return seeds_table(chosen) if any(len(run.seeds) > 1 for run in runs) else None
 
 
@@ -223,7 +223,7 @@ def _differences(runs: Sequence[MethodRuns]) -> list[Table]:
 
 
 def _captures(
-    sources: Sequence[Source],
+    sources: Sequence[ResultsSource],
     runs: Sequence[MethodRuns],
     infos: Mapping[str, CaptureInfo],
     album: Album,

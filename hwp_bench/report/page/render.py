@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from hwp_bench.base.files import atomic_write
 from hwp_bench.report.page.content import ReportPage, gather_report
-from hwp_bench.report.sources import Source
+from hwp_bench.report.sources import ResultsSource
 
 #: Name of the page.
 PAGE = "index.html"
@@ -57,7 +57,7 @@ def render_report(report: ReportPage, title: str) -> str:
 
 def write_report(
     folder: Path,
-    sources: Sequence[Source],
+    sources: Sequence[ResultsSource],
     captures: Sequence[str | os.PathLike[str]] = (),
     *,
     base: str | None = None,

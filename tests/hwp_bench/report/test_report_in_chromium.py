@@ -13,7 +13,7 @@ from made_results import made_results
 
 from hwp_bench.base.images import write_image
 from hwp_bench.report.page.render import write_report
-from hwp_bench.report.sources import Source
+from hwp_bench.report.sources import ResultsSource
 
 EVIL = '"><img src=x onerror="document.title=1"><script>document.title=2</script>'
 pytestmark = pytest.mark.slow
@@ -30,7 +30,7 @@ def browser(tmp_path) -> Iterator[Any]:
         picture = np.full((120, 400, 3), 90, np.uint8)
         for capture in result.captures:
             write_image(folder / f"captures/{capture.id}/pictures/comparison.png", picture)
-        sources.append(Source(result, folder))
+        sources.append(ResultsSource(result, folder))
     page = write_report(tmp_path / "page", sources)
     with open_page(page, tmp_path / "profile") as driver:
         yield driver

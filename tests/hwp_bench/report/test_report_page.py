@@ -19,7 +19,7 @@ from hwp_bench.report.page.album import Album
 from hwp_bench.report.page.content import gather_report, summary_sentence
 from hwp_bench.report.page.html_tables import tag, to_html
 from hwp_bench.report.page.render import write_report
-from hwp_bench.report.sources import Source
+from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import CurvePoint
 
 EVIL = '<script>alert("x")</script>'
@@ -55,7 +55,7 @@ class Page(HTMLParser):
 
 
 @pytest.fixture
-def sources(make_results, make_capture, tmp_path: Path) -> tuple[list[Source], Path]:
+def sources(make_results, make_capture, tmp_path: Path) -> tuple[list[ResultsSource], Path]:
     """Two methods on one capture; the first with a hostile title, pictures and weights."""
     capture = make_capture("capture2")
     found = []
@@ -77,7 +77,7 @@ def sources(make_results, make_capture, tmp_path: Path) -> tuple[list[Source], P
         folder = tmp_path / name
         picture = np.full((40, 90, 3), 90, np.uint8)
         write_image(folder / "captures/capture2/pictures/comparison.png", picture)
-        found.append(Source(result, folder))
+        found.append(ResultsSource(result, folder))
     diagnostics = tmp_path / "mine" / "captures" / "capture2" / "diagnostics"
     write_json(diagnostics / "temporal.json", {"frames": [0, 1], "weights": [0.001, 0.003]})
     for frame in range(9):
@@ -156,7 +156,7 @@ def test_pictures_stay_within_their_budget(sources) -> None:
 def test_a_bare_result_makes_a_page_too(make_results, tmp_path) -> None:
     result = make_results()
     bare = replace(result.captures[0], curve=[], perturbations=[])
-    page = write_report(tmp_path, [Source(replace(result, captures=[bare]), None)])
+    page = write_report(tmp_path, [ResultsSource(replace(result, captures=[bare]), None)])
     text = page.read_text(encoding="utf-8")
     Page(text)
     assert "severity of its frames is not shown" in text
@@ -165,7 +165,7 @@ def test_a_bare_result_makes_a_page_too(make_results, tmp_path) -> None:
 def test_results_that_cannot_stand_together_are_refused(make_results, tmp_path) -> None:
     other = make_results("other", digest="e")
     with pytest.raises(UsageError, match="different data"):
-        write_report(tmp_path, [Source(make_results(), None), Source(other, None)])
+        write_report(tmp_path, [ResultsSource(make_results(), None), ResultsSource(other, None)])
     with pytest.raises(UsageError, match="results are needed"):
         write_report(tmp_path, [])
     assert not (tmp_path / "index.html").exists()

@@ -11,7 +11,7 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import write_json
 from hwp_bench.capture import Capture
 from hwp_bench.report.requested_table import TableRequest, make_table
-from hwp_bench.report.sources import Source, find_captures, mean_severity, temporal_weights
+from hwp_bench.report.sources import ResultsSource, find_captures, mean_severity, temporal_weights
 from hwp_bench.report.study_tables import robustness_table
 from hwp_bench.results import Results, write_results
 
@@ -22,7 +22,7 @@ def cells(table) -> list[dict]:
 
 
 @pytest.fixture
-def on_disk(make_results, make_capture, tmp_path) -> tuple[Source, Capture]:
+def on_disk(make_results, make_capture, tmp_path) -> tuple[ResultsSource, Capture]:
     """A result on a capture whose training frames have motion blur of mean severity 0.75."""
     capture = make_capture("capture2")
     plain = make_results("plain")
@@ -31,12 +31,12 @@ def on_disk(make_results, make_capture, tmp_path) -> tuple[Source, Capture]:
     )
     results = replace(plain, captures=[scored])
     write_results(tmp_path / "run" / "results.json", results)
-    return Source(results, tmp_path / "run"), capture
+    return ResultsSource(results, tmp_path / "run"), capture
 
 
 def test_the_gap_is_what_it_is_by_hand(make_results) -> None:
-    def run(name: str, psnr: float, frames: str) -> Source:
-        return Source(replace(make_results(name, psnr), frames=frames), None)
+    def run(name: str, psnr: float, frames: str) -> ResultsSource:
+        return ResultsSource(replace(make_results(name, psnr), frames=frames), None)
 
     sources = [
         run("plain", 20, "perturbed"),
@@ -55,10 +55,10 @@ def test_the_gap_is_what_it_is_by_hand(make_results) -> None:
 
 
 def test_robustness_needs_both_kinds_of_frames(make_results) -> None:
-    sources = [Source(make_results(), None)]
+    sources = [ResultsSource(make_results(), None)]
     with pytest.raises(UsageError, match="perturbed and on clean frames"):
         robustness_table(sources)
-    clean = Source(replace(make_results(), frames="clean"), None)
+    clean = ResultsSource(replace(make_results(), frames="clean"), None)
     with pytest.raises(UsageError, match="Given: plain"):
         robustness_table([*sources, clean], "other")
 
