@@ -7,6 +7,7 @@ contributors read, one page of API reference for each public package), and gives
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 from typing import Any
@@ -45,7 +46,11 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
         text = (ROOT / name).read_text(encoding="utf-8")
         files.append(File.generated(config, page, content=_from_root(text)))
     for package in API:
-        text = f"# `{package}`\n\n::: {package}\n"
+        names = getattr(importlib.import_module(package), "__all__", ())
+        public = sorted(set(names) - {"__version__"})
+        # A package whose names are lazy lists them in a stub, so they are named here.
+        options = f"    options:\n      members: {public}\n" if public else ""
+        text = f"# `{package}`\n\n::: {package}\n{options}"
         files.append(File.generated(config, f"api/{package}.md", content=text))
     return files
 
