@@ -58,7 +58,7 @@ level = 0.5
 settings_off = { level = 0.2 }
 """
 _FIT = (
-    "import sys, wildghand.fit.session as session; session.SAVE_EVERY = 0.2; "
+    "import sys, wildghand.fitting.session as session; session.SAVE_EVERY = 0.2; "
     "from wildghand.cli.main import main; sys.exit(main())"
 )
 

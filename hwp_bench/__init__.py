@@ -1,3 +1,51 @@
-"""HWP bench: a benchmark for hand avatars learned from perturbed monocular video."""
+"""HWP bench: a benchmark for hand avatars learned from perturbed monocular video.
 
-__version__ = "0.1.0"
+The names below are loaded when they are first used; `import hwp_bench` loads neither numpy nor
+torch. `docs/python.md` shows them at work.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+from hwp_bench.base.version import __version__
+
+if TYPE_CHECKING:
+    from hwp_bench.api import compare as compare
+    from hwp_bench.api import evaluate as evaluate
+    from hwp_bench.api import score as score
+    from hwp_bench.base.errors import HwpError as HwpError
+    from hwp_bench.capture import Capture as Capture
+    from hwp_bench.capture import open_capture as open_capture
+    from hwp_bench.results import Results as Results
+    from hwp_bench.results import read_results as read_results
+    from hwp_bench.sim import render_capture as render_capture
+
+# Not through lazy_loader: the launcher of the sandbox imports this package in an interpreter that
+# has only the standard library.
+_HOMES = {
+    "Capture": "hwp_bench.capture",
+    "HwpError": "hwp_bench.base.errors",
+    "Results": "hwp_bench.results",
+    "compare": "hwp_bench.api",
+    "evaluate": "hwp_bench.api",
+    "open_capture": "hwp_bench.capture",
+    "read_results": "hwp_bench.results",
+    "render_capture": "hwp_bench.sim",
+    "score": "hwp_bench.api",
+}
+
+__all__ = [*_HOMES, "__version__"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(import_module(_HOMES[name]), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return sorted(__all__)

@@ -117,7 +117,7 @@ def is_defined(name: str) -> bool:
 def test_the_example_of_the_method_contract_runs(
     make_capture: CaptureMaker, tmp_path: Path
 ) -> None:
-    from hwp_bench.evaluate.evaluation import EvaluationSettings, evaluate
+    from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
 
     blocks = re.findall(
         r"```(toml|python)\n(.*?)```", (ROOT / "docs" / "methods.md").read_text(), re.DOTALL

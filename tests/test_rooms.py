@@ -151,3 +151,10 @@ def test_parts_of_a_package_do_not_import_one_another_in_a_circle(parent: str) -
             others = {part(target) for target in targets} - {"", part(name)}
             graph.setdefault(part(name), set()).update(others)
     assert circles(graph) == []
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_no_public_name_of_a_package_is_also_a_room(package: str) -> None:
+    # Importing a room sets it as an attribute of the package, in place of the public name.
+    public = set(__import__(package).__all__)
+    assert public.isdisjoint(room(name) for name in MODULES if name.split(".")[0] == package)

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from hwp_bench.cli.evaluate import add_evaluation_arguments
 
 if TYPE_CHECKING:
-    from hwp_bench.evaluate.ablate.runs import AblationRuns
+    from hwp_bench.evaluation.ablate.runs import AblationRuns
 
 _EXAMPLES = """examples:
   hwp-bench ablate --suite mini                          # 2 x 2 of DPD and PAO, three seeds
@@ -83,8 +83,8 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings
-    from hwp_bench.evaluate.ablate.design import make_design
-    from hwp_bench.evaluate.ablate.runs import run_ablation
+    from hwp_bench.evaluation.ablate.design import make_design
+    from hwp_bench.evaluation.ablate.runs import run_ablation
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.run.engine.options import engine_for, needs_of
 
@@ -121,12 +121,12 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.analysis.statistics.pairing import common_metrics
     from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table, write_tables
-    from hwp_bench.evaluate.ablate.ablation_tables import (
+    from hwp_bench.evaluation.ablate.ablation_tables import (
         ablation_record,
         ablation_tables,
         write_record,
     )
-    from hwp_bench.evaluate.ablate.effects import cost_effects, score_effects
+    from hwp_bench.evaluation.ablate.effects import cost_effects, score_effects
     from hwp_bench.report.evaluation_tables import HEADLINE
 
     metrics = common_metrics(list(ablation.runs.values()), HEADLINE)

@@ -48,47 +48,25 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from dataclasses import asdict
-
-    from hwp_bench.analysis.statistics.compare import compare, standings
-    from hwp_bench.analysis.statistics.comparison_tables import differences_table, standings_table
-    from hwp_bench.analysis.statistics.pairing import common_metrics, group_runs, refuse_unlike
-    from hwp_bench.base.errors import UsageError
+    from hwp_bench.analysis.statistics.comparison import compare_results
     from hwp_bench.base.tables import format_table, print_table
-    from hwp_bench.metrics import metric
     from hwp_bench.report.evaluation_tables import HEADLINE
     from hwp_bench.results import read_all
 
-    if not 100 <= args.resamples <= 1_000_000:
-        raise UsageError(f"{args.resamples} is not between 100 and 1000000", field="--resamples")
-    runs = group_runs(read_all(args.results))
-    refuse_unlike(runs)
-    if len(runs) < 2:
-        raise UsageError(
-            "there is only one method to compare",
-            field="RESULTS",
-            remedy="Results that differ only in the seed count as one method.",
-        )
-    asked = [metric(name).name for name in args.metric] or list(HEADLINE)
-    names = common_metrics(runs, asked)
-    if not names or (args.metric and len(names) < len(asked)):
-        raise UsageError("not every result has every metric asked for", field="--metric")
-    value = {}
-    for name in names:
-        differences = compare(runs, name, resamples=args.resamples, seed=args.seed)
-        methods = standings(runs, name, differences)
-        if args.json:
-            value[name] = {
-                "methods": [asdict(item) for item in methods],
-                "differences": [asdict(item) for item in differences],
-            }
-            continue
-        for table in (standings_table(name, methods), differences_table(name, differences)):
-            if args.format == "terminal":
-                print_table(table)
-            else:
-                print(format_table(table, args.format))
+    comparison = compare_results(
+        read_all(args.results),
+        args.metric or HEADLINE,
+        all_metrics=bool(args.metric),
+        resamples=args.resamples,
+        seed=args.seed,
+    )
     if args.json:
-        json.dump(value, sys.stdout, indent=1)
+        json.dump(comparison.as_dict(), sys.stdout, indent=1)
         print()
+        return 0
+    for table in comparison.tables():
+        if args.format == "terminal":
+            print_table(table)
+        else:
+            print(format_table(table, args.format))
     return 0

@@ -28,7 +28,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.progress import JobsView
     from hwp_bench.base.tables import Column, Table, print_table, write_tables
     from hwp_bench.cli.evaluate import report_outcome
-    from hwp_bench.evaluate.evaluation import EvaluationSettings, evaluate
+    from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.sim import ensure_suite
 

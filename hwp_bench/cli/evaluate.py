@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from hwp_bench.run.engine.options import add_engine_arguments
 
 if TYPE_CHECKING:
-    from hwp_bench.evaluate.evaluation import EvaluationSettings
+    from hwp_bench.evaluation.evaluate import EvaluationSettings
     from hwp_bench.publish import SealedPart
     from hwp_bench.results import Results
     from hwp_bench.run.engine import Engine
@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.progress import JobsView
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.capture.splits import read_splits
-    from hwp_bench.evaluate.evaluation import evaluate
+    from hwp_bench.evaluation.evaluate import evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.run.engine.options import engine_for, needs_of
@@ -199,7 +199,7 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
     """
     from hwp_bench.base.errors import UsageError
     from hwp_bench.cli.overrides import overrides
-    from hwp_bench.evaluate.evaluation import EvaluationSettings
+    from hwp_bench.evaluation.evaluate import EvaluationSettings
     from hwp_bench.methods.contract import Budget, RunSettings
     from hwp_bench.run.sandbox.confinement import Confinement
 

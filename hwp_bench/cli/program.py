@@ -12,8 +12,8 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from hwp_bench import __version__
 from hwp_bench.base.errors import HwpError
+from hwp_bench.base.version import __version__
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from hwp_bench.evaluate.verify import Verification
+    from hwp_bench.evaluation.verify import Verification
 
 _EXAMPLES = """examples:
   hwp-bench verify runs/plain-mini
@@ -49,7 +49,7 @@ def run(args: argparse.Namespace) -> int:
 
     from hwp_bench.base.progress import track
     from hwp_bench.capture.splits import read_splits
-    from hwp_bench.evaluate.verify import verify_results
+    from hwp_bench.evaluation.verify import verify_results
     from hwp_bench.results import result_files
 
     splits = read_splits(args.splits) if args.splits else None
@@ -68,7 +68,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _captures(args: argparse.Namespace, file: Path) -> list[Path]:
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.evaluate.verify import capture_folders
+    from hwp_bench.evaluation.verify import capture_folders
     from hwp_bench.results import read_results
     from hwp_bench.sim import ensure_suite
     from hwp_bench.sim.produce.suites import suite_names

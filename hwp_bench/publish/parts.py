@@ -10,9 +10,9 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hwp_bench import __version__
 from hwp_bench.base.errors import BadCapture, UsageError
 from hwp_bench.base.files import atomic_folder, write_json
+from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import CAMERAS, HANDS, IMAGE_FOLDERS, METADATA, TRUE_HANDS
 from hwp_bench.capture.splits import Split, split_for

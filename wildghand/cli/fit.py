@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from wildghand.fit.parallel import World
+    from wildghand.fitting.parallel import World
 
 _EXAMPLES = """examples:
   wildghand fit my_capture -o my_avatar
@@ -61,7 +61,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command, alone or with the processes that torchrun started."""
-    from wildghand.fit.parallel import run_in_world
+    from wildghand.fitting.parallel import run_in_world
     from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings
 
@@ -74,7 +74,7 @@ def run(args: argparse.Namespace) -> int:
 def _run(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.methods.contract import Budget
-    from wildghand.fit.session import fit_capture
+    from wildghand.fitting.session import fit_capture
 
     if args.steps is not None and args.steps < 1:
         raise UsageError(f"is {args.steps}", field="--steps", remedy="Use 1 or more.")

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fit.fit import Fit, make_optimizer
-from wildghand.fit.optimise import Watchers
+from wildghand.fitting.fit import Fit, make_optimizer
+from wildghand.fitting.optimise import Watchers
 from wildghand.gaussians.fit_loop import batches
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import PredictionNetwork

@@ -16,9 +16,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-import wildghand
 from hwp_bench.base.errors import BadInput, BadResult, HwpError
 from hwp_bench.base.files import atomic_folder, inside, read_json, write_json
+from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture.schema import HandModelId
 from wildghand.model.settings import WildGHandSettings
@@ -95,7 +95,7 @@ def find_prior(text: str) -> Path:
     try:
         path = Path(text)
         if not path.is_absolute():
-            path = inside(Path(wildghand.__file__).parent, text)
+            path = inside(PACKAGES / "wildghand", text)
         found = (path / DESCRIPTION).is_file()
     except (BadInput, OSError, ValueError) as error:
         problem = str(error).splitlines()[0][:300]

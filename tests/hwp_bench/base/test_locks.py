@@ -148,7 +148,7 @@ def test_a_full_disc_is_one_message_and_the_next_start_finishes(
 
 def test_two_fits_of_one_avatar_are_one_message(make_capture: CaptureMaker, tmp_path: Path) -> None:
     from hwp_bench.methods.contract import Budget
-    from wildghand.fit.session import fit_capture
+    from wildghand.fitting.session import fit_capture
 
     out = tmp_path / "avatar"
     with (

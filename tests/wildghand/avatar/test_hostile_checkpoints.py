@@ -14,7 +14,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from hwp_bench.base.errors import BadInput
-from wildghand.fit.saved_state import SCHEMA, load_state
+from wildghand.fitting.saved_state import SCHEMA, load_state
 from wildghand.gaussians.perceptual import Vgg19
 
 

@@ -27,9 +27,9 @@ from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.fit.fit import Fit
-from wildghand.fit.optimise import Watchers
-from wildghand.fit.saved_state import load_state, save_state
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.optimise import Watchers
+from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.network import network_settings
 from wildghand.pretrain.joint import JointFit, take_steps

@@ -17,9 +17,9 @@ from engine_jobs import Told, write_gray_method
 from same_results import contents
 from small_captures import CaptureMaker
 
-from hwp_bench.evaluate.ablate.design import make_design
-from hwp_bench.evaluate.ablate.runs import run_ablation
-from hwp_bench.evaluate.evaluation import EvaluationSettings
+from hwp_bench.evaluation.ablate.design import make_design
+from hwp_bench.evaluation.ablate.runs import run_ablation
+from hwp_bench.evaluation.evaluate import EvaluationSettings
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.run.engine import LocalEngine, Needs
 

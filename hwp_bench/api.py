@@ -1,0 +1,147 @@
+"""Evaluate, score and compare from Python: the functions that `import hwp_bench` offers.
+
+Each does what the command of its name does.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
+from hwp_bench.base.tables import write_tables
+from hwp_bench.capture import Capture
+from hwp_bench.evaluation.evaluate import EvaluationSettings
+from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
+from hwp_bench.methods.contract import Budget, RunSettings
+from hwp_bench.metrics.score import score_frame
+from hwp_bench.report.evaluation_tables import HEADLINE, all_tables
+from hwp_bench.results import Results, read_all
+from hwp_bench.run.engine import Engine, LocalEngine
+from hwp_bench.run.engine.parallel import ParallelEngine
+from hwp_bench.sim.produce.suites import ensure_suite, suite_names
+
+#: A capture, its folder, or the name of a suite; `evaluate` takes one or several.
+Captures: TypeAlias = (
+    "str | os.PathLike[str] | Capture | Sequence[os.PathLike[str] | str | Capture]"
+)
+
+
+def evaluate(
+    method: str | os.PathLike[str],
+    captures: Captures = "mini",
+    out: str | os.PathLike[str] | None = None,
+    *,
+    preset: str | None = None,
+    settings: Mapping[str, Any] | None = None,
+    seed: int = 0,
+    seconds: float | None = None,
+    steps: int | None = None,
+    frames: str = "perturbed",
+    jobs: int = 1,
+) -> Results:
+    """Run a method on captures and score it, as `hwp-bench evaluate` does.
+
+    An evaluation that is started again with the same arguments takes finished captures as they
+    are.
+
+    Args:
+        method: method directory, or the name of one that ships: `plain`, `wildghand`.
+        captures: a suite (`smoke`, `mini`, `full`; rendered on first use), a capture or its
+            folder, or a list of these.
+        out: results folder; `runs/METHOD-SUITE` if None.
+        preset: preset of the method; the suite's, else `default`, if None.
+        settings: settings that override the preset, such as `{"dpd.enabled": False}`.
+        seed: seed of everything random.
+        seconds: limit of the fit on the method's clock, s.
+        steps: limit of the fit in optimizer steps.
+        frames: training frames that the method is given: `perturbed`, or an oracle's (`clean`,
+            `unperturbed-only`).
+        jobs: captures that are evaluated at once, each in a process of its own.
+
+    Returns:
+        The results, which `out/results.json` then holds; tables are written to `out/tables`.
+
+    Raises:
+        BadMethod: the method directory or a setting is wrong.
+        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
+        UsageError: there is no such suite.
+        HwpError: another evaluation is writing to `out`, or `out` cannot be written.
+    """
+    name = Path(os.fspath(method)).name
+    suite = captures if isinstance(captures, str) and captures in suite_names() else "captures"
+    folder = Path(out) if out is not None else Path("runs") / f"{name}-{suite}"
+    engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs)
+    with engine:
+        paths = ensure_suite(suite, engine=engine) if suite != "captures" else _folders(captures)
+        results = evaluate_method(
+            os.fspath(method),
+            paths,
+            folder,
+            EvaluationSettings(
+                suite=suite,
+                preset=preset,
+                run=RunSettings(dict(settings or {}), seed, Budget(seconds, steps), frames),
+            ),
+            engine=engine,
+        )
+    write_tables(folder / "tables", all_tables([results]))
+    return results
+
+
+def _folders(captures: Captures) -> list[Path]:
+    """The folders of one capture or several."""
+    several = [captures] if isinstance(captures, str | os.PathLike | Capture) else list(captures)
+    return [item.root if isinstance(item, Capture) else Path(item) for item in several]
+
+
+def score(
+    prediction: np.ndarray, target: np.ndarray, mask: np.ndarray, *, exact: bool = False
+) -> dict[str, float]:
+    """Score one rendered frame in every protocol, on the pixels of the data set's mask.
+
+    Args:
+        prediction: (H, W, 3) sRGB, uint8 or float in [0, 1].
+        target: (H, W, 3) sRGB, uint8 or float in [0, 1].
+        mask: (H, W) uint8 or bool, the visible hand.
+        exact: the mask is exact coverage, not an estimate (`Capture.scoring_mask` says so).
+
+    Returns:
+        Score by metric; `hwp_bench.metrics.METRICS` says what each means.
+
+    Raises:
+        ShapeMismatch: the three do not describe one image.
+        BadInput: a pixel is NaN or out of range, or the mask leaves nothing to score.
+    """
+    return score_frame(prediction, target, mask, coverage=exact)
+
+
+def compare(
+    *results: Results | str | os.PathLike[str],
+    metrics: Sequence[str] = HEADLINE,
+    resamples: int = 10_000,
+    seed: int = 0,
+) -> Comparison:
+    """Say how sure the differences between methods are, as `hwp-bench compare` does.
+
+    Args:
+        results: results, results folders or `results.json` files, of at least two methods on the
+            same captures.
+        metrics: metrics to compare; those that not all results have are left out.
+        resamples: bootstrap resamples of each interval.
+        seed: seed of the resampling.
+
+    Raises:
+        UsageError: there is only one method, or the results are of different data.
+        BadInput, BadResult: a results file is missing or wrong.
+    """
+    read = [
+        item
+        for result in results
+        for item in ([result] if isinstance(result, Results) else read_all([result]))
+    ]
+    return compare_results(read, metrics, resamples=resamples, seed=seed)

@@ -1,0 +1,301 @@
+"""Evaluate one method on one capture: run it, score its predictions, store the result."""
+
+from __future__ import annotations
+
+import shutil
+import tempfile
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+
+from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
+from hwp_bench.base.files import read_json, sha256_json, write_json
+from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.records import parse_record
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.schema import EXTRA
+from hwp_bench.capture.splits import Split
+from hwp_bench.evaluation.artifacts import keep_artifacts
+from hwp_bench.evaluation.scoring import (
+    mean_scores,
+    predictions_digest,
+    read_targets,
+    score_predictions,
+)
+from hwp_bench.methods.contents import exposed_digest
+from hwp_bench.methods.contract import RunSettings
+from hwp_bench.methods.manifest import MethodManifest, read_manifest
+from hwp_bench.methods.predictions import read_predictions
+from hwp_bench.methods.request import write_request
+from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.score import Network
+from hwp_bench.results import CaptureResult, CurvePoint
+from hwp_bench.run.engine import Folder, Job, Needs
+from hwp_bench.run.engine.job import OnProgress, ignore
+from hwp_bench.run.output import CHECKPOINTS, RunFacts
+from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
+from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
+
+#: Version of the evaluation itself; a stored result of another version is not taken.
+RECIPE = 1
+#: The result of one capture, inside its folder.
+RESULT = "result.json"
+
+
+@dataclass(frozen=True)
+class CaptureEvaluation:
+    """One method on one capture."""
+
+    #: The method.
+    manifest: MethodManifest
+    #: The capture.
+    capture: Capture
+    #: Its split.
+    split: Split
+    #: Settings, seed, budget and training frames.
+    run: RunSettings
+    #: Seconds after which the method is killed.
+    time_limit: float = DEFAULT_TIME_LIMIT
+    #: How the method's process is confined; it decides no score.
+    confinement: Confinement = field(default_factory=Confinement)
+    #: LPIPS by backbone, where the weights are there.
+    networks: Mapping[str, Network] = field(default_factory=dict)
+
+    @property
+    def key(self) -> str:
+        """Digest (hex) of everything that decides the scores."""
+        exposed = self.confinement.exposed
+        return sha256_json(
+            {
+                "recipe": RECIPE,
+                "method": [self.manifest.name, self.manifest.digest],
+                "capture": self.capture.digest,
+                "split": self.split.digest,
+                "settings": dict(self.run.settings),
+                "seed": self.run.seed,
+                "budget": asdict(self.run.budget),
+                "frames": self.run.frames,
+                "protocols": [protocol.as_dict() for protocol in PROTOCOLS],
+                "networks": sorted(self.networks),
+                **({"exposed": exposed_digest(exposed)} if exposed else {}),
+            }
+        )
+
+
+def evaluate_capture(
+    evaluation: CaptureEvaluation, folder: Path, on_progress: OnProgress = ignore
+) -> CaptureResult:
+    """Run a method on a capture and score it; a stored result of the same key is taken as it is.
+
+    Args:
+        evaluation: the method, the capture and the settings.
+        folder: where result, predictions, pictures and log go.
+        on_progress: called with (done, total) steps of the fit.
+
+    Returns:
+        The result, which `folder/result.json` then holds. A method that fails gives a result
+        with the reason and penalties, not an error.
+
+    Raises:
+        BadCapture, BadImage: the capture itself is damaged.
+    """
+    stored = stored_result(evaluation, folder)
+    if stored is not None:
+        return stored
+    began = time.perf_counter()
+    targets = read_targets(evaluation.capture, evaluation.split.test.tolist())
+    shutil.rmtree(folder, ignore_errors=True)
+    folder.mkdir(parents=True)
+    output = folder / "run"
+    record, failure = _run(evaluation, output, on_progress)
+    started = time.perf_counter()
+    frames = [target.frame for target in targets]
+    source = record.predictions if record else output / "none"
+    predictions = read_predictions(source, frames, evaluation.capture.size)
+    scores = score_predictions(targets, predictions, evaluation.networks)
+    score_seconds = time.perf_counter() - started
+    facts = record.facts if record else RunFacts()
+    result = CaptureResult(
+        id=evaluation.capture.info.id,
+        digest=evaluation.capture.digest,
+        hands=evaluation.capture.info.hands,
+        perturbations=list(evaluation.capture.info.perturbations),
+        split_digest=evaluation.split.digest,
+        exact_masks=all(target.exact for target in targets),
+        key=evaluation.key,
+        frames=scores,
+        failure=failure,
+        predictions_digest=predictions_digest(predictions),
+        fit_seconds=facts.fit_seconds,
+        render_seconds=facts.render_seconds,
+        score_seconds=score_seconds,
+        wall_seconds=record.wall_seconds if record else 0.0,
+        steps=facts.steps,
+        peak_memory=facts.peak_memory,
+        device=facts.device[:100] if facts.device else None,
+        curve=_curve(evaluation, output, facts),
+        curve_seconds=facts.curve_seconds,
+        isolation=record.isolation if record else None,
+    )
+    keep_artifacts(folder, output, source, evaluation.capture, scores, predictions)
+    result = replace(result, job_seconds=time.perf_counter() - began)
+    write_json(folder / RESULT, asdict(result))
+    return result
+
+
+def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult | None:
+    """Return the stored result of the same key, if there is one and the method did not fail."""
+    # Submitted predictions may change without their method.toml, so they are always scored.
+    if not (folder / RESULT).is_file() or evaluation.manifest.kind == "predictions":
+        return None
+    try:
+        result = read_result(folder)
+    except HwpError:
+        return None
+    return result if result.key == evaluation.key and result.failure is None else None
+
+
+def read_result(folder: Path) -> CaptureResult:
+    """Read the result that `evaluate_capture` left in a folder.
+
+    Raises:
+        BadInput, BadResult: it is missing or damaged.
+    """
+    path = folder / RESULT
+    return parse_record(CaptureResult, read_json(path), where=str(path))
+
+
+def _run(
+    evaluation: CaptureEvaluation, output: Path, on_progress: OnProgress
+) -> tuple[RunRecord | None, str | None]:
+    """Run the method on a copy of what it may see; returns the record, or why it failed."""
+    with tempfile.TemporaryDirectory(prefix="hwp-request-") as temporary:
+        request = Path(temporary) / "request"
+        try:
+            if evaluation.manifest.kind != "predictions":
+                write_request(request, evaluation.capture, evaluation.split, evaluation.run)
+            record = run_method(
+                evaluation.manifest,
+                evaluation.capture.info.id,
+                request,
+                output,
+                time_limit=evaluation.time_limit,
+                confinement=_confinement(evaluation, output),
+                on_progress=on_progress,
+            )
+        except (MethodFailed, BadMethod) as error:
+            return None, str(error)
+    return record, None
+
+
+def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
+    """Hide the capture and the results next to the run, which hold pictures of test frames."""
+    asked = evaluation.confinement
+    hands = hand_model_files(evaluation.capture.info.hand_model.source)
+    return replace(
+        asked,
+        exposed=(*asked.exposed, *hands),
+        hidden=(*asked.hidden, evaluation.capture.root, output.parent.parent),
+    )
+
+
+def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list[CurvePoint]:
+    validation = set(evaluation.split.validation.tolist())
+    frames = [frame for frame in facts.checkpoint_frames if frame in validation]
+    if not frames:
+        return []
+    targets = read_targets(evaluation.capture, frames)
+    curve = []
+    for index, checkpoint in enumerate(facts.checkpoints):
+        folder = output / CHECKPOINTS / f"{index:03d}"
+        predictions = read_predictions(folder, frames, evaluation.capture.size)
+        scores = mean_scores(score_predictions(targets, predictions))
+        curve.append(CurvePoint(**asdict(checkpoint), scores=scores))
+    return curve
+
+
+def evaluation_job(evaluation: CaptureEvaluation, folder: Path, text: str, needs: Needs) -> Job:
+    """Return an evaluation as a job of an engine.
+
+    Args:
+        evaluation: the evaluation.
+        folder: where its result goes.
+        text: what a person is shown.
+        needs: the share of a machine that it takes.
+    """
+    root = evaluation.manifest.root.resolve()
+    shipped = root.relative_to(PACKAGES).as_posix() if root.is_relative_to(PACKAGES) else None
+    inputs = {"capture": Folder(evaluation.capture.root, (EXTRA,))}
+    if shipped is None:
+        inputs["method"] = Folder(root)
+    return Job(
+        text=text,
+        here=partial(evaluate_capture, evaluation, folder),
+        work=EvaluateElsewhere(
+            evaluation.split,
+            evaluation.run,
+            evaluation.time_limit,
+            evaluation.confinement,
+            tuple(sorted(evaluation.networks)),
+            shipped,
+            evaluation.key,
+        ),
+        output=folder,
+        finished=lambda: stored_result(evaluation, folder) is not None,
+        inputs=inputs,
+        needs=needs,
+    )
+
+
+@dataclass(frozen=True)
+class EvaluateElsewhere:
+    """An evaluation on its way to another process or machine, which opens method and capture."""
+
+    #: The split of the capture.
+    split: Split
+    #: Settings, seed, budget and training frames.
+    run: RunSettings
+    #: Seconds after which the method is killed.
+    time_limit: float
+    #: How the method's process is confined.
+    confinement: Confinement
+    #: Backbones of LPIPS that are scored.
+    networks: tuple[str, ...]
+    #: Place of a method that ships with the toolkit; None where the method is sent.
+    shipped: str | None
+    #: Key of the evaluation where it was ordered; it must be the same here.
+    key: str
+
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
+        """Evaluate; see `hwp_bench.run.engine.job.Work`.
+
+        Raises:
+            HwpError: method, capture, weights or protocols differ here.
+        """
+        known = load_available() if self.networks else {}
+        missing = [name for name in self.networks if name not in known]
+        if missing:
+            raise HwpError(
+                f"the weights of LPIPS ({', '.join(missing)}) are not on this machine",
+                remedy="Put them on every node, or on none.",
+            )
+        method = inputs["method"] if self.shipped is None else PACKAGES / self.shipped
+        evaluation = CaptureEvaluation(
+            read_manifest(method),
+            open_capture(inputs["capture"]),
+            self.split,
+            self.run,
+            self.time_limit,
+            self.confinement,
+            {name: known[name] for name in self.networks},
+        )
+        if evaluation.key != self.key:
+            raise HwpError(
+                "method, capture or protocols are different on this machine",
+                where=evaluation.capture.info.id,
+                remedy="Install the same version everywhere, and change nothing while jobs run.",
+            )
+        evaluate_capture(evaluation, output, on_progress)

@@ -1,0 +1,194 @@
+"""Evaluate a method on a set of captures."""
+
+from __future__ import annotations
+
+import datetime
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+from hwp_bench.base.errors import BadCapture, BadMethod
+from hwp_bench.base.locks import exclusive
+from hwp_bench.base.records import check_json_values
+from hwp_bench.base.version import __version__
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.splits import Split, split_for
+from hwp_bench.evaluation.capture_evaluation import (
+    CaptureEvaluation,
+    evaluation_job,
+    read_result,
+)
+from hwp_bench.methods.contract import RunSettings
+from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
+from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.score import Network
+from hwp_bench.results import CaptureResult, MethodId, Results, write_results
+from hwp_bench.results.environment import environment
+from hwp_bench.run.engine import Engine, LocalEngine, Needs
+from hwp_bench.run.runner import DEFAULT_TIME_LIMIT
+from hwp_bench.run.sandbox.confinement import Confinement
+
+#: Called when a capture's work begins, with (index, count, capture id); returns a function that is
+#: then called with (done, total) steps.
+OnCapture = Callable[[int, int, str], Callable[[int, int], None] | None]
+
+
+@dataclass(frozen=True)
+class EvaluationSettings:
+    """How a method is evaluated."""
+
+    #: Name of the suite, for the record and as the name of the preset that fits it.
+    suite: str = "captures"
+    #: Preset of the method; None takes the one named like the suite, else `default`.
+    preset: str | None = None
+    #: Single settings that override the preset, seed, budget and training frames.
+    run: RunSettings = field(default_factory=RunSettings)
+    #: Seconds after which a method is killed on one capture.
+    time_limit: float = DEFAULT_TIME_LIMIT
+    #: How its process is confined, and its memory limit.
+    confinement: Confinement = field(default_factory=Confinement)
+
+
+def evaluate(
+    method: str,
+    captures: Sequence[Path],
+    out: Path,
+    settings: EvaluationSettings,
+    *,
+    splits: Mapping[str, Split] | None = None,
+    on_capture: OnCapture | None = None,
+    engine: Engine | None = None,
+    needs: Needs | None = None,
+) -> Results:
+    """Evaluate a method.
+
+    Every capture is opened and checked before the method runs on the first one. A capture's
+    result is on disk before the next begins, and an evaluation that is started again takes
+    finished captures as they are.
+
+    Args:
+        method: method directory, or the name of one that ships with the toolkit.
+        captures: capture folders.
+        out: results folder.
+        settings: suite, preset, seed, budget, limits.
+        splits: splits by capture id; None applies the 80/10/10 rule.
+        on_capture: hook for showing progress, where captures are evaluated in turn.
+        engine: where captures are evaluated; one after another in this process if None.
+        needs: the share of a machine that one capture takes.
+
+    Returns:
+        The results, which `out/results.json` then holds.
+
+    Raises:
+        BadMethod: the method directory is wrong.
+        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
+        HwpError: another evaluation is writing to `out`, or it cannot be written.
+    """
+    plan = make_plan(read_manifest(find_method(method)), open_captures(captures, splits), settings)
+    folders = [out / "captures" / item.capture.info.id for item in plan.evaluations]
+    jobs = [
+        evaluation_job(evaluation, folder, folder.name, needs or Needs())
+        for evaluation, folder in zip(plan.evaluations, folders, strict=True)
+    ]
+    with exclusive(out):
+        (engine or LocalEngine()).run(jobs, lambda index: None, on_capture)
+        results = plan.results([read_result(folder) for folder in folders])
+        write_results(out / "results.json", results)
+    return results
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A method with its settings on every capture; `evaluate_capture` runs one of them."""
+
+    #: The method.
+    manifest: MethodManifest
+    #: Name of the suite.
+    suite: str
+    #: Name of the preset that is taken.
+    preset: str
+    #: The preset with its overrides, seed, budget and training frames.
+    run: RunSettings
+    #: One for each capture.
+    evaluations: tuple[CaptureEvaluation, ...]
+    #: When the plan was made, ISO 8601, UTC.
+    started: str
+
+    def results(self, finished: Sequence[CaptureResult]) -> Results:
+        """Return the record of the captures that are finished."""
+        manifest, run = self.manifest, self.run
+        return Results(
+            method=MethodId(
+                manifest.name, manifest.title, manifest.digest, self.preset, dict(run.settings)
+            ),
+            suite=self.suite,
+            seed=run.seed,
+            budget={"seconds": run.budget.seconds, "steps": run.budget.steps},
+            frames=run.frames,
+            protocols={protocol.name: protocol.as_dict() for protocol in PROTOCOLS},
+            environment=environment(),
+            started=self.started,
+            captures=list(finished),
+            toolkit=__version__,
+        )
+
+
+def make_plan(
+    manifest: MethodManifest,
+    captures: Sequence[tuple[Capture, Split]],
+    settings: EvaluationSettings,
+    networks: Mapping[str, Network] | None = None,
+) -> Plan:
+    """Plan an evaluation; nothing runs yet.
+
+    Args:
+        manifest: the method.
+        captures: what `open_captures` returned.
+        settings: suite, preset, seed, budget, limits.
+        networks: LPIPS by backbone; None loads those whose weights are there.
+
+    Raises:
+        BadMethod: there is no such preset, or an override is not a plain value.
+    """
+    preset = manifest.preset(settings.preset, settings.suite)
+    check_json_values(
+        dict(settings.run.settings), where=manifest.name, field="settings", error=BadMethod
+    )
+    chosen = {**manifest.presets.get(preset, {}), **settings.run.settings}
+    run = replace(settings.run, settings=chosen)
+    known = load_available() if networks is None else networks
+    evaluations = tuple(
+        CaptureEvaluation(
+            manifest, capture, split, run, settings.time_limit, settings.confinement, known
+        )
+        for capture, split in captures
+    )
+    started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
+    return Plan(manifest, settings.suite, preset, run, evaluations, started)
+
+
+def open_captures(
+    paths: Sequence[Path], splits: Mapping[str, Split] | None = None
+) -> list[tuple[Capture, Split]]:
+    """Open captures, each with its split.
+
+    Args:
+        paths: capture folders.
+        splits: splits by capture id; None applies the 80/10/10 rule.
+
+    Raises:
+        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong, or two have one id.
+    """
+    opened: list[tuple[Capture, Split]] = []
+    for path in paths:
+        capture = open_capture(path)
+        if any(other.info.id == capture.info.id for other, _ in opened):
+            raise BadCapture(
+                f"another capture has the id {capture.info.id!r} too",
+                where=path,
+                field="id",
+                remedy="Evaluate them one by one, each into its own folder.",
+            )
+        opened.append((capture, split_for(capture.info.id, len(capture), splits)))
+    return opened

@@ -1,0 +1,235 @@
+"""Recompute the digests and scores of a result from its stored predictions.
+
+PSNR and SSIM of some frames are computed a second time, by scikit-image.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from hwp_bench.base.errors import BadSplit, HwpError
+from hwp_bench.base.files import inside, sha256_json
+from hwp_bench.base.version import __version__
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.check import check_capture
+from hwp_bench.capture.splits import Split, split_for
+from hwp_bench.evaluation import cross_check
+from hwp_bench.evaluation.scoring import (
+    Target,
+    predictions_digest,
+    read_targets,
+    score_predictions,
+)
+from hwp_bench.methods.predictions import Prediction, read_predictions
+from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
+from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.score import Network
+from hwp_bench.results import CaptureResult, FrameResult, Results, read_results
+from hwp_bench.results.environment import environment
+
+#: Largest difference of a score that rounding on another processor may make.
+TOLERANCE = 1e-6
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """One part of a result that is not as the result says."""
+
+    #: Id of the capture; empty for the whole result.
+    capture: str
+    #: The part that was verified: `capture`, `split`, `frames`, `predictions`, `protocols`, or a
+    #: frame and metric.
+    what: str
+    #: Its value in the result.
+    recorded: str
+    #: Its value as it was found.
+    found: str
+
+
+@dataclass(frozen=True)
+class Verification:
+    """The outcome of the verification of one result."""
+
+    #: The result file.
+    file: str
+    #: Captures whose scores were recomputed.
+    captures: int
+    #: Frames whose scores were recomputed.
+    frames: int
+    #: The differences; empty where the result holds.
+    discrepancies: tuple[Discrepancy, ...]
+    #: Parts that could not be verified, or that differ without being wrong.
+    notes: tuple[str, ...]
+    #: Frames whose PSNR and SSIM scikit-image computed too.
+    cross_checked: int = 0
+
+
+def capture_folders(places: Sequence[Path]) -> list[Path]:
+    """Return the capture folders among some folders and their subfolders."""
+    found = []
+    for place in places:
+        candidates = [place, *(sorted(place.iterdir()) if place.is_dir() else [])]
+        found += [folder for folder in candidates if (folder / "capture.json").is_file()]
+    return found
+
+
+def verify_results(
+    file: Path, captures: Sequence[Path], splits: Mapping[str, Split] | None = None
+) -> Verification:
+    """Recompute the digests of captures, splits and predictions, and the scores, of a result.
+
+    Args:
+        file: the result file; the predictions lie in `captures/ID/predictions` next to it.
+        captures: folders of the captures; further ones do no harm.
+        splits: splits by capture id; None applies the 80/10/10 rule.
+
+    Raises:
+        BadInput, BadResult: the result file is missing or damaged.
+    """
+    results = read_results(file)
+    found: list[Discrepancy] = []
+    ours = {protocol.name: protocol.as_dict() for protocol in PROTOCOLS}
+    if results.protocols != ours:
+        found.append(Discrepancy("", "protocols", _brief(results.protocols), _brief(ours)))
+    known = _by_id(captures)
+    networks = load_available()
+    frames = scored = checked = 0
+    for record in results.captures:
+        differences, count, cross = _verify_capture(file.parent, record, known, splits, networks)
+        found += differences
+        frames += count
+        scored += count > 0
+        checked += cross
+    notes = _notes(results, networks)
+    return Verification(str(file), scored, frames, tuple(found), tuple(notes), checked)
+
+
+def _by_id(folders: Sequence[Path]) -> dict[str, list[Capture]]:
+    known: dict[str, list[Capture]] = {}
+    for folder in folders:
+        try:
+            capture = open_capture(folder)
+        except HwpError:
+            continue
+        known.setdefault(capture.info.id, []).append(capture)
+    return known
+
+
+def _verify_capture(
+    root: Path,
+    record: CaptureResult,
+    known: Mapping[str, Sequence[Capture]],
+    splits: Mapping[str, Split] | None,
+    networks: Mapping[str, Network],
+) -> tuple[list[Discrepancy], int, int]:
+    """Return the differences, and how many frames were scored again and cross-checked."""
+    name = record.id
+    candidates = known.get(name, [])
+    fitting = [capture for capture in candidates if capture.digest == record.digest]
+    if not fitting:
+        seen = ", ".join(capture.digest for capture in candidates) or "no capture of this id"
+        return [Discrepancy(name, "capture", record.digest, seen)], 0, 0
+    capture = fitting[0]
+    damage = [item for item in check_capture(capture.root).findings if item.level == "error"]
+    if damage:
+        problem = f"{damage[0].where}: {damage[0].problem}"
+        return [Discrepancy(name, "capture", "an intact capture", problem)], 0, 0
+    found: list[Discrepancy] = []
+    numbers = [frame.frame for frame in record.frames]
+    try:
+        split = split_for(name, len(capture), splits)
+    except BadSplit as error:
+        return [Discrepancy(name, "split", record.split_digest, error.problem)], 0, 0
+    if split.digest != record.split_digest:
+        found.append(Discrepancy(name, "split", record.split_digest, split.digest))
+    elif split.test.tolist() != numbers:
+        found.append(Discrepancy(name, "frames", str(numbers), str(split.test.tolist())))
+    if any(not 0 <= number < len(capture) for number in numbers):
+        return found, 0, 0
+    targets = read_targets(capture, numbers)
+    predictions = read_predictions(
+        inside(root, f"captures/{name}/predictions"), numbers, capture.size
+    )
+    digest = predictions_digest(predictions)
+    if digest != record.predictions_digest:
+        found.append(Discrepancy(name, "predictions", record.predictions_digest, digest))
+    for old, new in zip(
+        record.frames, score_predictions(targets, predictions, networks), strict=True
+    ):
+        found += _compare_frame(name, old, new)
+    differences, checked = _cross_check(record, targets, predictions)
+    return found + differences, len(numbers), checked
+
+
+def _cross_check(
+    record: CaptureResult, targets: Sequence[Target], predictions: Sequence[Prediction]
+) -> tuple[list[Discrepancy], int]:
+    """Compare some recorded scores with scikit-image's; returns differences and frames."""
+    found = []
+    valid = [place for place, item in enumerate(predictions) if item.pixels is not None]
+    sample = [valid[place] for place in cross_check.sample_frames(len(valid))] if valid else []
+    for place in sample:
+        target, pixels, old = targets[place], predictions[place].pixels, record.frames[place]
+        assert pixels is not None
+        scores = cross_check.reference_scores(
+            pixels, target.pixels, target.mask, coverage=target.exact
+        )
+        for metric, value in scores.items():
+            recorded = old.scores.get(metric)
+            if recorded is None or abs(recorded - value) > cross_check.TOLERANCE:
+                what = f"frame {old.frame}, {metric} by scikit-image"
+                found.append(Discrepancy(record.id, what, repr(recorded), repr(value)))
+    return found, len(sample)
+
+
+def _compare_frame(name: str, old: FrameResult, new: FrameResult) -> list[Discrepancy]:
+    place = f"frame {old.frame}"
+    found = []
+    if (old.failure is None) != (new.failure is None):
+        found.append(
+            Discrepancy(name, f"{place}, failure", old.failure or "none", new.failure or "none")
+        )
+    for metric, value in old.scores.items():
+        again = new.scores.get(metric)
+        if again is None and metric not in _with_weights():
+            found.append(Discrepancy(name, f"{place}, {metric}", repr(value), "no such metric"))
+        elif again is not None and abs(again - value) > TOLERANCE:
+            found.append(Discrepancy(name, f"{place}, {metric}", repr(value), repr(again)))
+    return found
+
+
+def _with_weights() -> set[str]:
+    """Names of the metrics that need weights which may not be here."""
+    return {facts.name for facts in METRICS if facts.weights is not None}
+
+
+def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
+    notes = []
+    here = metric_names(networks=networks)
+    absent = [name for name in results.metrics if name in _with_weights() and name not in here]
+    if absent:
+        notes.append(f"Not recomputed, because their weights are missing: {', '.join(absent)}.")
+    if results.toolkit != __version__:
+        notes.append(f"Made with version {results.toolkit}; this is {__version__}.")
+    mine = environment()
+    if results.environment.get("code") != mine["code"]:
+        notes.append("Made with other code of the toolkit than this.")
+    recorded = results.environment.get("packages")
+    theirs = recorded if isinstance(recorded, dict) else {}
+    ours = mine["packages"]
+    other = [
+        f"{package} {theirs.get(package, 'absent')} (here {ours.get(package, 'absent')})"
+        for package in sorted(theirs.keys() | ours.keys())
+        if theirs.get(package) != ours.get(package)
+    ]
+    if other:
+        notes.append(f"Made with other packages: {', '.join(other)}.")
+    return notes
+
+
+def _brief(protocols: Mapping[str, Any]) -> str:
+    digests = [f"{name} {sha256_json(value)[:12]}" for name, value in sorted(protocols.items())]
+    return ", ".join(digests) or "none"

@@ -1,0 +1,98 @@
+"""Which variants an ablation runs. Oracle: the grids of docs/statistics.md, by hand."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.progress import clock, remaining
+from hwp_bench.evaluation.ablate.design import make_design
+from hwp_bench.methods.manifest import MethodManifest, read_manifest
+
+MANIFEST = """
+schema = "hwp-method/1"
+name = "mine"
+[entry]
+python = "a:B"
+[switches.a]
+title = "A"
+settings_off = {a = false}
+[switches.b]
+title = "B"
+settings_off = {b = 0}
+[switches.c]
+title = "C"
+settings_off = {c = false, d = 1}
+[switches.alt]
+title = "Alt"
+settings_on = {a = "alt"}
+"""
+
+
+@pytest.fixture
+def manifest(tmp_path: Path) -> MethodManifest:
+    (tmp_path / "method.toml").write_text(MANIFEST)
+    return read_manifest(tmp_path)
+
+
+def names(design) -> list[str]:
+    return [variant.name for variant in design.variants]
+
+
+def test_without_names_the_first_two_components_are_crossed(manifest) -> None:
+    design = make_design(manifest)
+    assert names(design) == ["no-a+no-b", "no-a", "no-b", "full"]
+    assert dict(design.variants[0].settings) == {"a": False, "b": 0}
+    assert [variant.title for variant in design.variants] == [
+        "without A, B", "without A", "without B", "",
+    ]  # fmt: skip
+    a, _b, both = design.effects
+    assert (a.title, a.kind) == ("A", "main")
+    assert a.contrast == {"full": 0.5, "no-b": 0.5, "no-a": -0.5, "no-a+no-b": -0.5}
+    assert (both.title, both.kind) == ("A x B", "interaction")
+    assert both.contrast == {"full": 1, "no-a": -1, "no-b": -1, "no-a+no-b": 1}
+    # Two components taken out one by one, and both: the same grid.
+    assert make_design(manifest, ["a", "b"]) == design
+
+
+def test_named_switches_are_thrown_alone_and_together(manifest) -> None:
+    assert names(make_design(manifest, ["b"])) == ["no-b", "full"]
+    design = make_design(manifest, ["a", "b", "c", "alt"])
+    assert names(design) == ["no-a+no-b+no-c", "no-a", "no-b", "no-c", "full", "alt"]
+    assert [(effect.title, effect.kind) for effect in design.effects] == [
+        ("A", "out"), ("B", "out"), ("C", "out"), ("all of them", "out"),
+        ("not Alt", "alternative"),
+    ]  # fmt: skip
+    assert design.effects[2].contrast == {"full": 1, "no-c": -1}
+    assert names(make_design(manifest, ["alt"])) == ["full", "alt"]
+
+
+def test_three_components_are_crossed_on_request(manifest) -> None:
+    design = make_design(manifest, crossed=["a", "b", "c"])
+    assert len(design.variants) == 8
+    assert names(design)[0] == "no-a+no-b+no-c"
+    for effect in design.effects:
+        assert sum(effect.contrast.values()) == pytest.approx(0)
+        gain = 1 if effect.kind == "main" else 2
+        assert sum(f for f in effect.contrast.values() if f > 0) == pytest.approx(gain)
+    assert [effect.title for effect in design.effects][3:] == ["A x B", "A x C", "B x C"]
+
+
+def test_what_cannot_be_ablated_is_refused(manifest, tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"has no switch 'bb'.*Did you mean 'b'"):
+        make_design(manifest, ["bb"])
+    with pytest.raises(UsageError, match="either crossed or taken out"):
+        make_design(manifest, ["a"], ["b"])
+    with pytest.raises(UsageError, match="no alternatives, can be crossed"):
+        make_design(manifest, crossed=["a", "alt"])
+    (tmp_path / "method.toml").write_text(MANIFEST.split("[switches.a]")[0])
+    with pytest.raises(UsageError, match="declares no component"):
+        make_design(read_manifest(tmp_path))
+
+
+def test_the_remaining_time_ignores_what_was_found_finished() -> None:
+    assert remaining([], 3) is None
+    assert remaining([0.01, 0.02, 10.0, 12.0], 4) == pytest.approx(44)
+    assert (clock(59.6), clock(3723)) == ("1:00", "1:02:03")

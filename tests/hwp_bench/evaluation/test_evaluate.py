@@ -1,0 +1,239 @@
+"""Evaluation end to end. Oracles: the truth submitted as an entry, black images, arithmetic."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_captures import CaptureMaker
+
+from hwp_bench.base.errors import BadCapture, BadImage, BadSplit
+from hwp_bench.base.images import write_image
+from hwp_bench.capture import Capture
+from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
+from hwp_bench.methods.contract import RunSettings
+from hwp_bench.metrics import METRICS, PROTOCOLS, metric, penalty
+from hwp_bench.results import Results, read_results
+from hwp_bench.run.sandbox.confinement import Confinement
+
+# Some methods here note their fits beside themselves, which no sandbox would let them.
+SETTINGS = EvaluationSettings(confinement=Confinement("none"))
+
+
+def submission(folder: Path, captures: list[Capture], pixels=Capture.frame) -> Path:
+    """An entry that is nothing but predictions; `pixels(capture, frame)` makes them."""
+    for capture in captures:
+        target = folder / "predictions" / capture.info.id
+        for frame in contiguous_split(capture.info.id, len(capture)).test.tolist():
+            write_image(target / f"{frame:06d}.png", pixels(capture, frame))
+    (folder / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "entry"\n[entry]\npredictions = "predictions"\n'
+    )
+    return folder
+
+
+def run(entry: Path, captures: list[Capture], out: Path) -> Results:
+    return evaluate(str(entry), [capture.root for capture in captures], out, SETTINGS)
+
+
+def scores(results: Results) -> list[dict[str, float]]:
+    return [frame.scores for capture in results.captures for frame in capture.frames]
+
+
+@pytest.fixture
+def captures(make_capture: CaptureMaker) -> list[Capture]:
+    return [
+        make_capture("single", frames=20, size=48, truth=True),
+        make_capture("pair", frames=20, size=48, hands="both"),
+    ]
+
+
+def test_the_ground_truth_scores_perfectly_in_every_metric(captures, tmp_path: Path) -> None:
+    results = run(submission(tmp_path / "entry", captures), captures, tmp_path / "out")
+    rows = scores(results)
+    assert len(rows) == 4
+    weight_free = {facts.name for facts in METRICS if facts.weights is None}
+    for row in rows:
+        assert weight_free <= set(row)
+        for name, value in row.items():
+            assert value == pytest.approx(metric(name).perfect, abs=1e-9), name
+    assert [capture.exact_masks for capture in results.captures] == [True, False]
+    assert read_results(tmp_path / "out") == results
+    for name in ("worst", "median", "best", "comparison"):
+        assert (tmp_path / "out" / "captures" / "pair" / "pictures" / f"{name}.png").is_file()
+
+
+def test_black_images_score_what_arithmetic_says(captures, tmp_path: Path) -> None:
+    entry = submission(
+        tmp_path / "entry", captures, lambda capture, frame: np.zeros((48, 48, 3), np.uint8)
+    )
+    results = run(entry, captures, tmp_path / "out")
+    capture = captures[0]
+    for frame in results.captures[0].frames:
+        hand = capture.true_mask(frame.frame) == 255
+        error = ((capture.frame(frame.frame)[hand] / 255.0) ** 2).mean()
+        assert frame.scores["psnr"] == pytest.approx(-10 * np.log10(error), abs=1e-9)
+        share = hand.mean()
+        assert frame.scores["psnr_full"] == pytest.approx(-10 * np.log10(error * share), abs=1e-9)
+        assert frame.scores["ssim"] < 0.1
+
+
+def noisy(capture: Capture, frame: int) -> np.ndarray:
+    rng = np.random.default_rng(frame)
+    return np.clip(capture.frame(frame) + rng.normal(0, 20, (48, 48, 3)), 0, 255).astype(np.uint8)
+
+
+def test_order_extra_files_and_masks_in_a_submission_change_nothing(captures, tmp_path) -> None:
+    plain = run(submission(tmp_path / "a", captures, noisy), captures, tmp_path / "out-a")
+    entry = submission(tmp_path / "b", captures, noisy)
+    folder = entry / "predictions" / "single"
+    # Written again in the opposite order, with masks, other frames and files beside them.
+    files = sorted(folder.iterdir(), reverse=True)
+    contents = [(path, path.read_bytes()) for path in files]
+    shutil.rmtree(folder)
+    (folder / "masks").mkdir(parents=True)
+    for path, content in contents:
+        path.write_bytes(content)
+        write_image(folder / "masks" / path.name, np.zeros((48, 48), np.uint8))
+        write_image(folder / f"{path.stem}_mask.png", np.zeros((48, 48), np.uint8))
+    write_image(folder / "000001.png", np.zeros((48, 48, 3), np.uint8))
+    (folder / "notes.txt").write_text("hello")
+    (entry / "masks").mkdir()
+    other = run(entry, captures, tmp_path / "out-b")
+    assert scores(other) == scores(plain)
+    assert other.captures[0].predictions_digest == plain.captures[0].predictions_digest
+
+
+def test_an_alpha_channel_does_not_act_as_a_mask(captures, tmp_path: Path) -> None:
+    plain = run(submission(tmp_path / "a", captures, noisy), captures, tmp_path / "out-a")
+
+    def transparent(capture: Capture, frame: int) -> np.ndarray:
+        alpha = np.zeros((48, 48, 1), np.uint8)
+        return np.concatenate([noisy(capture, frame), alpha], axis=2)
+
+    other = run(submission(tmp_path / "b", captures, transparent), captures, tmp_path / "out-b")
+    assert scores(other) == scores(plain)
+
+
+def test_pixels_outside_the_mask_do_not_count(captures, tmp_path: Path) -> None:
+    def painted(capture: Capture, frame: int) -> np.ndarray:
+        mask, _ = capture.scoring_mask(frame)
+        return np.where(mask[:, :, None] > 127, noisy(capture, frame), 255).astype(np.uint8)
+
+    plain = run(submission(tmp_path / "a", captures, noisy), captures, tmp_path / "out-a")
+    other = run(submission(tmp_path / "b", captures, painted), captures, tmp_path / "out-b")
+    assert scores(other) == scores(plain)
+
+
+@pytest.mark.parametrize(
+    ("damage", "problem"),
+    [
+        (lambda path: path.unlink(), "000018.png: does not exist"),
+        (lambda path: path.write_bytes(b""), "000018.png: is empty"),
+        (lambda path: path.write_bytes(path.read_bytes()[:200]), "is damaged or truncated"),
+        (
+            lambda path: write_image(path, np.zeros((47, 48, 3), np.uint8)),
+            "is 48x47 pixels where 48x48",
+        ),
+    ],
+)
+def test_a_frame_that_cannot_be_scored_is_named_and_penalised(
+    captures, tmp_path: Path, damage, problem: str
+) -> None:
+    entry = submission(tmp_path / "entry", captures)
+    damage(entry / "predictions" / "single" / "000018.png")
+    results = run(entry, captures, tmp_path / "out")
+    bad, good = results.captures[0].frames
+    assert problem in bad.failure
+    assert bad.scores == {name: penalty(PROTOCOLS)[name] for name in bad.scores}
+    assert good.failure is None
+    assert good.scores["psnr"] == metric("psnr").perfect
+    assert results.captures[0].failed_frames == 1
+
+
+def test_a_capture_without_predictions_fails_by_name_and_the_rest_is_scored(
+    captures, tmp_path: Path
+) -> None:
+    entry = submission(tmp_path / "entry", captures)
+    shutil.rmtree(entry / "predictions" / "single")
+    results = run(entry, captures, tmp_path / "out")
+    assert "has no predictions for single" in results.captures[0].failure
+    assert results.captures[0].failed_frames == 2
+    assert results.captures[1].failure is None
+    assert results.captures[1].failed_frames == 0
+
+
+def counting_method(folder: Path, body: str = "") -> Path:
+    """A method that paints gray and notes each fit in a file beside itself."""
+    folder.mkdir()
+    (folder / "counting_method.py").write_text(
+        f"""
+import pathlib
+import numpy as np
+class Method:
+    steps = 4
+    def __init__(self, settings, seed): self.level = settings.get("level", 0.5)
+    def fit(self, training, budget, report):
+        {body or "pass"}
+        with open({str(folder / "fits.log")!r}, "a") as stream: stream.write(training.id + " ")
+        return self
+    def render(self, hands, camera):
+        return np.full((camera.height, camera.width, 4), self.level)
+"""
+    )
+    (folder / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "count"\n[entry]\npython = "counting_method:Method"\n'
+        "[presets.default]\nlevel = 0.5\n"
+    )
+    return folder
+
+
+def test_a_second_start_takes_what_is_finished_and_redoes_what_changed(
+    captures, tmp_path: Path
+) -> None:
+    method, out = counting_method(tmp_path / "method"), tmp_path / "out"
+    fits = method / "fits.log"
+    first = run(method, captures[:1], out)
+    second = run(method, captures, out)
+    assert fits.read_text() == "single pair "
+    assert second.captures[0] == first.captures[0]
+    assert first.captures[0].steps == 4
+    assert first.captures[0].curve[-1].scores["psnr"] > 0
+    changed = replace(SETTINGS, run=RunSettings({"level": 0.25}))
+    third = evaluate(str(method), [captures[0].root], out, changed)
+    assert fits.read_text() == "single pair single "
+    assert scores(third) != scores(first)
+
+
+def test_a_crash_on_one_capture_loses_nothing_and_is_tried_again(captures, tmp_path) -> None:
+    body = "if training.id == 'single': raise RuntimeError('no luck')"
+    method, out = counting_method(tmp_path / "method", body), tmp_path / "out"
+    results = run(method, captures, out)
+    assert "RuntimeError: no luck" in results.captures[0].failure
+    assert results.captures[1].failed_frames == 0
+    assert "RuntimeError: no luck" in (out / "captures" / "single" / "log.txt").read_text()
+    run(method, captures, out)
+    assert (method / "fits.log").read_text() == "pair "
+
+
+def test_faults_of_the_capture_are_errors_before_the_method_runs(
+    captures, make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    method = counting_method(tmp_path / "method")
+    single, pair = captures
+    with pytest.raises(BadCapture, match="another capture has the id 'single' too"):
+        run(method, [single, single], tmp_path / "out")
+    short = make_capture("short", frames=2, perturbations={})
+    with pytest.raises(BadSplit, match="has 2 frames, too few"):
+        run(method, [short], tmp_path / "out")
+    write_image(pair.root / "masks" / "000019.png", np.zeros((48, 48), np.uint8))
+    with pytest.raises(BadCapture, match="mask of test frame 19 leaves no pixel"):
+        run(method, [pair], tmp_path / "out")
+    (single.root / "frames" / "000018.png").write_bytes(b"")
+    with pytest.raises(BadImage, match=r"000018\.png: is empty"):
+        run(method, [single], tmp_path / "out")
+    assert not (method / "fits.log").exists()

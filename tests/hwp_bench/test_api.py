@@ -1,0 +1,132 @@
+"""The front door of the toolkit. Oracle: a fresh interpreter, and the commands' own functions."""
+
+from __future__ import annotations
+
+import ast
+import subprocess
+import sys
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from small_captures import CaptureMaker
+
+import hwp_bench
+from hwp_bench.capture import Capture
+from hwp_bench.metrics.score import score_frame
+from hwp_bench.results import Results, write_results
+
+METHOD = '''
+import numpy as np
+
+
+class Gray:
+    """Draws every pixel in one gray."""
+
+    def __init__(self, settings, seed):
+        self.gray = settings["gray"]
+
+    def fit(self, training, budget, report):
+        report(0, self)
+        return self
+
+    def render(self, hands, camera):
+        return np.full((camera.height, camera.width, 4), self.gray, np.float32)
+'''
+
+
+@pytest.fixture
+def gray_method(tmp_path: Path) -> Path:
+    folder = tmp_path / "gray"
+    folder.mkdir()
+    (folder / "gray_method.py").write_text(METHOD)
+    (folder / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "gray"\n[entry]\npython = "gray_method:Gray"\n'
+        "[presets.default]\ngray = 0.5\n"
+    )
+    return folder
+
+
+def test_the_import_is_light() -> None:
+    code = (
+        "import sys, hwp_bench, wildghand\n"
+        "print([name for name in ('numpy', 'torch') if name in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("package", ["hwp_bench", "wildghand"])
+def test_every_name_is_there_and_is_listed(package: str) -> None:
+    module = __import__(package)
+    assert set(module.__all__) <= set(dir(module))
+    for name in module.__all__:
+        assert getattr(module, name) is not None
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        module.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize("package", ["hwp_bench", "wildghand"])
+def test_type_checkers_see_the_same_names(package: str) -> None:
+    module = __import__(package)
+    tree = ast.parse(Path(str(module.__file__)).read_text("utf-8"))
+    block = next(node for node in tree.body if isinstance(node, ast.If))
+    names = {
+        alias.asname: node.module
+        for node in block.body
+        if isinstance(node, ast.ImportFrom)
+        for alias in node.names
+    }
+    assert names == module._HOMES
+
+
+def test_evaluate_takes_captures_and_folders_and_resumes(
+    gray_method: Path, make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    capture = make_capture(frames=20, size=48)
+    results = hwp_bench.evaluate(gray_method, capture, tmp_path / "out", settings={"gray": 0.25})
+    assert results.method.settings == {"gray": 0.25}
+    assert results.captures[0].failure is None
+    assert (tmp_path / "out" / "tables" / "overall.md").is_file()
+    again = hwp_bench.evaluate(
+        gray_method, [capture.root], tmp_path / "out", settings={"gray": 0.25}
+    )
+    assert again.captures == results.captures
+    assert hwp_bench.read_results(tmp_path / "out") == again
+
+
+def test_score_takes_float_images(make_capture: CaptureMaker) -> None:
+    capture = make_capture(frames=20, size=48)
+    image, mask = capture.frame(0), capture.mask(0)
+    gray = np.full_like(image, 128)
+    assert hwp_bench.score(gray, image, mask) == score_frame(gray, image, mask)
+    assert hwp_bench.score(gray / np.float32(255), image / 255.0, mask) == score_frame(
+        gray, image, mask
+    )
+    assert hwp_bench.score(image, image, mask)["psnr"] == 100.0
+
+
+def test_compare_takes_results_and_folders(
+    make_results: Callable[..., Results], tmp_path: Path
+) -> None:
+    first = make_results()
+    second = replace(first, method=replace(first.method, name="other", title="Other"))
+    write_results(tmp_path / "results.json", second)
+    found = hwp_bench.compare(first, tmp_path, metrics=["psnr"], resamples=200)
+    assert found.metrics["psnr"].differences[0].scope == "macro"
+    assert all(item.estimate.value == 0.0 for item in found.metrics["psnr"].differences)
+    assert "| Other |" in str(found)
+    assert repr(found).startswith("Comparison(")
+    with pytest.raises(hwp_bench.HwpError, match="only one method"):
+        hwp_bench.compare(first)
+
+
+def test_a_capture_gives_poses_and_cameras_and_says_what_it_is(make_capture: CaptureMaker) -> None:
+    capture = hwp_bench.open_capture(make_capture("mine", frames=20, size=48).root)
+    assert isinstance(capture, Capture)
+    assert "mine" in repr(capture)
+    pose, camera = capture.hand_poses(3)["right"], capture.camera(3)
+    np.testing.assert_array_equal(pose.pose, capture.hands["right"].pose[3])
+    assert (camera.width, camera.height) == (48, 48)

@@ -1,0 +1,269 @@
+"""A whole fit at toy size: it learns, repeats, stops and goes on, and fails in one line.
+
+Oracles: a capture drawn with the plain avatar, the fit that was never stopped, and the avatar
+before it was written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from painted import FRAMES, SIZE, SilentReport
+
+from hwp_bench.base.errors import BadInput, DidNotConverge, UsageError
+from hwp_bench.base.images import read_rgb
+from hwp_bench.capture import Capture
+from hwp_bench.methods import find_method, read_manifest
+from hwp_bench.methods.contract import Budget, TrainingCapture
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.avatar.files import load_avatar, save_avatar
+from wildghand.cli.main import main
+from wildghand.fitting import fit_capture
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.method import WildGHandMethod
+from wildghand.fitting.optimise import Watchers, optimise
+from wildghand.fitting.parallel import World
+from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.model.settings import read_settings
+from wildghand.splat import rasterize
+
+QUICK: dict[str, Any] = {
+    "gaussians": 600,
+    "schedule.steps": 60,
+    "device": "cpu",
+    "network.identity_resolution": 40,
+    "network.plane_resolution": 20,
+}
+TrainingMaker = Callable[..., TrainingCapture]
+
+
+def fitted(training: TrainingCapture, steps: int = 60, **changes: Any) -> WildGHandAvatar:
+    return WildGHandMethod({**QUICK, "schedule.steps": steps, **changes}, 0).fit(
+        training, Budget(), SilentReport()
+    )
+
+
+def error(avatar: WildGHandAvatar, training: TrainingCapture, frame: int) -> float:
+    truth = training.frame(frame).astype(float) / 255.0
+    hand = training.mask(frame) > 127
+    drawn = avatar.render(training.hand_poses(frame), training.camera(frame))[..., :3]
+    return float(np.abs(drawn - truth)[hand].mean())
+
+
+@pytest.mark.parametrize("hands", ["right", "both"])
+def test_a_fit_learns_what_the_frames_show(hands: str, make_training: TrainingMaker) -> None:
+    training = make_training(hands)
+    start, end = fitted(training, steps=1), fitted(training)
+    frame = int(training.validation[0])
+    assert error(end, training, frame) < 0.6 * error(start, training, frame)
+    assert end.steps == QUICK["schedule.steps"]
+    assert set(end.record.temporal) == set(training.sides)
+    assert sorted(end.weight_masks) == end.record.frames == training.train.tolist()
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"dpd.enabled": False},
+        {"pao.enabled": False},
+        {"heads.enabled": False},
+        {"pao.variant": "binary"},
+        {"pao.robust": True, "pao.robust_start": 0.0},
+        {"mode": "paper"},
+        {"prepass.enabled": False},
+        {"schedule.decay": "halving"},
+    ],
+    ids=str,
+)
+def test_every_variant_stays_finite(changes: dict[str, Any], make_training: TrainingMaker) -> None:
+    training = make_training()
+    avatar = fitted(training, steps=12, **changes)
+    assert avatar.model.finite()
+    image = avatar.render(training.hand_poses(0), training.camera(0))
+    assert image.shape == (SIZE, SIZE, 4)
+    assert np.isfinite(image).all()
+    assert image[..., 3].max() > 0.5
+    assert bool(avatar.record.temporal) == changes.get("dpd.enabled", True)
+
+
+def test_the_same_seed_gives_the_same_bits_and_another_does_not(
+    make_training: TrainingMaker,
+) -> None:
+    training = make_training()
+    first, again = (fitted(training, steps=8).model.snapshot() for _ in range(2))
+    assert all(torch.equal(first[name], again[name]) for name in first)
+    other = WildGHandMethod({**QUICK, "schedule.steps": 8}, 1).fit(
+        training, Budget(), SilentReport()
+    )
+    assert any(not torch.equal(first[n], v) for n, v in other.model.snapshot().items())
+
+
+def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
+    make_training: TrainingMaker, tmp_path: Path
+) -> None:
+    training, device = make_training(), torch.device("cpu")
+    settings = read_settings({**QUICK, "schedule.steps": 30})
+
+    class Stopped(Exception):
+        pass
+
+    def stop(step: int, watchers: Watchers) -> None:
+        if step == 17:
+            save_state(
+                tmp_path / "state", half, watchers, step=step, seconds=1.5, digest="of this fit"
+            )
+            raise Stopped
+
+    report = SilentReport()
+    whole = optimise(Fit(training, settings, 0, device), Budget(), report)
+    assert [step for step, _ in report.offers] == list(range(31))
+    half = Fit(training, settings, 0, device)
+    with pytest.raises(Stopped):
+        optimise(half, Budget(), SilentReport(), after_step=stop)
+    rest, watchers = Fit(training, settings, 0, device), Watchers(0)
+    assert load_state(tmp_path / "state", rest, watchers, "of this fit") == (17, 1.5)
+    resumed = optimise(rest, Budget(), SilentReport(), start=17, watchers=watchers)
+    expected, found = whole.model.snapshot(), resumed.model.snapshot()
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+    with pytest.raises(BadInput, match="another capture"):
+        load_state(tmp_path / "state", rest, watchers, "of another")
+    (tmp_path / "state").write_bytes(b"PK\x03\x04 no state")
+    with pytest.raises(BadInput, match=r"state.*is damaged.*Remove it"):
+        load_state(tmp_path / "state", rest, watchers, "of this fit")
+
+
+def test_rates_far_too_high_stop_with_a_message_or_keep_the_best(
+    make_training: TrainingMaker, capsys: pytest.CaptureFixture[str]
+) -> None:
+    training = make_training()
+    high = {
+        f"schedule.rates.{name}": 3.0 for name in ("identity", "direct", "light", "network", "dpd")
+    }
+    high["schedule.clip_gradient"] = 0
+    try:
+        avatar = fitted(training, steps=150, **high)
+    except DidNotConverge:
+        return
+    assert avatar.model.finite()
+    if avatar.steps < 150:
+        assert "the state of step" in capsys.readouterr().err
+
+
+def test_an_avatar_is_read_as_it_was_written(make_training: TrainingMaker, tmp_path: Path) -> None:
+    training = make_training("both")
+    avatar = fitted(training, steps=5)
+    save_avatar(avatar, tmp_path / "avatar")
+    read = load_avatar(tmp_path / "avatar")
+    poses, camera = training.hand_poses(3), training.camera(3)
+    np.testing.assert_array_equal(avatar.render(poses, camera), read.render(poses, camera))
+    assert read.record == avatar.record
+    assert len(list((tmp_path / "avatar" / "weights").iterdir())) == len(avatar.record.frames)
+    with pytest.raises(UsageError):
+        save_avatar(avatar, tmp_path / "avatar")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("avatar.json", "{}", "is missing"),
+        ("avatar.json", "[" * 5000, "avatar"),
+        ("model.safetensors", "no tensors", "tensors"),
+    ],
+)
+def test_damaged_avatars_are_one_line(
+    name: str, content: str, message: str, make_training: TrainingMaker, tmp_path: Path
+) -> None:
+    save_avatar(fitted(make_training(), steps=1), tmp_path / "avatar")
+    (tmp_path / "avatar" / name).write_text(content)
+    with pytest.raises(BadInput, match=message) as caught:
+        load_avatar(tmp_path / "avatar")
+    assert "\n" not in str(caught.value)
+
+
+def test_the_commands_make_draw_and_export_an_avatar(
+    make_painted: Callable[..., Capture], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    capture, avatar = make_painted().root, tmp_path / "avatar"
+    options = [word for name, value in QUICK.items() for word in ("--set", f"{name}={value}")]
+    assert main(["fit", str(capture), "-o", str(avatar), "--steps", "5", *options]) == 0
+    assert not (tmp_path / "avatar.fit").exists()
+    assert "5 steps" in capsys.readouterr().out
+    assert main(["fit", str(capture), "-o", str(avatar)]) == 2
+    pictures = tmp_path / "pictures"
+    words = ["render", str(avatar), "--poses", str(capture), "-o", str(pictures)]
+    assert main([*words, "--frames", "2:5", "--video", str(tmp_path / "clip.mp4")]) == 0
+    assert sorted(path.name for path in pictures.iterdir()) == [f"{f:06d}.png" for f in (2, 3, 4)]
+    assert read_rgb(pictures / "000002.png").max() > 0
+    assert (tmp_path / "clip.mp4").stat().st_size > 0
+    assert main(["export", str(avatar), "--ply", str(tmp_path / "hand.ply")]) == 0
+    header, _, body = (tmp_path / "hand.ply").read_bytes().partition(b"end_header\n")
+    assert b"element vertex 600" in header
+    # x y z, normal, f_dc, opacity, scale, rotation.
+    table = np.frombuffer(body, "<f4").reshape(600, 17)
+    assert np.isfinite(table).all()
+    np.testing.assert_allclose(np.linalg.norm(table[:, 13:], axis=1), 1.0, atol=1e-5)
+    assert (
+        main(["render", str(avatar), "--poses", str(capture), "-o", "x", "--frames", "9:99"]) == 2
+    )
+
+
+def test_from_python_nothing_is_written(
+    make_painted: Callable[..., Capture], tmp_path: Path
+) -> None:
+    source = make_painted().root
+    before = sorted(path.name for path in source.parent.iterdir())
+    changes = {**QUICK, "schedule.steps": 3}
+    avatar = fit_capture(source, settings=changes)
+    written = fit_capture(str(source), str(tmp_path / "avatar"), settings=changes)
+    assert sorted(path.name for path in source.parent.iterdir()) == before
+    for name, value in avatar.model.snapshot().items():
+        assert torch.equal(value, written.model.snapshot()[name])
+    assert repr(avatar) == (
+        "WildGHandAvatar(right hand of anny-1, 600 Gaussians each, 3 steps on 32 frames)"
+    )
+    with pytest.raises(UsageError, match="several processes"):
+        fit_capture(source, settings={**changes, "schedule.batch": 2}, world=World(0, 2))
+
+
+@pytest.mark.parametrize("hands", ["right", "both"])
+def test_posed_gaussians_are_what_is_drawn(hands: str, make_training: TrainingMaker) -> None:
+    training = make_training(hands)
+    avatar = fitted(training, steps=2)
+    poses, camera = training.hand_poses(3), training.camera(3)
+    posed = avatar.gaussians(poses)
+    count = len(training.sides) * QUICK["gaussians"]
+    assert len(posed) == count
+    shapes = [np.shape(array) for array in (posed.means, posed.quats, posed.scales, posed.colors)]
+    assert shapes == [(count, 3), (count, 4), (count, 3), (count, 3)]
+    assert posed.opacities.shape == (count,)
+    np.testing.assert_allclose(np.linalg.norm(posed.quats, axis=1), 1.0, atol=1e-5)
+    image, coverage, _ = rasterize(
+        *(
+            torch.from_numpy(array)[None]
+            for array in (posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
+        ),
+        torch.from_numpy(camera.viewmat).float()[None],
+        torch.from_numpy(camera.K).float()[None],
+        camera.width,
+        camera.height,
+    )
+    drawn = torch.cat((image, coverage), dim=-1)[0].clamp(0.0, 1.0).numpy()
+    np.testing.assert_allclose(drawn, avatar.render(poses, camera), atol=1e-6)
+
+
+def test_settings_of_presets_and_switches() -> None:
+    for name in ("wildghand", "interaction-gaussian"):
+        manifest = read_manifest(find_method(name))
+        for preset in manifest.presets.values():
+            read_settings(preset)
+        for switch in manifest.switches.values():
+            read_settings(switch.settings)
+    base = read_manifest(find_method("interaction-gaussian")).presets["mini"]
+    assert not read_settings(base).dpd.enabled
+    assert not read_settings(base).pao.enabled
+    assert FRAMES > 0

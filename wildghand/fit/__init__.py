@@ -1,5 +1,0 @@
-"""The fit of an avatar to a capture."""
-
-from wildghand.fit.session import fit_capture
-
-__all__ = ["fit_capture"]

@@ -1,0 +1,302 @@
+"""A fit: how it is made from a capture, everything that changes from step to step, and one step."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import torch
+
+from hwp_bench.capture.schema import HandModelId
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
+from wildghand.dpd.dpd import drop
+from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.fitting.objective import Objective
+from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
+from wildghand.fitting.weighting import Weighting, assess_frames
+from wildghand.gaussians.training import TrainingClip, load_frames
+from wildghand.model.assemble import make_model
+from wildghand.model.model import RenderedFrames, WildGHandModel
+from wildghand.model.settings import WildGHandSettings
+from wildghand.network import parameter_groups
+from wildghand.pao.pao import PerturbationAwareWeights
+from wildghand.prior.files import choose_prior
+
+# Gradients of a mean over all pixels are small next to Adam's usual 1e-8.
+_EPSILON = 1e-15
+_BETAS = (0.9, 0.99)
+
+
+class Fit:
+    """One fit of one capture.
+
+    Args:
+        training: what may be seen of the capture.
+        settings: how.
+        seed: of anchors, initial weights, order of the frames, and dropout.
+        device: where it runs.
+        world: the processes that share its batches.
+
+    Raises:
+        BadInput: no training frame can be used, or the prior is damaged or of another kind.
+    """
+
+    def __init__(
+        self,
+        training: TrainingCapture,
+        settings: WildGHandSettings,
+        seed: int,
+        device: torch.device,
+        world: World = SINGLE_PROCESS,
+    ) -> None:
+        self.training = training
+        self.settings = settings
+        self.seed = seed
+        self.device = device
+        self.world = world
+        self.frames = load_frames(training)
+        self.mean_color = self.frames.mean_color()
+        templates = {side: training.template(side) for side in training.sides}
+        self.model = make_model(
+            templates, settings, self.mean_color, len(self.frames), seed, device
+        )
+        self.source = {"capture": training.id}
+        self.source |= start_from_prior(self.model, settings, training.hand_model)
+        self.clip = TrainingClip(training, self.frames.indices, self.model.rigs, device)
+        assessment = assess_frames(training, self.frames, settings)
+        self.weighting = Weighting(self.frames, len(training.sides), assessment, settings, device)
+        temporal = begin_temporal_weights(self.model, self.weighting.clean, settings)
+        self.objective = Objective(settings, self.model.rigs, temporal)
+        self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
+        self.generator = torch.Generator().manual_seed(seed)
+
+    def step(self, rows: torch.Tensor, fraction: float) -> float:
+        """Take one step on a batch, of which each process draws its part.
+
+        Args:
+            rows: (B,) int64, which of the training frames; the same in every process.
+            fraction: share of the budget that is used up.
+
+        Returns:
+            The loss, the same in every process; nothing is changed where it is not finite.
+
+        Raises:
+            UsageError: the processes cannot share the batch evenly.
+            PeerLost: another process has ended.
+        """
+        settings, weighting, world = self.settings, self.weighting, self.world
+        set_rates(self.optimizer, settings, fraction)
+        part = world.shard(len(rows))
+        mine = rows[part]
+        kept = {side: keep[part] for side, keep in self._keep(rows).items()}
+        drawing = self.draw(mine, kept, move=weighting.moves(rows))
+        target = weighting(rows, drawing, fraction, world)
+        loss = self.objective(self.model, drawing, target, mine, weighting.clean[mine])
+        value = float(world.average_(loss.detach().clone()))
+        if not math.isfinite(value):
+            return value
+        self.optimizer.zero_grad(set_to_none=True)
+        loss.backward()
+        average_gradients(
+            (tensor for group in self.optimizer.param_groups for tensor in group["params"]), world
+        )
+        limit = settings.schedule.clip_gradient
+        if limit > 0.0:
+            torch.nn.utils.clip_grad_norm_(self.model.parameters(), limit)
+        self.optimizer.step()
+        return value
+
+    def require_same(self, step: int) -> None:
+        """Check that all processes start from the same state.
+
+        Args:
+            step: steps behind it.
+
+        Raises:
+            HwpError: one does not.
+        """
+        if self.world.size == 1:
+            return
+        weighting = self.weighting
+        numbers = {**self.model.state_dict(), **weighting.pao.state_dict()}
+        numbers |= {"clean": weighting.clean, "dropped": weighting.drop_probability}
+        numbers |= {"frames": torch.from_numpy(self.frames.indices)}
+        self.world.require_same(digest_of(numbers, step))
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that steps change; what `load_state_dict` takes."""
+        return {
+            "model": self.model.state_dict(),
+            "thresholds": self.weighting.pao.state_dict(),
+            "median": self.weighting.median,
+            "optimizer": self.optimizer.state_dict(),
+            "generator": self.generator.get_state(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.model.load_state_dict(state["model"])
+        self.weighting.pao.load_state_dict(state["thresholds"])
+        self.weighting.median = None if state["median"] is None else float(state["median"])
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.generator.set_state(state["generator"].cpu())
+
+    def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
+        """(B,) bool by side: which frames of a batch keep their biases in this step."""
+        ones, chances = torch.ones(len(rows)), self.weighting.drop_probability[rows]
+        return {side: drop(ones, chances, self.generator) > 0.0 for side in self.model.perturbation}
+
+    def draw(
+        self,
+        rows: torch.Tensor,
+        kept: Mapping[str, torch.Tensor] | None = None,
+        *,
+        move: bool | None = None,
+    ) -> RenderedFrames:
+        """Draw training frames with everything that is particular to them.
+
+        Args:
+            rows: (B,) int64, which of the training frames.
+            kept: (B,) bool by side, whether a frame keeps its biases; None: every one does.
+            move: refine the poses of the frames; None: if any of them needs it.
+        """
+        with self._precision():
+            return self.model.draw_frames(
+                self.clip,
+                rows,
+                self.training.width,
+                self.training.height,
+                kept=kept,
+                shares=self.weighting.shares(rows),
+                move=self.weighting.moves(rows) if move is None else move,
+                refine=self.settings.heads.refinement,
+            )
+
+    def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
+        """The avatar as it stands; it goes on changing with the fit.
+
+        Args:
+            steps: optimiser steps behind it.
+            seconds: of fitting.
+            final: also record the temporal weights and weight masks of all frames.
+        """
+        hands = self.training.hands
+        return WildGHandAvatar(
+            self.model,
+            self.settings,
+            self.training.hand_model,
+            {side: hands[side].betas for side in self.model.rigs},
+            self.mean_color,
+            self.seed,
+            FitRecord(
+                frames=self.frames.indices.tolist(),
+                temporal=self._temporal() if final else {},
+                clean=self.weighting.clean.tolist(),
+                frame_weights=self.weighting.frame_weights.tolist(),
+                steps=steps,
+                seconds=seconds,
+                source=dict(self.source),
+            ),
+            self._weight_masks() if final else None,
+        )
+
+    @torch.no_grad()
+    def _weight_masks(self) -> dict[int, np.ndarray]:
+        """The weights of pixels within every training frame as pictures, 255 = full weight.
+
+        The paper's equations have no bound: with them 255 is the largest weight of the frame.
+        """
+        masks = {}
+        unbounded = self.settings.pao.variant == "paper"
+        if self.settings.pao.enabled:
+            for row, frame in enumerate(self.frames.indices.tolist()):
+                rows = torch.tensor([row])
+                weights = self.weighting(rows, self.draw(rows), 1.0).weights[0]
+                largest = weights.max().clamp(min=1e-12 if unbounded else 1.0)
+                masks[frame] = (255.0 * weights / largest).byte().cpu().numpy()
+        return masks
+
+    def _precision(self) -> torch.autocast:
+        enabled = self.settings.mixed_precision and self.device.type == "cuda"
+        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
+
+    @torch.no_grad()
+    def _temporal(self) -> dict[str, list[float]]:
+        rows = torch.arange(len(self.frames), device=self.device)
+        return {
+            side: self.model.biases_of(side).temporal(rows).omega.tolist()
+            for side in self.model.perturbation
+        }
+
+
+def start_from_prior(
+    model: WildGHandModel, settings: WildGHandSettings, hand_model: HandModelId
+) -> dict[str, str]:
+    """Put the prior's weights in place of the network's, where the settings have one.
+
+    Returns:
+        What an avatar says of it: the digest of the weights as `prior`, or nothing.
+
+    Raises:
+        BadInput: the prior is damaged or of another kind.
+    """
+    prior = choose_prior(settings, hand_model, model.network)
+    if prior is None:
+        return {}
+    prior.initialise(model.network)
+    return {"prior": prior.record.weights}
+
+
+def begin_temporal_weights(
+    model: WildGHandModel, clean: torch.Tensor, settings: WildGHandSettings
+) -> TemporalTarget | None:
+    """Bring temporal weights to what the pre-pass found; None without it or without DPD.
+
+    Args:
+        model: it is changed.
+        clean: (R,) probability that a frame is clean.
+        settings: of the fit.
+    """
+    if not (settings.dpd.enabled and settings.prepass.enabled):
+        return None
+    device = model.log_gains.device
+    temporal = TemporalTarget.judged(clean.to(device), settings.dpd.omega_scale)
+    temporal.begin(model.biases)
+    return temporal
+
+
+def make_optimizer(
+    model: WildGHandModel, weights: PerturbationAwareWeights, settings: WildGHandSettings
+) -> torch.optim.Adam:
+    """Adam over everything that is fitted; each group keeps its first rate as `start`."""
+    rates = settings.schedule.rates
+    groups = {name: list(group) for name, group in parameter_groups(model.network).items()}
+    groups["dpd"] = list(model.perturbation.parameters())
+    groups["thresholds"] = list(weights.parameters())
+    groups["gains"] = [model.log_gains]
+    groups["pose"] = [model.pose_steps]
+    groups["transl"] = [model.transl_steps]
+    return torch.optim.Adam(
+        [
+            {"params": group, "lr": getattr(rates, name), "start": getattr(rates, name)}
+            for name, group in groups.items()
+            if group
+        ],
+        eps=_EPSILON,
+        betas=_BETAS,
+        fused=True,
+    )
+
+
+def set_rates(optimizer: torch.optim.Adam, settings: WildGHandSettings, fraction: float) -> None:
+    """Set the steps for a share of the budget that is used up."""
+    schedule = settings.schedule
+    if schedule.decay == "halving":
+        factor = 0.5 ** int(fraction * schedule.halvings)
+    else:
+        factor = schedule.final_rate**fraction
+    for group in optimizer.param_groups:
+        group["lr"] = group["start"] * factor

@@ -1,0 +1,45 @@
+"""WildGHand as an entry of the benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from hwp_bench.methods.contract import Budget, Report, TrainingCapture
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.optimise import optimise, ready_device
+from wildghand.model.settings import read_settings
+
+
+class WildGHandMethod:
+    """See `hwp_bench.methods.contract.Method`.
+
+    Args:
+        settings: any of the fields of `wildghand.model.settings.WildGHandSettings`.
+        seed: of anchors, initial weights, order of the frames and dropout; on one machine's CPU
+            the same seed and number of steps give the same avatar bit for bit.
+
+    Raises:
+        BadMethod: a setting is unknown or out of range.
+        MissingDependency: CUDA was asked for and is not there.
+    """
+
+    def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
+        self.settings = read_settings(settings)
+        self.seed = seed
+        self.device = ready_device(self.settings.device)
+
+    def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> WildGHandAvatar:
+        """Fit an avatar to the training frames (the validation frames are left alone).
+
+        Args:
+            training: what the method may see of the capture.
+            budget: when to stop; without steps the settings' number holds.
+            report: where checkpoints are offered.
+
+        Raises:
+            BadInput: no training frame can be used.
+            DidNotConverge: the fit diverged at once.
+        """
+        return optimise(Fit(training, self.settings, self.seed, self.device), budget, report)

@@ -1,0 +1,113 @@
+"""What is minimised: the weighted reconstruction and the regularisers."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+from torch import Tensor
+
+from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.fitting.weighting import FrameTarget
+from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.laplacian import surface_laplacian
+from wildghand.gaussians.perceptual import FilterBankLoss
+from wildghand.gaussians.rig import HandRig
+from wildghand.model import terms
+from wildghand.model.model import RenderedFrames, WildGHandModel
+from wildghand.model.settings import WildGHandSettings
+
+
+class Objective:
+    """The loss of a batch; terms of weight 0 cost nothing.
+
+    Args:
+        settings: weights of the terms.
+        rigs: by side.
+        temporal: what holds the temporal weights; None: nothing.
+    """
+
+    def __init__(
+        self,
+        settings: WildGHandSettings,
+        rigs: Mapping[str, HandRig],
+        temporal: TemporalTarget | None = None,
+    ) -> None:
+        self.settings = settings
+        self.temporal = temporal
+        self.weights = settings.terms
+        smooth = (
+            self.weights.laplacian_offsets,
+            self.weights.laplacian_scales,
+            self.weights.laplacian_colors,
+        )
+        self._laplacians = (
+            {side: surface_laplacian(rig) for side, rig in rigs.items()} if any(smooth) else {}
+        )
+        self._perceptual = FilterBankLoss() if self.weights.perceptual else None
+
+    def __call__(
+        self,
+        model: WildGHandModel,
+        drawing: RenderedFrames,
+        target: FrameTarget,
+        rows: Tensor,
+        clean: Tensor,
+    ) -> Tensor:
+        """The loss, a scalar.
+
+        Args:
+            model: what is fitted.
+            drawing: of B frames.
+            target: what they are compared with.
+            rows: (B,) which of the training frames they are.
+            clean: (B,) probability that a frame is clean.
+        """
+        weights, settings = self.weights, self.settings
+        image = drawing.image
+        total = weights.reconstruction * terms.reconstruction(
+            image, target.image, target.weights, weights.dssim_weight
+        )
+        if self._perceptual is not None:
+            found = self._perceptual(image, target.image, target.weights)
+            total = total + weights.perceptual * found
+        if weights.silhouette:
+            total = total + weights.silhouette * terms.silhouette(drawing.coverage, target.hand)
+        if weights.weight_reward and target.weights.requires_grad:
+            total = total + weights.weight_reward * terms.weight_reward(target.weights)
+        for side, hand in drawing.hands.items():
+            if weights.bias and hand.biases is not None:
+                total = total + weights.bias * terms.bias_size(hand.biases)
+            if weights.shadow:
+                total = total + weights.shadow * terms.distance_to_one(hand.prediction.shadow)
+            if weights.opacity:
+                total = total + weights.opacity * terms.distance_to_one(hand.opacities)
+            total = total + self._roughness(
+                side, hand.prediction.raw, hand.prediction.template_offsets
+            )
+        if weights.cross_hand and len(drawing.hands) == 2:
+            left, right = (drawing.hands[side].prediction.texture for side in ("left", "right"))
+            total = total + weights.cross_hand * terms.cross_hand(left, right)
+        if self.temporal is not None and settings.dpd.omega_weight:
+            held = self.temporal.temporal_loss(model.biases, int(rows[0]))
+            total = total + settings.dpd.omega_weight * held
+        if settings.dpd.gains:
+            # Clean frames have no gain: without this prior gain and colours could trade places.
+            size = model.log_gains[rows].square().mean(dim=-1)
+            total = total + settings.dpd.gain_weight * (clean.to(size) * size).mean()
+        return total
+
+    def _roughness(self, side: str, raw: RawAttributes, offsets: Tensor) -> Tensor:
+        weights = self.weights
+        total = offsets.new_zeros(())
+        if not self._laplacians:
+            return total
+        laplacian = self._laplacians[side]
+        if weights.laplacian_offsets and self.settings.heads.enabled:
+            total = total + weights.laplacian_offsets * laplacian.offsets(offsets)
+        if weights.laplacian_scales:
+            total = total + weights.laplacian_scales * laplacian.roughness(raw.log_scales)
+        if weights.laplacian_colors:
+            total = total + weights.laplacian_colors * laplacian.roughness(
+                raw.logit_colors.sigmoid()
+            )
+        return total

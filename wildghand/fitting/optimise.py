@@ -1,0 +1,158 @@
+"""The loop of a fit: steps within a budget, checkpoints, and what is kept of a failed one."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import torch
+
+from hwp_bench.base.progress import notice
+from hwp_bench.methods.contract import Budget, Report
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.parallel import World
+from wildghand.gaussians.fit_loop import Guard, batches, choose_device, spent
+from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
+from wildghand.splat.warmup import warm_up
+
+#: Fall of the mean loss from window to window, as a share, that still counts as progress.
+PROGRESS = 1e-3
+
+
+class Watchers:
+    """What watches the loss of a fit.
+
+    Args:
+        plateau_steps: window of the plateau; 0 never stops early.
+    """
+
+    def __init__(self, plateau_steps: int) -> None:
+        self.guard: Guard[dict[str, torch.Tensor]] = Guard()
+        self.plateau = Plateau(plateau_steps)
+
+    def state_dict(self) -> dict[str, Any]:
+        """What `load_state_dict` takes."""
+        return {"guard": self.guard.state_dict(), "plateau": self.plateau.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.guard.load_state_dict(state["guard"])
+        self.plateau.load_state_dict(state["plateau"])
+
+
+def ready_device(name: str) -> torch.device:
+    """Choose the device, and compile for it what a fit needs.
+
+    Compiling takes some ten seconds, once on a machine. It is not a part of a fit, so this goes
+    before its clock.
+
+    Args:
+        name: `auto`, `cpu` or `cuda`.
+
+    Raises:
+        MissingDependency: CUDA was asked for and is not there.
+    """
+    device = choose_device(name)
+    if device.type == "cpu":
+        warm_up()
+        warm_up_loss()
+    return device
+
+
+def optimise(
+    fit: Fit,
+    budget: Budget,
+    report: Report,
+    *,
+    start: int = 0,
+    watchers: Watchers | None = None,
+    after_step: Callable[[int, Watchers], None] | None = None,
+) -> WildGHandAvatar:
+    """Take steps until the budget is spent, the loss stands still, or the fit diverges.
+
+    Args:
+        fit: what is fitted.
+        budget: when to stop; without steps the settings' number holds.
+        report: where checkpoints are offered.
+        start: steps that `fit` has behind it.
+        watchers: those of the fit so far, where it goes on.
+        after_step: called with the number of steps after each; saves, for instance.
+
+    Returns:
+        The last state; the best one if the fit diverged later. Of several processes, rank 0's
+        has the record of the weights.
+
+    Raises:
+        DidNotConverge: the fit diverged without ever having been better than its start.
+    """
+    settings, world = fit.settings, fit.world
+    steps = settings.schedule.steps if budget.steps is None else budget.steps
+    order = batches(len(fit.frames), settings.schedule.batch, fit.seed)
+    for _ in range(start):
+        next(order)
+    watchers = watchers or Watchers(settings.schedule.plateau_steps)
+    step = start
+    report(step, fit.avatar(step))
+    while step < steps:
+        # All processes go by the clock of rank 0, or some would stop a step before the others.
+        fraction = world.broadcast(spent(step, steps, budget, report))
+        if fraction >= 1.0:
+            break
+        loss = fit.step(next(order), fraction)
+        if not watchers.guard.watch(step, loss, fit.model):
+            fit.model.load_state_dict(watchers.guard.best())
+            kept = watchers.guard.step
+            _tell(world, f"The fit diverged at step {step}; the state of step {kept} is kept.")
+            step = kept
+            break
+        step += 1
+        report.progress(step, steps)
+        report(step, fit.avatar(step))
+        if after_step is not None:
+            after_step(step, watchers)
+        if watchers.plateau.reached(loss):
+            window = settings.schedule.plateau_steps
+            _tell(world, f"The loss has stood still for {window} steps; finished early.")
+            break
+    return fit.avatar(step, report.elapsed, final=world.is_main)
+
+
+def _tell(world: World, text: str) -> None:
+    if world.is_main:
+        notice(text)
+
+
+class Plateau:
+    """Notices that the mean loss of a window is hardly lower than that of the window before.
+
+    Args:
+        window: steps of a window; 0 never notices.
+    """
+
+    def __init__(self, window: int) -> None:
+        self._window = window
+        self._losses: list[float] = []
+        self._before = math.inf
+
+    def reached(self, loss: float) -> bool:
+        """Take note of a loss; True when the fit may stop."""
+        if not self._window:
+            return False
+        self._losses.append(loss)
+        if len(self._losses) < self._window:
+            return False
+        mean = sum(self._losses) / self._window
+        self._losses.clear()
+        before, self._before = self._before, mean
+        return mean > (1.0 - PROGRESS) * before
+
+    def state_dict(self) -> dict[str, Any]:
+        """What `load_state_dict` takes."""
+        return {"losses": list(self._losses), "before": self._before}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self._losses = [float(loss) for loss in state["losses"]]
+        self._before = float(state["before"])

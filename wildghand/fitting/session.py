@@ -1,0 +1,187 @@
+"""A fit from a capture folder to an avatar, which can be stopped and goes on."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.files import sha256_file, sha256_json
+from hwp_bench.base.locks import exclusive
+from hwp_bench.base.progress import notice, progress
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.splits import Split, contiguous_split
+from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings
+from hwp_bench.methods.request import open_request, write_request
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.avatar.files import save_avatar
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.optimise import Watchers, optimise, ready_device
+from wildghand.fitting.parallel import SINGLE_PROCESS, World
+from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.model.settings import WildGHandSettings, read_settings
+
+#: Seconds between two saved states.
+SAVE_EVERY = 20.0
+#: Name of the saved state in the work folder.
+STATE = "state.pt"
+
+
+class _Clock:
+    """The `Report` of a fit that nobody scores.
+
+    Args:
+        before: seconds that earlier runs of the fit took.
+        show: takes the number of steps that are done.
+    """
+
+    def __init__(self, before: float, show: Any) -> None:
+        self._start = time.perf_counter() - before
+        self._show = show
+
+    def __call__(self, step: int, avatar: Avatar) -> None:
+        """Take a checkpoint: none is ever due."""
+
+    def progress(self, done: int, total: int) -> None:
+        """Show how far the fit is."""
+        self._show(done)
+
+    @property
+    def elapsed(self) -> float:
+        """Seconds of fitting, those of earlier runs included."""
+        return time.perf_counter() - self._start
+
+
+def fit_capture(
+    source: str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    settings: Mapping[str, Any] | None = None,
+    budget: Budget | None = None,
+    seed: int = 0,
+    all_frames: bool = False,
+    overwrite: bool = False,
+    world: World = SINGLE_PROCESS,
+) -> WildGHandAvatar:
+    """Fit an avatar to a capture, and write it if a folder is named.
+
+    With `out` the state is saved next to it every 20 seconds. The same call goes on with it after
+    a stop; with a budget in steps the result is that of a fit that was never stopped.
+
+    Args:
+        source: the capture folder.
+        out: the avatar folder; None: nothing is written (`save_avatar` can do it later).
+        settings: what `wildghand.model.settings.read_settings` takes.
+        budget: when to stop; without steps the settings' number holds.
+        seed: of everything random.
+        all_frames: fit the validation and test frames too: for an avatar, not for a score.
+        overwrite: replace an avatar that is there.
+        world: the processes that fit together; only rank 0 writes.
+
+    Raises:
+        BadMethod: a setting is unknown or out of range.
+        UsageError: `out` exists, the processes cannot share a batch evenly, or there are several
+            and no `out`.
+        BadInput: no training frame can be used, or the saved state is of another fit.
+        DidNotConverge: the fit diverged at once.
+        HwpError: another fit is writing to `out`, or `out` cannot be written to, or another
+            process has ended.
+    """
+    chosen = read_settings(settings or {})
+    world.shard(chosen.schedule.batch)
+    run = RunSettings(dict(settings or {}), seed, budget or Budget())
+    if out is None:
+        if world.size > 1:
+            raise UsageError("is missing; several processes share a fit in its folder", field="out")
+        capture = open_capture(source)
+        split = every_frame(capture) if all_frames else _split(capture)
+        with tempfile.TemporaryDirectory() as folder:
+            write_request(Path(folder) / "request", capture, split, run)
+            return _fit_in(Path(folder), capture, run, chosen, world, save=False)
+    out = Path(out)
+    if out.exists() and not overwrite:
+        raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
+    capture = open_capture(source)
+    split = every_frame(capture) if all_frames else _split(capture)
+    work = out.with_name(out.name + ".fit")
+    with exclusive(work) if world.is_main else contextlib.nullcontext():
+        if world.is_main:
+            write_request(work / "request", capture, split, run)
+        world.wait_for_main()
+        avatar = _fit_in(work, capture, run, chosen, world)
+        if world.is_main:
+            save_avatar(avatar, out, overwrite=overwrite)
+            shutil.rmtree(work, ignore_errors=True)
+        world.wait_for_main()
+    return avatar
+
+
+def _fit_in(
+    work: Path,
+    capture: Capture,
+    run: RunSettings,
+    chosen: WildGHandSettings,
+    world: World,
+    *,
+    save: bool = True,
+) -> WildGHandAvatar:
+    """Fit, from the state that is saved in the work folder if there is one."""
+    training = open_request(work / "request")
+    digest = sha256_json(
+        [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
+    )
+    fit = Fit(training, chosen, run.seed, ready_device(chosen.device), world)
+    watchers, start, before = Watchers(chosen.schedule.plateau_steps), 0, 0.0
+    state = work / STATE
+    if state.is_file():
+        start, before = load_state(state, fit, watchers, digest)
+        if world.is_main:
+            notice(f"Going on after {start} steps.")
+    fit.require_same(start)
+    steps = chosen.schedule.steps if run.budget.steps is None else run.budget.steps
+    with _shown(capture, steps, world) as show:
+        clock = _Clock(before, show)
+        saved = time.perf_counter()
+
+        def after_step(step: int, watched: Watchers) -> None:
+            nonlocal saved
+            if save and world.is_main and time.perf_counter() - saved >= SAVE_EVERY:
+                save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
+                saved = time.perf_counter()
+
+        return optimise(
+            fit, run.budget, clock, start=start, watchers=watchers, after_step=after_step
+        )
+
+
+@contextlib.contextmanager
+def _shown(capture: Capture, steps: int, world: World) -> Iterator[Callable[[int], None]]:
+    """The progress bar, which only rank 0 shows."""
+    if not world.is_main:
+        yield lambda done: None
+        return
+    with progress(f"Fitting {capture.info.id}", steps) as show:
+        yield show
+
+
+def _split(capture: Capture) -> Split:
+    try:
+        return contiguous_split(capture.info.id, capture.info.frame_count)
+    except HwpError as error:
+        raise UsageError(
+            f"is too short for a split ({error})",
+            where=capture.root,
+            remedy="Fit all of it with --all-frames.",
+        ) from error
+
+
+def every_frame(capture: Capture) -> Split:
+    """Every frame but the last two, which stand for the parts that a split must have."""
+    count = capture.info.frame_count
+    return Split(capture.info.id, count, (0, count - 2), (count - 2, count - 1), (count - 1, count))
