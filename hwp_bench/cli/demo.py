@@ -12,7 +12,7 @@ _EXAMPLES = """examples:
 
 Renders the two captures of the smoke suite, fits the plain baseline to their training frames,
 scores it on their test frames, prints the table and the seconds of each step, and writes a
-picture. Needs no data and no network.
+sheet of images. Needs no data and no network.
 """
 
 

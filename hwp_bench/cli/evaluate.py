@@ -22,14 +22,14 @@ _EXAMPLES = """examples:
   hwp-bench evaluate baselines/plain --capture my_capture --out runs/plain-mine
   hwp-bench evaluate my_method --suite mini --budget 60 --seed 1
   hwp-bench evaluate my_method --suite mini --set gaussians=20000 --json
-  hwp-bench evaluate baselines/plain --suite mini --frames clean     # what no method can beat
+  hwp-bench evaluate baselines/plain --suite mini --frames clean     # upper bound
   hwp-bench evaluate submission --sealed publication/sealed
   hwp-bench evaluate my_method --suite mini --jobs 4                 # four captures at once
   hwp-bench evaluate my_method --suite full --engine ray://10.0.0.1:6379 --job-gpus 1
 
-An evaluation that is started again with the same arguments takes finished captures as they are.
+An evaluation that is started again with the same arguments keeps finished captures.
 Exit status 0: every frame was scored; 1: the method failed on a capture or left out frames
-(they get the protocol's penalty); 2: the command was given wrongly.
+(they get the protocol's penalty); 2: the command line is wrong.
 """
 
 
@@ -51,7 +51,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
-    """Add what every command that runs a method takes: captures, settings, limits."""
+    """Add the arguments of every command that runs a method: captures, settings, limits."""
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         "--suite",
@@ -75,7 +75,7 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         "--frames",
         choices=("perturbed", "clean", "unperturbed-only"),
         default="perturbed",
-        help="training frames to give; all but the first are oracles on simulated captures",
+        help="training frames to use; all but the first are oracles on simulated captures",
     )
     parser.add_argument("--budget", type=float, metavar="SECONDS", help="limit of the fit's time")
     parser.add_argument("--steps", type=int, help="limit of the fit's optimiser steps")
@@ -96,8 +96,8 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         "--isolation",
         choices=("auto", "required", "none"),
         default="auto",
-        help="run the method without network and other files where the system allows it (auto), "
-        "or not at all (required), or without these walls (none)",
+        help="run the method without network and other files: where the system allows it (auto), "
+        "always or not at all (required), or never (none)",
     )
     parser.add_argument(
         "--expose",
@@ -125,7 +125,7 @@ def run(args: argparse.Namespace) -> int:
     sealed = _sealed_part(args)
     if sealed is not None:
         settings = replace(settings, suite=f"sealed-{sealed.commitment[:12]}")
-    # A wrong method directory must be said before a suite is rendered for it.
+    # A wrong method directory is reported before a suite is rendered for it.
     read_manifest(find_method(args.method))
     method = Path(args.method.rstrip("/")).name
     oracle = "" if args.frames == "perturbed" else f"-{args.frames}"
@@ -158,7 +158,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
-    """Open the sealed part that is asked for, and tell its commitment."""
+    """Open the sealed part that is asked for, and print its commitment."""
     if args.sealed is None:
         return None
     from hwp_bench.base.errors import UsageError
@@ -166,14 +166,14 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
     from hwp_bench.publish import open_sealed
 
     if args.capture or args.splits:
-        raise UsageError("brings its captures and splits itself", field="--sealed")
+        raise UsageError("has its own captures and splits", field="--sealed")
     sealed = open_sealed(args.sealed)
     notice(f"sealed part is as committed to: {sealed.commitment}")
     return sealed
 
 
 def report_outcome(out: Path, results: Results) -> int:
-    """Tell a person where the results lie and what failed; returns the exit status."""
+    """Print where the results are and which captures failed; returns the exit status."""
     from hwp_bench.base.progress import notice
 
     failed = [capture for capture in results.captures if capture.failed_frames]
@@ -187,7 +187,7 @@ def report_outcome(out: Path, results: Results) -> int:
     for capture in results.captures:
         picture = out / "captures" / capture.id / "pictures" / "comparison.png"
         if picture.is_file():
-            notice(f"picture: {picture}")
+            notice(f"images: {picture}")
     return 1 if failed else 0
 
 
@@ -223,7 +223,7 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
 
 
 def chosen_captures(args: argparse.Namespace, engine: Engine) -> list[Path]:
-    """Return the capture folders that were named, or those of the suite, rendered if need be."""
+    """Return the capture folders that were named, or the suite, rendered if it is missing."""
     if args.capture:
         return [Path(path) for path in args.capture]
     from hwp_bench.run.engine.options import needs_of

@@ -20,7 +20,7 @@ def command_tree() -> Command:
     data = {
         "check": Command("check a capture and say what is wrong", f"{here}.data_check"),
         "show": Command("draw a contact sheet of a capture", f"{here}.data_show"),
-        "audit": Command("prove that a capture's split is fair", f"{here}.data_audit"),
+        "audit": Command("check that a capture's split is fair", f"{here}.data_audit"),
         "get": Command("download a public data set", f"{here}.data_get"),
         "import": Command("make captures of other data", commands=imports),
         "import-video": Command("make a capture of a video", f"{here}.import_video"),
@@ -33,10 +33,10 @@ def command_tree() -> Command:
         commands={
             "demo": Command("simulate a capture, fit a baseline, score it", f"{here}.demo"),
             "evaluate": Command("run a method on captures and score it", f"{here}.evaluate"),
-            "ablate": Command("say what components of a method buy and cost", f"{here}.ablate"),
+            "ablate": Command("measure gain and cost of components", f"{here}.ablate"),
             "cost": Command("show accuracy against time", f"{here}.cost"),
             "verify": Command("recompute digests and scores of results", f"{here}.verify"),
-            "compare": Command("say how sure the differences are", f"{here}.compare"),
+            "compare": Command("test differences for significance", f"{here}.compare"),
             "table": Command("print tables of results", f"{here}.table"),
             "report": Command("write one HTML page about results", f"{here}.report"),
             "leaderboard": Command("make, check and show leaderboards", f"{here}.leaderboard"),

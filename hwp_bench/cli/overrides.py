@@ -10,11 +10,12 @@ from hwp_bench.base.errors import UsageError
 
 
 def overrides(texts: Iterable[str]) -> dict[str, Any]:
-    """Take `NAME=VALUE` apart.
+    """Read texts of the form `NAME=VALUE`.
 
     Args:
-        texts: a name, or `name.field` for a field of a table, and a value as TOML writes it; what
-            is no TOML is a text, so that words need no quotation marks. The last of a name holds.
+        texts: a name, or `name.field` for a field of a table, and a value as TOML writes it; a
+            value that is not TOML is text, so that words need no quotation marks. The last value
+            of a name wins.
 
     Raises:
         UsageError: a text is not of this form.

@@ -1,4 +1,4 @@
-"""A program of commands: finds one, builds its parser, runs it, turns errors into one line."""
+"""A program of commands: finds one, builds its parser, runs it, prints an error as one line."""
 
 from __future__ import annotations
 
@@ -37,11 +37,11 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
         arguments: the words after the program's name; None takes the process's.
 
     Returns:
-        The exit status: 0 done, 1 failed, 2 asked for wrongly, 130 stopped by the user.
+        The exit status: 0 done, 1 failed, 2 wrong command line, 130 stopped by the user.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     if threading.current_thread() is threading.main_thread():
-        # Ended as by Ctrl-C, so that child processes are stopped and temporary files removed.
+        # As by Ctrl-C, so that child processes are stopped and temporary files removed.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
         status = _dispatch(program, tree, words)
@@ -58,7 +58,7 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except OSError as error:
-        # A full disc, a read-only folder: the fault of the place, and the place is named.
+        # A full disc or a read-only folder: the message names the place.
         where = f"{error.filename}: " if error.filename else ""
         print(
             f"{program}: error: {_one_line(f'{where}{error.strerror or error}')}", file=sys.stderr
@@ -78,7 +78,7 @@ def _dispatch(program: str, group: Command, words: list[str]) -> int:
             parser.print_help(sys.stderr)
             return 2
         parser.parse_args(words)
-        parser.error("a command is needed")
+        parser.error("name a command")
     name, rest = words[0], words[1:]
     if name not in group.commands:
         near = difflib.get_close_matches(name, group.commands, n=1)

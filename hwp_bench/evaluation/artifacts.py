@@ -1,4 +1,4 @@
-"""The files that an evaluation keeps with its scores: predictions, log, diagnostics, pictures."""
+"""The files that an evaluation keeps with its scores: predictions, log, diagnostics, images."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def keep_artifacts(
     scores: Sequence[FrameResult],
     predictions: Sequence[Prediction],
 ) -> None:
-    """Keep predictions, log and diagnostics of a run, and draw pictures; drop the rest of the run.
+    """Keep predictions, log and diagnostics of a run, and draw images; drop the rest of the run.
 
     Args:
         folder: the result folder of the capture.

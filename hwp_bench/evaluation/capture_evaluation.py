@@ -92,7 +92,7 @@ def evaluate_capture(
 
     Args:
         evaluation: the method, the capture and the settings.
-        folder: where result, predictions, pictures and log go.
+        folder: where result, predictions, images and log go.
         on_progress: called with (done, total) steps of the fit.
 
     Returns:
@@ -192,7 +192,7 @@ def _run(
 
 
 def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
-    """Hide the capture and the results next to the run, which hold pictures of test frames."""
+    """Hide the capture and the results next to the run, which hold images of test frames."""
     asked = evaluation.confinement
     hands = hand_model_files(evaluation.capture.info.hand_model.source)
     return replace(

@@ -1,4 +1,4 @@
-"""What a method consists of, as a digest: code, settings and weights."""
+"""Digests of the content of a method: code, settings and weights."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 
 from hwp_bench.base.files import files_digest, sha256_of
 
-#: Names of files that decide what a method does end in one of these; logs and pictures do not.
+#: Suffixes of the files that decide what a method does; logs and images are left out.
 CONTENT = frozenset(
     {".py", ".toml", ".json", ".yaml", ".yml", ".safetensors", ".pt", ".pth", ".ckpt", ".npz"}
     | {".npy", ".onnx", ".pkl", ".bin"}
@@ -27,7 +27,7 @@ def method_digest(root: Path) -> str:
 def exposed_digest(paths: Iterable[Path]) -> str:
     """SHA-256 (hex) of everything that a method may read besides its own folder.
 
-    Where it lies does not enter, so that the same files give the same digest on every machine.
+    The place does not count, so that the same files give the same digest on every machine.
 
     Args:
         paths: files and folders, in the order in which they were named. One that is missing
@@ -40,7 +40,7 @@ def exposed_digest(paths: Iterable[Path]) -> str:
 
 
 def _files(root: Path) -> Iterable[Path]:
-    """Regular files below a folder that no hidden folder and no cache holds."""
+    """Regular files below a folder, but not those in hidden folders and caches."""
     for path in root.rglob("*"):
         parents = path.relative_to(root).parts[:-1]
         odd = any(name.startswith(".") or name == "__pycache__" for name in parents)

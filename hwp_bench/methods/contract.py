@@ -1,4 +1,4 @@
-"""What a method written in Python must offer, and what it is given."""
+"""The contract of a method written in Python: the classes that it offers and those it is given."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Method(Protocol):
     """A way to make an avatar from a training capture.
 
     The entry of `method.toml` names a callable that takes `settings` (the preset's table, with
-    what the command line overrides) and `seed`, and returns an object with this method.
+    the overrides of the command line) and `seed`, and returns an object with this method.
     """
 
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> Avatar:
@@ -49,7 +49,7 @@ class Method(Protocol):
 
 
 class MethodFactory(Protocol):
-    """What `entry.python` of `method.toml` names."""
+    """The callable that `entry.python` of `method.toml` names."""
 
     def __call__(self, settings: Mapping[str, Any], seed: int) -> Method:
         """Make the method with its settings."""
@@ -73,13 +73,13 @@ class Avatar(Protocol):
 
 
 class Report(Protocol):
-    """What a method calls now and then while it fits."""
+    """The object that a method calls now and then while it fits."""
 
     def __call__(self, step: int, avatar: Avatar) -> None:
         """Offer the state after `step` steps; it is scored when a checkpoint is due.
 
         Cheap when none is due, so that a method offers its state after every step; the method's
-        clock stands still while a checkpoint is taken. What is offered first always is one: a
+        clock stands still while a checkpoint is taken. The first offer is always a checkpoint: a
         method offers the avatar before its first step, with `step` 0.
         """
         ...
@@ -96,11 +96,11 @@ class Report(Protocol):
 
 @dataclass(frozen=True)
 class Budget:
-    """How much fitting is allowed; a method stops at whichever limit it meets first."""
+    """How much fitting is allowed; a method stops at the limit that it reaches first."""
 
     #: Seconds on the method's clock, which stands still while checkpoints are scored.
     seconds: float | None = None
-    #: Optimiser steps; None leaves the method's preset.
+    #: Optimiser steps; None keeps the method's preset.
     steps: int | None = None
 
 
@@ -119,7 +119,7 @@ class RunSettings:
 
 
 class TrainingCapture:
-    """What a method sees of a capture.
+    """The part of a capture that a method sees.
 
     Attributes:
         root: the request folder.
@@ -188,7 +188,7 @@ class TrainingCapture:
         """Load the hand template of one side.
 
         Raises:
-            BadInput: the template that is installed here is another than the capture's.
+            BadInput: the template that is installed here is not the capture's.
         """
         from hwp_bench.capture.reader import load_matching_template
 

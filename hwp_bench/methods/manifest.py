@@ -90,7 +90,7 @@ class MethodManifest:
     entry: str | tuple[str, ...]
     #: Settings by preset.
     presets: Mapping[str, Mapping[str, Any]]
-    #: What can be taken out or put in place of something, by name, in the order of the file.
+    #: Components and alternatives for ablations, by name, in the order of the file.
     switches: Mapping[str, Switch] = field(default_factory=dict)
     #: Who made it; empty where the file does not say.
     authors: str = ""
@@ -183,6 +183,7 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
     if isinstance(authors, list) and all(isinstance(name, str) for name in authors):
         fields["authors"] = ", ".join(authors)
     table = parse_record(_Manifest, fields, where=where, error=BadMethod)
+    kind, entry = table.entry.given[0]
     if table.entry.predictions is not None:
         inside(root, table.entry.predictions)
     _check_plain(table.presets, where, "presets")
@@ -191,8 +192,8 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         name=table.name,
         title=table.name if table.title is None else table.title,
         description=table.description,
-        kind=table.entry.kind,
-        entry=table.entry.value,
+        kind=kind,
+        entry=tuple(entry) if isinstance(entry, list) else entry,
         presets=table.presets,
         switches=_switches(table.switches, where),
         authors=table.authors,
@@ -231,17 +232,15 @@ class _Entry:
     predictions: str | None = None
 
     def __post_init__(self) -> None:
-        if sum(getattr(self, kind) is not None for kind in ENTRY_KINDS) != 1:
+        if len(self.given) != 1:
             raise UsageError(f"must have exactly one of {', '.join(ENTRY_KINDS)}")
 
     @property
-    def kind(self) -> str:
-        return next(kind for kind in ENTRY_KINDS if getattr(self, kind) is not None)
-
-    @property
-    def value(self) -> str | tuple[str, ...]:
-        value = getattr(self, self.kind)
-        return value if isinstance(value, str) else tuple(value)
+    def given(self) -> list[tuple[str, Any]]:
+        """Kind and value of every entry that the file has."""
+        values = (self.python, self.command, self.predictions)
+        pairs = zip(ENTRY_KINDS, values, strict=True)
+        return [(kind, value) for kind, value in pairs if value is not None]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Check predicted frames before they are scored; nothing in a submission but its frames counts."""
+"""Check predicted frames before they are scored; only the frames of a submission count."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hwp_bench.capture.schema import frame_name
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
-    """One predicted frame, or the reason why there is none."""
+    """One predicted frame, or the reason why it cannot be scored."""
 
     #: Frame index in the capture.
     frame: int

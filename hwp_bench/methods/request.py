@@ -36,7 +36,7 @@ SCHEMA = "hwp-request/1"
 
 
 def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) -> Path:
-    """Write what a method may see of a capture into a folder of its own.
+    """Write the part of a capture that a method may see into a folder of its own.
 
     Images are copied, not linked: a link would lead to the capture, and so to its test frames.
 
@@ -83,12 +83,12 @@ def open_request(path: str | os.PathLike[str]) -> TrainingCapture:
     """Open a request folder.
 
     Raises:
-        BadInput: it is no request of this version, or damaged.
+        BadInput: it is not a request of this version, or damaged.
     """
     root = Path(path)
     value = read_json(root / REQUEST)
     if not isinstance(value, dict) or value.get("schema") != SCHEMA:
-        raise BadInput(f"is no request of schema {SCHEMA}", where=root / REQUEST)
+        raise BadInput(f"is not a request of schema {SCHEMA}", where=root / REQUEST)
     try:
         return TrainingCapture(root, value)
     except (KeyError, TypeError) as error:
@@ -110,7 +110,7 @@ class Material:
 
 
 def training_material(capture: Capture, split: Split, choice: str) -> Material:
-    """Return what a method is given of a capture.
+    """Return the training part that a method is given of a capture.
 
     Args:
         capture: the capture.
@@ -119,11 +119,11 @@ def training_material(capture: Capture, split: Split, choice: str) -> Material:
             true hand parameters in perturbed frames: an estimator would not have been misled.
 
     Raises:
-        UsageError: no such choice, or the capture does not know its clean frames or severities;
-            or no training frame is unperturbed.
+        UsageError: there is no such choice, or the capture does not know its clean frames or
+            severities, or every training frame is perturbed.
     """
     if choice not in FRAME_CHOICES:
-        raise UsageError(f"{choice!r} is none of {', '.join(FRAME_CHOICES)}", field="frames")
+        raise UsageError(f"{choice!r} is not one of {', '.join(FRAME_CHOICES)}", field="frames")
     hands = dict(capture.hands)
     if choice == "perturbed":
         return Material(split.train, "frames", "masks", hands)

@@ -1,4 +1,4 @@
-"""A digest that binds a data set's keeper to hidden frames without telling anything of them.
+"""A digest that binds a data set's keeper to hidden frames without revealing anything of them.
 
 The public manifest holds the commitments, the sealed part the salt. Without the salt nobody can
 test a guess of the hidden content; with it anybody can check, once the sealed part is opened,
@@ -16,14 +16,14 @@ from hwp_bench.base.images import pixel_digest
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import Split
 
-#: Version of what is committed to.
+#: Version of the commitments.
 SCHEME = "hwp-commitment/1"
 #: Length of a salt in bytes: too long to be guessed.
 SALT_BYTES = 32
 
 
 def target_content(capture: Capture, split: Split) -> dict[str, Any]:
-    """Describe by digests what test frames are scored against.
+    """Describe by digests the truth that test frames are scored against.
 
     Args:
         capture: the capture.
@@ -47,7 +47,7 @@ def commitment(content: Mapping[str, Any], salt: str) -> str:
     """Return the SHA-256 (hex) of a salted content.
 
     Args:
-        content: what `target_content` returned.
+        content: from `target_content`.
         salt: at least `SALT_BYTES` random bytes in hex.
     """
     text = f"{SCHEME}\n{salt}\n{canonical_json(dict(content))}"

@@ -30,7 +30,7 @@ PUBLIC, SEALED, MANIFEST, KEY = "public", "sealed", "manifest.json", "sealed.jso
 
 @dataclass(frozen=True)
 class Publication:
-    """What was written."""
+    """The parts that were written."""
 
     #: Folder of the public part, for authors.
     public: Path
@@ -49,7 +49,7 @@ def publish(
     splits: Mapping[str, Split] | None = None,
     salt: str | None = None,
 ) -> Publication:
-    """Divide captures into what authors get and what their submissions are scored with.
+    """Divide captures into a part for authors and a part that scores their submissions.
 
     The public part holds a request folder for each capture (what a method sees: training and
     validation frames and masks, and the parameters and cameras of every frame) and a manifest
@@ -57,7 +57,7 @@ def publish(
 
     Args:
         captures: capture folders.
-        out: folder to make; it gets `public/` and `sealed/`.
+        out: folder to make, with `public/` and `sealed/`.
         splits: splits by capture id; None applies the 80/10/10 rule.
         salt: hex of at least 32 bytes; None draws one. Only tests give it.
 

@@ -1,4 +1,4 @@
-"""Open a sealed part and prove that it is what its keeper committed to."""
+"""Open a sealed part and check it against its commitments."""
 
 from __future__ import annotations
 
@@ -36,15 +36,15 @@ def open_sealed(
 
     Args:
         path: the folder `sealed`, or the publication that holds it.
-        manifest: the public manifest (or its folder) to compare with; None takes the one beside
-            the sealed part where there is one.
+        manifest: the public manifest (or its folder) to compare with; None takes the one next
+            to the sealed part, if there is one.
 
     Returns:
         Captures and splits to score submissions with.
 
     Raises:
-        BadInput: no sealed part, or its content, its key and the public manifest contradict
-            each other; the capture is named.
+        BadInput: it is not a sealed part, or its content, its key and the public manifest
+            contradict each other; the capture is named.
     """
     root = Path(path)
     root = root / "sealed" if (root / "sealed" / KEY).is_file() else root
@@ -81,31 +81,31 @@ def _compare_public(
 ) -> None:
     if value.get("commitment") != joint:
         raise BadInput("does not match the captures", where=root / KEY, field="commitment")
-    beside = root.parent / "public" / MANIFEST
-    if manifest is None and not beside.is_file():
+    default = root.parent / "public" / MANIFEST
+    if manifest is None and not default.is_file():
         return
-    path = beside if manifest is None else Path(manifest)
+    path = default if manifest is None else Path(manifest)
     path = path / MANIFEST if path.is_dir() else path
     if _read(path, PUBLIC_SCHEMA).get("commitment") != joint:
         raise BadInput(
-            "publishes another commitment than this sealed part has",
+            "publishes a commitment that is not this sealed part's",
             where=path,
             field="commitment",
-            remedy="The two parts are not of one publication, or one of them was changed.",
+            remedy="The two parts belong to different publications, or one of them was changed.",
         )
 
 
 def _read(path: Path, schema: str) -> dict[str, Any]:
     value = read_json(path)
     if not isinstance(value, dict) or value.get("schema") != schema:
-        raise BadInput(f"is no file of schema {schema}", where=path)
+        raise BadInput(f"is not a file of schema {schema}", where=path)
     return value
 
 
 def _entries(value: Mapping[str, Any], where: Path) -> list[dict[str, Any]]:
     entries = value.get("captures")
     if not isinstance(entries, list) or not entries:
-        raise BadInput("is no list of captures", where=where, field="captures")
+        raise BadInput("is not a list of captures", where=where, field="captures")
     if not all(isinstance(e, dict) and isinstance(e.get("id"), str) for e in entries):
         raise BadInput("holds a capture without an id", where=where, field="captures")
     return entries

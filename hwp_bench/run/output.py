@@ -23,7 +23,7 @@ RUN = "run.json"
 PROGRESS = "progress.json"
 #: Why the run failed.
 FAILURE = "failure.json"
-#: What the method printed.
+#: The method's printed output.
 LOG = "log.txt"
 #: Largest `run.json` that is read, bytes.
 MAX_BYTES = 10 * 1024 * 1024
@@ -31,7 +31,7 @@ MAX_BYTES = 10 * 1024 * 1024
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """One moment of a fit that was put on record."""
+    """One recorded moment of a fit."""
 
     #: Optimiser steps done.
     step: int
@@ -64,7 +64,7 @@ class RunFacts:
 
 
 def read_facts(path: Path) -> RunFacts:
-    """Read `run.json`; a run that wrote none said nothing.
+    """Read `run.json`; a run need not write one.
 
     Raises:
         BadInput: it is damaged.

@@ -46,11 +46,11 @@ class RunRecord:
 
     #: Folder of the predicted frames.
     predictions: Path
-    #: What `run.json` says; says nothing for submitted predictions.
+    #: The content of `run.json`; empty for submitted predictions.
     facts: RunFacts
     #: Wall time of the whole process, start-up included, seconds.
     wall_seconds: float
-    #: How the process was isolated: `namespaces`, or `processes` with the reason why not more;
+    #: How the process was isolated: `namespaces`, or `processes` with the reason;
     #: None for submitted predictions.
     isolation: str | None = None
 
@@ -71,7 +71,7 @@ def run_method(
         manifest: the method.
         capture_id: names the folder of a submission's predictions.
         request: the request folder.
-        output: a folder of the run's own; emptied first.
+        output: the output folder of this run; emptied first.
         time_limit: seconds after which the process and its children are killed.
         confinement: how it is confined, and its memory limit; None takes the defaults.
         on_progress: called with (done, total) steps now and then.
@@ -197,7 +197,7 @@ def _broken(limit: str, capture_id: str, limits: Limits) -> str:
 
 
 def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
-    # A link may lead to what only the toolkit can read.
+    # A link may lead to a file that only the toolkit can read.
     if path.is_symlink():
         return
     with contextlib.suppress(BadInput, KeyError, TypeError, ValueError):

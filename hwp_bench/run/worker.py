@@ -1,6 +1,6 @@
 """The process that a Python method runs in: `python -m hwp_bench.run.worker`.
 
-It is given a request folder and an output folder, and never learns where the capture lies.
+It is given a request folder and an output folder, and does not know where the capture is.
 """
 
 from __future__ import annotations
@@ -153,15 +153,15 @@ def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
 
 
 def device_name(avatar: Avatar) -> str:
-    """Return what the avatar says it ran on, `cpu` if it says nothing."""
+    """Return the device that the avatar names; `cpu` if it names none."""
     return str(getattr(avatar, "device", "cpu"))[:100]
 
 
 def schedule(budget: Budget) -> list[float]:
     """Return the seconds at which checkpoints are due: dense at the start, then regular.
 
-    1, 2, 4, 8, ... s, and every tenth of the budget where one in seconds is set. (What a method
-    offers first, and tenths of a budget in steps, are `ReportClock`'s business.)
+    1, 2, 4, 8, ... s, and every tenth of a budget in seconds. (`ReportClock` adds the first offer
+    of a method, and every tenth of a budget in steps.)
     """
     horizon = budget.seconds or 24 * 3600.0
     due = {float(2**power) for power in range(18) if 2**power <= horizon}
@@ -203,7 +203,7 @@ class ReportClock:
         return self._paused
 
     def __call__(self, step: int, avatar: Avatar) -> None:
-        """Take a checkpoint if one is due; what is offered first always is one."""
+        """Take a checkpoint if one is due; the first offer is always one."""
         in_time = self._due and self.elapsed >= self._due[0]
         in_steps = self._due_steps and step >= self._due_steps[0]
         if in_time or in_steps or not self.checkpoints:

@@ -60,7 +60,7 @@ class Work(Protocol):
 class Job:
     """One piece of work with a folder as its result."""
 
-    #: What a person is shown.
+    #: The text that a person is shown.
     text: str
     #: Does the work in this process.
     here: Callable[[OnProgress], object]

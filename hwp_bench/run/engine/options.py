@@ -1,4 +1,4 @@
-"""The arguments by which a command is told where its jobs run. Imports nothing heavy."""
+"""Command-line arguments that say where jobs run. Imports nothing heavy."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def engine_for(args: argparse.Namespace) -> Engine:
 
 
 def needs_of(args: argparse.Namespace) -> Needs:
-    """Return what one job takes."""
+    """Return the share of a machine that one job takes."""
     from hwp_bench.run.engine.job import Needs
 
     return Needs(args.job_cpus, args.job_gpus)

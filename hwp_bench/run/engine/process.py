@@ -57,7 +57,7 @@ class Stopped(Exception):
 class LocalJob:
     """A job on the machine where it runs."""
 
-    #: What to do.
+    #: The work.
     work: Work
     #: Where its inputs lie here.
     inputs: Mapping[str, Path]
@@ -72,7 +72,7 @@ class LocalJob:
 def thread_environment(needs: Needs) -> dict[str, str]:
     """Return the variables that keep a job to its processors.
 
-    What is set in this process's environment stays; so a person can choose other numbers.
+    Variables that are set already stay, so that a person can choose other numbers.
     """
     threads = str(max(1, int(needs.cpus)))
     return {name: os.environ.get(name, threads) for name in THREADS}
@@ -167,7 +167,7 @@ def _raise_failure(status: int, messages: Path) -> None:
     if status < 0:
         raise WorkerLost(signal.Signals(-status).name)
     if status == INTERRUPTED:
-        # By somebody else: whoever asks for a stop here does not come so far.
+        # By somebody else: a stop that was asked for here raises `Stopped` before this line.
         raise WorkerLost("interrupted")
     lines = (messages / "log.txt").read_text(errors="replace").strip().splitlines()
     raise HwpError(f"a job broke: {lines[-1][:500] if lines else f'exit status {status}'}")

@@ -1,4 +1,4 @@
-"""Reach a Ray cluster, or say in bounded time why not."""
+"""Connect to a Ray cluster, or say in bounded time why that fails."""
 
 from __future__ import annotations
 
@@ -111,7 +111,7 @@ def check_head(address: str) -> None:
 def connected(address: str | None) -> Iterator[Any]:
     """Join a cluster, or start one on this machine; left again at the end.
 
-    What Ray prints goes nowhere: standard output is for results.
+    Ray's output is thrown away: standard output is for results.
 
     Args:
         address: as `head_address` returns it.

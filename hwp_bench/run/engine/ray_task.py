@@ -48,7 +48,7 @@ class Order:
 
     #: Number of this order; a job that is ordered again gets a new one.
     number: int
-    #: What to do.
+    #: The work.
     work: Work
     #: The folders that it reads, by name.
     inputs: Mapping[str, Input]

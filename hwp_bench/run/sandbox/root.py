@@ -1,4 +1,4 @@
-"""A root of its own for a program: only what is shown exists, and nothing else can be reached.
+"""A root of its own for a program: only the places that are shown exist in it.
 
 The order of steps is bubblewrap's: the new root grows on a tmpfs, the old one is moved below it
 with pivot_root(2) while places are bound out of it, and then detached.
@@ -14,17 +14,16 @@ from collections.abc import Sequence
 
 from hwp_bench.run.sandbox import syscalls
 
-#: Ways in which a place can appear: read-only or writable as it is, empty, as a private scratch
-#: folder, as a symbolic link, or as the process table.
-KINDS = ("read", "write", "hidden", "scratch", "link", "proc")
 #: Size of a scratch folder, bytes; it counts as memory.
 SCRATCH_BYTES = 1 << 30
 
-# Any folder that exists everywhere; what lies in it is bound out of the old root.
+# A folder that exists everywhere; its content is bound out of the old root.
 _STAGE = "/tmp"
 _OLD, _NEW = "/old", "/new"
 
-#: One place: kind, path, and the target of a link (empty for the others).
+#: One place: kind, path, and the target of a link (empty for the others). The kinds are `read` and
+#: `write` (the place as it is, read-only or writable), `hidden` (an empty folder), `scratch` (a
+#: private writable folder), `link` (a symbolic link) and `proc` (the process table).
 Place = tuple[str, str, str]
 
 
@@ -51,7 +50,7 @@ def enter_root(places: Sequence[Place]) -> None:
     os.chdir("/")
     # A hidden folder is one only where a place that is shown contains it.
     masks = [path for place in places if (path := _show(place))]
-    # Not before now: what lies in a hidden folder and is shown all the same needs mount points.
+    # Not before now: places inside a hidden folder that are shown need mount points.
     for path in masks:
         _restrict(path)
     syscalls.unmount(_OLD)

@@ -184,7 +184,7 @@ def _end(process: subprocess.Popen[bytes]) -> None:
         process.terminate()
         with contextlib.suppress(subprocess.TimeoutExpired):
             process.wait(timeout=10)
-    # What is left where there are no namespaces and the launcher itself was killed.
+    # The rest, where there are no namespaces and the launcher itself was killed.
     with contextlib.suppress(ProcessLookupError, PermissionError):
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
@@ -215,8 +215,8 @@ def _processes_of(root: int) -> list[psutil.Process]:
 def _memory_of(processes: Sequence[psutil.Process], enough: int) -> int:
     """Return the memory of some processes together, bytes.
 
-    What they share is counted once. That is slow to find out, so it is looked at only where the
-    plain sum, which is never smaller, lies above `enough`.
+    Shared memory is counted once. That is slow to find out, so it is done only where the plain
+    sum, which is never smaller, is above `enough`.
     """
     total = sum(_resident(process) for process in processes)
     return total if total <= enough else sum(_proportional(process) for process in processes)

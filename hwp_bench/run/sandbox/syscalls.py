@@ -1,6 +1,6 @@
 """The Linux calls behind a sandbox, through ctypes: namespaces, mounts, capabilities.
 
-Nothing but the standard library is imported, because every run of a method passes through here.
+It imports only the standard library, because every run of a method passes through here.
 """
 
 from __future__ import annotations
@@ -23,7 +23,6 @@ MS_SLAVE = 0x80000
 
 MOUNT_ATTR_RDONLY = 0x1
 MOUNT_ATTR_NOSUID = 0x2
-MOUNT_ATTR_NODEV = 0x4
 
 _MNT_DETACH = 2
 _AT_FDCWD = -100
@@ -85,14 +84,14 @@ def set_attributes(target: str, attributes: int, *, recursive: bool = True) -> N
     Raises:
         Refused: the kernel is older than 5.12, or forbids it.
     """
-    wanted = _MountAttributes(attributes, 0, 0, 0)
+    restrictions = _MountAttributes(attributes, 0, 0, 0)
     result = _libc().syscall(
         _SYS_MOUNT_SETATTR,
         _AT_FDCWD,
         os.fsencode(target),
         _AT_RECURSIVE if recursive else 0,
-        ctypes.byref(wanted),
-        ctypes.c_size_t(ctypes.sizeof(wanted)),
+        ctypes.byref(restrictions),
+        ctypes.c_size_t(ctypes.sizeof(restrictions)),
     )
     _checked(result, f"restricting {target}")
 

@@ -1,4 +1,4 @@
-"""What a method says of itself is kept by name and within bounds. Oracle: what was written."""
+"""Diagnostics of a method are kept by name and within bounds. Oracle: the files that it wrote."""
 
 from __future__ import annotations
 

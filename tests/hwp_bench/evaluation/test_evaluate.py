@@ -20,7 +20,7 @@ from hwp_bench.metrics import METRICS, PROTOCOLS, metric, penalty
 from hwp_bench.results import Results, read_results
 from hwp_bench.run.sandbox.confinement import Confinement
 
-# Some methods here note their fits beside themselves, which no sandbox would let them.
+# Some methods here note their fits in their own folder, which a sandbox forbids.
 SETTINGS = EvaluationSettings(confinement=Confinement("none"))
 
 
@@ -91,7 +91,7 @@ def test_order_extra_files_and_masks_in_a_submission_change_nothing(captures, tm
     plain = run(submission(tmp_path / "a", captures, noisy), captures, tmp_path / "out-a")
     entry = submission(tmp_path / "b", captures, noisy)
     folder = entry / "predictions" / "single"
-    # Written again in the opposite order, with masks, other frames and files beside them.
+    # Written again in the opposite order, with masks, other frames and files next to them.
     files = sorted(folder.iterdir(), reverse=True)
     contents = [(path, path.read_bytes()) for path in files]
     shutil.rmtree(folder)
@@ -168,7 +168,7 @@ def test_a_capture_without_predictions_fails_by_name_and_the_rest_is_scored(
 
 
 def counting_method(folder: Path, body: str = "") -> Path:
-    """A method that paints gray and notes each fit in a file beside itself."""
+    """A method that paints gray and notes each fit in a file of its own folder."""
     folder.mkdir()
     (folder / "counting_method.py").write_text(
         f"""

@@ -1,4 +1,4 @@
-"""What a stored result hangs on. Oracle: files that are changed, moved, or have nothing to say."""
+"""Digests of methods. Oracle: files that are changed, moved, or have nothing to say."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a method is given holds no test pixel, no truth and no word about perturbations."""
+"""A request holds no test pixel, no truth and no word about perturbations."""
 
 from __future__ import annotations
 

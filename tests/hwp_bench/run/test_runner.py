@@ -179,7 +179,7 @@ def test_the_clock_stands_still_while_a_checkpoint_is_taken(tmp_path: Path) -> N
 
 def test_a_budget_in_steps_is_checkpointed_every_tenth(tmp_path: Path) -> None:
     clock = ReportClock(Budget(steps=40), lambda index, avatar: None, tmp_path / "p.json")
-    # What is offered first is the unfitted avatar: it always is on record.
+    # The first offer is the unfitted avatar: it is always recorded.
     for step in range(41):
         clock(step, None)  # type: ignore[arg-type]
     assert [checkpoint.step for checkpoint in clock.checkpoints] == list(range(0, 40, 4))

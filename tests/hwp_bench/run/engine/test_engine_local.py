@@ -81,7 +81,7 @@ def test_finished_jobs_do_not_run_and_threads_follow_the_needs(
 @pytest.mark.parametrize(
     ("by", "reason"), [(signal.SIGKILL, "SIGKILL"), (signal.SIGTERM, "interrupted")]
 )
-def test_a_job_whose_process_is_killed_begins_anew_but_not_for_ever(
+def test_a_job_whose_process_is_killed_starts_again_but_not_for_ever(
     tmp_path: Path, by: int, reason: str
 ) -> None:
     graves = tmp_path / "graves"

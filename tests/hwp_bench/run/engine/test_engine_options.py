@@ -72,7 +72,7 @@ def test_nobody_at_the_address_is_said_in_bounded_time(monkeypatch) -> None:
         ray_connect.check_head("127.0.0.1:1")
     with pytest.raises(HwpError, match=r"there is no Ray head at nowhere\.invalid:6379"):
         ray_connect.check_head("nowhere.invalid:6379")
-    # Somebody listens who is no Ray head.
+    # Somebody listens who is not a Ray head.
     monkeypatch.setattr(ray_connect, "ANSWER_SECONDS", 2.0)
     with socket.create_server(("127.0.0.1", 0)) as server:
         address = f"127.0.0.1:{server.getsockname()[1]}"

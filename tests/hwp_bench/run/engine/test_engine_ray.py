@@ -117,7 +117,7 @@ def test_a_node_is_killed_in_the_middle_and_the_results_are_those_without_ray(
         run_ablation(manifest, design, captures, tmp_path / "ray", settings, [0], engine=engine)
     assert len(killed) == 1
     assert sum("again, its worker was lost" in text for text in view.said) <= 1
-    # What is told of the second start, and when, hangs on how soon Ray notices the loss; that
+    # What is said of the second start, and when, depends on how soon Ray notices the loss; that
     # every job ends, with the results of a run without Ray, does not.
     assert any(index == killed[0] and nodes.second_place in place for index, place in view.starts)
     assert len(view.ends) == 4

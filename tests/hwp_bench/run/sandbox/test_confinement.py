@@ -1,4 +1,4 @@
-"""What a sandbox shows. Oracle: the file system that the test builds."""
+"""The places that a sandbox shows. Oracle: the file system that the test builds."""
 
 from __future__ import annotations
 
