@@ -110,7 +110,7 @@ def test_a_changed_sealed_part_is_refused(
     key.write_text(words)
     manifest = publication.public / "manifest.json"
     manifest.write_text(manifest.read_text().replace(publication.commitment, "0" * 64))
-    with pytest.raises(BadInput, match="another commitment"):
+    with pytest.raises(BadInput, match="a commitment that is not this sealed part's"):
         open_sealed(sealed)
 
 
