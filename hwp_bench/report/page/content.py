@@ -20,8 +20,7 @@ from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.evaluation_tables import all_tables, same_data
 from hwp_bench.report.figures import Bar, draw_bars, draw_pareto
 from hwp_bench.report.page.album import Album, frame_sheets, mask_sheet
-from hwp_bench.report.page.html_tables import to_html
-from hwp_bench.report.page.inline_svg import inline_svg
+from hwp_bench.report.page.elements import inline_svg, to_html
 from hwp_bench.report.page.strips import StripMethod, strip_plot
 from hwp_bench.report.sources import ResultsSource, find_captures, temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table

@@ -22,7 +22,7 @@ from hwp_bench.report.figures import (
     scale_up,
     series_style,
 )
-from hwp_bench.report.page.inline_svg import inline_svg
+from hwp_bench.report.page.elements import inline_svg
 from hwp_bench.report.sources import TemporalWeights
 from hwp_bench.results import CaptureResult
 from hwp_bench.taxonomy import MAX_SEVERITY, perturbation

@@ -21,7 +21,7 @@ from hwp_bench.report.figures import (
     write_cost,
     write_figure,
 )
-from hwp_bench.report.page.inline_svg import inline_svg
+from hwp_bench.report.page.elements import inline_svg
 from hwp_bench.report.page.render import style_sheet
 
 HOSTILE = 'a $x^2$ </title><script>"&'

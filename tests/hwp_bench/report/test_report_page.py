@@ -17,7 +17,7 @@ from hwp_bench.base.images import write_image
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.report.page.album import Album
 from hwp_bench.report.page.content import gather_report, summary_sentence
-from hwp_bench.report.page.html_tables import tag, to_html
+from hwp_bench.report.page.elements import tag, to_html
 from hwp_bench.report.page.render import write_report
 from hwp_bench.report.sources import ResultsSource
 from hwp_bench.results import CurvePoint
