@@ -1,4 +1,4 @@
-"""Check everything about a capture folder and say what is wrong, where, and how to mend it."""
+"""Check everything about a capture folder; report what is wrong, where, and what to do."""
 
 from __future__ import annotations
 
@@ -17,9 +17,12 @@ from hwp_bench.capture.reader import Capture, open_capture
 from hwp_bench.capture.schema import IMAGE_FOLDERS, image_path
 from hwp_bench.capture.tracks import arrays_digest, hand_arrays
 from hwp_bench.capture.writer import combine
+from hwp_bench.hands.template import HandTemplate
 
 #: A visible hand smaller than this share of the frame is reported.
 SMALL_HAND = 0.002
+#: Faces of a hand template that are smaller than this are reported, in square metres.
+SMALL_FACE = 1e-12
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class CheckReport:
-    """What `check_capture` found."""
+    """Findings of `check_capture`."""
 
     #: The folder.
     path: str
@@ -56,15 +59,20 @@ class CheckReport:
 
 
 def check_capture(path: str | os.PathLike[str]) -> CheckReport:
-    """Check a capture: metadata, numbers, every image, geometry, digests.
+    """Check a capture: metadata, numbers, every image, geometry, hand model, digests.
 
-    Never raises for what is wrong with the capture: it all goes into the report.
+    Faults of the capture are not raised: they all go into the report.
     """
     try:
         capture = open_capture(path)
     except HwpError as error:
         return CheckReport(os.fspath(path), {}, (_finding(error),))
-    findings = [*_images(capture), *_geometry(capture), *_numbers(capture)]
+    findings = [
+        *_images(capture),
+        *_geometry(capture),
+        *_templates(capture),
+        *_numbers(capture),
+    ]
     findings.sort(key=lambda finding: finding.level)
     return CheckReport(os.fspath(path), _facts(capture), tuple(findings))
 
@@ -141,13 +149,13 @@ def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
     yield from (finding for _, finding in results if finding is not None)
     known = {image_path(capture.root, kind, frame).name for frame in range(len(capture))}
     present = {item.name for item in folder.iterdir()} if folder.is_dir() else set()
-    strangers = sorted(present - known)
-    if strangers:
+    others = sorted(present - known)
+    if others:
         yield Finding(
             "warning",
             os.fspath(folder),
             None,
-            f"holds {len(strangers)} further files (first: {strangers[0]})",
+            f"holds {len(others)} further files (first: {others[0]})",
             "They are ignored.",
         )
     digests = [digest for digest, _ in results]
@@ -180,6 +188,46 @@ def _geometry(capture: Capture) -> Iterator[Finding]:
                 f"frame {behind[0]} lies behind its camera ({len(behind)} frames do)",
                 "Mark such frames as not valid, or correct the translation.",
             )
+
+
+def _templates(capture: Capture) -> Iterator[Finding]:
+    for side in capture.info.sides:
+        try:
+            template = capture.template(side)
+        except HwpError:  # not installed here, or another edition: commands that need it say so
+            continue
+        for problem in mesh_problems(template):
+            yield Finding(
+                "warning",
+                os.fspath(capture.root / "capture.json"),
+                "hand_model",
+                f"the {side} template {problem}",
+                "Projections and renderings of it can be wrong; get the hand model again.",
+            )
+
+
+def mesh_problems(template: HandTemplate) -> list[str]:
+    """Return what is wrong with the mesh of a hand template; empty where nothing is.
+
+    A sound template has one opening (the wrist), no face without an area, and faces that all turn
+    the same way, counterclockwise seen from outside.
+    """
+    import trimesh
+
+    mesh = trimesh.Trimesh(template.vertices, template.faces, process=False)
+    edges = mesh.edges[trimesh.grouping.group_rows(mesh.edges_sorted, require_count=1)]
+    openings = len(trimesh.graph.connected_components(edges))
+    empty = int((mesh.area_faces < SMALL_FACE).sum())
+    problems = []
+    if openings != 1:
+        problems.append(f"has {openings} openings where only the wrist is open")
+    if empty:
+        problems.append(f"has {empty} faces without an area")
+    if not mesh.is_winding_consistent:
+        problems.append("has faces that turn in different directions")
+    elif mesh.volume < 0:
+        problems.append("is turned inside out")
+    return problems
 
 
 def _numbers(capture: Capture) -> Iterator[Finding]:

@@ -12,7 +12,8 @@ from small_captures import CaptureMaker, cameras, hand_parameters, hand_picture
 
 from hwp_bench.base.errors import BadCapture, BadInput, HwpError, ShapeMismatch, UsageError
 from hwp_bench.capture import Cameras, CaptureWriter, open_capture
-from hwp_bench.capture.check import check_capture
+from hwp_bench.capture.check import check_capture, mesh_problems
+from hwp_bench.hands import HandTemplate, mirror_template
 
 
 @pytest.mark.parametrize("hands", ["right", "left", "both"])
@@ -231,3 +232,29 @@ def test_frames_out_of_range_are_refused(make_capture: CaptureMaker) -> None:
     for frame in (-1, 10):
         with pytest.raises(UsageError, match="there is no frame"):
             capture.frame(frame)
+
+
+def test_a_damaged_hand_template_is_reported(
+    make_capture: CaptureMaker, free_right: HandTemplate, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    capture = make_capture("a", frames=12)
+    assert mesh_problems(free_right) == []
+    assert mesh_problems(mirror_template(free_right)) == []
+    faces = free_right.faces.copy()
+    faces[0] = faces[0, ::-1]
+    turned = replace(free_right, faces=faces)
+    assert mesh_problems(turned) == ["has faces that turn in different directions"]
+    inside_out = replace(free_right, faces=free_right.faces[:, ::-1].copy())
+    assert mesh_problems(inside_out) == ["is turned inside out"]
+    middle = len(faces) // 2
+    holed = replace(free_right, faces=np.delete(free_right.faces, middle, axis=0))
+    assert mesh_problems(holed) == ["has 2 openings where only the wrist is open"]
+    vertices = free_right.vertices.copy()
+    vertices[faces[middle]] = vertices[faces[middle, 0]]
+    assert "without an area" in mesh_problems(replace(free_right, vertices=vertices))[0]
+    monkeypatch.setattr("hwp_bench.capture.reader.Capture.template", lambda *_: turned)
+    report = check_capture(capture.root)
+    assert report.ok
+    assert [finding.problem for finding in report.findings] == [
+        "the right template has faces that turn in different directions"
+    ]
