@@ -1,24 +1,30 @@
-"""A process that renders some frames of a capture into a folder; started by `production`.
+"""Rendered frames that wait for their capture: one file each, written by one or more processes.
 
-Frames are kept as one file each, so that an interrupted render goes on where it stopped.
+An interrupted render goes on where it stopped, because finished frames are kept.
 """
 
 from __future__ import annotations
 
 import io
 import json
-import os
-import pickle
-import sys
-from collections.abc import Iterable
+import threading
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from hwp_bench.base.arrays import read_npz
-from hwp_bench.base.errors import BadInput
+from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_write
+from hwp_bench.run.engine.job import OnProgress
+from hwp_bench.run.engine.process import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
+from hwp_bench.sim.render.frame import render_frame
+from hwp_bench.sim.render.layers import write_layers
 from hwp_bench.sim.scene.schema import Scene
+
+_REMEDY = "Finished frames are kept; the same command goes on from there."
 
 
 def frame_file(folder: Path, frame: int) -> Path:
@@ -57,9 +63,6 @@ def render_frames(
         folder: where they go.
         exr: also write linear layers as EXR.
     """
-    from hwp_bench.sim.render.frame import render_frame
-    from hwp_bench.sim.render.layers import write_layers
-
     for frame in frames:
         result = render_frame(scene, frame, frame_count, size)
         cost = {
@@ -82,22 +85,74 @@ def render_frames(
         atomic_write(frame_file(folder, frame), buffer.getvalue())
 
 
-def main() -> int:
-    """Read one job from standard input and do it."""
-    for name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
-        os.environ.setdefault(name, "1")
-    import torch
+@dataclass(frozen=True)
+class RenderFrames:
+    """Renders frames into a folder: the work of one process. Fields as in `render_frames`."""
 
-    torch.set_num_threads(1)
-    # The job comes from our own parent process through a pipe.
-    scene, frames, frame_count, size, folder, exr = pickle.load(sys.stdin.buffer)
-    parent = os.getppid()
-    for frame in frames:
-        if os.getppid() != parent:
-            return 1  # whoever asked for the frames is gone
-        render_frames(scene, [frame], frame_count, size, Path(folder), exr)
-    return 0
+    #: The scene.
+    scene: Scene
+    #: Numbers of the frames.
+    frames: Sequence[int]
+    #: Frames over which the capture is spread.
+    frame_count: int
+    #: Edge of the image in pixels.
+    size: int
+    #: Whether linear layers are written too.
+    exr: bool
+
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
+        """Render; see `hwp_bench.run.engine.job.Work`."""
+        for done, frame in enumerate(self.frames, start=1):
+            render_frames(self.scene, [frame], self.frame_count, self.size, output, self.exr)
+            on_progress(done, len(self.frames))
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def render_in_processes(
+    works: Sequence[RenderFrames], folder: Path, on_progress: Callable[[int], None]
+) -> None:
+    """Render frames in as many processes as there are works; if one fails, all are ended.
+
+    Args:
+        works: the frames of each process.
+        folder: where the frames go.
+        on_progress: is told how many frames are finished.
+
+    Raises:
+        HwpError: a process failed or was killed.
+    """
+    stop = threading.Event()
+    done = [0] * len(works)
+
+    def run(index: int) -> None:
+        def count(steps: int, total: int) -> None:
+            done[index] = steps
+            on_progress(sum(done))
+
+        # One thread each: the processes share the processors.
+        job = LocalJob(works[index], {}, folder.absolute(), dict.fromkeys(THREADS, "1"))
+        try:
+            run_in_process(job, count, stop.is_set)
+        except BaseException:
+            stop.set()
+            raise
+
+    with ThreadPoolExecutor(len(works)) as pool:
+        futures = [pool.submit(run, index) for index in range(len(works))]
+        try:
+            while wait(futures, timeout=1.0).not_done:
+                pass  # a wait without end would not let Ctrl-C through on every system
+        finally:
+            stop.set()
+    for error in (future.exception() for future in futures):
+        if isinstance(error, WorkerLost):
+            problem = f"a rendering process was killed ({error})"
+            raise HwpError(problem, where=works[0].scene.id, remedy=_REMEDY) from error
+        if isinstance(error, HwpError):
+            raise type(error)(
+                error.problem,
+                where=error.where,
+                field=error.field,
+                remedy=error.remedy or _REMEDY,
+            ) from error
+        if error is not None and not isinstance(error, Stopped):
+            raise error

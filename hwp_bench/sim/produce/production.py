@@ -2,26 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import os
-import pickle
 import shutil
-import subprocess
-import sys
-import tempfile
 import time
-from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import IO, Any
 
 import numpy as np
 
 from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.base.files import canonical_json, sha256_json
 from hwp_bench.base.locks import exclusive
-from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.progress import progress
 from hwp_bench.capture import (
     Cameras,
@@ -34,7 +26,14 @@ from hwp_bench.capture import (
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.sim.effects.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.produce.estimates import estimate_hands, estimate_mask
-from hwp_bench.sim.produce.frames import exr_file, frame_file, read_frame, render_frames
+from hwp_bench.sim.produce.frames import (
+    RenderFrames,
+    exr_file,
+    frame_file,
+    read_frame,
+    render_frames,
+    render_in_processes,
+)
 from hwp_bench.sim.scene.motion import hand_parameters
 from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
 from hwp_bench.sim.scene.reader import load_scene
@@ -142,64 +141,12 @@ def _render_missing(
                 render_frames(scene, [frame], count, size, waiting, exr)
                 update(done)
             return
-        jobs = [missing[first::workers] for first in range(workers)]
-        with contextlib.ExitStack() as stack:
-            logs = [stack.enter_context(tempfile.TemporaryFile()) for _ in jobs]
-            processes = [
-                _start((scene, job, count, size, os.fspath(waiting), exr), log)
-                for job, log in zip(jobs, logs, strict=True)
-            ]
-            stack.callback(_stop, processes)
-            while any(process.poll() is None for process in processes):
-                time.sleep(0.2)
-                update(sum(frame_file(waiting, frame).exists() for frame in missing))
-                _raise_if_failed(scene, processes, logs)
-            _raise_if_failed(scene, processes, logs)
-            update(len(missing))
-
-
-def _start(job: tuple[Any, ...], log: IO[bytes]) -> subprocess.Popen[bytes]:
-    root = os.fspath(PACKAGES)
-    known = os.environ.get("PYTHONPATH")
-    environment = {
-        **os.environ,
-        "PYTHONPATH": root if not known else os.pathsep.join([root, known]),
-        "OMP_NUM_THREADS": "1",
-    }
-    process = subprocess.Popen(
-        [sys.executable, "-m", "hwp_bench.sim.produce.frames"],
-        stdin=subprocess.PIPE,
-        stdout=log,
-        stderr=log,
-        env=environment,
-    )
-    assert process.stdin is not None
-    with contextlib.suppress(BrokenPipeError):
-        process.stdin.write(pickle.dumps(job))
-        process.stdin.close()
-    return process
-
-
-def _stop(processes: list[subprocess.Popen[bytes]]) -> None:
-    for process in processes:
-        if process.poll() is None:
-            process.terminate()
-        process.wait()
-
-
-def _raise_if_failed(
-    scene: Scene, processes: list[subprocess.Popen[bytes]], logs: Sequence[IO[bytes]]
-) -> None:
-    for process, log in zip(processes, logs, strict=True):
-        if process.poll():
-            log.seek(0)
-            lines = log.read().decode(errors="replace").strip().splitlines()
-            reason = lines[-1] if lines else "it said nothing"
-            raise HwpError(
-                f"a rendering process ended with status {process.returncode}: {reason}",
-                where=scene.id,
-                remedy="Finished frames are kept; the same command goes on from there.",
-            )
+        works = [
+            RenderFrames(scene, missing[first::workers], count, size, exr)
+            for first in range(workers)
+        ]
+        render_in_processes(works, waiting, update)
+        update(len(missing))
 
 
 def _assemble(
