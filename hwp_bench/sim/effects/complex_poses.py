@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from hwp_bench.sim.effects.base import Effect
-from hwp_bench.sim.scene.effect_settings import complex_poses
+from hwp_bench.sim.scene.effect_settings import ComplexPoses, keys_by_side, read_settings
 from hwp_bench.sim.scene.episodes import envelope
 from hwp_bench.sim.scene.motion import HandMoment, along_keys, moment_of_key
 from hwp_bench.sim.scene.schema import EffectCall, Scene
@@ -18,10 +18,11 @@ class _ComplexPoses(Effect):
     def stage(
         self, scene: Scene, call: EffectCall, seconds: float, hands: dict[str, HandMoment]
     ) -> dict[str, HandMoment]:
-        settings = complex_poses(call, scene.sides, scene.id)
+        settings = read_settings(ComplexPoses, call, scene.id)
+        keys = keys_by_side(settings, scene.sides, call.kind, scene.id)
         weight = envelope(call, seconds / scene.duration)
         changed = dict(hands)
-        for side, rows in settings.keys.items():
+        for side, rows in keys.items():
             if rows:
                 row = [moment_of_key(key) for key in rows]
                 label = f"complex-{side}"

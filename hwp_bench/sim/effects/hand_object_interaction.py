@@ -6,7 +6,7 @@ import numpy as np
 
 from hwp_bench.sim.effects.base import Effect, Placement
 from hwp_bench.sim.props.objects import ObjectRequest
-from hwp_bench.sim.scene.effect_settings import object_interaction
+from hwp_bench.sim.scene.effect_settings import ObjectInteraction, keys_by_side, read_settings
 from hwp_bench.sim.scene.episodes import envelope
 from hwp_bench.sim.scene.motion import HandMoment, moment_of_key
 from hwp_bench.sim.scene.schema import EffectCall, Scene
@@ -24,7 +24,8 @@ class _HandObjectInteraction(Effect):
     def stage(
         self, scene: Scene, call: EffectCall, seconds: float, hands: dict[str, HandMoment]
     ) -> dict[str, HandMoment]:
-        staged = object_interaction(call, scene.sides, scene.id).staged
+        settings = read_settings(ObjectInteraction, call, scene.id)
+        staged = keys_by_side(settings.stage, scene.sides, call.kind, scene.id)
         weight = envelope(call, seconds / scene.duration)
         changed = dict(hands)
         for side, key in staged.items():
@@ -46,7 +47,7 @@ class _HandObjectInteraction(Effect):
         # Objects keep their front: +z of an object faces the camera, its top is up.
         flip = np.diag([1.0, -1.0, -1.0])
         placements = []
-        for item in object_interaction(call, scene.sides, scene.id).items:
+        for item in read_settings(ObjectInteraction, call, scene.id).items:
             if strength < item.above:
                 continue
             wave = np.sin(2.0 * np.pi * item.pace * seconds + np.array([0.0, 0.6, 1.2]))
@@ -58,8 +59,9 @@ class _HandObjectInteraction(Effect):
                 + (1.0 - strength) * np.array(item.away)
                 + wave * np.array(item.swing)
             )
+            anchor = item.anchor or scene.sides[0]
             placements.append(
-                Placement(ObjectRequest(item.object, item.variant), item.anchor, transform)
+                Placement(ObjectRequest(item.object, item.variant), anchor, transform)
             )
         return tuple(placements)
 

@@ -9,7 +9,7 @@ import numpy as np
 from hwp_bench.base.colors import lamp_color
 from hwp_bench.sim.effects.base import Effect
 from hwp_bench.sim.geometry.mesh import unit
-from hwp_bench.sim.scene.effect_settings import light_modes
+from hwp_bench.sim.scene.effect_settings import Illumination, read_settings
 from hwp_bench.sim.scene.optics import CastShadow, Lights
 from hwp_bench.sim.scene.schema import EffectCall, Episode, Scene
 
@@ -26,7 +26,7 @@ class _Illumination(Effect):
     def light(
         self, scene: Scene, call: EffectCall, seconds: float, strength: float, lights: Lights
     ) -> Lights:
-        modes = light_modes(call, scene.id)
+        modes = read_settings(Illumination, call, scene.id).modes
         moment = seconds / scene.duration
         number = next((i for i, e in enumerate(call.episodes) if e.start <= moment <= e.end), 0)
         mode = modes[number % len(modes)]

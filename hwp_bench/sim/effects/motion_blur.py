@@ -6,7 +6,7 @@ import numpy as np
 
 from hwp_bench.sim.effects.base import Effect, Shutter
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.scene.effect_settings import motion_blur
+from hwp_bench.sim.scene.effect_settings import MotionBlur, read_settings
 from hwp_bench.sim.scene.schema import EffectCall, Scene
 
 
@@ -22,7 +22,7 @@ class _MotionBlur(Effect):
     def shutter(
         self, scene: Scene, call: EffectCall, seconds: float, strength: float
     ) -> Shutter | None:
-        settings = motion_blur(call, scene.id)
+        settings = read_settings(MotionBlur, call, scene.id)
         angle = _slow_angle(scene, seconds)
         way = strength * np.array([np.cos(angle), np.sin(angle)])
         camera = (

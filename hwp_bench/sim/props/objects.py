@@ -41,7 +41,7 @@ def object_names() -> tuple[str, ...]:
     return tuple(_MODULES)
 
 
-def check_object(name: str, where: str, field: str) -> None:
+def check_object(name: str) -> None:
     """Refuse an object that does not exist.
 
     Raises:
@@ -50,8 +50,7 @@ def check_object(name: str, where: str, field: str) -> None:
     if name not in _MODULES:
         raise BadInput(
             f"there is no object {name!r}",
-            where=where,
-            field=field,
+            field="object",
             remedy=f"Known: {', '.join(_MODULES)}.",
         )
 
@@ -59,7 +58,7 @@ def check_object(name: str, where: str, field: str) -> None:
 @lru_cache(maxsize=64)
 def build_object(request: ObjectRequest) -> Surface:
     """Build an object around its own origin, in metres."""
-    check_object(request.name, "object", "name")
+    check_object(request.name)
     module = importlib.import_module(f"hwp_bench.sim.props.{_MODULES[request.name]}")
     surface: Surface = module.build(request.name, request.variant)
     return surface

@@ -1,28 +1,45 @@
-"""Settings of the four perturbations: what a scene's `[[effects]]` tables hold besides episodes."""
+"""Settings of the four perturbations: what a table of `effects` holds besides its episodes."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import Annotated, Literal, Protocol, TypeVar
 
+from msgspec import Meta
+
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.records import number, parse_record
 from hwp_bench.sim.props.objects import check_object
-from hwp_bench.sim.scene.fields import Fields
-from hwp_bench.sim.scene.gestures import gesture
-from hwp_bench.sim.scene.schema import EffectCall, HandKey, Scene
+from hwp_bench.sim.scene.schema import EffectCall, HandKey, Words
 
-#: What an episode of the illumination effect can do to the light.
-LIGHT_MODES = ("dim", "bright", "warm", "cool", "move", "flicker", "shadow")
+_Metres = Annotated[float, Meta(ge=-1.0, le=1.0)]
+_FarMetres = Annotated[float, Meta(ge=-2.0, le=2.0)]
+_Swing = Annotated[float, Meta(ge=-0.5, le=0.5)]
+_Degrees = Annotated[float, Meta(ge=-360.0, le=360.0)]
+_Spin = Annotated[float, Meta(ge=-3600.0, le=3600.0)]
+_LightMode = Literal["dim", "bright", "warm", "cool", "move", "flicker", "shadow"]
 _ZERO = (0.0, 0.0, 0.0)
+
+Settings = TypeVar("Settings")
+Keys_co = TypeVar("Keys_co", covariant=True)
+Keys = TypeVar("Keys")
 
 
 @dataclass(frozen=True)
 class ComplexPoses:
-    """Settings of `complex_poses`."""
+    """Settings of `complex_poses`; a side without keys keeps its track."""
 
     #: Keys per second.
-    pace: float
-    #: Keys of each side of the scene; a side without keys keeps its track.
-    keys: Mapping[str, tuple[HandKey, ...]]
+    pace: float = number(1.6, 0.1, 10.0)
+    #: Keys of the right hand.
+    right: tuple[HandKey, ...] | None = None
+    #: Keys of the left hand.
+    left: tuple[HandKey, ...] | None = None
+
+    def __post_init__(self) -> None:
+        if not self.right and not self.left:
+            raise UsageError("holds no key", field="right or left")
 
 
 @dataclass(frozen=True)
@@ -30,25 +47,38 @@ class ObjectItem:
     """One object of a scene and how it moves."""
 
     #: Name of the object.
-    object: str
+    object: Words
     #: Its look.
-    variant: int
-    #: Hand that it moves with, or `world`.
-    anchor: str
+    variant: int = number(0, 0, 1000)
+    #: Hand that it moves with, or `world`; the scene's first hand if None.
+    anchor: Literal["right", "left", "world"] | None = None
     #: m from the palm (or from the point looked at) at full strength.
-    place: tuple[float, float, float]
+    place: tuple[_Metres, _Metres, _Metres] = _ZERO
     #: m from there at strength 0: where the object comes from.
-    away: tuple[float, float, float]
+    away: tuple[_FarMetres, _FarMetres, _FarMetres] = _ZERO
     #: Degrees about x, y, z.
-    rotate: tuple[float, float, float]
+    rotate: tuple[_Degrees, _Degrees, _Degrees] = _ZERO
     #: Degrees per second about x, y, z.
-    spin: tuple[float, float, float]
+    spin: tuple[_Spin, _Spin, _Spin] = _ZERO
     #: m of swing along x, y, z, at `pace`.
-    swing: tuple[float, float, float]
+    swing: tuple[_Swing, _Swing, _Swing] = _ZERO
     #: Swings per second.
-    pace: float
+    pace: float = number(0.5, 0.0, 20.0)
     #: Strength from which it is there.
-    above: float
+    above: float = number(0.0, 0.0, 1.0)
+
+    def __post_init__(self) -> None:
+        check_object(self.object)
+
+
+@dataclass(frozen=True)
+class StagedHands:
+    """How hands are held while they interact; a hand without a key keeps its track."""
+
+    #: The right hand.
+    right: HandKey | None = None
+    #: The left hand.
+    left: HandKey | None = None
 
 
 @dataclass(frozen=True)
@@ -56,9 +86,25 @@ class ObjectInteraction:
     """Settings of `hand_object_interaction`."""
 
     #: The objects, at least one.
-    items: tuple[ObjectItem, ...]
-    #: How a hand is held while it interacts, by side; others keep their track.
-    staged: Mapping[str, HandKey]
+    items: tuple[ObjectItem, ...] = ()
+    #: How the hands are held.
+    stage: StagedHands = field(default_factory=StagedHands)
+
+    def __post_init__(self) -> None:
+        if not self.items:
+            raise UsageError("names no object", field="items")
+
+
+@dataclass(frozen=True)
+class Illumination:
+    """Settings of `illumination`."""
+
+    #: What the episodes do to the light, in turn.
+    modes: tuple[_LightMode, ...] = ("dim", "warm", "move", "bright", "cool", "shadow")
+
+    def __post_init__(self) -> None:
+        if not self.modes:
+            raise UsageError("is empty", field="modes")
 
 
 @dataclass(frozen=True)
@@ -66,112 +112,81 @@ class MotionBlur:
     """Settings of `motion_blur`."""
 
     #: How long the shutter is open, s.
-    shutter: float
+    shutter: float = number(0.02, 0.001, 0.5)
     #: Way of the whole image, as a share of the hands' way.
-    camera_share: float
+    camera_share: float = number(0.0, 0.0, 1.0)
 
 
-def check_settings(scene: Scene, call: EffectCall, where: str) -> None:
+_KINDS: Mapping[str, type] = {
+    "complex_poses": ComplexPoses,
+    "hand_object_interaction": ObjectInteraction,
+    "illumination": Illumination,
+    "motion_blur": MotionBlur,
+}
+
+
+class _BySide(Protocol[Keys_co]):
+    """A table with one entry for each hand."""
+
+    @property
+    def right(self) -> Keys_co | None: ...
+
+    @property
+    def left(self) -> Keys_co | None: ...
+
+
+def check_settings(call: EffectCall, sides: tuple[str, ...], where: str) -> None:
     """Check the settings of an effect.
+
+    Args:
+        call: the effect.
+        sides: the hands of the scene.
+        where: the file, for messages.
 
     Raises:
         BadInput: a setting is missing, unknown or out of range; it is named.
     """
-    if call.kind == "complex_poses":
-        complex_poses(call, scene.sides, where)
-    elif call.kind == "hand_object_interaction":
-        object_interaction(call, scene.sides, where)
-    elif call.kind == "illumination":
-        light_modes(call, where)
-    else:
-        motion_blur(call, where)
+    settings: object = read_settings(_KINDS[call.kind], call, where)
+    path = _path(call)
+    if isinstance(settings, ComplexPoses):
+        keys_by_side(settings, sides, path, where)
+    elif isinstance(settings, ObjectInteraction):
+        keys_by_side(settings.stage, sides, f"{path}.stage", where)
+        for index, item in enumerate(settings.items):
+            if item.anchor not in (*sides, "world", None):
+                raise BadInput(
+                    f"is {item.anchor!r}",
+                    where=where,
+                    field=f"{path}.items[{index}].anchor",
+                    remedy=f"Known: {', '.join((*sides, 'world'))}.",
+                )
 
 
-def complex_poses(call: EffectCall, sides: tuple[str, ...], where: str) -> ComplexPoses:
-    """Read the settings of `complex_poses`."""
-    fields = _fields(call, where)
-    pace = fields.number("pace", 0.1, 10.0, default=1.6)
-    keys = {side: tuple(hand_key(row) for row in fields.rows(side)) for side in sides}
-    if not any(keys.values()):
-        raise fields.wrong("right or left", "holds no key")
-    fields.finish()
-    return ComplexPoses(pace, keys)
+def read_settings(kind: type[Settings], call: EffectCall, where: str) -> Settings:
+    """The settings of an effect as the dataclass of its kind; see `check_settings`."""
+    return parse_record(kind, call.settings, where=where, field=_path(call), error=BadInput)
 
 
-def object_interaction(call: EffectCall, sides: tuple[str, ...], where: str) -> ObjectInteraction:
-    """Read the settings of `hand_object_interaction`."""
-    fields = _fields(call, where)
-    items = tuple(_item(row, sides) for row in fields.rows("items"))
-    if not items:
-        raise fields.wrong("items", "names no object")
-    staged = {}
-    table = fields.optional_table("stage")
-    if table is not None:
-        for side in sides:
-            key = table.optional_table(side)
-            if key is not None:
-                staged[side] = hand_key(key)
-        table.finish()
-    fields.finish()
-    return ObjectInteraction(items, staged)
+def keys_by_side(
+    table: _BySide[Keys], sides: tuple[str, ...], path: str, where: str
+) -> dict[str, Keys]:
+    """What a table says of each hand of a scene, right first.
+
+    Raises:
+        BadInput: it speaks of a hand that the scene does not show.
+    """
+    found = {
+        side: keys
+        for side, keys in (("right", table.right), ("left", table.left))
+        if keys is not None
+    }
+    for side in found:
+        if side not in sides:
+            raise BadInput(
+                f"the scene does not show the {side} hand", where=where, field=f"{path}.{side}"
+            )
+    return found
 
 
-def light_modes(call: EffectCall, where: str) -> tuple[str, ...]:
-    """Read the settings of `illumination`: what its episodes do to the light, in turn."""
-    fields = _fields(call, where)
-    modes = fields.rest().get("modes", ["dim", "warm", "move", "bright", "cool", "shadow"])
-    unknown = set(call.settings) - {"modes"}
-    if unknown:
-        raise fields.wrong(sorted(unknown)[0], "is unknown")
-    if not isinstance(modes, list) or not modes or not set(modes) <= set(LIGHT_MODES):
-        raise fields.wrong("modes", f"is {modes!r}", remedy=f"Known: {', '.join(LIGHT_MODES)}.")
-    return tuple(modes)
-
-
-def motion_blur(call: EffectCall, where: str) -> MotionBlur:
-    """Read the settings of `motion_blur`."""
-    fields = _fields(call, where)
-    blur = MotionBlur(
-        shutter=fields.number("shutter", 0.001, 0.5, default=0.02),
-        camera_share=fields.number("camera_share", 0.0, 1.0, default=0.0),
-    )
-    fields.finish()
-    return blur
-
-
-def hand_key(fields: Fields) -> HandKey:
-    """Read one hand key, of a track or of an effect that stages the hands."""
-    name = fields.text("gesture")
-    gesture(name, where=fields.where, field=fields.name("gesture"))
-    key = HandKey(
-        gesture=name,
-        place=fields.vector("place", 1.0, default=_ZERO),
-        turn=fields.number("turn", -360.0, 360.0, default=0.0),
-        tilt=fields.number("tilt", -90.0, 90.0, default=0.0),
-        roll=fields.number("roll", -180.0, 180.0, default=0.0),
-    )
-    fields.finish()
-    return key
-
-
-def _fields(call: EffectCall, where: str) -> Fields:
-    return Fields(call.settings, where, f"effects({call.kind}).")
-
-
-def _item(row: Fields, sides: tuple[str, ...]) -> ObjectItem:
-    name = row.text("object")
-    check_object(name, row.where, row.name("object"))
-    item = ObjectItem(
-        object=name,
-        variant=row.whole("variant", 0, 1000, default=0),
-        anchor=row.choice("anchor", (*sides, "world"), default=sides[0]),
-        place=row.vector("place", 1.0, default=_ZERO),
-        away=row.vector("away", 2.0, default=_ZERO),
-        rotate=row.vector("rotate", 360.0, default=_ZERO),
-        spin=row.vector("spin", 3600.0, default=_ZERO),
-        swing=row.vector("swing", 0.5, default=_ZERO),
-        pace=row.number("pace", 0.0, 20.0, default=0.5),
-        above=row.number("above", 0.0, 1.0, default=0.0),
-    )
-    row.finish()
-    return item
+def _path(call: EffectCall) -> str:
+    return f"effects({call.kind})"

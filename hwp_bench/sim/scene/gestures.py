@@ -40,7 +40,7 @@ def gestures() -> Mapping[str, np.ndarray]:
     )
 
 
-def gesture(name: str, *, where: str | None = None, field: str | None = None) -> np.ndarray:
+def gesture(name: str) -> np.ndarray:
     """Look a hand shape up.
 
     Raises:
@@ -51,7 +51,7 @@ def gesture(name: str, *, where: str | None = None, field: str | None = None) ->
     except KeyError:
         known = ", ".join(gestures())
         raise BadInput(
-            f"there is no gesture {name!r}", where=where, field=field, remedy=f"Known: {known}."
+            f"there is no gesture {name!r}", field="gesture", remedy=f"Known: {known}."
         ) from None
 
 

@@ -3,25 +3,33 @@
 from __future__ import annotations
 
 import tomllib
+from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
+from typing import Annotated, Any, Literal
+
+from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.records import number, parse_record
 from hwp_bench.sim.props.backdrop import check_backdrop
-from hwp_bench.sim.scene.effect_settings import check_settings, hand_key
+from hwp_bench.sim.scene.effect_settings import check_settings, keys_by_side
 from hwp_bench.sim.scene.episodes import clean_share
-from hwp_bench.sim.scene.fields import Fields
 from hwp_bench.sim.scene.schema import (
     CLEAN_FROM,
     MIN_CLEAN_SHARE,
     Camera,
     EffectCall,
     Episode,
+    HandKey,
     Light,
     Scene,
+    Seed,
     Sensor,
     Subject,
     Track,
+    Words,
+    sides_of,
 )
 from hwp_bench.taxonomy import MAX_SEVERITY, PERTURBATIONS
 
@@ -76,121 +84,129 @@ def parse_scene(text: str, *, where: str) -> Scene:
         content = tomllib.loads(text)
     except (tomllib.TOMLDecodeError, RecursionError) as error:
         raise BadInput(f"is not valid TOML ({error})", where=where) from error
-    top = Fields(content, where)
-    hands = top.choice("hands", ("right", "left", "both"))
-    sides = ("right", "left") if hands == "both" else (hands,)
+    file = parse_record(_SceneFile, content, where=where, error=BadInput)
     scene = Scene(
-        id=top.text("id"),
-        title=top.text("title"),
-        hands=hands,
-        action=top.text("action"),
-        device=top.text("device"),
-        frame_count=top.whole("frame_count", 10, 100_000),
-        fps=top.number("fps", 1.0, 240.0),
-        seed=top.whole("seed", 0, 2**31),
-        subject=_subject(top.table("subject")),
-        camera=_camera(top.table("camera")),
-        light=_light(top.table("light")),
-        background=top.text("background"),
-        sensor=_sensor(top),
-        track=_track(top.table("track"), sides),
-        effects=tuple(_effect(row) for row in top.rows("effects")),
+        id=file.id,
+        title=file.title,
+        hands=file.hands,
+        action=file.action,
+        device=file.device,
+        frame_count=file.frame_count,
+        fps=file.fps,
+        seed=file.seed,
+        subject=file.subject,
+        camera=file.camera,
+        light=file.light,
+        background=file.background,
+        sensor=_sensor(file, where),
+        track=Track(
+            file.track.period,
+            keys_by_side(file.track, sides_of(file.hands), "track", where),
+            file.track.variation,
+        ),
+        effects=tuple(_effect(row, f"effects[{i}]", where) for i, row in enumerate(file.effects)),
     )
-    top.finish()
-    _check_parts(scene, where)
+    for side in scene.sides:
+        if not scene.track.keys.get(side):
+            raise BadInput("holds no key", where=where, field=f"track.{side}")
+    check_backdrop(scene.background, where)
+    _check_effects(scene, where)
     return scene
 
 
-def _subject(fields: Fields) -> Subject:
-    sleeve = fields.vector("sleeve", 1.0, default=(0.25, 0.3, 0.4))
-    subject = Subject(
-        seed=fields.whole("seed", 0, 2**31),
-        tone=fields.number("tone", 0.0, 1.0),
-        age=fields.number("age", 5.0, 100.0),
-        sleeve=sleeve,
-        model=fields.text("model", default="anny"),
-    )
-    fields.finish()
-    return subject
+@dataclass(frozen=True)
+class _TrackTable:
+    """The table `track`."""
+
+    period: Annotated[float, Meta(ge=0.2, le=600.0)]
+    right: tuple[HandKey, ...] | None = None
+    left: tuple[HandKey, ...] | None = None
+    variation: float = number(6.0, 0.0, 30.0)
 
 
-def _camera(fields: Fields) -> Camera:
-    camera = Camera(
-        handheld=fields.flag("handheld"),
-        field_of_view=fields.number("field_of_view", 5.0, 100.0),
-        sway=fields.number("sway", 0.0, 0.05, default=0.004),
-    )
-    fields.finish()
-    return camera
+@dataclass(frozen=True)
+class _SceneFile:
+    """A scene file; see `Scene`."""
+
+    id: Words
+    title: Words
+    hands: Literal["right", "left", "both"]
+    action: Words
+    device: Words
+    frame_count: Annotated[int, Meta(ge=10, le=100_000)]
+    fps: Annotated[float, Meta(ge=1.0, le=240.0)]
+    seed: Seed
+    subject: Subject
+    camera: Camera
+    light: Light
+    background: Words
+    track: _TrackTable
+    sensor: Sensor | None = None
+    noise: Annotated[float, Meta(ge=0.0, le=0.2)] | None = None
+    effects: list[dict[str, Any]] = field(default_factory=list)
 
 
-def _light(fields: Fields) -> Light:
-    light = Light(
-        direction=fields.vector("direction", 100.0),
-        key=fields.number("key", 0.0, 20.0),
-        sky=fields.number("sky", 0.0, 20.0),
-        kelvin=fields.number("kelvin", 1500.0, 15000.0),
-    )
-    if not any(light.direction):
-        raise fields.wrong("direction", "is zero")
-    fields.finish()
-    return light
+@dataclass(frozen=True)
+class _EffectTable:
+    """What every table of `effects` holds; the rest are settings of its kind."""
 
+    kind: Words
+    episodes: list[tuple[float, float, float]]
+    strengths: tuple[float, float, float, float, float] | None = None
 
-def _sensor(top: Fields) -> Sensor:
-    """The table `sensor`, or `noise` at the top where a scene says no more of its sensor."""
-    fields = top.optional_table("sensor")
-    if fields is None:
-        return Sensor(noise=top.number("noise", 0.0, 0.2))
-    sensor = Sensor(
-        noise=fields.number("noise", 0.0, 0.2),
-        jpeg_quality=fields.whole("jpeg_quality", 0, 100, default=0),
-        rolling_shutter=fields.number("rolling_shutter", 0.0, 0.05, default=0.0),
-    )
-    fields.finish()
-    return sensor
-
-
-def _track(fields: Fields, sides: tuple[str, ...]) -> Track:
-    keys = {side: tuple(hand_key(row) for row in fields.rows(side)) for side in sides}
-    for side, rows in keys.items():
-        if not rows:
-            raise fields.wrong(side, "holds no key")
-    track = Track(
-        period=fields.number("period", 0.2, 600.0),
-        keys=keys,
-        variation=fields.number("variation", 0.0, 30.0, default=6.0),
-    )
-    fields.finish()
-    return track
-
-
-def _effect(fields: Fields) -> EffectCall:
-    kind = fields.choice("kind", PERTURBATIONS)
-    episodes = []
-    for start, end, severity in fields.triples("episodes"):
-        if not 0.0 <= start < end <= CLEAN_FROM:
-            raise fields.wrong(
-                "episodes",
-                f"[{start}, {end}] does not lie in order within 0 and {CLEAN_FROM}",
-                remedy="The last fifth (validation and test) stays clean.",
+    def __post_init__(self) -> None:
+        if self.kind not in PERTURBATIONS:
+            known = ", ".join(PERTURBATIONS)
+            raise UsageError(f"is {self.kind!r}", field="kind", remedy=f"Known: {known}.")
+        if not self.episodes:
+            raise UsageError("is empty", field="episodes")
+        for start, end, severity in self.episodes:
+            if not 0.0 <= start < end <= CLEAN_FROM:
+                raise UsageError(
+                    f"[{start}, {end}] does not lie in order within 0 and {CLEAN_FROM}",
+                    field="episodes",
+                    remedy="The last fifth (validation and test) stays clean.",
+                )
+            if not 1.0 <= severity <= MAX_SEVERITY:
+                raise UsageError(
+                    f"severity {severity} is not in 1..{MAX_SEVERITY}", field="episodes"
+                )
+        values = self.strengths or (0.0,)
+        if values[0] < 0.0 or sorted(values) != list(values):
+            raise UsageError(
+                f"is {list(values)}, expected rising numbers from 0 up", field="strengths"
             )
-        if not 1.0 <= severity <= MAX_SEVERITY:
-            raise fields.wrong("episodes", f"severity {severity} is not in 1..{MAX_SEVERITY}")
-        episodes.append(Episode(start, end, severity))
-    strengths = fields.rising("strengths", MAX_SEVERITY)
-    call = EffectCall(kind, tuple(episodes), strengths, fields.rest())
-    fields.finish()
-    return call
 
 
-def _check_parts(scene: Scene, where: str) -> None:
-    check_backdrop(scene.background, where)
+def _sensor(file: _SceneFile, where: str) -> Sensor:
+    """The table `sensor`, or `noise` at the top where a scene says no more of its sensor."""
+    if file.sensor is None:
+        if file.noise is None:
+            raise BadInput("is missing", where=where, field="noise")
+        return Sensor(noise=file.noise)
+    if file.noise is not None:
+        raise BadInput("is in the table sensor already", where=where, field="noise")
+    return file.sensor
+
+
+def _effect(row: dict[str, Any], path: str, where: str) -> EffectCall:
+    names = {item.name for item in fields(_EffectTable)}
+    head = {name: value for name, value in row.items() if name in names}
+    table = parse_record(_EffectTable, head, where=where, field=path, error=BadInput)
+    return EffectCall(
+        kind=table.kind,
+        episodes=tuple(Episode(*episode) for episode in table.episodes),
+        strengths=table.strengths,
+        settings={name: value for name, value in row.items() if name not in names},
+    )
+
+
+def _check_effects(scene: Scene, where: str) -> None:
     kinds = [call.kind for call in scene.effects]
     if len(set(kinds)) != len(kinds):
         raise BadInput("an effect is called twice", where=where, field="effects")
     for call in scene.effects:
-        check_settings(scene, call, where)
+        check_settings(call, scene.sides, where)
     share = clean_share(scene)
     if share < MIN_CLEAN_SHARE:
         raise BadInput(

