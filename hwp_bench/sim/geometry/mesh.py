@@ -6,6 +6,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hwp_bench.hands.topology import boundary_vertices
+
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
@@ -68,8 +70,14 @@ def normal_operator(faces: np.ndarray, vertex_count: int) -> csr_matrix:
     return csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(vertex_count, len(faces)))
 
 
-def vertex_normals(vertices: np.ndarray, faces: np.ndarray, operator: csr_matrix) -> np.ndarray:
-    """Unit normals, weighted by area: (V, 3)."""
+def surface_normals(vertices: np.ndarray, faces: np.ndarray, operator: csr_matrix) -> np.ndarray:
+    """Unit normals at the vertices, weighted by area: (V, 3).
+
+    Args:
+        vertices: (V, 3).
+        faces: (F, 3).
+        operator: `normal_operator` of the mesh; frames share it.
+    """
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     return unit(operator @ np.cross(b - a, c - a))
 
@@ -80,15 +88,13 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(length, 1e-12)
 
 
-def boundary_vertices(faces: np.ndarray) -> np.ndarray:
-    """Vertices on edges that only one face has."""
-    return np.unique(_boundary_edges(faces))
-
-
 def boundary_loop(faces: np.ndarray) -> np.ndarray:
     """The longest loop of boundary vertices, in order."""
-    edges = _boundary_edges(faces)
-    following = dict(edges.tolist())
+    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
+    _, inverse, counts = np.unique(
+        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
+    )
+    following = dict(edges[counts[inverse.reshape(-1)] == 1].tolist())
     loops = []
     while following:
         start = next(iter(following))
@@ -99,14 +105,6 @@ def boundary_loop(faces: np.ndarray) -> np.ndarray:
             step = following.pop(step)
         loops.append(loop)
     return np.array(max(loops, key=len, default=[]), dtype=np.int64)
-
-
-def _boundary_edges(faces: np.ndarray) -> np.ndarray:
-    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, inverse, counts = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    return edges[counts[inverse.reshape(-1)] == 1]
 
 
 def _adjacency(faces: np.ndarray, vertex_count: int) -> csr_matrix:

@@ -30,8 +30,7 @@ from hwp_bench.sim.render.instant import Lens, render_instant
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.optics import intrinsics, steady_light, viewmat
 from hwp_bench.sim.scene.reader import parse_scene
-from hwp_bench.sim.scene.schema import EffectCall, Scene, Sensor
-from hwp_bench.sim.scene.variants import with_effects
+from hwp_bench.sim.scene.schema import EffectCall, Scene, Sensor, with_effects
 from hwp_bench.sim.subject.hand import MOVING
 
 #: What severity 1 to 5 means: mean PSNR over the hand in dB, or its covered share.

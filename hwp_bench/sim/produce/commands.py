@@ -60,6 +60,7 @@ def list_scenes(args: argparse.Namespace) -> int:
 
 def print_plan(args: argparse.Namespace) -> int:
     """Print passes and predicted cost."""
+    from hwp_bench.base.tables import to_markdown
     from hwp_bench.sim.produce.forecast import forecast, plan_table, share_table
 
     reports = [
@@ -69,10 +70,8 @@ def print_plan(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps([report.to_json() for report in reports], indent=1))
     else:
-        print(plan_table(reports))
-        if not args.no_probe:
-            print()
-            print(share_table(reports))
+        tables = [plan_table(reports)] + ([] if args.no_probe else [share_table(reports)])
+        print("\n".join(to_markdown(table) for table in tables), end="")
     return 0
 
 
@@ -195,7 +194,7 @@ def _scenes(names: list[str]) -> list[Scene]:
 
 
 def _changed(scene: Scene, severity: float | None, subject: int | None) -> Scene:
-    from hwp_bench.sim.scene.variants import with_severity, with_subject
+    from hwp_bench.sim.scene.schema import with_severity, with_subject
 
     if severity is not None:
         scene = with_severity(scene, severity)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.sim.effects.base import ORDER
 from hwp_bench.sim.effects.plan import FramePlan, plan
 from hwp_bench.sim.render.frame import carry_out
@@ -117,38 +118,42 @@ def _probed(
     return seconds, rays
 
 
-def share_table(forecasts: list[Forecast]) -> str:
-    """A Markdown table: what each effect of each scene costs, in processor seconds."""
-    lines = [
-        f"| scene | frames | clean | {' | '.join(ORDER)} | all | s a frame |",
-        "| --- | ---: | ---: | " + "---: | " * len(ORDER) + "---: | ---: |",
-    ]
+def share_table(forecasts: list[Forecast]) -> Table:
+    """What each effect of each scene costs, in processor seconds."""
+    names = ("clean", *ORDER)
+    rows: list[tuple[Cell, ...]] = []
     for item in forecasts:
         shares = item.shares() or {}
         total = sum(shares.values())
-        cells = [f"{shares[name]:.0f}" if name in shares else "" for name in ("clean", *ORDER)]
-        row = [item.scene, str(item.frame_count), *cells, f"{total:.0f}"]
-        lines.append("| " + " | ".join([*row, f"{total / item.frame_count:.2f}"]) + " |")
-    return "\n".join(lines)
+        costs = [shares.get(name) for name in names]
+        rows.append((item.scene, item.frame_count, *costs, total, total / item.frame_count))
+    columns = [Column(name, digits=0) for name in ("scene", "frames", *names, "all")]
+    return Table(
+        "Processor seconds by what calls for them", (*columns, Column("s a frame")), tuple(rows)
+    )
 
 
-def plan_table(forecasts: list[Forecast]) -> str:
-    """A Markdown table: per scene and group of frames, passes and predicted cost."""
-    lines = [
-        "| scene | frames with | frames | s a frame | s in all | rays (millions) |",
-        "| --- | --- | ---: | ---: | ---: | ---: |",
-    ]
+def plan_table(forecasts: list[Forecast]) -> Table:
+    """Passes and predicted cost of each scene and group of frames."""
+    rows: list[tuple[Cell, ...]] = []
     for item in forecasts:
+        seconds, rays = item.seconds, item.rays
         for name, count in item.groups.items():
-            cells = [item.scene, name, str(count)]
-            if item.seconds is None or item.rays is None:
-                cells += ["", "", ""]
+            if seconds is None or rays is None:
+                rows.append((item.scene, name, count, None, None, None))
             else:
-                spent = item.seconds[name]
-                cells += [f"{spent / count:.2f}", f"{spent:.0f}", f"{item.rays[name] / 1e6:.1f}"]
-            lines.append("| " + " | ".join(cells) + " |")
+                spent = seconds[name]
+                rows.append((item.scene, name, count, spent / count, spent, rays[name] / 1e6))
         passes = ", ".join(f"{name} {count}" for name, count in item.passes.items())
-        total = "" if item.seconds is None else f"{sum(item.seconds.values()):.0f}"
-        cells = [item.scene, f"all ({passes}; {item.subframes} sub-frames)"]
-        lines.append("| " + " | ".join([*cells, str(item.frame_count), "", total, ""]) + " |")
-    return "\n".join(lines)
+        total = None if seconds is None else sum(seconds.values())
+        content = f"all ({passes}; {item.subframes} sub-frames)"
+        rows.append((item.scene, content, item.frame_count, None, total, None))
+    columns = (
+        Column("scene"),
+        Column("frames with"),
+        Column("frames"),
+        Column("s a frame"),
+        Column("s in all", digits=0),
+        Column("rays (millions)", digits=1),
+    )
+    return Table("Frames by the effects that act in them", columns, tuple(rows))

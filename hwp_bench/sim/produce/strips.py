@@ -19,8 +19,7 @@ from hwp_bench.sim.render.frame import FrameResult, render_frame
 from hwp_bench.sim.scene.motion import hand_parameters
 from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
 from hwp_bench.sim.scene.reader import load_scene, scene_names
-from hwp_bench.sim.scene.schema import EffectCall, Scene
-from hwp_bench.sim.scene.variants import with_effects, with_severity
+from hwp_bench.sim.scene.schema import EffectCall, Scene, with_effects, with_severity
 from hwp_bench.sim.subject.hand import scene_hands
 from hwp_bench.taxonomy import MAX_SEVERITY
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.sim.geometry.mesh import normal_operator, vertex_normals
+from hwp_bench.sim.geometry.mesh import normal_operator, surface_normals
 from hwp_bench.sim.geometry.surface import Material, Surface
 
 Color = tuple[float, float, float]
@@ -31,7 +31,7 @@ def shape(
     if not smooth:
         vertices = vertices[faces].reshape(-1, 3)
         faces = np.arange(len(vertices)).reshape(-1, 3)
-    normals = vertex_normals(vertices, faces, normal_operator(faces, len(vertices)))
+    normals = surface_normals(vertices, faces, normal_operator(faces, len(vertices)))
     return Surface(
         vertices=vertices,
         normals=normals,

@@ -13,7 +13,7 @@ import numpy as np
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import atomic_write, cache_root, sha256_json
-from hwp_bench.sim.geometry.mesh import unit, vertex_normals
+from hwp_bench.sim.geometry.mesh import surface_normals, unit
 from hwp_bench.sim.geometry.raycast import Tracer
 from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.hand import SubjectHand, anatomy_at, subject_hand
@@ -75,7 +75,7 @@ def _paint(hand: SubjectHand, subject: Subject) -> SkinAtlas:
     template = hand.template
 
     rest = hand.lift @ (template.vertices + template.shape_basis @ hand.betas)
-    normals = vertex_normals(rest, hand.faces, hand.normal_sum)
+    normals = surface_normals(rest, hand.faces, hand.normal_sum)
 
     def spread(values: np.ndarray) -> np.ndarray:
         return np.einsum("nk,nkc->nc", hits.weights, values[corners])

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.sim.geometry.mesh import normal_operator, smoothing, subdivision, vertex_normals
+from hwp_bench.sim.geometry.mesh import normal_operator, smoothing, subdivision, surface_normals
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.schema import Scene, Subject
 from hwp_bench.sim.subject.anatomy import Anatomy
@@ -66,9 +66,9 @@ class SubjectHand:
         """
         coarse = template_vertices(self.tensors, pose, self.betas, transl)
         smooth = self.lift @ coarse
-        normals = vertex_normals(smooth, self.faces, self.normal_sum)
+        normals = surface_normals(smooth, self.faces, self.normal_sum)
         vertices = smooth + self.relief[:, None] * normals
-        return vertices, vertex_normals(vertices, self.faces, self.normal_sum)
+        return vertices, surface_normals(vertices, self.faces, self.normal_sum)
 
 
 def template_vertices(
@@ -135,7 +135,7 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
     joints = template.joints + template.joint_basis @ betas
     normal_sum = normal_operator(faces, count)
     rest = lift @ (template.vertices + template.shape_basis @ betas)
-    normals = vertex_normals(rest, faces, normal_sum)
+    normals = surface_normals(rest, faces, normal_sum)
     anatomy = anatomy_at(template, betas, rest, normals, lift @ template.weights)
     return SubjectHand(
         template=template,

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.sim.geometry.mesh import boundary_loop, normal_operator, unit, vertex_normals
+from hwp_bench.sim.geometry.mesh import boundary_loop, normal_operator, surface_normals, unit
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import Material, Surface
 
@@ -94,7 +94,7 @@ def sleeve(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray, material: Ma
     uv_a, uv_b = np.stack([left, along], 1), np.stack([right, along], 1)
     uv_c, uv_d = np.stack([left, next_along], 1), np.stack([right, next_along], 1)
     corner_uv = np.concatenate([np.stack([uv_a, uv_c, uv_b], 1), np.stack([uv_b, uv_c, uv_d], 1)])
-    normals = vertex_normals(vertices, faces, normal_operator(faces, len(vertices)))
+    normals = surface_normals(vertices, faces, normal_operator(faces, len(vertices)))
     outward = vertices - np.repeat([ring.mean(axis=0) for ring in rings], _AROUND, axis=0)
     if np.einsum("ni,ni->n", normals, outward).sum() < 0:
         faces, corner_uv, normals = faces[:, ::-1], corner_uv[:, ::-1], -normals

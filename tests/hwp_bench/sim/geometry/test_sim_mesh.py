@@ -10,7 +10,7 @@ from hwp_bench.sim.geometry.mesh import (
     normal_operator,
     smoothing,
     subdivision,
-    vertex_normals,
+    surface_normals,
 )
 
 
@@ -38,7 +38,7 @@ def test_subdivided_corners_follow_their_vertices() -> None:
 def test_normals_point_along_the_radius() -> None:
     ball = trimesh.creation.icosphere(subdivisions=3)
     faces = np.asarray(ball.faces)
-    normals = vertex_normals(ball.vertices, faces, normal_operator(faces, len(ball.vertices)))
+    normals = surface_normals(ball.vertices, faces, normal_operator(faces, len(ball.vertices)))
     assert np.einsum("ni,ni->n", normals, ball.vertices).min() > 0.999
 
 

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SINGLE
 
+from hwp_bench.base.tables import to_markdown
 from hwp_bench.sim.effects.plan import SUBFRAME_STEP, plan
 from hwp_bench.sim.produce.forecast import forecast, plan_table
 from hwp_bench.sim.render.frame import FrameResult, render_frame
-from hwp_bench.sim.scene.schema import Scene, Sensor
-from hwp_bench.sim.scene.variants import with_effects
+from hwp_bench.sim.scene.schema import Scene, Sensor, with_effects
 
 SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48
@@ -145,7 +145,7 @@ def test_a_scene_without_objects_imports_none() -> None:
     program = f"""
 import sys
 from hwp_bench.sim.scene.reader import parse_scene
-from hwp_bench.sim.scene.variants import with_effects
+from hwp_bench.sim.scene.schema import with_effects
 from hwp_bench.sim.render.frame import render_frame
 scene = with_effects(parse_scene('''{SINGLE}''', where='tiny'), ['illumination'])
 render_frame(scene, {LIGHT}, {COUNT}, {SIZE})
@@ -168,7 +168,7 @@ def test_the_forecast_is_the_sum_of_what_is_called_for(make_scene: SceneMaker) -
     clean = render_frame(scene, CLEAN, COUNT, SIZE).cost.rays.total()
     # Clean frames differ in pose only; their rays differ by how much of the picture they fill.
     assert 0.5 < report.rays["clean"] / (report.groups["clean"] * clean) < 2.0
-    assert "| tiny | clean |" in plan_table([report])
+    assert "| tiny | clean |" in to_markdown(plan_table([report]))
     shares, seconds = report.shares(), report.seconds
     assert shares is not None
     assert seconds is not None

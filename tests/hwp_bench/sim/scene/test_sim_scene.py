@@ -14,8 +14,14 @@ from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.sim.produce.suites import suite, suite_names
 from hwp_bench.sim.scene.episodes import clean_share, level, moments, severity
 from hwp_bench.sim.scene.reader import load_scene, parse_scene, scene_names
-from hwp_bench.sim.scene.schema import CLEAN_FROM, MIN_CLEAN_SHARE, Scene
-from hwp_bench.sim.scene.variants import with_effects, with_severity, with_subject
+from hwp_bench.sim.scene.schema import (
+    CLEAN_FROM,
+    MIN_CLEAN_SHARE,
+    Scene,
+    with_effects,
+    with_severity,
+    with_subject,
+)
 from hwp_bench.taxonomy import catalogue
 
 SceneMaker = Callable[..., Scene]
