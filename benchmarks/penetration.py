@@ -73,7 +73,7 @@ def segments(template: HandTemplate) -> Segments:
 
 
 def self_penetration(parts: Segments, vertices: np.ndarray) -> np.ndarray:
-    """Depth of every vertex inside segments of its own hand that are no neighbours.
+    """Depth of every vertex inside segments of its own hand that are not neighbours.
 
     Args:
         parts: the hand.

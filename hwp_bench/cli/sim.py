@@ -29,7 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_plan(actions.add_parser("plan", help="print what a scene's frames need and will cost"))
     _add_render(actions.add_parser("render", help="render captures"))
     _add_preview(actions.add_parser("preview", help="contact sheet and animation of a scene"))
-    _add_gallery(actions.add_parser("gallery", help="pictures for the documentation"))
+    _add_gallery(actions.add_parser("gallery", help="images for the documentation"))
     _add_calibrate(actions.add_parser("calibrate", help="solve strengths for stated losses"))
 
 
@@ -69,7 +69,7 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--severity", type=float, help="one severity, 1-5, for every episode")
     parser.add_argument("--subject", type=int, metavar="SEED", help="another person")
     parser.add_argument("--seed", type=int, help="another seed of everything random")
-    parser.add_argument("--workers", type=int, help="processes (default: as many as pay)")
+    parser.add_argument("--workers", type=int, help="processes (default: as many as are worth it)")
     parser.add_argument("--exr", action="store_true", help="also linear EXR with extra layers")
     parser.add_argument("--overwrite", action="store_true", help="replace what exists")
     add_engine_arguments(parser)
@@ -100,4 +100,4 @@ def _add_calibrate(parser: argparse.ArgumentParser) -> None:
 
 def _add_extent(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--frames", type=int, help="frames (default: the scene's own)")
-    parser.add_argument("--size", type=int, help="edge of the picture in pixels (default 256)")
+    parser.add_argument("--size", type=int, help="edge of the image in pixels (default 256)")

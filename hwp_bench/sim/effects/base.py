@@ -1,4 +1,4 @@
-"""What an effect is, and the effects by name: the four perturbations and the sensor.
+"""The base of every effect, and the effects by name: four perturbations and the sensor.
 
 An effect is a set of hooks, each of which changes one part of a frame's recipe. Effects compose
 in a stated order: first the perturbations in the order of `ORDER` (pose, objects, light,
@@ -31,7 +31,7 @@ def registered(kind: str) -> Effect:
     """Return the effect of a name; its module is imported on the first request.
 
     Raises:
-        BadInput: there is none of that name.
+        BadInput: no effect has that name.
     """
     known = (*ORDER, SENSOR)
     if kind not in known:
@@ -55,13 +55,13 @@ class Placement:
 
 @dataclass(frozen=True)
 class Shutter:
-    """What moves while the shutter is open."""
+    """How hands and image move while the shutter is open."""
 
     #: How long it is open, s.
     seconds: float
-    #: Way of the hands across the picture in that time, fraction of the picture's width.
+    #: Way of the hands across the image in that time, fraction of the image's width.
     hand: tuple[float, float]
-    #: Way of the whole picture, likewise.
+    #: Way of the whole image, likewise.
     camera: tuple[float, float]
     #: Turn of the hands about the viewing axis, degrees.
     twist: float
@@ -120,7 +120,7 @@ class Effect:
         return colors
 
     def store(self, scene: Scene, image: np.ndarray) -> np.ndarray:
-        """Change the picture that is stored: (S, S, 3) uint8 sRGB."""
+        """Change the image that is stored: (S, S, 3) uint8 sRGB."""
         return image
 
     def estimate_error(self, strength: float) -> tuple[float, float]:

@@ -12,7 +12,7 @@ from hwp_bench.sim.scene.schema import EffectCall, Scene
 
 class _MotionBlur(Effect):
     name = "motion_blur"
-    #: Length of the streak, fraction of the picture's width.
+    #: Length of the streak, fraction of the image's width.
     default_strengths = (0.008, 0.018, 0.034, 0.06, 0.1)
     max_strength = 0.25
 

@@ -1,4 +1,4 @@
-"""What a frame needs: the recipe that the renderer follows, and nothing else."""
+"""The plan of a frame: which passes, hands, objects and light the renderer needs for it."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ class FramePlan:
 
     @property
     def perturbed(self) -> bool:
-        """Whether the picture differs from its clean version."""
+        """Whether the image differs from its clean version."""
         return any(name in self.passes for name in ("objects", "light", "shutter"))
 
 
@@ -59,7 +59,7 @@ def plan(
         scene: the scene.
         frame: 0 to frame_count - 1.
         frame_count: frames over which the capture is spread.
-        size: edge of the picture in pixels; decides the number of sub-frames.
+        size: edge of the image in pixels; decides the number of sub-frames.
         strengths: instead of those that follow from the severity of the effects that act.
     """
     moment = float(moments(frame_count)[frame])
@@ -95,7 +95,7 @@ def plan(
 
 
 def hands_at(scene: Scene, seconds: float) -> dict[str, HandMoment]:
-    """What the hands do at a time, effects on the pose included."""
+    """The hands at a time, with the effects on their pose."""
     hands = {side: track_moment(scene, side, seconds) for side in scene.sides}
     moment = seconds / scene.duration
     for kind in ORDER:
@@ -128,7 +128,7 @@ def _call(scene: Scene, kind: str) -> EffectCall:
 
 
 def _screen_way(scene: Scene, seconds: float, shutter: Shutter, size: int) -> float:
-    """Longest way of a hand across the picture while the shutter is open, px."""
+    """Longest way of a hand across the image while the shutter is open, px."""
     half = shutter.seconds / 2.0
     before, after = hands_at(scene, seconds - half), hands_at(scene, seconds + half)
     focal = intrinsics(scene, size)[0, 0]

@@ -1,6 +1,6 @@
 """The sensor: noise, rows that are read in turn, and the JPEG that the device stores.
 
-It is no perturbation: a frame and its clean version pass it alike, with the same noise.
+It is not a perturbation: a frame and its clean version both pass it, with the same noise.
 """
 
 from __future__ import annotations

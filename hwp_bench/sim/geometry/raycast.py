@@ -87,7 +87,7 @@ class Tracer:
 
 @dataclass
 class RenderCost:
-    """What rendering costs: seconds by pass, rays by purpose."""
+    """Cost of rendering: seconds by pass, rays by purpose."""
 
     #: Processor seconds by pass; other work on the machine does not count.
     seconds: dict[str, float] = field(default_factory=lambda: defaultdict(float))

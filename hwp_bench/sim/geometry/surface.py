@@ -15,15 +15,15 @@ class Material:
     albedo: np.ndarray
     #: (H, W) float32 in 0-1, or None for `gloss` everywhere.
     roughness: np.ndarray | None = None
-    #: Roughness where there is no map.
+    #: Roughness of a material without a map.
     gloss: float = 0.6
-    #: Reflectance seen head-on.
+    #: Reflectance at normal incidence.
     specular: float = 0.04
     #: (H, W) float32 m, or None for a smooth surface.
     height: np.ndarray | None = None
     #: Light that wraps around the terminator inside the material, per linear channel.
     wrap: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    #: Share of the albedo that shines by itself, such as a screen.
+    #: Share of the albedo that the surface emits itself, such as a screen.
     glow: float = 0.0
 
 

@@ -1,7 +1,7 @@
 """Severity calibrated: which strength of an effect costs a scene's frames how much.
 
 Severity 1 to 5 means a stated loss between a frame and its clean version over the hand
-(`TARGETS`). For illumination and motion blur that is the PSNR of the two pictures; for complex
+(`TARGETS`). For illumination and motion blur that is the PSNR of the two images; for complex
 poses the PSNR between the hand and the same hand as the estimator believes it; for hand-object
 interaction the share of the hand that is covered. Skin is smooth, so blur costs few decibels
 inside the hand long before it ruins a fit: its scale is finer.
@@ -42,7 +42,7 @@ TARGETS: Mapping[str, tuple[float, ...]] = MappingProxyType(
         "motion_blur": (36.0, 32.0, 29.5, 27.5, 26.0),
     }
 )
-#: Edge of the pictures that are compared.
+#: Edge of the images that are compared.
 SIZE = 112
 # Strengths that are tried, as a share of the largest.
 _TRIED = np.array([0.01, 0.03, 0.06, 0.11, 0.18, 0.28, 0.42, 0.66, 1.0])
@@ -61,7 +61,7 @@ class Calibration:
     strengths: tuple[float, ...]
     #: What was measured with them.
     measured: tuple[float, ...]
-    #: What was wanted.
+    #: The losses that were aimed at.
     targets: tuple[float, ...]
 
 
@@ -71,7 +71,7 @@ def calibrate(scene: Scene, call: EffectCall, size: int = SIZE) -> Calibration:
     Args:
         scene: the scene.
         call: one of its effects.
-        size: edge of the pictures in pixels.
+        size: edge of the images in pixels.
     """
     covering = call.kind == "hand_object_interaction"
     top = registered(call.kind).max_strength
@@ -166,7 +166,7 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
         wrong[side] = (pose + turn, transl + length * rng.normal(size=3) * [1.0, 1.0, 2.0])
     lens = Lens(intrinsics(scene, size), viewmat(scene, seconds), size, 1)
     lights = steady_light(scene.light)
-    pictures = [
+    images = [
         render_instant(
             scene,
             lens,
@@ -177,8 +177,8 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
         )
         for parameters in (stage.parameters(hands), wrong)
     ]
-    hand = pictures[0].coverage > 0.999
-    true, believed = (linear_to_srgb(picture.color[hand]) for picture in pictures)
+    hand = images[0].coverage > 0.999
+    true, believed = (linear_to_srgb(image.color[hand]) for image in images)
     return _psnr(believed, true)
 
 

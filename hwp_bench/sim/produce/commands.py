@@ -1,4 +1,4 @@
-"""What `hwp-bench sim` does, action by action."""
+"""The actions of `hwp-bench sim`."""
 
 from __future__ import annotations
 
@@ -178,8 +178,8 @@ def calibrate_scenes(args: argparse.Namespace) -> int:
             )
             if not args.json:
                 measured = " ".join(f"{value:7.3f}" for value in item.measured)
-                wanted = " ".join(f"{value:7.3f}" for value in item.targets)
-                print(f"{scene.id} {item.kind} ({item.measure}): {measured}  wanted {wanted}")
+                target = " ".join(f"{value:7.3f}" for value in item.targets)
+                print(f"{scene.id} {item.kind} ({item.measure}): {measured}  target {target}")
     if args.json:
         print(json.dumps(rows, indent=1))
     return 0

@@ -1,4 +1,4 @@
-"""What a method is given instead of the truth: hands and masks as estimators deliver them."""
+"""Inputs of a method in place of the truth: hands and masks as estimators deliver them."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ HABIT = 0.5
 FAILURE_CHANCE = 0.06
 #: Least and largest share of an occluder over the hand that a segmenter takes for hand.
 OCCLUDER_TAKEN = (0.35, 1.0)
-#: Share of hand from which a segmenter takes a pixel for hand: in sharp pictures, and where the
+#: Share of hand from which a segmenter takes a pixel for hand: in sharp images, and where the
 #: shutter smears hand and background into each other.
 TAKEN_FROM = (0.5, 0.2)
 _MOVING = ("complex_poses", "motion_blur")
@@ -72,7 +72,7 @@ def estimate_mask(
     """Visible-hand mask as a segmenter gives it.
 
     Soft and slightly displaced borders, bites around occluders, parts of occluders taken for
-    hand, smeared borders taken for hand, and now and then a missed part.
+    hand, smeared borders taken for hand, and sometimes a missed part.
 
     Args:
         scene: the scene.

@@ -1,4 +1,4 @@
-"""What rendering a scene will need: passes counted from its plan, cost from a few probes."""
+"""Forecast of a render: passes counted from the plan, cost predicted from a few probes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Forecast:
     scene: str
     #: Number of frames.
     frame_count: int
-    #: Edge of the picture in pixels.
+    #: Edge of the image in pixels.
     size: int
     #: Frames that need each pass.
     passes: Mapping[str, int]
@@ -39,9 +39,9 @@ class Forecast:
     rays: Mapping[str, int] | None
 
     def shares(self) -> dict[str, float] | None:
-        """Seconds by what calls for them: `clean`, then each effect on top; they add up to all.
+        """Seconds by cause: `clean`, then the extra of each effect; they add up to all.
 
-        Where effects meet in a frame the extra cost is split by what each costs alone.
+        Where effects meet in a frame the extra cost is split by what each costs on its own.
         """
         if self.seconds is None:
             return None
@@ -76,7 +76,7 @@ def forecast(
     Args:
         scene: the scene.
         frame_count: frames over which it is spread; its own if None.
-        size: edge of the picture in pixels; 256 if None.
+        size: edge of the image in pixels; 256 if None.
         probe: render the probes; without them nothing is predicted.
     """
     count = scene.frame_count if frame_count is None else frame_count
@@ -119,7 +119,7 @@ def _probed(
 
 
 def share_table(forecasts: list[Forecast]) -> Table:
-    """What each effect of each scene costs, in processor seconds."""
+    """Processor seconds of each effect in each scene."""
     names = ("clean", *ORDER)
     rows: list[tuple[Cell, ...]] = []
     for item in forecasts:

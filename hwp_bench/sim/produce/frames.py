@@ -1,6 +1,6 @@
 """Rendered frames that wait for their capture: one file each, written by one or more processes.
 
-An interrupted render goes on where it stopped, because finished frames are kept.
+An interrupted render continues where it stopped, because finished frames are kept.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.layers import write_layers
 from hwp_bench.sim.scene.schema import Scene
 
-_REMEDY = "Finished frames are kept; the same command goes on from there."
+_REMEDY = "Finished frames are kept; the same command continues from there."
 
 
 def frame_file(folder: Path, frame: int) -> Path:
@@ -38,7 +38,7 @@ def exr_file(folder: Path, frame: int) -> Path:
 
 
 def read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
-    """Read a rendered frame; None where there is none or it is damaged."""
+    """Read a rendered frame; None if it is missing or damaged."""
     try:
         return read_npz(frame_file(folder, frame))
     except BadInput:
@@ -59,7 +59,7 @@ def render_frames(
         scene: the scene.
         frames: which.
         frame_count: frames over which the capture is spread.
-        size: edge of the picture in pixels.
+        size: edge of the image in pixels.
         folder: where they go.
         exr: also write linear layers as EXR.
     """

@@ -41,15 +41,15 @@ from hwp_bench.sim.scene.schema import Scene
 from hwp_bench.sim.subject.atlas import skin_atlas
 from hwp_bench.sim.subject.hand import scene_hands
 
-#: Version of the renderer's look; part of every render key.
+#: Version of the pixels that the renderer makes; part of every render key.
 RENDERER = 9
-#: Smallest and largest edge of a picture.
+#: Smallest and largest edge of an image.
 SIZES = (32, 1024)
-#: Edge of a picture where nobody says otherwise.
+#: Edge of an image where no other is given.
 DEFAULT_SIZE = 256
 #: Terms under which simulated captures may be used.
 LICENCE = "CC0-1.0"
-# Frames below which a second process costs more than it brings.
+# Frames below which a second process costs more than it saves.
 _FRAMES_PER_WORKER = 10
 
 
@@ -71,14 +71,14 @@ def render_capture(
 ) -> Capture:
     """Render a capture.
 
-    A render that was interrupted goes on where it stopped: finished frames wait beside `out`
+    A render that was interrupted continues where it stopped: finished frames wait next to `out`
     until the capture is whole.
 
     Args:
         scene: a scene, its name, or its file.
         out: the capture folder to make.
         frame_count: frames over which the scene is spread; the scene's own if None.
-        size: edge of the square picture in pixels.
+        size: edge of the square image in pixels.
         seed: replaces the scene's seed.
         workers: processes; as many as pay if None.
         overwrite: replace an existing folder.
@@ -170,7 +170,7 @@ def _assemble(
                 raise HwpError(
                     f"frame {item.frame} was damaged while it waited",
                     where=waiting,
-                    remedy="Run the same command again; only this frame is rendered anew.",
+                    remedy="Run the same command again; only this frame is rendered again.",
                 )
             coverage = arrays["coverage"].astype(np.float64)
             writer.frame(item.frame, arrays["rgb"])

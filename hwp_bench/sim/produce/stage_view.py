@@ -1,4 +1,4 @@
-"""A look at a scene's stage from the side: hands, objects, key light, camera and its path."""
+"""A 3D view of a scene from the side: hands, objects, key light, camera and its path."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from hwp_bench.sim.scene.optics import focus_point, viewmat
 from hwp_bench.sim.scene.schema import Scene
 from hwp_bench.sim.subject.hand import MOVING
 
-#: Edge of the picture in pixels.
+#: Edge of the image in pixels.
 EDGE = 900
 # Moments of the camera's path that are drawn.
 _PATH = 200

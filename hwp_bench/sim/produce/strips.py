@@ -33,10 +33,10 @@ _SHORT = {
     "illumination": "il",
     "motion_blur": "mb",
 }
-#: Edge of a picture in pixels.
+#: Edge of an image in pixels.
 GALLERY_SIZE = 176
-#: Pictures in the strip of a capture.
-PICTURES = 8
+#: Images in the strip of a capture.
+STRIP_FRAMES = 8
 #: Scene in which each perturbation is shown.
 SHOWN_IN = (
     ("hand_object_interaction", "capture0"),
@@ -50,7 +50,7 @@ _QUALITY = 88
 def write_preview(
     scene: Scene, folder: Path, *, frame_count: int = 48, size: int = 160
 ) -> tuple[Path, Path]:
-    """Write `ID-sheet.png` and `ID.gif`, each frame beside its clean version.
+    """Write `ID-sheet.png` and `ID.gif`, each frame next to its clean version.
 
     Args:
         scene: the scene.
@@ -80,10 +80,10 @@ def write_gallery(folder: Path) -> list[Path]:
     paths = []
     for name in track(scene_names(), "Strips of the captures"):
         scene = load_scene(name)
-        paths.append(_write(folder / f"{name}.jpg", strip(_capture_strip(scene), PICTURES)))
+        paths.append(_write(folder / f"{name}.jpg", strip(_capture_strip(scene), STRIP_FRAMES)))
     for kind, name in track(SHOWN_IN, "Strips of the severities"):
-        picture = strip(_severity_strip(load_scene(name), kind), MAX_SEVERITY + 1)
-        paths.append(_write(folder / f"severity-{kind}.jpg", picture))
+        image = strip(_severity_strip(load_scene(name), kind), MAX_SEVERITY + 1)
+        paths.append(_write(folder / f"severity-{kind}.jpg", image))
     return paths
 
 
@@ -94,10 +94,10 @@ def _capture_strip(scene: Scene) -> list[FrameResult]:
         for step in range(3)
         for call in scene.effects
         for part in call.episodes[step : step + 1]
-    ][: PICTURES - 3]
+    ][: STRIP_FRAMES - 3]
     moments = sorted([0.0, *busy, 0.87, 0.96])
     moments += [0.8, 0.83, 0.99, 0.9]
-    frames = [int(moment * scene.frame_count) for moment in sorted(moments[:PICTURES])]
+    frames = [int(moment * scene.frame_count) for moment in sorted(moments[:STRIP_FRAMES])]
     return [render_frame(scene, frame, scene.frame_count, GALLERY_SIZE) for frame in frames]
 
 
@@ -192,9 +192,9 @@ def _animation(results: list[FrameResult]) -> bytes:
     return buffer.getvalue()
 
 
-def _write(path: Path, picture: np.ndarray) -> Path:
+def _write(path: Path, image: np.ndarray) -> Path:
     import cv2
 
     settings = [cv2.IMWRITE_JPEG_QUALITY, _QUALITY]
-    _, data = cv2.imencode(".jpg", np.ascontiguousarray(picture[..., ::-1]), settings)
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(image[..., ::-1]), settings)
     return atomic_write(path, data.tobytes())

@@ -29,7 +29,7 @@ class SuiteItem:
     scene: Scene
     #: Frames over which it is spread.
     frame_count: int
-    #: Edge of the picture in pixels.
+    #: Edge of the image in pixels.
     size: int
     #: Seed of the scene.
     seed: int
@@ -121,7 +121,7 @@ class RenderCapture:
     scene: Scene
     #: Frames over which it is spread.
     frame_count: int | None = None
-    #: Edge of the picture in pixels.
+    #: Edge of the image in pixels.
     size: int | None = None
     #: Seed; the scene's own if None.
     seed: int | None = None
@@ -129,7 +129,7 @@ class RenderCapture:
     workers: int | None = None
     #: Whether linear layers are stored too.
     exr: bool = False
-    #: Whether a capture that is there already is taken as it is.
+    #: Whether a capture that exists already is used as it is.
     keep: bool = False
     #: Whether one that is there is replaced.
     overwrite: bool = False
@@ -146,7 +146,7 @@ class RenderCapture:
             watch.join()
 
     def render(self, output: Path) -> None:
-        """Render into a folder, or take what is there where that is wanted.
+        """Render into a folder, or use the capture that exists there if `keep` says so.
 
         Raises:
             HwpError: as `render_capture`.
@@ -173,7 +173,7 @@ class RenderCapture:
         )
 
     def _count(self, output: Path, on_progress: OnProgress, ended: threading.Event) -> None:
-        """Tell how many frames wait beside the capture to be."""
+        """Report how many frames of the unfinished capture exist."""
         total = self.frame_count or self.scene.frame_count
         while not ended.wait(_COUNT_SECONDS):
             on_progress(sum(1 for _ in output.parent.glob(f".{output.name}.*/*.npz")), total)

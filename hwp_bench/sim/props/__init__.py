@@ -1,1 +1,1 @@
-"""What stands in a scene besides hands: objects and backdrops."""
+"""Objects and backdrops of a scene."""

@@ -24,7 +24,7 @@ class Backdrop:
     wall: tuple[float, float, float]
     #: sRGB of the table.
     table: tuple[float, float, float]
-    #: How far below the centre of the picture the table's edge is, as a slope.
+    #: How far below the centre of the image the table's edge is, as a slope.
     edge: float
     #: Number of things that stand around.
     clutter: int
@@ -90,8 +90,8 @@ def _texture(name: str, seed: int) -> np.ndarray:
     return cv2.GaussianBlur(linear, (0, 0), 4.0)
 
 
-def look(name: str, seed: int, directions: np.ndarray) -> np.ndarray:
-    """What the camera sees past the hands under white light.
+def backdrop_colors(name: str, seed: int, directions: np.ndarray) -> np.ndarray:
+    """The backdrop in each viewing direction, under white light.
 
     Args:
         name: a backdrop.

@@ -32,7 +32,7 @@ class ObjectRequest:
 
     #: Name of the object.
     name: str
-    #: Chooses among the looks of this object.
+    #: Chooses among the variants of this object.
     variant: int = 0
 
 

@@ -19,7 +19,7 @@ def shape(
     *,
     smooth: bool,
 ) -> Surface:
-    """Make a surface that is no hand.
+    """Make a surface that is not a hand.
 
     Args:
         vertices: (V, 3) m.

@@ -25,7 +25,7 @@ from hwp_bench.sim.subject.hand import FINE, MOVING
 # The golden ratio's powers spread the sub-frames' rays evenly inside the pixel.
 _SPREAD = (0.7548776662466927, 0.5698402909980532)
 # Rounds in which place and time of a vertex find each other. Each shrinks the error by the way
-# that the vertex moves down the picture during the readout, in heights of the picture.
+# that the vertex moves down the image during the readout, in heights of the image.
 _ROUNDS = 4
 
 #: A surface at three instants, in the camera's axes at each: opening, middle, closing.
@@ -66,9 +66,9 @@ def exposed(stage: Stage, window: Window, sky: dict[str, np.ndarray], lens: Lens
             with stage.cost.time("hands"):
                 body = stage.traced(between((first, middle, last), s))
             things = stage.things(objects_at(scene, recipe, window.seconds(s)), window.hands(s))
-        picture = render_instant(scene, moved, body, things, lights, stage.cost)
-        color += picture.color / recipe.subframes
-        coverage += picture.coverage / recipe.subframes
+        image = render_instant(scene, moved, body, things, lights, stage.cost)
+        color += image.color / recipe.subframes
+        coverage += image.coverage / recipe.subframes
     return LinearImage(color, coverage)
 
 
@@ -97,7 +97,7 @@ class Window:
         return self.recipe.seconds + s * self.length
 
     def hands(self, s: float) -> dict[str, HandMoment]:
-        """What the hands do."""
+        """The hands."""
         hands = hands_at(self.scene, self.seconds(s))
         if self.shutter is None:
             return hands
@@ -119,7 +119,7 @@ class Window:
 
     @property
     def _width(self) -> float:
-        """Width of the picture at the point looked at, m."""
+        """Width of the image at the point looked at, m."""
         return 2.0 * FOCUS_DISTANCE * np.tan(np.radians(self.scene.camera.field_of_view) / 2.0)
 
 

@@ -45,7 +45,7 @@ def render_frame(scene: Scene, frame: int, frame_count: int, size: int) -> Frame
         scene: the scene.
         frame: 0 to frame_count - 1.
         frame_count: frames over which the capture is spread.
-        size: edge of the picture in pixels.
+        size: edge of the image in pixels.
     """
     recipe = plan(scene, frame, frame_count, size)
     return carry_out(scene, recipe, size)
@@ -88,10 +88,10 @@ def carry_out(scene: Scene, recipe: FramePlan, size: int) -> FrameResult:
 
 
 def _developed(
-    scene: Scene, recipe: FramePlan, pictures: tuple[LinearImage, ...], cost: RenderCost
+    scene: Scene, recipe: FramePlan, images: tuple[LinearImage, ...], cost: RenderCost
 ) -> list[np.ndarray]:
-    """What the sensor makes of pictures of the same frame: (S, S, 3) uint8 sRGB each."""
+    """Images of the same frame as the sensor stores them: (S, S, 3) uint8 sRGB each."""
     sensor = registered(SENSOR)
     with cost.time("sensor"):
-        colors = sensor.record(scene, recipe.frame, tuple(picture.color for picture in pictures))
+        colors = sensor.record(scene, recipe.frame, tuple(image.color for image in images))
         return [sensor.store(scene, eight_bit_srgb(color)) for color in colors]

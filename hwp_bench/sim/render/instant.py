@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hwp_bench.sim.geometry.raycast import Hits, RenderCost, Tracer
-from hwp_bench.sim.props.backdrop import look
+from hwp_bench.sim.props.backdrop import backdrop_colors
 from hwp_bench.sim.render.samples import gather
 from hwp_bench.sim.render.shading import lit, shade
 from hwp_bench.sim.render.stage import Body
@@ -36,7 +36,7 @@ class Lens:
     K: np.ndarray
     #: (4, 4) world to camera.
     view: np.ndarray
-    #: Edge of the picture in pixels.
+    #: Edge of the image in pixels.
     size: int
     #: Edge of the grid of rays inside a pixel.
     grid: int
@@ -102,7 +102,7 @@ def _backdrop(scene: Scene, lens: Lens, lights: Lights) -> np.ndarray:
         _, first = pixel_rays(lens.K, lens.rows[0], whole, 1)
         _, last = pixel_rays(lens.K, lens.rows[1], whole, 1)
         directions = first + (last - first) * np.linspace(0.0, 1.0, lens.size)[:, None, None]
-    seen = look(scene.background, scene.seed, directions)
+    seen = backdrop_colors(scene.background, scene.seed, directions)
     return seen * (0.45 * lights.key + 0.5 * lights.sky) * lights.exposure
 
 

@@ -31,11 +31,11 @@ class Samples:
     albedo: np.ndarray
     #: (H,) 0-1.
     roughness: np.ndarray
-    #: (H,) reflectance head-on.
+    #: (H,) reflectance at normal incidence.
     specular: np.ndarray
     #: (H, 3) wrap of the diffuse light.
     wrap: np.ndarray
-    #: (H,) share of the albedo that shines by itself.
+    #: (H,) share of the albedo that the surface emits itself.
     glow: np.ndarray
     #: (H,) share of the sky that is seen.
     openness: np.ndarray

@@ -1,4 +1,4 @@
-"""What stands before the camera at one instant: hands, sleeves and objects, as surfaces."""
+"""Surfaces before the camera at one instant: hands, sleeves and objects."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Settings of the four perturbations: what a table of `effects` holds besides its episodes."""
+"""Settings of the four perturbations: the fields of an `effects` table after its episodes."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ class ObjectItem:
 
     #: Name of the object.
     object: Words
-    #: Its look.
+    #: Its variant.
     variant: int = number(0, 0, 1000)
     #: Hand that it moves with, or `world`; the scene's first hand if None.
     anchor: Literal["right", "left", "world"] | None = None
@@ -170,10 +170,10 @@ def read_settings(kind: type[Settings], call: EffectCall, where: str) -> Setting
 def keys_by_side(
     table: _BySide[Keys], sides: tuple[str, ...], path: str, where: str
 ) -> dict[str, Keys]:
-    """What a table says of each hand of a scene, right first.
+    """The entries of a table for the hands of a scene, right first.
 
     Raises:
-        BadInput: it speaks of a hand that the scene does not show.
+        BadInput: it has an entry for a hand that the scene does not show.
     """
     found = {
         side: keys

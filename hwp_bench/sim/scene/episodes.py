@@ -42,7 +42,7 @@ def envelope(call: EffectCall, moment: float) -> float:
 
 
 def severity(call: EffectCall, moment: float) -> int:
-    """Severity that is written into the capture: the level as a whole number, 0-5."""
+    """Severity that is written into the capture: the level rounded to an integer, 0-5."""
     return int(np.floor(level(call, moment) + 0.5))
 
 

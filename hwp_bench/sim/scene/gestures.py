@@ -44,7 +44,7 @@ def gesture(name: str) -> np.ndarray:
     """Look a hand shape up.
 
     Raises:
-        BadInput: there is none of that name; the message lists them.
+        BadInput: no shape has that name; the message lists the known ones.
     """
     try:
         return gestures()[name]

@@ -1,4 +1,4 @@
-"""What the hands do at any time: the scene's key track, and its conversion to parameters."""
+"""The hands at any time: the key track of a scene, and its conversion to hand parameters."""
 
 from __future__ import annotations
 

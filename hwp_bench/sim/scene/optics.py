@@ -21,7 +21,7 @@ def focus_point() -> np.ndarray:
 
 
 def intrinsics(scene: Scene, size: int) -> np.ndarray:
-    """(3, 3) K in pixels of a square picture."""
+    """(3, 3) K in pixels of a square image."""
     focal = 0.5 * size / np.tan(np.radians(scene.camera.field_of_view) / 2.0)
     return np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
 
@@ -57,7 +57,7 @@ def pixel_rays(
     Args:
         K: (3, 3) px.
         view: (4, 4) world to camera.
-        box: top, bottom, left, right: the rows and columns wanted.
+        box: top, bottom, left, right: the rows and columns to cover.
         grid: edge of the grid inside a pixel.
         shift: moves the grid right and down, in steps of the grid.
 
@@ -107,7 +107,7 @@ class Lights:
     ground: np.ndarray
     #: Factor on everything at the end: what the exposure does.
     exposure: float = 1.0
-    #: Shadow that something outside the picture casts, or None.
+    #: Shadow that something outside the image casts, or None.
     cast: CastShadow | None = None
 
 

@@ -148,7 +148,7 @@ class _SceneFile:
 
 @dataclass(frozen=True)
 class _EffectTable:
-    """What every table of `effects` holds; the rest are settings of its kind."""
+    """Fields that every table of `effects` has; the others are settings of its kind."""
 
     kind: Words
     episodes: list[tuple[float, float, float]]

@@ -46,7 +46,7 @@ _Metres = Annotated[float, Meta(ge=-1.0, le=1.0)]
 
 @dataclass(frozen=True)
 class Subject:
-    """Whose hands they are."""
+    """The person whose hands are shown."""
 
     #: Identity: shape parameters, surface detail, mottling.
     seed: Seed
@@ -63,7 +63,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Camera:
-    """How the picture is taken."""
+    """How the image is taken."""
 
     #: Held in a hand (sways and drifts) or standing still.
     handheld: bool
@@ -93,7 +93,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Sensor:
-    """How light becomes a stored picture; the same for a frame and its clean version."""
+    """How light becomes a stored image; the same for a frame and its clean version."""
 
     #: Standard deviation of the noise at mid grey, of 1.
     noise: Annotated[float, Meta(ge=0.0, le=0.2)]
@@ -116,7 +116,7 @@ class HandKey:
     turn: float = number(0.0, -360.0, 360.0)
     #: Fingers away from the camera (positive) or towards it, degrees.
     tilt: float = number(0.0, -90.0, 90.0)
-    #: In the picture plane, degrees, clockwise; 0 points the fingers up.
+    #: In the image plane, degrees, clockwise; 0 points the fingers up.
     roll: float = number(0.0, -180.0, 180.0)
 
     def __post_init__(self) -> None:
@@ -125,7 +125,7 @@ class HandKey:
 
 @dataclass(frozen=True)
 class Track:
-    """What the hands do: keys that repeat, never twice the same."""
+    """The motion of the hands: keys that repeat, varied in every round."""
 
     #: Length of one round, s.
     period: float
@@ -198,7 +198,7 @@ class Scene:
 
     @property
     def sides(self) -> tuple[str, ...]:
-        """The hands in the picture, right first."""
+        """The hands in the image, right first."""
         return sides_of(self.hands)
 
     @property

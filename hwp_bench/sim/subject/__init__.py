@@ -1,1 +1,1 @@
-"""Whose hands they are: surface, skin and sleeve."""
+"""The hands of one person: surface, skin and sleeve."""

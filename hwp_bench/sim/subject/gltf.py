@@ -40,7 +40,7 @@ class Gltf:
             raise
         except Exception as error:
             # The library raises whatever its parsers raise; all of it means a damaged file.
-            raise self._wrong(f"is no readable glTF ({error})") from error
+            raise self._wrong(f"is not a readable glTF file ({error})") from error
 
     def _wrong(self, problem: str) -> BadHandModel:
         return BadHandModel(problem, where=self._path)

@@ -51,7 +51,7 @@ class SubjectHand:
     normal_sum: csr_matrix
     #: (V,) m along the normal that no parameter explains.
     relief: np.ndarray
-    #: Colour that the rig brings along, (H, W, 3) uint8 sRGB, or None to paint skin.
+    #: Colour of the rig, (H, W, 3) uint8 sRGB, or None to paint skin.
     texture: np.ndarray | None
 
     def pose(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -52,12 +52,12 @@ def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, n
 
     Args:
         path: a `.glb` or `.gltf` file with one skinned hand.
-        side: the hand that is wanted; a rig of the other side is mirrored.
+        side: the hand to return; a rig of the other side is mirrored.
         model: the hand model of that side, whose size the rig takes.
 
     Returns:
         The rig as a template without shape parameters, and its base colour, (H, W, 3) uint8
-        sRGB, or None where it brings none.
+        sRGB, or None if it has none.
 
     Raises:
         BadHandModel: the file is missing or damaged, or joints are missing; it names them.

@@ -1,4 +1,4 @@
-"""The sleeve: closes the open wrist of the hand model and leads out of the picture."""
+"""The sleeve: closes the open wrist of the hand model and leads out of the image."""
 
 from __future__ import annotations
 

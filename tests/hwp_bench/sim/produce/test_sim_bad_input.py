@@ -130,6 +130,6 @@ def test_a_killed_worker_is_one_clear_error(
     with pytest.raises(HwpError, match=r"a rendering process was killed \(SIGKILL\)") as caught:
         render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=2)
     killer.join()
-    assert "the same command goes on" in str(caught.value)
+    assert "the same command continues" in str(caught.value)
     assert not out.exists()
     assert not set(psutil.Process().children()) - before  # the other worker was ended

@@ -99,14 +99,14 @@ def test_subframes_follow_the_motion_on_the_screen(make_scene: SceneMaker) -> No
 
 
 def test_blur_moves_light_but_makes_none(make_scene: SceneMaker) -> None:
-    # Oracle: the exposure is a mean of instants, so the picture's mean hardly changes.
+    # Oracle: the exposure is a mean of instants, so the image's mean hardly changes.
     scene = replace(make_scene(), sensor=Sensor(noise=0.0))
     result = render_frame(scene, BLUR, COUNT, SIZE)
     assert abs(result.rgb.mean() - result.clean.mean()) < 0.04 * result.clean.mean()
     # A smeared edge has the same step in all, but spread over more pixels: smaller squares.
     steepness = [
-        sum(float(np.square(np.diff(picture.astype(float), axis=axis)).sum()) for axis in (0, 1))
-        for picture in (result.rgb, result.clean)
+        sum(float(np.square(np.diff(image.astype(float), axis=axis)).sum()) for axis in (0, 1))
+        for image in (result.rgb, result.clean)
     ]
     assert steepness[0] < steepness[1]
     partial = (result.coverage > 0.02) & (result.coverage < 0.98)
@@ -166,7 +166,7 @@ def test_the_forecast_is_the_sum_of_what_is_called_for(make_scene: SceneMaker) -
     assert sum(report.groups.values()) == COUNT
     assert report.rays is not None
     clean = render_frame(scene, CLEAN, COUNT, SIZE).cost.rays.total()
-    # Clean frames differ in pose only; their rays differ by how much of the picture they fill.
+    # Clean frames differ in pose only; their rays differ by how much of the image they fill.
     assert 0.5 < report.rays["clean"] / (report.groups["clean"] * clean) < 2.0
     assert "| tiny | clean |" in to_markdown(plan_table([report]))
     shares, seconds = report.shares(), report.seconds

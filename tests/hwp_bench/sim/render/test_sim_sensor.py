@@ -95,7 +95,7 @@ def test_jpeg_changes_frame_and_clean_version_alike(with_sensor: Callable[[str],
     stored = render_frame(with_sensor("noise = 0.0\njpeg_quality = 10"), CLEAN, COUNT, SIZE)
     np.testing.assert_array_equal(stored.rgb, stored.clean)
     assert stored.cost.rays == raw.cost.rays
-    # A coarse JPEG steps where its blocks of 8 px meet, more than the picture itself does.
+    # A coarse JPEG steps where its blocks of 8 px meet, more than the image itself does.
     steps = np.abs(np.diff(stored.clean.astype(float), axis=1)).mean(axis=(0, 2))
     before = np.abs(np.diff(raw.clean.astype(float), axis=1)).mean(axis=(0, 2))
     assert steps[7::8].mean() / steps.mean() > 1.2 * before[7::8].mean() / before.mean()
@@ -164,7 +164,7 @@ def test_vertices_stand_where_their_rows_see_them(
 
 @pytest.mark.parametrize("moves", ["hand", "camera"])
 def test_a_moving_edge_is_slanted(make_scene: SceneMaker, moves: str) -> None:
-    # Oracle: in a picture of S rows the edge leans by speed * readout, in pixels at its depth.
+    # Oracle: in an image of S rows the edge leans by speed * readout, in pixels at its depth.
     size, focal, speed, readout = 64, 128.0, 1.0, 0.03
     lens = Lens(np.array([[focal, 0, 32], [0, focal, 32], [0, 0, 1.0]]), np.eye(4), size, 2)
     panel = _panel(0.3, 0.2, 32)
@@ -185,8 +185,8 @@ def test_a_moving_edge_is_slanted(make_scene: SceneMaker, moves: str) -> None:
     cost = RenderCost()
     body = Body(surface, Tracer(surface.vertices, surface.faces, cost.rays))
     scene = make_scene()
-    picture = render_instant(scene, lens, body, None, steady_light(scene.light), cost)
-    edge = size - picture.coverage.sum(axis=1)
+    image = render_instant(scene, lens, body, None, steady_light(scene.light), cost)
+    edge = size - image.coverage.sum(axis=1)
     slope = np.polyfit(np.arange(size), edge, 1)[0]
     assert slope == pytest.approx(speed * readout * focal / 0.5 / size, rel=0.05)
     assert np.abs(edge - np.polyval(np.polyfit(np.arange(size), edge, 1), range(size))).max() < 0.6
