@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand, project, vertex_normals
-from wildghand.prepass.zbuffer import draw_faces, mix_corners
+from hwp_bench.hands.raster import draw_faces, mix_corners
 
 # Frames that are posed at a time, so that memory does not grow with the clip.
 _CHUNK = 32

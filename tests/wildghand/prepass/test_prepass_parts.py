@@ -9,42 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hwp_bench.base.colors import linear_to_srgb
-from hwp_bench.hands.raster import draw_silhouette
 from wildghand.prepass.borders import border_width, misplacement
 from wildghand.prepass.classify import clean_probability, evidence
 from wildghand.prepass.robust_location import densest, excess, normal_value
-from wildghand.prepass.zbuffer import draw_faces, mix_corners
-
-
-def test_faces_cover_what_the_importer_fills() -> None:
-    random = np.random.default_rng(0)
-    pixels = random.uniform(-10, 74, (90, 2))
-    faces = np.arange(90).reshape(30, 3)
-    face, _ = draw_faces(pixels, np.ones(90), faces, (64, 64))
-    # A pixel centre on an edge may fall to either side in the last digit: none does here.
-    np.testing.assert_array_equal(face >= 0, draw_silhouette(pixels, faces, 64) > 0)
-
-
-def test_the_nearer_face_wins_and_corners_mix() -> None:
-    pixels = np.array([[0, 0], [40.3, 0], [0, 40.3]] * 2, dtype=np.float64)
-    depth = np.array([2.0, 2.0, 2.0, 1.0, 3.0, 3.0])
-    faces = np.array([[0, 1, 2], [3, 4, 5]])
-    face, mix = draw_faces(pixels, depth, faces, (32, 32))
-    # The second is nearer where 1 + 2 (x + y) / 40.3 < 2.
-    x, y = np.meshgrid(np.arange(32) + 0.5, np.arange(32) + 0.5)
-    inside = x + y < 40.3
-    np.testing.assert_array_equal(face[inside], np.where(x + y < 20.15, 1, 0)[inside])
-    shown = face.reshape(-1) >= 0
-    mixed = mix_corners(pixels, faces, face.reshape(-1)[shown], mix.reshape(-1, 2)[shown])
-    places = np.stack([x.reshape(-1)[shown], y.reshape(-1)[shown]], axis=1)
-    np.testing.assert_allclose(mixed, places, atol=1e-4)
-
-
-def test_faces_behind_the_camera_or_not_finite_are_left_out() -> None:
-    pixels = np.array([[0, 0], [40, 0], [0, 40], [np.nan, 0], [40, 0], [0, 40]])
-    depth = np.array([1.0, -1.0, 1.0, 1.0, 1.0, 1.0])
-    face, _ = draw_faces(pixels, depth, np.array([[0, 1, 2], [3, 4, 5]]), (8, 8))
-    assert (face == -1).all()
 
 
 def test_normal_values_of_a_normal_distribution() -> None:
