@@ -14,20 +14,19 @@ import torch
 
 from hwp_bench.base.errors import HwpError
 from wildghand.splat.backward_stages import (
-    BlendGradients,
-    ProjectGradients,
     background_backward_stage,
     blend_backward_stage,
     project_backward_stage,
 )
 from wildghand.splat.kernels import geometry
+from wildghand.splat.kernels.project import Ellipsoids, Projected
+from wildghand.splat.kernels.project_backward import PlaneGradients
+from wildghand.splat.kernels.reduce import BlendGradients
 from wildghand.splat.kernels.rows import GROUP
 from wildghand.splat.scene import Options
 from wildghand.splat.stages import (
     Drawn,
-    Inputs,
     Lists,
-    Projected,
     blend_stage,
     list_stage,
     project_stage,
@@ -67,14 +66,10 @@ class Project(torch.autograd.Function):
         ctx.save_for_backward(means, quats, scales, viewmats)
         ctx.call = call
         call.projected = project_stage(
-            Inputs(
-                means=_gaussians(means),
-                quats=_gaussians(quats),
-                scales=_gaussians(scales),
-                opacities=_gaussians(opacities),
-                colors=_gaussians(colors),
-                cameras=call.cameras,
-            ),
+            Ellipsoids(_gaussians(means), _gaussians(quats), _gaussians(scales)),
+            _gaussians(opacities),
+            _gaussians(colors),
+            call.cameras,
             call.options,
         )
         count = means.shape[1]
@@ -94,28 +89,23 @@ class Project(torch.autograd.Function):
         call: Call = ctx.call
         means, quats, scales, viewmats = ctx.saved_tensors
         shape = call.projected.depths.shape
-        nothing = np.zeros(0, np.float32)
         v_means2d, v_shapes, v_depths, v_compensations = (
             None if v is None else _gaussians(v.contiguous()) for v in upstream
         )
         wanted = [_like_gaussians(tensor) for tensor in (means, quats, scales)]
         rows = project_backward_stage(
-            Inputs(
-                means=_gaussians(means),
-                quats=_gaussians(quats),
-                scales=_gaussians(scales),
-                opacities=nothing,
-                colors=nothing,
-                cameras=call.cameras,
-            ),
+            Ellipsoids(_gaussians(means), _gaussians(quats), _gaussians(scales)),
+            call.cameras,
             call.projected,
-            np.zeros((*shape, 2), np.float32) if v_means2d is None else v_means2d,
-            np.zeros((*shape, 3), np.float32) if v_shapes is None else v_shapes,
-            nothing if v_depths is None else v_depths,
-            np.zeros(shape, np.float32) if v_compensations is None else v_compensations,
+            PlaneGradients(
+                np.zeros((*shape, 2), np.float32) if v_means2d is None else v_means2d,
+                np.zeros((*shape, 3), np.float32) if v_shapes is None else v_shapes,
+                np.zeros((0, 0), np.float32) if v_depths is None else v_depths,
+                np.zeros(shape, np.float32) if v_compensations is None else v_compensations,
+            ),
             call.options,
             ctx.needs_input_grad[3],
-            ProjectGradients(*(_array(tensor) for tensor in wanted)),
+            Ellipsoids(*(_array(tensor) for tensor in wanted)),
         )
         v_viewmats = None
         if ctx.needs_input_grad[3]:

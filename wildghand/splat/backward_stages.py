@@ -2,50 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 
 from wildghand.splat.kernels.blend_backward import background_backward, blend_backward
 from wildghand.splat.kernels.channels import slot_size
-from wildghand.splat.kernels.project import PIECE
-from wildghand.splat.kernels.project_backward import project_backward
-from wildghand.splat.kernels.reduce import reduce_slots
+from wildghand.splat.kernels.project import PIECE, Ellipsoids, Projected
+from wildghand.splat.kernels.project_backward import PlaneGradients, project_backward
+from wildghand.splat.kernels.reduce import BlendGradients, reduce_slots
 from wildghand.splat.memory import lease
 from wildghand.splat.scene import Options
 from wildghand.splat.stages import (
     UNROLLED,
     Drawn,
-    Inputs,
     Lists,
-    Projected,
     kernel_channels,
     repeat_of,
     tile_jobs,
+    view_of,
 )
 from wildghand.splat.threads import even_jobs, run, thread_count
 
 #: Pixels of the background's gradient that take as long as a (Gaussian, tile) pair.
 _PIXELS_LIKE_A_PAIR = 20
-
-
-@dataclass(frozen=True)
-class BlendGradients:
-    """Where the gradients of what was blended are written."""
-
-    means2d: np.ndarray  # (I, N, 2)
-    shapes: np.ndarray  # (I, N, 3), see kernels.reduce
-    opacities: np.ndarray  # (S, N)
-    colors: np.ndarray  # (S, N, D)
-
-
-@dataclass(frozen=True)
-class ProjectGradients:
-    """Where the gradients of what was projected are written."""
-
-    means: np.ndarray  # (S, N, 3)
-    quats: np.ndarray  # (S, N, 4)
-    scales: np.ndarray  # (S, N, 3)
 
 
 def blend_backward_stage(
@@ -103,21 +81,13 @@ def blend_backward_stage(
     run(
         reduce_slots,
         even_jobs(pieces, thread_count(pieces, count * gaussians)),
-        gaussians,
-        size,
-        projected.geom.reshape(-1),
-        opacities.reshape(-1),
-        repeat_of(opacities, count),
-        repeat_of(colors, count),
-        lists.first_entry,
+        projected.geom,
         projected.depths,
+        opacities,
+        lists.first_entry,
         slot_of,
-        slots.reshape(-1),
-        floats,
-        gradients.means2d.reshape(-1),
-        gradients.shapes.reshape(-1),
-        gradients.opacities.reshape(-1),
-        gradients.colors.reshape(-1),
+        slots,
+        gradients,
     )
 
 
@@ -137,26 +107,22 @@ def background_backward_stage(v_images: np.ndarray, remaining: np.ndarray) -> np
 
 
 def project_backward_stage(
-    inputs: Inputs,
+    ellipsoids: Ellipsoids,
+    cameras: np.ndarray,
     projected: Projected,
-    v_means2d: np.ndarray,
-    v_shapes: np.ndarray,
-    v_depths: np.ndarray,
-    v_compensations: np.ndarray,
+    upstream: PlaneGradients,
     options: Options,
     want_cameras: bool,
-    gradients: ProjectGradients,
+    gradients: Ellipsoids,
 ) -> np.ndarray:
     """Fills `gradients`.
 
     Args:
-        inputs: of the call; opacities and colours are not read.
+        ellipsoids, cameras: as projected.
         projected: from the forward pass.
-        v_means2d, v_shapes: (I, N, 2) and (I, N, 3) float32, see `BlendGradients`.
-        v_depths: (I, N) float32, or (0,) for none.
-        v_compensations: (I, N) float32.
+        upstream: gradients of the loss by what was projected.
         options: of the call.
-        want_cameras: whether the result is wanted.
+        want_cameras: whether the result is needed.
         gradients: overwritten.
 
     Returns:
@@ -168,23 +134,12 @@ def project_backward_stage(
     run(
         project_backward,
         even_jobs(pieces, thread_count(pieces, count * gaussians)),
-        inputs.means.reshape(-1),
-        inputs.quats.reshape(-1),
-        inputs.scales.reshape(-1),
-        inputs.repeats,
-        inputs.cameras,
-        gaussians,
-        projected.depths.reshape(-1),
-        options.eps2d,
-        v_means2d.reshape(-1),
-        v_shapes.reshape(-1),
-        v_depths.reshape(-1),
-        v_compensations.reshape(-1),
-        options.antialiased,
-        want_cameras,
-        gradients.means.reshape(-1),
-        gradients.quats.reshape(-1),
-        gradients.scales.reshape(-1),
+        ellipsoids,
+        cameras,
+        projected.depths,
+        view_of(options),
+        upstream,
+        gradients,
         v_cameras,
     )
     return v_cameras.sum(1)

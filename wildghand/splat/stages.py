@@ -15,7 +15,7 @@ from wildghand.splat.kernels import geometry
 from wildghand.splat.kernels.bins import count_tiles, fill_tiles, place_tiles
 from wildghand.splat.kernels.blend import blend
 from wildghand.splat.kernels.cameras import CAMERA, prepare_cameras
-from wildghand.splat.kernels.project import PIECE, project
+from wildghand.splat.kernels.project import PIECE, Ellipsoids, Projected, View, project
 from wildghand.splat.kernels.sort import sort_by_depth
 from wildghand.splat.kernels.tiles import TILE_HEIGHT, TILE_WIDTH
 from wildghand.splat.memory import lease
@@ -30,35 +30,6 @@ _BYTES_PER_ENTRY = 12
 _LITTLE = 1 << 30
 #: Most chunks: each has a counter for every tile.
 _MOST_CHUNKS = 32
-
-
-@dataclass(frozen=True)
-class Inputs:
-    """Float32 arrays of one call: S entries of N Gaussians each, at least `rows.GROUP`."""
-
-    means: np.ndarray  # (S, N, 3)
-    quats: np.ndarray  # (S, N, 4)
-    scales: np.ndarray  # (S, N, 3)
-    opacities: np.ndarray  # (S, N)
-    colors: np.ndarray  # (S, N, D), to see which are finite
-    cameras: np.ndarray  # (I, CAMERA) float64
-
-    @property
-    def repeats(self) -> np.ndarray:
-        """(5,) int64: how many images in a row read the same entry of each of the five."""
-        arrays = (self.means, self.quats, self.scales, self.opacities, self.colors)
-        return np.array([repeat_of(part, len(self.cameras)) for part in arrays])
-
-
-@dataclass(frozen=True)
-class Projected:
-    """The Gaussians on the image planes."""
-
-    geom: np.ndarray  # (I, N, 16) float32, see kernels.geometry
-    depths: np.ndarray  # (I, N) float32, 0 where culled
-    rows: np.ndarray  # (I, N) int32, rows of tiles touched
-    radii: np.ndarray  # (I, N, 2) int32, half the size of the visible part in pixels
-    compensations: np.ndarray  # (I, N) float32, or (I, 0)
 
 
 @dataclass(frozen=True)
@@ -98,9 +69,35 @@ def camera_rows(viewmats: np.ndarray, Ks: np.ndarray, options: Options) -> np.nd
     return rows
 
 
-def project_stage(inputs: Inputs, options: Options) -> Projected:
-    """Culls and projects."""
-    images, gaussians = len(inputs.cameras), inputs.means.shape[1]
+def view_of(options: Options) -> View:
+    """The options that the projection reads."""
+    return View(
+        width=float(options.width),
+        height=float(options.height),
+        near=options.near_plane,
+        far=options.far_plane,
+        eps2d=options.eps2d,
+        antialiased=options.antialiased,
+    )
+
+
+def project_stage(
+    ellipsoids: Ellipsoids,
+    opacities: np.ndarray,
+    colors: np.ndarray,
+    cameras: np.ndarray,
+    options: Options,
+) -> Projected:
+    """Culls and projects.
+
+    Args:
+        ellipsoids: S entries of N Gaussians, N at least `rows.GROUP`.
+        opacities: (S, N) float32.
+        colors: (S, N, D) float32, to see which are finite.
+        cameras: (I, CAMERA) float64.
+        options: of the call.
+    """
+    images, gaussians = len(cameras), ellipsoids.means.shape[1]
     projected = Projected(
         geom=lease((images, gaussians, geometry.ROW), np.float32),
         depths=lease((images, gaussians), np.float32),
@@ -112,26 +109,12 @@ def project_stage(inputs: Inputs, options: Options) -> Projected:
     run(
         project,
         even_jobs(jobs, thread_count(jobs, images * gaussians)),
-        inputs.means.reshape(-1),
-        inputs.quats.reshape(-1),
-        inputs.scales.reshape(-1),
-        inputs.opacities.reshape(-1),
-        inputs.colors.reshape(-1),
-        inputs.colors.shape[-1],
-        inputs.repeats,
-        inputs.cameras,
-        gaussians,
-        float(options.width),
-        float(options.height),
-        options.near_plane,
-        options.far_plane,
-        options.eps2d,
-        options.antialiased,
-        projected.geom.reshape(-1),
-        projected.depths.reshape(-1),
-        projected.rows.reshape(-1),
-        projected.radii.reshape(-1),
-        projected.compensations.reshape(-1),
+        ellipsoids,
+        opacities,
+        colors,
+        cameras,
+        view_of(options),
+        projected,
     )
     return projected
 

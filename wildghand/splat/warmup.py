@@ -12,6 +12,9 @@ import numpy as np
 
 from wildghand.splat import backward_stages, stages
 from wildghand.splat.kernels.jit import Kernel
+from wildghand.splat.kernels.project import Ellipsoids
+from wildghand.splat.kernels.project_backward import PlaneGradients
+from wildghand.splat.kernels.reduce import BlendGradients
 from wildghand.splat.kernels.rows import GROUP
 from wildghand.splat.scene import Options
 
@@ -74,30 +77,19 @@ def _draw_nothing(channels: int) -> None:
 
     cameras = stages.camera_rows(np.eye(4)[None], np.eye(3)[None], options)
     opacities, colors = zeros(1, GROUP), zeros(1, GROUP, channels)
-    inputs = stages.Inputs(
-        zeros(1, GROUP, 3), zeros(1, GROUP, 4), zeros(1, GROUP, 3), opacities, colors, cameras
-    )
-    projected = stages.project_stage(inputs, options)
+    ellipsoids = Ellipsoids(zeros(1, GROUP, 3), zeros(1, GROUP, 4), zeros(1, GROUP, 3))
+    projected = stages.project_stage(ellipsoids, opacities, colors, cameras, options)
     lists = stages.list_stage(projected, options)
     image, alpha = zeros(1, 1, 1, channels), zeros(1, 1, 1, 1)
     drawn = stages.blend_stage(projected, lists, colors, zeros(1, channels), options, image, alpha)
     backward_stages.background_backward_stage(image, drawn.remaining)
-    blended = backward_stages.BlendGradients(
+    blended = BlendGradients(
         zeros(1, GROUP, 2), zeros(1, GROUP, 3), opacities, zeros(1, GROUP, channels)
     )
     backward_stages.blend_backward_stage(
         projected, lists, opacities, colors, drawn, image, image, alpha, options, blended
     )
+    upstream = PlaneGradients(blended.means2d, blended.shapes, zeros(0, 0), zeros(1, GROUP))
     backward_stages.project_backward_stage(
-        inputs,
-        projected,
-        blended.means2d,
-        blended.shapes,
-        zeros(0),
-        zeros(1, GROUP),
-        options,
-        True,
-        backward_stages.ProjectGradients(
-            zeros(1, GROUP, 3), zeros(1, GROUP, 4), zeros(1, GROUP, 3)
-        ),
+        ellipsoids, cameras, projected, upstream, options, True, ellipsoids
     )

@@ -1,4 +1,4 @@
-"""What the projection reads of a camera."""
+"""The numbers of a camera that the projection reads, and its two maps."""
 
 # Numba infers the types.
 # mypy: allow-untyped-defs
@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 
 from wildghand.splat import conventions as rules
-from wildghand.splat.kernels.jit import kernel
+from wildghand.splat.kernels.jit import inline, kernel
 
 #: Numbers of a camera: rotation row by row, translation, fx, fy, cx, cy, and the range of the
 #: tangents of view angles within which the perspective's Jacobian is followed, x then y.
@@ -48,3 +48,21 @@ def prepare_cameras(viewmats, Ks, width, height, rows):
             size = height if j else width
             row[TANGENTS + 2 * j] = -(row[CENTER + j] + _MARGIN * size) / row[FOCAL + j]
             row[TANGENTS + 2 * j + 1] = (size - row[CENTER + j] + _MARGIN * size) / row[FOCAL + j]
+
+
+@inline
+def to_camera(camera, row, x, y, z):
+    """One coordinate in camera axes; `row` 0, 1 or 2."""
+    turned = x * camera[3 * row] + y * camera[3 * row + 1] + z * camera[3 * row + 2]
+    return turned + camera[9 + row]
+
+
+@inline
+def jacobian_row(camera, axis, scale, tangent):
+    """One row of J R: the perspective's Jacobian times the camera's rotation."""
+    first = 3 * axis
+    return (
+        scale * (camera[first] - tangent * camera[6]),
+        scale * (camera[first + 1] - tangent * camera[7]),
+        scale * (camera[first + 2] - tangent * camera[8]),
+    )

@@ -10,6 +10,7 @@ order of its tiles: the sums are the same bits on every run.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from wildghand.splat.kernels.channels import MOMENTS
 from wildghand.splat.kernels.jit import inline, kernel
 from wildghand.splat.kernels.jobs import next_job
 from wildghand.splat.kernels.lanes import prefetch, store
-from wildghand.splat.kernels.project import PIECE
+from wildghand.splat.kernels.project import PIECE, entry_of
 from wildghand.splat.kernels.project_backward import clear_first
 from wildghand.splat.kernels.rows import GROUP, fill_exact, load1
 
@@ -27,31 +28,38 @@ _AHEAD = 24
 _TWO_LN2 = 2.0 * math.log(2.0)
 
 
+class BlendGradients(NamedTuple):
+    """Gradients of the loss by what was blended.
+
+    `shapes`: with the exponent -1/2 (a u^2 + c e^2), u = dx + s dy, e = dy, they are the gradient
+    of log a, of log c, and of s times sqrt(c / a). They have no unit, so they fit into float32 for
+    every size of splat.
+    """
+
+    means2d: np.ndarray  # (I, N, 2) float32, px^-1
+    shapes: np.ndarray  # (I, N, 3) float32
+    opacities: np.ndarray  # (S, N) float32
+    colors: np.ndarray  # (S, N, D) float32
+
+
 @kernel
 def reduce_slots(
-    worker, counters, ends,
-    gaussians, channels, geom, opacities, opacity_repeat, color_repeat, first_entry,
-    depths, slot_of, slots, slot_size, v_means2d, v_shapes, v_opacities, v_colors,
-):  # fmt: skip
+    worker, counters, ends, geom, depths, opacities, first_entry, slot_of, slots, gradients
+):
     """Gradients of the projected Gaussians, summed over images for what images share.
 
     Args:
         worker, counters, ends: see `next_job`; a job is a piece of Gaussians.
-        gaussians, channels: N and D.
-        geom: flat float32 (I, N, 16).
-        opacities: flat float32 (S, N), as blended.
-        opacity_repeat, color_repeat: image i reads entry i // repeat of the S.
+        geom, depths: of `Projected`.
+        opacities: float32 (S, N), as blended.
         first_entry: int32 (I * N + 1,); see `bins`.
-        depths: float32 (I, N); 0 where culled.
         slot_of: int32 (E,); slot of each entry, -1 if nothing of it was blended.
-        slots: flat float32, `slot_size` for each; see `channels.finish_sums`.
-        v_means2d: out, flat float32 (I, N, 2); px^-1.
-        v_shapes: out, flat float32 (I, N, 3); with the exponent -1/2 (a u^2 + c e^2), u = dx +
-            s dy, e = dy: gradient of log a, of log c, of s times sqrt(c / a). They have no unit,
-            so they fit into float32 for every size of splat.
-        v_opacities, v_colors: out, flat float32 (S, N) and (S, N, D).
+        slots: float32, a row for each; see `channels.finish_sums`.
+        gradients: out, `BlendGradients`.
     """
-    images = depths.shape[0]
+    images, gaussians = depths.shape
+    v_means2d, v_shapes, v_opacities, v_colors = gradients
+    channels = v_colors.shape[2]
     pieces = max(1, gaussians // PIECE)
     groups = (MOMENTS + channels + GROUP - 1) // GROUP
     sums = np.empty(groups * GROUP, np.float64)
@@ -61,37 +69,37 @@ def reduce_slots(
             break
         begin, stop = piece * gaussians // pieces, (piece + 1) * gaussians // pieces
         for i in range(images):
-            clear_first(v_opacities, 1, i, opacity_repeat, gaussians, begin, stop)
-            clear_first(v_colors, channels, i, color_repeat, gaussians, begin, stop)
+            clear_first(v_opacities, i, images, begin, stop)
+            clear_first(v_colors, i, images, begin, stop)
+            of_opacities = entry_of(v_opacities, i, images)
+            of_colors = entry_of(v_colors, i, images)
             for n in range(begin, stop):
-                to = i * gaussians + n
                 if not depths[i, n] > 0:
-                    v_means2d[2 * to] = v_means2d[2 * to + 1] = 0.0
+                    v_means2d[i, n, 0] = v_means2d[i, n, 1] = 0.0
                     for k in range(3):
-                        v_shapes[3 * to + k] = 0.0
+                        v_shapes[i, n, k] = 0.0
                     continue
-                add_slots(first_entry[to], first_entry[to + 1], slot_of, slots, slot_size, sums)
-                row = to * at.ROW
-                along = np.float64(geom[row + at.ALONG])
-                across = np.float64(geom[row + at.ACROSS])
-                shear = np.float64(geom[row + at.SHEAR]) + np.float64(geom[row + at.SHEAR_LOW])
+                to = i * gaussians + n
+                add_slots(first_entry[to], first_entry[to + 1], slot_of, slots, sums)
+                along = np.float64(geom[i, n, at.ALONG])
+                across = np.float64(geom[i, n, at.ACROSS])
+                shear = np.float64(geom[i, n, at.SHEAR]) + np.float64(geom[i, n, at.SHEAR_LOW])
                 m, m_u, m_e, m_uu, m_ue, m_ee = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
                 v_x = _TWO_LN2 * along * m_u
-                v_means2d[2 * to] = v_x
-                v_means2d[2 * to + 1] = _TWO_LN2 * across * m_e + shear * v_x
-                v_shapes[3 * to] = -0.5 * _TWO_LN2 * m_uu
-                v_shapes[3 * to + 1] = -0.5 * _TWO_LN2 * m_ee
-                v_shapes[3 * to + 2] = -_TWO_LN2 * m_ue
-                share = i // opacity_repeat * gaussians + n
-                v_opacities[share] += m / opacities[share]
-                share = (i // color_repeat * gaussians + n) * channels
+                v_means2d[i, n, 0] = v_x
+                v_means2d[i, n, 1] = _TWO_LN2 * across * m_e + shear * v_x
+                v_shapes[i, n, 0] = -0.5 * _TWO_LN2 * m_uu
+                v_shapes[i, n, 1] = -0.5 * _TWO_LN2 * m_ee
+                v_shapes[i, n, 2] = -_TWO_LN2 * m_ue
+                v_opacities[of_opacities, n] += m / opacities[of_opacities, n]
                 for k in range(channels):
-                    v_colors[share + k] += sums[MOMENTS + k]
+                    v_colors[of_colors, n, k] += sums[MOMENTS + k]
 
 
 @inline
-def add_slots(first, last, slot_of, slots, slot_size, sums):
+def add_slots(first, last, slot_of, slots, sums):
     """Writes the sum of the slots of entries `first` to `last` to `sums`, in their order."""
+    slot_size = slots.shape[1]
     low, high = fill_exact(0.0), fill_exact(0.0)
     for entry in range(first, last):
         if entry + _AHEAD < slot_of.size:
