@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
@@ -22,6 +22,9 @@ from wildghand.model.settings import WildGHandSettings
 @dataclass(frozen=True)
 class FitRecord:
     """How an avatar was fitted."""
+
+    #: Fields that old avatars have; they are read and dropped.
+    removed_fields: ClassVar[tuple[str, ...]] = ("loss",)
 
     #: Frames of the capture that were fitted.
     frames: list[int] = field(default_factory=list)

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from hwp_bench.base.errors import BadInput, BadResult, HwpError
+from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.records import parse_record
@@ -44,13 +44,13 @@ class _Description:
     """The content of `avatar.json`."""
 
     schema: str
-    hand_model: dict[str, str]
+    hand_model: HandModelId
     sides: list[str]
     seed: int
     mean_color: list[float]
     betas: dict[str, list[float]]
     settings: dict[str, Any]
-    fit: dict[str, Any]
+    fit: FitRecord
 
 
 def save_avatar(
@@ -65,13 +65,13 @@ def save_avatar(
 
     description = _Description(
         schema=SCHEMA,
-        hand_model=dataclasses.asdict(avatar.hand_model),
+        hand_model=avatar.hand_model,
         sides=list(avatar.sides),
         seed=avatar.seed,
         mean_color=[float(value) for value in avatar.mean_color],
         betas={side: [float(b) for b in betas] for side, betas in avatar.betas.items()},
         settings=dataclasses.asdict(avatar.settings),
-        fit=dataclasses.asdict(avatar.record),
+        fit=avatar.record,
     )
     with atomic_folder(path, overwrite=overwrite) as folder:
         tensors = avatar.model.state_dict()
@@ -120,24 +120,20 @@ def load_avatar(
             remedy="Make one with `wildghand fit CAPTURE -o AVATAR`.",
         )
     where = str(root / DESCRIPTION)
+    description = read_json(root / DESCRIPTION)
+    value = parse_record(_Description, description, where=where, error=BadInput)
     try:
-        value = parse_record(_Description, read_json(root / DESCRIPTION), where=where)
         if value.schema == VERSION_1:
             settings = read_version_1(value.settings)
-            value.fit.pop("loss", None)
         elif value.schema == SCHEMA:
             settings = read_settings(value.settings)
         else:
             raise BadInput(f"is {value.schema!r} where {SCHEMA!r} is read", field="schema")
-        record = parse_record(FitRecord, value.fit, where=where, field="fit.")
-        hand_model = parse_record(HandModelId, value.hand_model, where=where, field="hand_model.")
         _check_description(value)
-    except BadResult as error:
-        raise BadInput(str(error)) from error
     except HwpError as error:
         raise BadInput(str(error), where=where) from error
-    templates = _templates(hand_model, value.sides, hand, where)
-    mean_color, frame_count = torch.tensor(value.mean_color), max(1, len(record.frames))
+    templates = _templates(value.hand_model, value.sides, hand, where)
+    mean_color, frame_count = torch.tensor(value.mean_color), max(1, len(value.fit.frames))
     device = torch.device(device)
     model = make_model(templates, settings, mean_color, frame_count, value.seed, device)
     file = root / MODEL
@@ -153,7 +149,7 @@ def load_avatar(
             raise BadInput("holds NaN or infinity", where=file, field=name)
     betas = {side: np.array(given) for side, given in value.betas.items()}
     return WildGHandAvatar(
-        model.eval(), settings, hand_model, betas, mean_color, value.seed, record
+        model.eval(), settings, value.hand_model, betas, mean_color, value.seed, value.fit
     )
 
 

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from hwp_bench.base.errors import BadInput, BadResult, HwpError
+from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_folder, inside, read_json, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import parse_record
@@ -185,10 +185,8 @@ def load_prior(
 
 def _read_record(root: Path) -> PriorRecord:
     where = str(root / DESCRIPTION)
-    try:
-        record = parse_record(PriorRecord, read_json(root / DESCRIPTION), where=where)
-    except BadResult as error:
-        raise BadInput(str(error)) from error
+    description = read_json(root / DESCRIPTION)
+    record = parse_record(PriorRecord, description, where=where, error=BadInput)
     try:
         _check_record(record)
     except HwpError as error:
