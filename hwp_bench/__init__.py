@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hwp_bench.capture import open_capture as open_capture
     from hwp_bench.results import Results as Results
     from hwp_bench.results import read_results as read_results
-    from hwp_bench.sim import render_capture as render_capture
+    from hwp_bench.sim.produce.production import render_capture as render_capture
 
 # Not through lazy_loader: the launcher of the sandbox imports this package in an interpreter that
 # has only the standard library.

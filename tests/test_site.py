@@ -32,7 +32,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The built site; in strict mode a link or an anchor that leads nowhere ends the build."""
     folder = tmp_path_factory.mktemp("site") / "site"
     done = subprocess.run(
-        [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(folder)],
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-d", str(folder)],
         cwd=ROOT,
         env={**os.environ, "NO_MKDOCS_2_WARNING": "1"},
         capture_output=True,
@@ -62,7 +62,7 @@ def test_the_reference_has_every_public_name(site: Path, package: str) -> None:
 
 def test_fields_of_records_are_documented(site: Path) -> None:
     page = (site / "api" / "hwp_bench.methods.html").read_text(encoding="utf-8")
-    assert "Optimiser steps; None leaves the method" in page
+    assert "Optimiser steps; None keeps the method" in page
 
 
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:

@@ -6,6 +6,7 @@ an entry that is not needed any more.
 
 PlainMethod  # the entry of baselines/plain/method.toml
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/interaction-gaussian
+_.__dir__  # Python calls it for completion of a package's lazy names
 _.__getattr__  # Python calls it for a package's lazy names
 modified  # part of the cache's key: a changed file is read again
 _.maxlong  # reprlib reads it
@@ -15,10 +16,10 @@ _.find_class  # pickle.Unpickler calls it
 _.persistent_load  # pickle.Unpickler calls it
 align  # pickles of numpy pass it
 typecode  # pickles of numpy pass it
+_._repr_markdown_  # notebooks call it
 _.formatter_class  # argparse reads it
 _.channelnames  # OpenImageIO reads it
 _.camera_position  # pyvista reads it
-_.python  # read by getattr: one of the kinds of entry in method.toml
 _.date  # read by the leaderboard's template
 _.pareto  # read by the report's template
 _.provenance  # read by the report's template
@@ -31,3 +32,7 @@ _.sharpness  # a field of the pre-pass's judgement file
 _.blur_deviation  # a field of the pre-pass's judgement file
 _.misplacement_deviation  # a field of the pre-pass's judgement file
 _.hidden_deviation  # a field of the pre-pass's judgement file
+as_float  # for now: the reader of the images that the front door takes
+LOG_255  # for now: a constant of the rasterizer
+REACH_X  # for now: a row of the rasterizer's records
+PER_BLOCK  # for now: a vector type of the rasterizer's kernels
