@@ -46,7 +46,7 @@ class FrameScore:
 
     @property
     def empty(self) -> bool:
-        """True where the mask leaves no pixel to score, whatever was predicted."""
+        """True where the mask leaves no pixel to score; this does not depend on the prediction."""
         return not self.values
 
 
@@ -114,7 +114,7 @@ def _score(
     prediction = frame.prediction
     failure: HwpError | None = None
     if isinstance(prediction, HwpError):
-        # The mask is looked at first all the same: a frame without a hand is nobody's failure.
+        # The mask is still checked first: a frame without a hand is not a failure of the method.
         failure, prediction = prediction, frame.target
     else:
         try:

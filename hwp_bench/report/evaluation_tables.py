@@ -146,7 +146,7 @@ def perturbation_table(results: Sequence[Results], means: Sequence[Aggregate]) -
 
 
 def same_data(results: Sequence[Results]) -> None:
-    """Refuse captures of one name that are not the same data, or not split alike.
+    """Refuse captures of one name that differ in their data or their split.
 
     Raises:
         UsageError: naming the capture.

@@ -14,7 +14,7 @@ from hwp_bench.results.published import MARK, NOTE, Measurement, PublishedTable,
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, catalogue, perturbation
 
-#: Published metrics, and what stands for them among the measured.
+#: Published metrics, and the measured metrics that correspond to them.
 METRIC_OF = {"psnr": "paper_psnr", "ssim": "paper_ssim", "lpips": "paper_lpips"}
 #: Digits that the paper prints.
 PAPER_DIGITS = {"psnr": 2, "ssim": 3, "lpips": 3}
@@ -30,11 +30,11 @@ _ELSEWHERE = {"interhand2.6m": "InterHand2.6M (Inter.)", "anchorcrafter": "Ancho
 
 @dataclass(frozen=True)
 class Layout:
-    """Which columns a table of the paper has."""
+    """The columns of a table of the paper."""
 
     #: Its number in the paper, in Arabic digits.
     number: int
-    #: What it shows.
+    #: Its caption.
     caption: str
     #: Heading of each group of columns by scope.
     scopes: Mapping[str, str]
@@ -52,7 +52,7 @@ LAYOUTS: Mapping[int, Layout] = {
             "Comparison of methods",
             {"single": "HWP (Single)", "interacting": "HWP (Inter.)", **_ELSEWHERE},
         ),
-        Layout(4, "Comparison on videos of one's own", {"all": ""}),
+        Layout(4, "Comparison on own videos", {"all": ""}),
         Layout(5, "Interacting hands by perturbation", _PERTURBED),
         Layout(
             6,

@@ -35,19 +35,19 @@ from hwp_bench.report.study_tables import (
 from hwp_bench.results import read_results
 from hwp_bench.results.schema import ABLATION
 
-#: Table of the paper whose numbers go with a table of ours.
+#: The paper's table with the same content, by name of our table.
 PAPER_OF = {"overall": 3, "paper": 3, "perturbations": 5, "bias": 9, "seeds": 10}
 
 
 @dataclass(frozen=True)
 class TableRequest:
-    """Which table of which results."""
+    """A table to make, and the results to make it of."""
 
     #: Results folders, `results.json` files or ablation folders.
     paths: Sequence[str | os.PathLike[str]]
     #: Name of the table.
     by: str = "overall"
-    #: Number of the table of the paper whose layout is asked for, in place of `by`.
+    #: Number of the table of the paper whose layout is used instead of `by`.
     paper: int | None = None
     #: True appends the published rows.
     published: bool = False

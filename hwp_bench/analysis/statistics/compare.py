@@ -31,7 +31,7 @@ class Difference:
     scope: str
     #: First less second, in the metric's unit.
     estimate: Estimate
-    #: Probability that the first is the better one, whichever direction that is.
+    #: Probability that the first is better, in the metric's own direction.
     better: float | None
     #: p-value, adjusted over the perturbations for perturbations and over the pairs of methods
     #: for the macro mean; None where nothing is adjusted.

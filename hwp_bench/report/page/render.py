@@ -1,4 +1,4 @@
-"""From a gathered report to one HTML file that needs nothing else."""
+"""Writes a gathered report as one self-contained HTML file."""
 
 from __future__ import annotations
 
