@@ -12,7 +12,7 @@ from hwp_bench.base.drawing import error_map, fitted, labelled, sheet
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.methods.predictions import Prediction
+from hwp_bench.evaluation.scoring import Prediction
 from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.results import FrameResult

@@ -21,13 +21,13 @@ from hwp_bench.evaluation.artifacts import keep_artifacts
 from hwp_bench.evaluation.scoring import (
     mean_scores,
     predictions_digest,
+    read_predictions,
     read_targets,
     score_predictions,
 )
 from hwp_bench.methods.contents import exposed_digest
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
-from hwp_bench.methods.predictions import read_predictions
 from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available

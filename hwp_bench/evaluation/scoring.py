@@ -1,17 +1,22 @@
-"""From predictions to scores: every frame that the split lists is scored, failures included."""
+"""From predicted frames to scores: every frame that the split lists is scored, failures included.
+
+Predictions are checked before they are scored; only the frames of a submission count.
+"""
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import BadCapture, BadPrediction
-from hwp_bench.base.images import pixel_digest
+from hwp_bench.base.errors import BadCapture, BadImage, BadPrediction
+from hwp_bench.base.images import pixel_digest, read_rgb
 from hwp_bench.capture import Capture
-from hwp_bench.methods.predictions import Prediction
+from hwp_bench.capture.schema import frame_name
 from hwp_bench.metrics.batch import Frame, score_frames
 from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
@@ -33,6 +38,18 @@ class Target:
     exact: bool
 
 
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """One predicted frame, or the reason why it cannot be scored."""
+
+    #: Frame index in the capture.
+    frame: int
+    #: (H, W, 3) uint8 sRGB, or None.
+    pixels: np.ndarray | None
+    #: Why it cannot be scored, or None.
+    failure: str | None
+
+
 def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
     """Read the truth of the given frames, before any method runs.
 
@@ -52,6 +69,37 @@ def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
             )
         targets.append(Target(frame, capture.frame(frame), mask, exact))
     return targets
+
+
+def read_predictions(
+    folder: str | os.PathLike[str], frames: Iterable[int], size: tuple[int, int]
+) -> list[Prediction]:
+    """Read the predictions of the given frames, in that order; other files are ignored."""
+    return [read_prediction(folder, frame, size) for frame in frames]
+
+
+def read_prediction(
+    folder: str | os.PathLike[str], frame: int, size: tuple[int, int]
+) -> Prediction:
+    """Read one predicted frame.
+
+    Args:
+        folder: where the predictions of a capture lie, `000123.png` for frame 123.
+        frame: index of the frame.
+        size: the capture's (height, width).
+
+    Returns:
+        The pixels, or a named failure: missing, a link, empty, damaged, not 8-bit, of another
+        size. An alpha channel is dropped: the data set owns the mask.
+    """
+    path = Path(folder) / frame_name(frame)
+    # A link could lead to the very frame that is to be predicted.
+    if path.is_symlink():
+        return Prediction(frame, None, f"{path.name}: is a link")
+    try:
+        return Prediction(frame, read_rgb(path, size), None)
+    except BadImage as error:
+        return Prediction(frame, None, f"{path.name}: {error.problem}")
 
 
 def score_predictions(

@@ -18,12 +18,13 @@ from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation import cross_check
 from hwp_bench.evaluation.scoring import (
+    Prediction,
     Target,
     predictions_digest,
+    read_predictions,
     read_targets,
     score_predictions,
 )
-from hwp_bench.methods.predictions import Prediction, read_predictions
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network

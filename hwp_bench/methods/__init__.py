@@ -1,4 +1,4 @@
-"""The method contract, method directories, and the runner that keeps test frames away."""
+"""The method contract, method directories, requests, and settings."""
 
 from hwp_bench.methods.contract import (
     Avatar,

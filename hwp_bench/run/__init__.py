@@ -1,1 +1,1 @@
-"""Runs a method: its process, its walls (`sandbox`), and where jobs run (`engine`)."""
+"""Run a method: `runner` and `worker`, in a `sandbox`; an `engine` says where jobs run."""

@@ -18,8 +18,8 @@ import numpy as np
 import pytest
 
 from hwp_bench.base.errors import MethodFailed
+from hwp_bench.evaluation.scoring import read_prediction
 from hwp_bench.methods.manifest import read_manifest
-from hwp_bench.methods.predictions import read_prediction
 from hwp_bench.run.runner import RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement
 

@@ -11,9 +11,9 @@ from small_captures import CaptureMaker
 
 from hwp_bench.base.errors import MethodFailed
 from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.evaluation.scoring import read_prediction
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
-from hwp_bench.methods.predictions import read_prediction
 from hwp_bench.methods.request import write_request
 from hwp_bench.run.runner import run_method
 from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
