@@ -1,28 +1,11 @@
 """HWP-Sim: from a scene description to a capture, with everything that a real one hides.
 
-Heavy imports happen when a name is first asked for.
+The names of this package are listed in `__init__.pyi`. `lazy_loader` imports a name from its
+module when it is first asked for.
 """
 
 from __future__ import annotations
 
-import importlib
-from typing import Any
+import lazy_loader
 
-_HOMES = {
-    "Scene": "scene.schema",
-    "SuiteItem": "produce.suites",
-    "ensure_suite": "produce.suites",
-    "load_scene": "scene.reader",
-    "render_capture": "produce.production",
-    "render_frame": "render.frame",
-    "scene_names": "scene.reader",
-    "suite": "produce.suites",
-}
-
-__all__ = sorted(_HOMES)
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(f"{__name__}.{_HOMES[name]}"), name)
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
