@@ -1,13 +1,13 @@
-"""Hard cases as data, and where they come from.
+"""Numerical hard cases as data, and the registry that finds them.
 
-A part of the product, or a stranger's package, offers its cases by an entry point in the group
+A part of the product, or another package, offers its cases through an entry point in the group
 `hwp_bench.stability` that names a function without arguments:
 
     [project.entry-points."hwp_bench.stability"]
     splat = "wildghand.splat.hard_cases:cases"
 
-So the benchmark runs cases of packages that it knows nothing of, and imports none of them
-before their cases are asked for.
+So the benchmark runs cases of packages that it does not know, and imports none of them before
+their cases are needed.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ENTRY_POINTS = "hwp_bench.stability"
 
 @dataclass(frozen=True)
 class Context:
-    """What a case is told when it runs."""
+    """The choice that a case is run with."""
 
     #: The implementation to run it on; empty where a case has no choice of them.
     backend: str = ""
@@ -35,9 +35,9 @@ class Context:
 
 @dataclass(frozen=True)
 class Measured:
-    """What came out."""
+    """The outcome of a case, before its time is added."""
 
-    #: Whether what must hold did hold.
+    #: Whether the statement `must_hold` was true.
     passed: bool
     #: The numbers behind it, in a few words.
     text: str
@@ -49,11 +49,11 @@ class Case:
 
     #: Unique within its group.
     name: str
-    #: The part of the product that it tries, such as "splat".
+    #: The part of the product that it tests, such as "splat".
     group: str
-    #: What must hold, as a person reads it.
+    #: The statement that must be true, for a person.
     must_hold: str
-    #: Tries it. An exception counts as a failure.
+    #: Runs it. An exception counts as a failure.
     run: Callable[[Context], Measured]
     #: Implementations that this machine has; one empty name where there is no choice.
     backends: tuple[str, ...] = ("",)
@@ -70,15 +70,15 @@ class Outcome:
 
 
 def find_cases(groups: Sequence[str] = (), providers: Sequence[str] = ()) -> list[Case]:
-    """The cases that are on offer.
+    """Return the cases that packages offer.
 
     Args:
         groups: only these; all if empty.
-        providers: more sources, each "module:function", beside the installed entry points.
+        providers: more sources, each "module:function", in addition to the installed entry points.
 
     Raises:
-        UsageError: a group that nobody offers.
-        MissingDependency: nothing is installed that offers cases.
+        UsageError: no package offers such a group.
+        MissingDependency: no installed package offers cases.
         HwpError: a source cannot be loaded.
     """
     sources = {point.name: point.value for point in metadata.entry_points(group=ENTRY_POINTS)}
@@ -105,7 +105,7 @@ def find_cases(groups: Sequence[str] = (), providers: Sequence[str] = ()) -> lis
 def run_cases(
     cases: Iterable[Case], backends: Sequence[str] = (), clock: Callable[[], float] = time.monotonic
 ) -> Iterator[Outcome]:
-    """Runs cases one by one, each on every backend that it has, and yields as it goes.
+    """Run cases one by one, each on every backend that it has, and yield each outcome.
 
     Args:
         cases: in the order to run them.
@@ -119,7 +119,7 @@ def run_cases(
             start = clock()
             try:
                 measured = case.run(Context(backend))
-            except Exception as error:  # what a case throws is its result
+            except Exception as error:  # an exception is a result too
                 measured = Measured(False, f"raised {type(error).__name__}: {error}")
             yield Outcome(case, backend, measured, clock() - start)
 

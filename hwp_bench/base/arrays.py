@@ -45,14 +45,14 @@ def read_npz(
     # A damaged archive can raise whatever a decompressor or numpy's parser of headers raises.
     except Exception as error:
         raise BadInput(
-            f"is no readable array file ({shown(str(error))[:200]})",
+            f"is not a readable array file ({shown(str(error))[:200]})",
             where=path,
             remedy="It must be an .npz of plain arrays.",
         ) from error
 
 
 def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> np.ndarray:
-    """Read one array, after a look at how large its header says that it is."""
+    """Read one array, after checking the size that its header states."""
     with archive.open(item) as stream:
         version = np.lib.format.read_magic(stream)
         readers = {
@@ -87,11 +87,11 @@ def take(
     """Take one array out of a file and check it.
 
     Args:
-        arrays: what the file holds.
+        arrays: the arrays of the file.
         name: which array.
-        shape: expected shape; None admits any length.
+        shape: expected shape; None accepts any length.
         where: the file, for the message.
-        dtype: wanted type; floats must be finite.
+        dtype: type to return; floats must be finite.
 
     Returns:
         The array as `dtype`.
@@ -103,11 +103,11 @@ def take(
         raise BadInput("is missing", where=where, field=name)
     array = arrays[name]
     if len(array.shape) != len(shape) or any(
-        wanted is not None and got != wanted for got, wanted in zip(array.shape, shape, strict=True)
+        size is not None and got != size for got, size in zip(array.shape, shape, strict=True)
     ):
-        wanted_text = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
+        expected = "(" + ", ".join("any" if n is None else str(n) for n in shape) + ")"
         raise BadInput(
-            f"has shape {array.shape} where {wanted_text} is expected", where=where, field=name
+            f"has shape {array.shape} where {expected} is expected", where=where, field=name
         )
     kinds = "b" if dtype is bool else "fiu"
     if array.dtype.kind not in kinds:

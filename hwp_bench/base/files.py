@@ -21,7 +21,7 @@ from hwp_bench.base.errors import BadInput, HwpError, UsageError
 MAX_JSON_BYTES = 256 * 1024 * 1024
 #: Deepest nesting of JSON that is read: no format here needs ten levels.
 MAX_JSON_DEPTH = 100
-#: Largest whole number that is read; above it other programs would round.
+#: Largest integer that is read; above it other programs would round.
 MAX_JSON_INTEGER = 2**63
 
 
@@ -103,12 +103,12 @@ def atomic_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
 
 
 def canonical_json(value: Any) -> str:
-    """Return one spelling of a JSON value: sorted keys, no spaces, NaN refused."""
+    """Return the canonical format of a JSON value: sorted keys, no spaces, NaN refused."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
 
 
 def sha256_json(value: Any) -> str:
-    """Return the SHA-256 (hex) of a JSON value's canonical spelling."""
+    """Return the SHA-256 (hex) of a JSON value's canonical format."""
     return hashlib.sha256(canonical_json(value).encode()).hexdigest()
 
 
@@ -142,14 +142,14 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
     """Read a JSON file from outside.
 
     Raises:
-        BadInput: the file is missing, no regular file, larger than `max_bytes`, not UTF-8, not
+        BadInput: the file is missing, not a regular file, larger than `max_bytes`, not UTF-8, not
             JSON, nested too deeply, or holds a number that is infinite or absurdly large.
     """
     path = Path(path)
     try:
         text = _read_bounded(path, max_bytes).decode()
         value = json.loads(
-            text, parse_constant=_refuse_constant, parse_float=_finite, parse_int=_whole
+            text, parse_constant=_refuse_constant, parse_float=_finite, parse_int=_bounded_int
         )
     except FileNotFoundError as error:
         raise BadInput("does not exist", where=path) from error
@@ -167,12 +167,12 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
 
 
 def _read_bounded(path: Path, max_bytes: int) -> bytes:
-    # Not blocking: a named pipe would keep its reader waiting for ever. And what a device or a
-    # growing file holds is not known from its size.
+    # Non-blocking: a named pipe would keep its reader waiting forever. The size of a device or a
+    # growing file does not say how much can be read from it.
     handle = os.open(path, os.O_RDONLY | getattr(os, "O_NONBLOCK", 0))
     with os.fdopen(handle, "rb") as stream:
         if not stat.S_ISREG(os.fstat(stream.fileno()).st_mode):
-            raise BadInput("is no regular file", where=path)
+            raise BadInput("is not a regular file", where=path)
         data = stream.read(max_bytes + 1)
     if len(data) > max_bytes:
         raise BadInput(f"holds more than the {max_bytes} bytes that are read", where=path)
@@ -195,7 +195,7 @@ def _deeper_than(value: Any, limit: int) -> bool:
 
 
 def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is no JSON number")
+    raise ValueError(f"{name} is not a JSON number")
 
 
 def _finite(text: str) -> float:
@@ -205,8 +205,8 @@ def _finite(text: str) -> float:
     return number
 
 
-def _whole(text: str) -> int:
-    # Long ones are told from their length: turning them into numbers takes long.
+def _bounded_int(text: str) -> int:
+    # Long ones are recognised by their length: converting them takes long.
     if len(text) > 20 or abs(int(text)) > MAX_JSON_INTEGER:
         raise ValueError(f"{text[:20]}... is too large a number")
     return int(text)

@@ -1,4 +1,4 @@
-"""Where the toolkit's own packages and data lie, in a checkout and in an installed wheel."""
+"""The folders of the toolkit's own packages and data, in a checkout and in an installed wheel."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ PACKAGES = Path(__file__).resolve().parents[2]
 def data_folder(name: str) -> Path:
     """Return a folder of data that ships with the toolkit.
 
-    In an installed wheel it lies inside the package `hwp_bench`, in a checkout beside it.
+    In an installed wheel it lies inside the package `hwp_bench`, in a checkout next to it.
 
     Args:
         name: `baselines`, `leaderboard` or `splits`.

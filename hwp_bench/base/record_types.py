@@ -116,7 +116,7 @@ def _limits(metas: Iterable[Any]) -> dict[str, Any]:
 
 
 def explain(kind: Any, value: Any, path: str) -> tuple[str, str, str | None]:
-    """What is wrong with a value that `msgspec` refuses: problem, path, remedy."""
+    """Say what is wrong with a value that `msgspec` refuses: problem, path, remedy."""
     kind, metas = _unwrap(kind)
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         if not isinstance(value, Mapping):
@@ -140,7 +140,7 @@ def explain(kind: Any, value: Any, path: str) -> tuple[str, str, str | None]:
 
 
 def _parts(kind: Any, value: Any, path: str) -> Iterator[tuple[Any, Any, str]]:
-    """The parts of a value, each with its type and path; none where it has not the right form."""
+    """The parts of a value, each with its type and path; none where its form is wrong."""
     origin, types_ = typing.get_origin(kind), typing.get_args(kind)
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         for item in msgspec.structs.fields(kind):
@@ -208,7 +208,7 @@ def _remedy(name: str, path: str, kind: type[msgspec.Struct]) -> str:
 
 
 def brief(value: Any) -> str:
-    """What a value is, short enough for a message and safe for a terminal."""
+    """Return a value as text, short enough for a message and safe for a terminal."""
     if isinstance(value, int) and value.bit_length() > 256:
         return "an absurdly large number"
     return shown(_REPR.repr(value))[:_SHOWN]

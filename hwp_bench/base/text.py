@@ -1,11 +1,11 @@
-"""Text from others: what could steer a terminal or turn a line around is found or taken out."""
+"""Text from others: finds and replaces characters that steer a terminal or reverse a line."""
 
 from __future__ import annotations
 
 import re
 
 #: Control characters except tab and line feed, and the marks that reverse the direction of
-#: writing: what stands between the brackets of a regular expression.
+#: writing, as a set of characters in a regular expression (without its brackets).
 ODD_CHARACTERS = "\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069"
 _ODD = re.compile(f"[{ODD_CHARACTERS}]")
 

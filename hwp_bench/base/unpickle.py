@@ -29,7 +29,7 @@ _KINDS = "biufcSU"
 
 
 class StandIn:
-    """What is left of an object whose class is not admitted: the name and the state."""
+    """The name and the state of an object whose class is not admitted."""
 
     #: The class that the pickle names, "module.name".
     origin: str = ""
@@ -88,9 +88,9 @@ def load_pickle(
             return _Unpickler(stream, path, stand_ins).load()
     except HwpError:
         raise
-    # A damaged pickle can raise anything that its opcodes can be made to do.
+    # A damaged pickle can raise any exception.
     except Exception as error:
-        raise BadInput(f"is no readable pickle ({error})", where=path) from error
+        raise BadInput(f"is not a readable pickle ({error})", where=path) from error
 
 
 def _check_memo(stream: Any) -> None:
@@ -182,7 +182,7 @@ class _Array(np.ndarray):
         expected = plain.itemsize
         for length in shape:
             if not isinstance(length, int) or length < 0:
-                raise ValueError("an array's shape is not made of whole numbers")
+                raise ValueError("an array's shape is not made of integers")
             expected *= length
         if expected != len(data):
             raise ValueError(f"an array of shape {shape} holds {len(data)} bytes, not {expected}")

@@ -1,4 +1,4 @@
-"""From the parameters of one hand model to those of another, by fitting; and one shape a clip."""
+"""Convert the parameters of one hand model to another by fitting; give a clip one shape."""
 
 from __future__ import annotations
 
@@ -146,7 +146,7 @@ def convert_capture(
         The error of the conversion, by side.
 
     Raises:
-        UsageError: `out` exists, or there is no such hand model.
+        UsageError: `out` exists, or the hand model does not exist.
         BadHandModel: the template that the capture names cannot be loaded.
         BadInput: the template that is loaded is not the capture's.
     """

@@ -99,7 +99,7 @@ class Capture:
 
         Raises:
             BadImage: missing, damaged or of another size.
-            UsageError: there is no such frame.
+            UsageError: the capture has no such frame.
         """
         return read_rgb(self._path("frames", frame), self.size)
 
@@ -123,7 +123,7 @@ class Capture:
         """Return the estimated parameters of every hand in one frame, by side.
 
         Raises:
-            UsageError: there is no such frame.
+            UsageError: the capture has no such frame.
         """
         self._check(frame)
         return hand_poses(self.hands, frame)
@@ -132,7 +132,7 @@ class Capture:
         """Return the camera of one frame.
 
         Raises:
-            UsageError: there is no such frame.
+            UsageError: the capture has no such frame.
         """
         self._check(frame)
         return self.cameras.camera(frame, self.info.width, self.info.height)

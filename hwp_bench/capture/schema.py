@@ -39,7 +39,7 @@ IMAGE_FOLDERS = {
 MAX_FRAMES = 100_000
 #: Largest edge of a frame, in pixels.
 MAX_EDGE = 8192
-#: Which hands a capture may hold, and the sides that it then has parameters for.
+#: The hands that a capture may hold, and the sides that it then has parameters for.
 SIDES: Mapping[str, tuple[str, ...]] = {
     "right": ("right",),
     "left": ("left",),
@@ -51,7 +51,7 @@ _Edge = Annotated[int, Meta(ge=1, le=MAX_EDGE)]
 
 @dataclass(frozen=True)
 class HandModelId:
-    """Which hand model the parameters of a capture belong to."""
+    """The hand model to which the parameters of a capture belong."""
 
     #: Name of the template, such as `anny-1` or `mano`.
     name: Text
@@ -69,9 +69,9 @@ class CaptureInfo:
     id: Text
     #: `right`, `left` or `both`.
     hands: str = field(metadata={"choices": tuple(SIDES)})
-    #: What the hands do.
+    #: Action of the hands.
     action: Text
-    #: What recorded it.
+    #: Device that recorded it.
     device: Text
     #: Frames per second.
     fps: Annotated[float, Meta(gt=0.0, lt=1e6)]

@@ -1,4 +1,4 @@
-"""Write a capture folder: whole at the end, or not there."""
+"""Write a capture folder: it is complete at the end, or it does not exist."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from hwp_bench.hands.parameters import HandParameters
 
 
 class CaptureWriter:
-    """Context manager that fills a capture folder.
+    """A context manager that fills a capture folder.
 
     Frames may come in any order, and from several threads. When the block ends well every frame
     must have been given; the folder then takes its name. When it ends with an error nothing is
@@ -45,7 +45,7 @@ class CaptureWriter:
 
     Args:
         path: the capture folder to make.
-        info: what the capture says of itself; digests are filled in.
+        info: description of the capture; digests are filled in.
         hands: parameters by side, as a method is given them.
         cameras: one camera a frame.
         overwrite: replace an existing folder.

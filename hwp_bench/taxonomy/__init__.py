@@ -1,4 +1,4 @@
-"""What can disturb a hand video, and the eleven captures of the paper."""
+"""The perturbations of a hand video, and the eleven captures of the paper."""
 
 from hwp_bench.taxonomy.catalogue import CatalogueEntry, catalogue
 from hwp_bench.taxonomy.perturbations import (

@@ -17,7 +17,7 @@ class CatalogueEntry:
     id: str
     #: `single` or `interacting`.
     hands: str
-    #: What the hands do.
+    #: Action of the hands.
     action: str
     #: `Mobile phone` (handheld) or `Webcam` (fixed).
     device: str

@@ -21,7 +21,7 @@ class Perturbation:
     title: str
     #: Heading of the paper's per-scenario table.
     heading: str
-    #: What it does to a frame.
+    #: Its effect on a frame.
     description: str
     #: Whether it acts on the whole frame (True) or on a part of it.
     holistic: bool
@@ -67,7 +67,7 @@ def perturbation(name: str) -> Perturbation:
     """Look a perturbation up by name.
 
     Raises:
-        BadInput: there is none of that name; the message lists the four.
+        BadInput: no perturbation has that name; the message lists the four.
     """
     for item in _ALL:
         if item.name == name:
@@ -78,16 +78,16 @@ def perturbation(name: str) -> Perturbation:
 
 
 def check_severity(values: Iterable[int], *, where: str, field: str) -> tuple[int, ...]:
-    """Check the severities of one perturbation, one whole number from 0 to 5 for each frame.
+    """Check the severities of one perturbation, one integer from 0 to 5 for each frame.
 
     Raises:
-        BadInput: a value is no whole number or out of range; the frame is named.
+        BadInput: a value is not an integer or is out of range; the frame is named.
     """
     checked = []
     for frame, value in enumerate(values):
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEVERITY:
             raise BadInput(
-                f"severity {value!r} of frame {frame} is no whole number from 0 to {MAX_SEVERITY}",
+                f"severity {value!r} of frame {frame} is not an integer from 0 to {MAX_SEVERITY}",
                 where=where,
                 field=field,
             )

@@ -1,4 +1,4 @@
-"""Prove that a split is fair: disjoint, a clean test clip, no near-copies across the border."""
+"""Audit a split: disjoint parts, a clean test clip, no near-copies across the border."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ if TYPE_CHECKING:
     from hwp_bench.capture import Capture
 
 #: Two frames whose thumbnails differ by less than this RMS (8-bit levels) count as near-copies;
-#: sensor noise of a phone alone gives about 2 at this thumbnail size.
+#: the sensor noise of a phone gives about 2 at this thumbnail size.
 NEAR_DUPLICATE_RMS = 2.0
 #: Edge of the thumbnails, px.
 THUMBNAIL = 32
-#: Perceptual hashes (64 bits) that differ in at most this many bits count as one picture; unlike
+#: Perceptual hashes (64 bits) that differ in at most this many bits count as one image; unlike
 #: the RMS they see through another exposure, contrast or compression.
-SAME_PICTURE_BITS = 4
+SAME_IMAGE_BITS = 4
 
 
 @dataclass(frozen=True)
 class AuditReport:
-    """What the audit of one split found."""
+    """Findings of the audit of one split."""
 
     #: Id of the capture.
     capture: str
@@ -34,20 +34,20 @@ class AuditReport:
     counts: dict[str, int]
     #: Frames that belong to more than one part; must be empty.
     overlap: tuple[int, ...]
-    #: Frames of no part: the guard gap.
+    #: Frames that belong to no part: the guard gap.
     left_out: tuple[int, ...]
     #: Perturbed test frames, with the perturbation's name; must be empty.
     perturbed_test: tuple[tuple[int, str], ...]
-    #: Perturbations whose severity is not known frame by frame, so that nothing is proven.
+    #: Perturbations whose severity is not known frame by frame, so that the audit proves nothing.
     unknown_severity: tuple[str, ...]
     #: Test frames that nearly equal a training or validation frame: (test, other, RMS).
     near_duplicates: tuple[tuple[int, int, float], ...]
     #: Smallest guard gap (frames before the test clip) that leaves no near-copy.
     guard_needed: int
-    #: Test frames whose perceptual hash is that of a training or validation frame, but for a few
+    #: Test frames whose perceptual hash is that of a training or validation frame, except for a few
     #: bits: (test, other, bits that differ).
     same_hashes: tuple[tuple[int, int, int], ...]
-    #: Smallest guard gap that leaves no such frame.
+    #: Smallest guard gap that leaves none of them.
     guard_needed_by_hash: int
 
     @property
@@ -61,7 +61,7 @@ def audit_split(
     split: Split,
     *,
     threshold: float = NEAR_DUPLICATE_RMS,
-    bits: int = SAME_PICTURE_BITS,
+    bits: int = SAME_IMAGE_BITS,
 ) -> AuditReport:
     """Audit the split of a capture.
 
@@ -70,7 +70,7 @@ def audit_split(
         split: its split.
         threshold: RMS difference of 32x32 thumbnails, in 8-bit levels, below which two frames
             count as near-copies.
-        bits: most bits in which the perceptual hashes of one picture differ.
+        bits: most bits in which the perceptual hashes of one image differ.
 
     Returns:
         The report; near-copies are reported, not judged, because neighbouring frames of a still

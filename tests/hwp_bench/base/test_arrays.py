@@ -58,9 +58,9 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
             "claims 8000000000000 bytes",
         ),
         (_header("{'descr': '|O', 'fortran_order': False, 'shape': ()}"), "Object arrays|claims"),
-        (_header("[" * 90), "no readable array file"),
-        (b"plain text", "no readable array file"),
-        (b"", "no readable array file"),
+        (_header("[" * 90), "not a readable array file"),
+        (b"plain text", "not a readable array file"),
+        (b"", "not a readable array file"),
         (b"\x93NUMPY\x09\x00" + b"\0" * 200, "version"),
     ],
 )

@@ -64,7 +64,7 @@ def test_a_full_folder_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
     ("text", "problem"),
     [
         ("{", "is not valid JSON"),
-        ('{"a": NaN}', "NaN is no JSON number"),
+        ('{"a": NaN}', "NaN is not a JSON number"),
         ("[" * 100_000, "nested too deeply"),
         ("[" * 200 + "]" * 200, "nested too deeply"),
         ('{"a":' * 150 + "1" + "}" * 150, "nested too deeply"),
@@ -119,7 +119,7 @@ def test_pipes_devices_and_folders_are_not_waited_for(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
     (tmp_path / "zero").symlink_to("/dev/zero")
     for name in ("pipe", "zero"):
-        with pytest.raises(BadInput, match="is no regular file"):
+        with pytest.raises(BadInput, match="is not a regular file"):
             read_json(tmp_path / name)
     with pytest.raises(BadInput, match="cannot be read"):
         read_json(tmp_path)

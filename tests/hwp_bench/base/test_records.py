@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass, field
 from typing import Annotated, Any, ClassVar, Literal
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import Meta
 
@@ -67,6 +67,7 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 plain = st.text(st.characters(codec="ascii", categories=["L", "N", "P"]), max_size=8)
 
 
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     st.builds(
         Whole,

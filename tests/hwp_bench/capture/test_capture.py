@@ -176,7 +176,7 @@ def test_damaged_numbers_are_named(make_capture: CaptureMaker, tmp_path: Path) -
     with pytest.raises(BadInput, match=r"has shape \(11, 16, 3\) where \(12, 16, 3\)"):
         open_capture(root)
     (root / "hands.npz").write_bytes(b"no zip")
-    with pytest.raises(BadInput, match="no readable array file"):
+    with pytest.raises(BadInput, match="not a readable array file"):
         open_capture(root)
     root = make_capture("b", frames=12).root
     Ks = cameras(12, 32).Ks.copy()
@@ -193,7 +193,7 @@ def test_damaged_numbers_are_named(make_capture: CaptureMaker, tmp_path: Path) -
 def test_an_array_file_with_pickled_objects_is_refused(make_capture: CaptureMaker) -> None:
     root = make_capture(frames=12).root
     np.savez(root / "hands.npz", right_pose=np.array([{"a": 1}], dtype=object))
-    with pytest.raises(BadInput, match="no readable array file"):
+    with pytest.raises(BadInput, match="not a readable array file"):
         open_capture(root)
 
 

@@ -67,7 +67,7 @@ def test_sides_are_not_mixed(free_right: HandTemplate, free_left: HandTemplate) 
 def test_a_hand_that_is_never_valid_is_refused(free_right: HandTemplate) -> None:
     hand = hand_parameters(3)
     nowhere = HandParameters(hand.pose, hand.betas, hand.transl, np.zeros(3, dtype=bool))
-    with pytest.raises(BadInput, match="nothing to fit"):
+    with pytest.raises(BadInput, match="no frame is valid"):
         convert_hand(nowhere, free_right, free_right)
 
 
