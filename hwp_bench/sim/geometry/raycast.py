@@ -16,7 +16,7 @@ LIFT = 4e-4
 
 @dataclass(frozen=True)
 class Hits:
-    """Where rays met a mesh."""
+    """The points where rays meet a mesh."""
 
     #: (H,) index of the ray.
     ray: np.ndarray

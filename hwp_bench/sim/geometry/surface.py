@@ -1,4 +1,4 @@
-"""Surfaces and materials: what a ray can hit, whatever it is part of."""
+"""Surfaces and materials: everything that a ray can hit."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class Material:
-    """How a surface looks; textures have row 0 at the top (v = 1)."""
+    """Appearance of a surface; textures have row 0 at the top (v = 1)."""
 
     #: (H, W, 3) float32, linear reflectance.
     albedo: np.ndarray

@@ -81,7 +81,7 @@ def render(args: argparse.Namespace) -> int:
     from hwp_bench.sim.produce.suites import ensure_suite
 
     if (args.suite is None) == (args.scene is None):
-        raise UsageError("name a scene, all, or a suite with --suite")
+        raise UsageError("give a scene, all, or a suite with --suite")
     changes = (args.frames, args.size, args.severity, args.subject, args.seed)
     if args.suite is not None:
         if any(change is not None for change in changes) or args.exr:
@@ -94,7 +94,7 @@ def render(args: argparse.Namespace) -> int:
             print(folder)
         return 0
     if args.out is None:
-        raise UsageError("says not where to", field="-o", remedy="Give a folder with -o.")
+        raise UsageError("is missing", field="-o", remedy="Give a folder with -o.")
     scenes = [_changed(scene, args.severity, args.subject) for scene in _scenes([args.scene])]
     with engine_for(args) as engine:
         folders = _render_scenes(args, scenes, engine)

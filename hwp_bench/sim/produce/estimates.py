@@ -127,7 +127,7 @@ def _correlated(noise: np.ndarray) -> np.ndarray:
 
 
 def _taken(covered: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """Where a segmenter takes the occluder for hand: blobs over a part of it, (S, S) 0 or 1."""
+    """Blobs of the occluder that a segmenter takes for hand: (S, S), 0 or 1."""
     from scipy.ndimage import gaussian_filter
 
     field = gaussian_filter(rng.normal(size=covered.shape), len(covered) / 20.0)

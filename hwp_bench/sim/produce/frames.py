@@ -1,4 +1,4 @@
-"""Rendered frames that wait for their capture: one file each, written by one or more processes.
+"""Rendered frames before their capture is whole: one file each, written by one or more processes.
 
 An interrupted render continues where it stopped, because finished frames are kept.
 """
@@ -28,12 +28,12 @@ _REMEDY = "Finished frames are kept; the same command continues from there."
 
 
 def frame_file(folder: Path, frame: int) -> Path:
-    """Where a rendered frame waits."""
+    """Path of a rendered frame."""
     return folder / f"{frame:06d}.npz"
 
 
 def exr_file(folder: Path, frame: int) -> Path:
-    """Where the linear layers of a rendered frame wait."""
+    """Path of the linear layers of a rendered frame."""
     return folder / f"{frame:06d}.exr"
 
 

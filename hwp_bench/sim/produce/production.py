@@ -80,7 +80,7 @@ def render_capture(
         frame_count: frames over which the scene is spread; the scene's own if None.
         size: edge of the square image in pixels.
         seed: replaces the scene's seed.
-        workers: processes; as many as pay if None.
+        workers: processes; as many as are worth it if None.
         overwrite: replace an existing folder.
         exr: also store linear light, depth, normals, object ids and motion of every frame as
             OpenEXR, under `extra/`.

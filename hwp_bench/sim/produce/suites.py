@@ -125,7 +125,7 @@ class RenderCapture:
     size: int | None = None
     #: Seed; the scene's own if None.
     seed: int | None = None
-    #: Processes of one render; as many as pay if None.
+    #: Processes of one render; as many as are worth it if None.
     workers: int | None = None
     #: Whether linear layers are stored too.
     exr: bool = False
@@ -210,8 +210,9 @@ def is_capture(folder: Path) -> bool:
 
 
 def workers_each(workers: int | None, engine: Engine, needs: Needs) -> int | None:
-    """Return the processes of one render: what was asked for, else what an engine leaves it.
+    """Return the processes of one render: as asked for, else as many as the engine allows.
 
-    In turn each render takes as many as pay; where several run at once, the processors of a job.
+    In turn each render takes as many as are worth it; where several run at once, the processors
+    of a job.
     """
     return workers if workers is not None or engine.in_turn else max(1, int(needs.cpus))

@@ -30,7 +30,7 @@ class LinearImage:
 
 @dataclass(frozen=True, eq=False)
 class Lens:
-    """How an instant is sampled."""
+    """Camera and sampling of one instant."""
 
     #: (3, 3) px.
     K: np.ndarray

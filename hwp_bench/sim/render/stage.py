@@ -189,6 +189,6 @@ def _skin(subject: Subject, side: str) -> Material:
 
 
 def _elbow(side: str) -> np.ndarray:
-    """Where the elbow is, m from the point looked at."""
+    """Place of the elbow, m from the point looked at."""
     mirror = 1.0 if side == "right" else -1.0
     return np.array([0.10 * mirror, 0.42, 0.02])

@@ -55,7 +55,7 @@ def smoothstep(x: float) -> float:
 def along_keys(
     keys: list[HandMoment], phase: float, scene: Scene, label: str, variation: float
 ) -> HandMoment:
-    """Where a repeating row of keys is at `phase` (one key per unit), varied in every round.
+    """State of a repeating row of keys at `phase` (one key per unit), varied in every round.
 
     Args:
         keys: the row.

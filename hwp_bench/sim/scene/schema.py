@@ -63,7 +63,7 @@ class Subject:
 
 @dataclass(frozen=True)
 class Camera:
-    """How the image is taken."""
+    """The camera."""
 
     #: Held in a hand (sways and drifts) or standing still.
     handheld: bool
@@ -93,7 +93,7 @@ class Light:
 
 @dataclass(frozen=True)
 class Sensor:
-    """How light becomes a stored image; the same for a frame and its clean version."""
+    """The sensor: light becomes a stored image, in the same way for a clean version."""
 
     #: Standard deviation of the noise at mid grey, of 1.
     noise: Annotated[float, Meta(ge=0.0, le=0.2)]

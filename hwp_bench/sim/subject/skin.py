@@ -1,7 +1,7 @@
 """Skin: colour, relief and gloss of a subject's hand, painted into the template's UV atlas.
 
 Everything is a function of the place on the rest hand, so that the atlas shows no seams, and
-none of it is known to the hand model: it is what a method has to find out.
+the hand model knows none of it: a method has to find it out.
 """
 
 from __future__ import annotations
