@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from hwp_bench.base.images import as_float
 from hwp_bench.metrics.protocol import HWP_V1, Protocol
 
 #: Largest difference between a score and scikit-image's: dB of PSNR, or units of SSIM. Both are
@@ -61,7 +62,7 @@ def reference_scores(
     )
     inside = np.pad(region, border)[part]
     x, y = (
-        np.pad(np.where(region[..., None], image / 255.0, 0.0), ((border,) * 2,) * 2 + ((0, 0),))[
+        np.pad(np.where(region[..., None], as_float(image), 0.0), ((border,) * 2,) * 2 + ((0, 0),))[
             part
         ]
         for image in (prediction, target)

@@ -10,7 +10,7 @@ import pytest
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.cli.main import main
-from hwp_bench.stability import Case, Context, Measured, find_cases, registry, run_cases
+from hwp_bench.stability import Case, Context, Measured, find_cases, run_cases
 
 
 def fine(context: Context) -> Measured:
@@ -40,7 +40,7 @@ def _provider(monkeypatch: pytest.MonkeyPatch) -> None:
     module.cases = cases
     monkeypatch.setitem(sys.modules, "offered", module)
     point = types.SimpleNamespace(name="offered", value="offered:cases")
-    monkeypatch.setattr(registry.metadata, "entry_points", lambda group: [point])
+    monkeypatch.setattr("hwp_bench.stability.metadata.entry_points", lambda group: [point])
 
 
 def test_cases_of_installed_packages_are_found() -> None:
@@ -55,7 +55,7 @@ def test_what_cannot_be_found_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     for source in ("no_such_module:cases", "offered:nothing", "offered"):
         with pytest.raises(HwpError, match=source):
             find_cases(providers=[source])
-    monkeypatch.setattr(registry.metadata, "entry_points", lambda group: [])
+    monkeypatch.setattr("hwp_bench.stability.metadata.entry_points", lambda group: [])
     with pytest.raises(MissingDependency, match="pip install"):
         find_cases()
 
