@@ -32,7 +32,6 @@ _.sharpness  # a field of the pre-pass's judgement file
 _.blur_deviation  # a field of the pre-pass's judgement file
 _.misplacement_deviation  # a field of the pre-pass's judgement file
 _.hidden_deviation  # a field of the pre-pass's judgement file
-as_float  # for now: the reader of the images that the front door takes
 LOG_255  # for now: a constant of the rasterizer
 REACH_X  # for now: a row of the rasterizer's records
 PER_BLOCK  # for now: a vector type of the rasterizer's kernels
