@@ -8,8 +8,8 @@ the method.
 For every capture: Spearman correlation over the training frames of |omega|, the largest among the
 hands, with the true severity, the largest among the perturbations; mean |omega| of unperturbed
 frames and of those of severity 3 to 5; and, in frames with objects, the area under the ROC curve
-of the weight masks for visible against covered pixels of the hand, beside the estimated mask's.
-Numbers are means over the results given, such as the seeds of a variant. The picture shows the
+of the weight masks for visible against covered pixels of the hand, next to the estimated mask's.
+Numbers are means over the results given, such as the seeds of a variant. The figure shows the
 temporal weights of every capture over the true severity.
 """
 

@@ -2,7 +2,7 @@
 
 Run from the repository: `python -m benchmarks.gap --base RESULTS... --method RESULTS... --selection
 RESULTS... --clean RESULTS...`, results folders whose seeds are averaged. Base and method were given
-the perturbed frames, the oracles (fits of the base) the unperturbed frames alone (`--frames
+the perturbed frames, the oracles (fits of the base) only the unperturbed frames (`--frames
 unperturbed-only`) and the clean versions of all frames (`--frames clean`).
 
 Share of a gap: (method - base) / (oracle - base). The last rows are of mean scores, so that a

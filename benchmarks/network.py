@@ -1,8 +1,8 @@
-"""What the prediction network costs, and how sharp it fits beside Gaussians fitted directly.
+"""What the prediction network costs, and how sharp it fits next to Gaussians fitted directly.
 
 Run from the repository:
 `python -m benchmarks.network time [--size compact|paper] [--gaussians N] [--threads 2]` times one
-hand in one frame, the network alone (on a busy machine read the processor time, with one thread);
+hand in one frame, only the network (on a busy machine read the processor time, with one thread);
 `python -m benchmarks.network fit CAPTURE [--steps 600] [--frames clean]` fits a capture of one
 hand twice, by the same loss, frames and number of steps: Gaussians whose attributes are free (the
 plain baseline), and the network, each at its own learning rates. PSNR is over the hand, on the

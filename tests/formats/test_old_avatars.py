@@ -1,4 +1,4 @@
-"""Avatars that earlier versions wrote open for ever. Oracle: the image that those versions drew.
+"""Avatars of earlier versions can always be opened. Oracle: the image that those versions drew.
 
 `avatar_version_1` was made from a simulated capture by the last version that wrote
 `wildghand-avatar/1` (300 Gaussians, 20 steps, no DPD), and `avatar_version_1.png` was drawn by it.

@@ -38,7 +38,7 @@ class FitRecord:
     steps: int = 0
     #: Seconds of fitting.
     seconds: float = 0.0
-    #: What the avatar was made of, such as a capture's id.
+    #: The avatar's origin, such as a capture's id.
     source: dict[str, Any] = field(default_factory=dict)
 
 

@@ -85,7 +85,7 @@ def save_avatar(
 
 
 def write_weight_masks(avatar: WildGHandAvatar, folder: Path) -> None:
-    """Write weight masks as pictures, at most `MAX_MASKS`, evenly spread over the clip."""
+    """Write weight masks as images, at most `MAX_MASKS`, evenly spread over the clip."""
     frames = sorted(avatar.weight_masks)
     picks = np.linspace(0, len(frames) - 1, min(MAX_MASKS, len(frames))).round().astype(int)
     for pick in dict.fromkeys(picks.tolist()):
@@ -115,7 +115,7 @@ def load_avatar(
     root = Path(path)
     if not (root / DESCRIPTION).is_file():
         raise BadInput(
-            f"is no avatar: it has no {DESCRIPTION}",
+            f"is not an avatar: it has no {DESCRIPTION}",
             where=root,
             remedy="Make one with `wildghand fit CAPTURE -o AVATAR`.",
         )

@@ -1,4 +1,4 @@
-"""RenderedFrames an avatar along the poses of a capture, to pictures and a video."""
+"""Drawing an avatar along the poses of a capture, to images and a video."""
 
 from __future__ import annotations
 
@@ -61,9 +61,9 @@ def render_clip(
             where=capture.root,
             remedy="Convert them with `hwp-bench hands convert`.",
         )
-    info, seconds, pictures = capture.info, 0.0, []
+    info, seconds, images = capture.info, 0.0, []
     with atomic_folder(out, overwrite=overwrite) as folder:
-        for frame in track(frames, "RenderedFrames"):
+        for frame in track(frames, "Drawing"):
             camera = Camera(
                 capture.cameras.Ks[frame], capture.cameras.viewmats[frame], info.width, info.height
             )
@@ -75,12 +75,12 @@ def render_clip(
             rgba = avatar.render(hands, camera)
             seconds += time.perf_counter() - started
             behind = (1.0 - rgba[..., 3:]) * (background / 255.0)
-            picture = np.rint(255.0 * (rgba[..., :3] + behind)).clip(0, 255).astype(np.uint8)
-            write_image(folder / f"{frame:06d}.png", picture)
+            image = np.rint(255.0 * (rgba[..., :3] + behind)).clip(0, 255).astype(np.uint8)
+            write_image(folder / f"{frame:06d}.png", image)
             if video is not None:
-                pictures.append(picture)
+                images.append(image)
     if video is not None:
-        _write_video(video, pictures, info.fps)
+        _write_video(video, images, info.fps)
     return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
 
 
@@ -97,15 +97,15 @@ def rest_poses(avatar: WildGHandAvatar) -> dict[str, HandPose]:
     return hands
 
 
-def _write_video(path: Path, pictures: list[np.ndarray], fps: float) -> None:
+def _write_video(path: Path, images: list[np.ndarray], fps: float) -> None:
     import cv2
 
-    height, width = pictures[0].shape[:2]
+    height, width = images[0].shape[:2]
     partial = path.with_name(f".{path.stem}.partial.mp4")
     writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
     if not writer.isOpened():
         raise HwpError("cannot be written as a video", where=path)
-    for picture in pictures:
-        writer.write(picture[:, :, ::-1])
+    for image in images:
+        writer.write(image[:, :, ::-1])
     writer.release()
     partial.replace(path)

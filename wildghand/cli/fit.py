@@ -20,7 +20,7 @@ _EXAMPLES = """examples:
 
 With torchrun each process draws its part of every batch, on a GPU of its own.
 A capture is a folder (`hwp-bench data import-video`, `hwp-bench sim render`). A video becomes one
-first, beside the avatar. A stopped fit goes on when the same command is given again.
+first, next to the avatar. A stopped fit goes on when the same command is given again.
 """
 
 
@@ -60,7 +60,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 
 def run(args: argparse.Namespace) -> int:
-    """Run the command, alone or with the processes that torchrun started."""
+    """Run the command, in one process or in those that torchrun started."""
     from wildghand.fitting.parallel import run_in_world
     from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings

@@ -22,7 +22,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--poses", type=Path, required=True, metavar="CAPTURE", help="capture to take poses from"
     )
-    parser.add_argument("-o", "--out", type=Path, required=True, help="folder of pictures to make")
+    parser.add_argument("-o", "--out", type=Path, required=True, help="folder of images to make")
     parser.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
     parser.add_argument(
         "--background", type=int, default=0, metavar="GREY", help="0 black to 255 white"
@@ -73,6 +73,8 @@ def _frames(text: str | None, count: int) -> range:
         start = stop = -1
     if not 0 <= start < stop <= count:
         raise UsageError(
-            f"{text!r} is no part of {count} frames", field="--frames", remedy="Use A:B, as 0:10."
+            f"{text!r} is not a part of {count} frames",
+            field="--frames",
+            remedy="Use A:B, as 0:10.",
         )
     return range(start, stop)

@@ -79,7 +79,7 @@ class DynamicPerturbation(nn.Module):
         nn.init.zeros_(self.psi.weight)
         nn.init.zeros_(self.psi.bias)
         self.varphi = nn.ModuleDict({name: nn.Linear(width + k, k) for name, k in SIZES.items()})
-        # It follows from the number of frames: no part of a checkpoint.
+        # It follows from the number of frames, so checkpoints do not hold it.
         table = encode_frames(torch.arange(frame_count), frame_count)
         self.register_buffer("encoding", table, persistent=False)
 
@@ -110,7 +110,7 @@ class DynamicPerturbation(nn.Module):
         """Delta g, to be added to the attributes before their activation.
 
         The linear layer on [z, g] is split into one on z, once for each frame, and one on g:
-        the same function with the same parameters, at the cost of the second alone.
+        the same function with the same parameters, at the cost of the second only.
 
         Args:
             raw: g: (B, N, k) each, or (N, k) where all frames share it.
@@ -161,7 +161,7 @@ def encode_frames(frames: Tensor, frame_count: int) -> Tensor:
 
 
 def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator) -> Tensor:
-    """Set temporal weights to 0 at random, so that the canonical attributes stand alone.
+    """Set temporal weights to 0 at random: the canonical attributes learn without biases.
 
     Training only; the paper's probability is 0.3 for every frame.
 
@@ -176,7 +176,7 @@ def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator)
 
     Raises:
         UsageError: a probability outside [0, 1].
-        ShapeMismatch: as many probabilities as frames are wanted.
+        ShapeMismatch: there are not as many probabilities as frames.
     """
     chance = torch.as_tensor(probability, dtype=torch.float32).detach().cpu()
     if not bool(((chance >= 0.0) & (chance <= 1.0)).all()):

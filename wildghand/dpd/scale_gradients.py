@@ -28,10 +28,10 @@ class _Share(torch.autograd.Function):
 
 
 def scale_gradients(prediction: NetworkOutput, shares: Tensor) -> NetworkOutput:
-    """The same prediction, which learns from each of B frames by its share.
+    """The same output, which learns from each of B frames by its share.
 
-    What belongs to a frame alone (biases, gain, pose) still learns from all of its gradient: a
-    perturbed frame is explained by what is particular to it and leaves the hand alone. Weighing
+    What belongs to a single frame (biases, gain, pose) still learns from all of its gradient: a
+    perturbed frame is explained by what is particular to it and hardly changes the hand. Weighing
     the frame's loss instead would silence both.
 
     Args:

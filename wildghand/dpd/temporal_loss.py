@@ -1,4 +1,4 @@
-"""Temporal weights that say what the pre-pass found: their start, and what holds them there."""
+"""Temporal weights follow what the pre-pass found: their start, and the loss that holds them."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class TemporalTarget:
 
     @classmethod
     def judged(cls, clean: Tensor, scale: float) -> TemporalTarget:
-        """What the pre-pass says.
+        """The targets by the pre-pass.
 
         Args:
             clean: (R,) probability that nothing perturbs a frame.

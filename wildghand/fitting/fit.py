@@ -127,7 +127,7 @@ class Fit:
         self.world.require_same(digest_of(numbers, step))
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that steps change; what `load_state_dict` takes."""
+        """Everything that steps change, for `load_state_dict`."""
         return {
             "model": self.model.state_dict(),
             "thresholds": self.weighting.pao.state_dict(),
@@ -205,7 +205,7 @@ class Fit:
 
     @torch.no_grad()
     def _weight_masks(self) -> dict[int, np.ndarray]:
-        """The weights of pixels within every training frame as pictures, 255 = full weight.
+        """The weights of pixels within every training frame as images, 255 = full weight.
 
         The paper's equations have no bound: with them 255 is the largest weight of the frame.
         """

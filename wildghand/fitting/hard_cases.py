@@ -100,14 +100,14 @@ def _weights() -> Iterator[_Entry]:
 
 def _frames() -> Iterator[_Entry]:
     black = torch.zeros(1, _SIZE, _SIZE, 3)
-    spoilt = _noise(1, _SIZE, _SIZE, 3)
-    spoilt[0, 5, 6, 1] = math.nan
+    spoiled = _noise(1, _SIZE, _SIZE, 3)
+    spoiled[0, 5, 6, 1] = math.nan
     frames = {
         "a black frame": black,
         "a saturated frame": black + 1.0,
         "a frame of NaN": black + math.nan,
         "a frame of infinities": black + math.inf,
-        "a frame with one NaN": spoilt,
+        "a frame with one NaN": spoiled,
     }
     for name, frame in frames.items():
         for mask, hand in (("", _hand()), (" and a mask of no pixel", torch.zeros_like(_hand()))):
@@ -268,7 +268,7 @@ def _run_frame(frame: Tensor, hand: Tensor, context: Context) -> Measured:
 def _run_gradient(
     function: Callable[[Tensor], Tensor], value: Tensor, context: Context
 ) -> Measured:
-    # What float32 cannot hold is no fault of the term.
+    # What float32 cannot hold is not a fault of the term.
     value = value.detach().float()
     made = []
     for dtype in (torch.float32, torch.float64):
@@ -334,7 +334,7 @@ def _noise(*shape: int, seed: int = 0) -> Tensor:
 
 
 def _finite(*tensors: Tensor | None) -> bool:
-    """Whether no number is NaN or infinite; what has no gradient has none that is bad."""
+    """Whether every number is finite; None (a tensor without gradient) counts as finite."""
     return all(bool(tensor.isfinite().all()) for tensor in tensors if tensor is not None)
 
 

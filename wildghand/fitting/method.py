@@ -31,7 +31,7 @@ class WildGHandMethod:
         self.device = ready_device(self.settings.device)
 
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> WildGHandAvatar:
-        """Fit an avatar to the training frames (the validation frames are left alone).
+        """Fit an avatar to the training frames (the validation frames are not used).
 
         Args:
             training: what the method may see of the capture.

@@ -1,4 +1,4 @@
-"""What is minimised: the weighted reconstruction and the regularisers."""
+"""The loss of a fit: the weighted reconstruction and the regularisers."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ PROGRESS = 1e-3
 
 
 class Watchers:
-    """What watches the loss of a fit.
+    """Guard and plateau: the watchers of the loss of a fit.
 
     Args:
         plateau_steps: window of the plateau; 0 never stops early.
@@ -33,7 +33,7 @@ class Watchers:
         self.plateau = Plateau(plateau_steps)
 
     def state_dict(self) -> dict[str, Any]:
-        """What `load_state_dict` takes."""
+        """The state for `load_state_dict`."""
         return {"guard": self.guard.state_dict(), "plateau": self.plateau.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -149,7 +149,7 @@ class Plateau:
         return mean > (1.0 - PROGRESS) * before
 
     def state_dict(self) -> dict[str, Any]:
-        """What `load_state_dict` takes."""
+        """The state for `load_state_dict`."""
         return {"losses": list(self._losses), "before": self._before}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

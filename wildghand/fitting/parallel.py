@@ -193,8 +193,8 @@ def run_in_world(choose: Callable[[], torch.device], work: Callable[[World], int
         status = work(world)
     except (Exception, KeyboardInterrupt) as error:
         # Before the processes have met, they fail alike: the first of them speaks for all.
-        alone = os.environ.get("WORLD_SIZE", "1") == "1" or os.environ.get("RANK", "0") == "0"
-        if alone if world is None else world.speaks_first():
+        first = os.environ.get("WORLD_SIZE", "1") == "1" or os.environ.get("RANK", "0") == "0"
+        if first if world is None else world.speaks_first():
             raise
         stopped = 130 if isinstance(error, KeyboardInterrupt) else 1
         return error.exit_status if isinstance(error, HwpError) else stopped
@@ -204,7 +204,7 @@ def run_in_world(choose: Callable[[], torch.device], work: Callable[[World], int
 
 
 def join(device: torch.device) -> World:
-    """Meet the processes that `torchrun` started; without it, the process stays alone.
+    """Meet the processes that `torchrun` started; without it there is one process.
 
     NCCL connects GPUs, one for each process of a machine; gloo connects CPUs.
 

@@ -87,7 +87,7 @@ def load_state(
     try:
         state = torch.load(file, map_location=fit.device, weights_only=True)
         if not isinstance(state, Mapping) or state.get("schema") != SCHEMA:
-            raise BadInput(f"is no state of schema {SCHEMA}", where=file)
+            raise BadInput(f"is not a state of schema {SCHEMA}", where=file)
         _check_digest(state, digest, file)
         fit.load_state_dict(state["fit"])
         watchers.load_state_dict(state["watchers"])
@@ -113,5 +113,5 @@ def _check_digest(state: Mapping[str, Any], digest: str, file: Path) -> None:
         raise BadInput(
             "belongs to another capture, other settings or another seed",
             where=file,
-            remedy="Give the same arguments to go on with it, or remove it to start anew.",
+            remedy="Give the same arguments to go on with it, or remove it to start again.",
         )

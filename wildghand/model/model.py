@@ -36,7 +36,7 @@ class Gaussians:
 
 @dataclass(frozen=True, eq=False)
 class HandState:
-    """What the model says of one hand in B training frames; the regularisers read it."""
+    """State of one hand in B training frames; the regularisers read it."""
 
     #: Output of the network.
     prediction: NetworkOutput
@@ -78,7 +78,7 @@ class WildGHandModel(nn.Module):
         embedding: width of the temporal embedding.
 
     Attributes:
-        log_gains: (R, 3) log of the gain on the sRGB picture of each frame.
+        log_gains: (R, 3) log of the gain on the sRGB image of each frame.
         pose_steps: (S, R, 16, 3) rad, added to the given poses of the hands in order.
         transl_steps: (S, R, 3) m, added to the given translations.
     """
@@ -174,7 +174,7 @@ class WildGHandModel(nn.Module):
             parts.append(gaussians)
             states[side] = HandState(prediction, biases, omega, gaussians.opacities)
         image, coverage = _rasterize(parts, clip.viewmats[rows], clip.Ks[rows], width, height)
-        # The picture lies over black, so a gain on it is one on every Gaussian.
+        # The image lies over black, so a gain on it is one on every Gaussian.
         image = image * self.log_gains[rows].exp()[:, None, None]
         return RenderedFrames(image, coverage, states)
 

@@ -61,7 +61,7 @@ class CompactTexture(nn.Module):
 class CompactGeometry(nn.Module):
     """Geometry branch: place, posed normal and pose of each Gaussian through one hidden layer.
 
-    The spherical harmonics of the normal are passed on beside it, so that a linear head sees
+    The spherical harmonics of the normal are passed on too, so that a linear head sees
     light on a matte surface as what it is.
     """
 

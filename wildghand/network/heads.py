@@ -77,7 +77,7 @@ class AttributeHead(nn.Module):
 
 
 class ShadowHead(nn.Module):
-    """Head (ii): the shadow coefficient from geometry features alone.
+    """Head (ii): the shadow coefficient from geometry features only.
 
     The logit is linear in the features plus a small network: light on a matte surface is linear
     in the harmonics of the normal.
@@ -117,7 +117,7 @@ class TemplateHead(nn.Module):
 class RefinementHead(nn.Module):
     """Head (iv): corrections of pose, shape and translation from the mean of both features.
 
-    The shape belongs to the hand, not to a frame: it sees the texture features alone.
+    The shape belongs to the hand, not to a frame: it sees the texture features only.
     """
 
     def __init__(self, settings: NetworkSettings, texture: int, geometry: int) -> None:

@@ -21,7 +21,7 @@ from wildghand.network.surface import Chart, SurfacePoints
 
 @dataclass(frozen=True, eq=False)
 class Refinement:
-    """What head (iv) adds to the given hand parameters."""
+    """Corrections of the given hand parameters by head (iv)."""
 
     #: (B, 16, 3) rad, added to the axis-angle vectors.
     pose: Tensor
@@ -33,7 +33,7 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class NetworkOutput:
-    """What the network says of one hand in B frames."""
+    """Output of the network for one hand in B frames."""
 
     #: (B, N, k) attributes before `PredictionNetwork.activation`.
     raw: RawAttributes
@@ -51,13 +51,13 @@ class PredictionNetwork(nn.Module):
     """Predicts the Gaussians of one or two hands.
 
     The state dict holds what is learned and nothing else: it fits any number of anchors. What
-    belongs to the anchors (samplers, initial attributes) is made anew from `surfaces`.
+    belongs to the anchors (samplers, initial attributes) is made again from `surfaces`.
 
     Args:
         settings: dimensions and bounds.
         surfaces: the anchors of each hand, by side.
         seed: of the initial weights; the same seed gives the same network bit for bit, and the
-            global random state is left alone.
+            global random state stays as it is.
 
     Raises:
         UsageError: no hand, or one that is neither right nor left.
@@ -138,11 +138,11 @@ class PredictionNetwork(nn.Module):
         chart = self._chart(side)
         if normals.ndim != 3 or normals.shape[1:] != (len(chart), 3):
             raise ShapeMismatch(
-                f"are {tuple(normals.shape)}, wanted (B, {len(chart)}, 3)", field="normals"
+                f"are {tuple(normals.shape)}, not (B, {len(chart)}, 3)", field="normals"
             )
         if pose.shape != (len(normals), 16, 3):
             raise ShapeMismatch(
-                f"is {tuple(pose.shape)}, wanted ({len(normals)}, 16, 3)", field="pose"
+                f"is {tuple(pose.shape)}, not ({len(normals)}, 16, 3)", field="pose"
             )
         return self.geometry_branch(chart, normals, pose)
 

@@ -118,7 +118,7 @@ class PaperGeometry(nn.Module):
 
 
 class ResidualBlock(nn.Module):
-    """Two linear layers beside a straight one; `inputs` and `width` channels."""
+    """Two linear layers next to a straight one; `inputs` and `width` channels."""
 
     def __init__(self, inputs: int, width: int) -> None:
         super().__init__()
@@ -134,7 +134,7 @@ class ResidualBlock(nn.Module):
 class LocalPointNet(nn.Module):
     """Local-pooling PointNet.
 
-    After each block the mean over a point's cell is put beside its own features.
+    After each block the mean over a point's cell is appended to its own features.
 
     Args:
         inputs: channels of a point.

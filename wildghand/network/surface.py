@@ -33,11 +33,11 @@ class SurfacePoints:
 
     def __post_init__(self) -> None:
         count = len(self.uv)
-        wanted = {"uv": (count, 2), "positions": (count, 3), "color": (3,)}
-        for name, shape in wanted.items():
+        expected = {"uv": (count, 2), "positions": (count, 3), "color": (3,)}
+        for name, shape in expected.items():
             tensor = getattr(self, name)
             if tuple(tensor.shape) != shape or count == 0:
-                raise ShapeMismatch(f"is {tuple(tensor.shape)}, wanted {shape}", field=name)
+                raise ShapeMismatch(f"is {tuple(tensor.shape)}, not {shape}", field=name)
             if not bool(torch.isfinite(tensor).all()):
                 raise BadInput("holds NaN or infinity", field=name)
         if not (np.isfinite(self.spacing) and self.spacing > 0.0):

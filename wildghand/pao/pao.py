@@ -48,7 +48,7 @@ class PaoSettings:
     #: The same for two hands.
     background_threshold_both: float = 10.0
     #: What mu is a share of: "hand" = |region and hand| / |hand|, the paper's formula, which
-    #: wants regions as large as a hand; "region" = |region and hand| / |region|, the paper's
+    #: needs regions as large as a hand; "region" = |region and hand| / |region|, the paper's
     #: sentence, which superpixels can reach too. "auto" takes the formula where regions may
     #: overlap (Segment Anything's) and the sentence for a partition into superpixels.
     share_of: Literal["auto", "hand", "region"] = "auto"

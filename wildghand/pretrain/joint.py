@@ -105,7 +105,7 @@ class JointFit:
                 current[name].copy_(value)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything that steps change; what `load_state_dict` takes."""
+        """Everything that steps change, for `load_state_dict`."""
         return {
             "models": self._tensors(),
             "thresholds": [fit.weighting.pao.state_dict() for fit in self.fits],

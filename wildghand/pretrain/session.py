@@ -35,7 +35,7 @@ def pretrain(
 ) -> Prior:
     """Fit one network to captures of several subjects, and write it as a prior.
 
-    The state is saved beside `out` every 20 seconds. The same call goes on with it after a stop;
+    The state is saved next to `out` every 20 seconds. The same call goes on with it after a stop;
     the result is that of a run that was never stopped.
 
     Args:
@@ -56,7 +56,7 @@ def pretrain(
     """
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
-    # What ships is no part of a prior that somebody makes, unless it is asked for.
+    # A new prior does not start from the one that ships, unless that is asked for.
     settings = {"prior": "", **settings}
     chosen = read_settings(settings)
     captures = [open_capture(source) for source in sources]
@@ -142,7 +142,7 @@ def _check_captures(captures: Sequence[Capture]) -> None:
 
 
 def _described(capture: Capture) -> dict[str, Any]:
-    """What a prior says of a capture that it was fitted to."""
+    """A prior's description of a capture that it was fitted to."""
     info = capture.info.to_json()
     return {
         "id": capture.info.id,

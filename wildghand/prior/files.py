@@ -86,7 +86,7 @@ def find_prior(text: str) -> Path:
     names it with an absolute one.
 
     Raises:
-        BadInput: a relative path leads out of the package, or there is no prior.
+        BadInput: a relative path leads out of the package, or there is not a prior.
     """
     remedy = (
         "Give the absolute path of a folder that `wildghand pretrain` made, and show it to an "
@@ -99,10 +99,10 @@ def find_prior(text: str) -> Path:
         found = (path / DESCRIPTION).is_file()
     except (BadInput, OSError, ValueError) as error:
         problem = str(error).splitlines()[0][:300]
-        raise BadInput(f"is no prior ({problem})", field="prior", remedy=remedy) from error
+        raise BadInput(f"is not a prior ({problem})", field="prior", remedy=remedy) from error
     if not found:
         raise BadInput(
-            f"is no prior: it has no {DESCRIPTION}", where=path, field="prior", remedy=remedy
+            f"is not a prior: it has no {DESCRIPTION}", where=path, field="prior", remedy=remedy
         )
     return path
 
@@ -124,7 +124,7 @@ def save_prior(
         path: the folder.
         tensors: as `wildghand.prior.prior.mean_weights` returns them; stored with 16 bits each.
         hand_model: of the captures.
-        captures: what it was fitted to.
+        captures: those that it was fitted to.
         settings: of the fit.
         seed: of the fit.
         steps: of the fit.
@@ -206,11 +206,11 @@ def _check_fit(
     record: PriorRecord, network: NetworkSettings, hand_model: HandModelId, where: str
 ) -> None:
     """Refuse a prior that is sound but of another kind than the fit."""
-    wanted = network.to_json()
+    needed = network.to_json()
     for name, value in dataclasses.asdict(network_settings(**record.network)).items():
-        if value != wanted[name]:
+        if value != needed[name]:
             raise BadInput(
-                f"was made with {name} = {value}, and this fit has {wanted[name]}",
+                f"was made with {name} = {value}, and this fit has {needed[name]}",
                 where=where,
                 field="network",
                 remedy="Fit with the network settings of the prior, or without it.",

@@ -13,13 +13,13 @@ from hwp_bench.base.errors import BadInput
 from wildghand.network import NetworkSettings, PredictionNetwork
 from wildghand.network.parameters import blank_network
 
-#: What the names of identity maps start with in a network's state.
+#: Start of the names of identity maps in a network's state.
 MAPS = "identity.maps."
 
 
 @dataclass(frozen=True)
 class PriorRecord:
-    """What a prior is and how it was made."""
+    """Description of a prior, and how it was made."""
 
     #: Version of the folder.
     schema: str
@@ -29,7 +29,7 @@ class PriorRecord:
     sides: list[str]
     #: `wildghand.network.NetworkSettings` of its network.
     network: dict[str, Any]
-    #: What it was fitted to: `id`, `digest`, `hands` and `source` of each capture.
+    #: The captures that it was fitted to: `id`, `digest`, `hands` and `source` of each capture.
     captures: list[dict[str, Any]]
     #: All settings of that fit.
     settings: dict[str, Any]
@@ -66,10 +66,10 @@ class Prior:
 
 
 def mean_weights(networks: Iterable[PredictionNetwork]) -> dict[str, Tensor]:
-    """What networks of several subjects with shared branches and heads have in common.
+    """Weights that networks of several subjects with shared branches and heads have in common.
 
     Args:
-        networks: they differ in their identity maps alone.
+        networks: they differ in their identity maps only.
 
     Returns:
         The shared weights, and for each hand the mean of the maps there are of it; float32, CPU.
@@ -112,15 +112,15 @@ def check_tensors(
         BadInput: one is missing, too many, of another shape, no float, or not finite; it is named.
     """
     absent = {f"{MAPS}{side}" for side in ("right", "left") if side not in sides}
-    wanted = {name: shape for name, shape in shapes.items() if name not in absent}
-    for name in sorted(wanted.keys() ^ tensors.keys()):
-        raise BadInput("is missing" if name in wanted else "is not known", field=name[:100])
+    expected = {name: shape for name, shape in shapes.items() if name not in absent}
+    for name in sorted(expected.keys() ^ tensors.keys()):
+        raise BadInput("is missing" if name in expected else "is not known", field=name[:100])
     for name, value in tensors.items():
-        if value.shape != wanted[name]:
+        if value.shape != expected[name]:
             raise BadInput(
-                f"is {tuple(value.shape)}, wanted {tuple(wanted[name])}"[:200], field=name
+                f"is {tuple(value.shape)}, not {tuple(expected[name])}"[:200], field=name
             )
         if not value.is_floating_point():
-            raise BadInput(f"holds {value.dtype}, wanted numbers with a point", field=name)
+            raise BadInput(f"holds {value.dtype}, not floating point", field=name)
         if not bool(value.isfinite().all()):
             raise BadInput("holds NaN or infinity", field=name)

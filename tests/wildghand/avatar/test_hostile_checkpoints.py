@@ -1,4 +1,4 @@
-"""Checkpoints and tensors from strangers. Oracle: what the payload would have done."""
+"""Untrusted checkpoints and tensors. Oracle: what the payload would have done."""
 
 from __future__ import annotations
 

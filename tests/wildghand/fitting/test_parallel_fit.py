@@ -75,26 +75,26 @@ def resumed(request: Path, world: World, state: Path) -> State:
     return optimise(rest, Budget(), SilentReport(), start=start, watchers=watchers).model.snapshot()
 
 
-class NoNumber(Objective):
-    """An objective that is never a number."""
+class NanObjective(Objective):
+    """An objective that is always NaN."""
 
     def __call__(self, *given: Any) -> torch.Tensor:
         return super().__call__(*given) * math.nan
 
 
 def check_spoiled(request: Path, world: World) -> None:
-    """A loss that is no number in one process alone stops the step in all of them."""
+    """A loss that is NaN in one process only stops the step in all of them."""
     settings = read_settings(TINY)
     fit = Fit(open_request(request), settings, 0, CPU, world)
     before = fit.model.snapshot()
     if world.rank == 1:
-        fit.objective = NoNumber(settings, fit.model.rigs)
+        fit.objective = NanObjective(settings, fit.model.rigs)
     assert math.isnan(fit.step(torch.tensor([0, 1]), 0.0))
     assert all(torch.equal(before[name], v) for name, v in fit.model.snapshot().items())
 
 
 def process(rank: int, port: int, folder: Path) -> None:
-    """What each of two processes does; both leave what they found in `folder`."""
+    """The work of each of two processes; both leave what they found in `folder`."""
     torch.set_num_threads(1)
     os.environ |= {
         "RANK": str(rank),

@@ -1,4 +1,4 @@
-"""The regions y_u of pictures: one label for each pixel, and which labels a region is made of."""
+"""The regions y_u of images: one label for each pixel, and which labels a region is made of."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from torch import Tensor
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 
-#: Most labels of one picture; they are stored as 16-bit numbers.
+#: Most labels of one image; they are stored as 16-bit numbers.
 MAX_LABELS = 65536
 
 
 @dataclass(frozen=True, eq=False)
 class FrameRegions:
-    """U regions of one picture.
+    """U regions of one image.
 
     Regions that do not overlap are their labels. Regions that do (Segment Anything's) are unions
     of atoms, the sets of pixels that lie in the same regions; then labels number the atoms.
@@ -42,7 +42,7 @@ class FrameRegions:
 
 
 def partition(labels: np.ndarray) -> FrameRegions:
-    """Regions that cover the picture without overlap.
+    """Regions that cover the image without overlap.
 
     Args:
         labels: (H, W) integers, any values; they are renumbered from 0 without gaps.
@@ -140,7 +140,7 @@ def stack_regions(frames: Sequence[FrameRegions], device: torch.device | str = "
     """Put the regions of B frames together.
 
     Args:
-        frames: all of one picture size, at least one.
+        frames: all of one image size, at least one.
         device: where the tensors live.
 
     Raises:

@@ -22,12 +22,12 @@ def hand_of_mask(mask: np.ndarray) -> np.ndarray:
 
 
 def graph_cut_hands(
-    pictures: Sequence[np.ndarray], silhouettes: Sequence[np.ndarray]
+    images: Sequence[np.ndarray], silhouettes: Sequence[np.ndarray]
 ) -> Iterator[np.ndarray]:
     """y_h of raw frames: graph cuts prompted by the projected hand, one colour model for all.
 
     Args:
-        pictures: (H, W, 3) uint8 sRGB each.
+        images: (H, W, 3) uint8 sRGB each.
         silhouettes: (H, W) bool each, where the posed hand would be seen if nothing covered it;
             where it is empty, so is the mask.
 
@@ -35,18 +35,17 @@ def graph_cut_hands(
         (H, W) bool for each frame.
 
     Raises:
-        ShapeMismatch: a silhouette that does not belong to its picture.
+        ShapeMismatch: a silhouette that does not belong to its image.
 
     Source: `hwp_bench.importers.video.segmentation`, which the video import uses.
     """
     from hwp_bench.importers.video.segmentation import NARROW, Prompt, segment_clip
 
-    if len(pictures) != len(silhouettes) or any(
-        picture.shape[:2] != drawn.shape
-        for picture, drawn in zip(pictures, silhouettes, strict=True)
+    if len(images) != len(silhouettes) or any(
+        image.shape[:2] != drawn.shape for image, drawn in zip(images, silhouettes, strict=True)
     ):
-        raise ShapeMismatch("do not fit the pictures", field="silhouettes")
-    if not pictures:
+        raise ShapeMismatch("do not fit the images", field="silhouettes")
+    if not images:
         return
 
     def prompt(frame: int) -> Prompt:
@@ -54,9 +53,9 @@ def graph_cut_hands(
         return Prompt(drawn, np.zeros(drawn.shape, dtype=bool), detected=True)
 
     segmented = segment_clip(
-        lambda frame: np.ascontiguousarray(pictures[frame]),
+        lambda frame: np.ascontiguousarray(images[frame]),
         prompt,
-        len(pictures),
+        len(images),
         _hand_size(silhouettes),
         NARROW,
     )

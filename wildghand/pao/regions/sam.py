@@ -20,12 +20,12 @@ MODEL_TYPES = ("vit_h", "vit_l", "vit_b")
 
 
 class SegmentAnything:
-    """Overlapping regions of a picture, and the object at a pixel.
+    """Overlapping regions of an image, and the object at a pixel.
 
     Args:
         identity: digest of the model and its options.
-        masks: gives the automatic masks of a picture, (U, H, W) bool.
-        at: gives the best mask at a pixel (x, y) of a picture, (H, W) bool.
+        masks: gives the automatic masks of an image, (U, H, W) bool.
+        at: gives the best mask at a pixel (x, y) of an image, (H, W) bool.
     """
 
     def __init__(
@@ -38,25 +38,25 @@ class SegmentAnything:
         self._masks = masks
         self._at = at
 
-    def regions(self, picture: np.ndarray) -> FrameRegions:
-        """The automatic masks of an (H, W, 3) uint8 sRGB picture; there may be none."""
-        masks = np.asarray(self._masks(picture), dtype=bool)
-        return overlapping(masks.reshape(-1, *picture.shape[:2]))
+    def regions(self, image: np.ndarray) -> FrameRegions:
+        """The automatic masks of an (H, W, 3) uint8 sRGB image; there may be none."""
+        masks = np.asarray(self._masks(image), dtype=bool)
+        return overlapping(masks.reshape(-1, *image.shape[:2]))
 
-    def hand(self, picture: np.ndarray, root: tuple[float, float]) -> np.ndarray:
+    def hand(self, image: np.ndarray, root: tuple[float, float]) -> np.ndarray:
         """y_h: the mask prompted by the projected hand root.
 
         Args:
-            picture: (H, W, 3) uint8 sRGB.
+            image: (H, W, 3) uint8 sRGB.
             root: (x, y) px, the centre of the top left pixel at 0.5.
 
         Returns:
-            (H, W) bool, empty where the root is off the picture.
+            (H, W) bool, empty where the root is off the image.
         """
-        height, width = picture.shape[:2]
+        height, width = image.shape[:2]
         if not (0.0 <= root[0] < width and 0.0 <= root[1] < height):
             return np.zeros((height, width), dtype=bool)
-        return np.asarray(self._at(picture, root), dtype=bool).reshape(height, width)
+        return np.asarray(self._at(image, root), dtype=bool).reshape(height, width)
 
 
 def open_sam(checkpoint: str | os.PathLike[str], device: str = "cpu") -> SegmentAnything:
@@ -70,7 +70,7 @@ def open_sam(checkpoint: str | os.PathLike[str], device: str = "cpu") -> Segment
     Raises:
         MissingDependency: the checkpoint or a package that reads it is not there.
         BadInput: the checkpoint cannot be read.
-        UsageError: the file's name tells no model type.
+        UsageError: the file's name does not tell the model type.
     """
     path = Path(checkpoint)
     if not path.exists():
@@ -92,22 +92,22 @@ def _open_folder(path: Path, device: str) -> SegmentAnything:
     except Exception as error:
         raise _unreadable(path, error) from error
     model = model.to(device).eval()
-    image = _package("PIL.Image", path)
+    pil_image = _package("PIL.Image", path)
 
     @functools.cache
     def generator() -> Any:
-        _package("torchvision", path)  # transformers says so only after the first picture
+        _package("torchvision", path)  # transformers says so only after the first image
         return transformers.pipeline(
             "mask-generation", model=model, image_processor=processor.image_processor, device=device
         )
 
-    def masks(picture: np.ndarray) -> np.ndarray:
-        found = generator()(image.fromarray(picture), points_per_batch=64)["masks"]
+    def masks(image: np.ndarray) -> np.ndarray:
+        found = generator()(pil_image.fromarray(image), points_per_batch=64)["masks"]
         return np.stack([np.asarray(mask) for mask in found]) if len(found) else np.zeros(0)
 
-    def at(picture: np.ndarray, root: tuple[float, float]) -> np.ndarray:
+    def at(image: np.ndarray, root: tuple[float, float]) -> np.ndarray:
         inputs = processor(
-            image.fromarray(picture), input_points=[[list(root)]], return_tensors="pt"
+            pil_image.fromarray(image), input_points=[[list(root)]], return_tensors="pt"
         ).to(device)
         with torch.no_grad():
             outputs = model(**inputs, multimask_output=True)
@@ -129,7 +129,7 @@ def _open_file(path: Path, device: str) -> SegmentAnything:
     kinds = [kind for kind in MODEL_TYPES if kind in path.name]
     if len(kinds) != 1:
         raise UsageError(
-            "the name tells no model type",
+            "the name does not tell the model type",
             where=path,
             remedy=f"Let it hold one of {', '.join(MODEL_TYPES)}.",
         )
@@ -144,11 +144,11 @@ def _open_file(path: Path, device: str) -> SegmentAnything:
     generator = package.SamAutomaticMaskGenerator(model)
     predictor = package.SamPredictor(model)
 
-    def masks(picture: np.ndarray) -> np.ndarray:
-        return np.array([item["segmentation"] for item in generator.generate(picture)])
+    def masks(image: np.ndarray) -> np.ndarray:
+        return np.array([item["segmentation"] for item in generator.generate(image)])
 
-    def at(picture: np.ndarray, root: tuple[float, float]) -> np.ndarray:
-        predictor.set_image(picture)
+    def at(image: np.ndarray, root: tuple[float, float]) -> np.ndarray:
+        predictor.set_image(image)
         found, scores, _ = predictor.predict(
             point_coords=np.array([root]), point_labels=np.ones(1, int), multimask_output=True
         )
@@ -173,5 +173,6 @@ def _package(name: str, path: Path) -> Any:
 
 def _unreadable(path: Path, error: Exception) -> BadInput:
     return BadInput(
-        f"is no readable Segment Anything checkpoint ({type(error).__name__}: {error})", where=path
+        f"is not a readable Segment Anything checkpoint ({type(error).__name__}: {error})",
+        where=path,
     )

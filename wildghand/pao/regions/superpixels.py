@@ -26,7 +26,7 @@ _MAX_FILE_BYTES = 64 * 1024 * 1024
 
 @dataclass(frozen=True)
 class Superpixels:
-    """SLIC superpixels of a picture: small areas of like colour that follow edges."""
+    """SLIC superpixels of an image: small areas of like colour that follow edges."""
 
     #: Superpixels that are aimed at.
     count: int = 250
@@ -44,34 +44,34 @@ class Superpixels:
 
     @property
     def identity(self) -> str:
-        """Digest of everything that the regions of a picture depend on."""
+        """Digest of everything that the regions of an image depend on."""
         return sha256_json(["slic-1", asdict(self)])
 
-    def regions(self, picture: np.ndarray) -> FrameRegions:
-        """Cut a picture into superpixels; the same picture gives the same ones.
+    def regions(self, image: np.ndarray) -> FrameRegions:
+        """Cut an image into superpixels; the same image gives the same ones.
 
         Args:
-            picture: (H, W, 3) uint8 sRGB.
+            image: (H, W, 3) uint8 sRGB.
 
         Returns:
             A partition; at least one region, about `count`.
 
         Raises:
-            UsageError: not such a picture, or an empty one.
+            UsageError: not such an image, or an empty one.
 
         Source: Achanta et al., "SLIC superpixels compared to state-of-the-art superpixel
         methods"; OpenCV's implementation, small pieces joined to their neighbours.
         """
         import cv2
 
-        if picture.ndim != 3 or picture.shape[2] != 3 or picture.dtype != np.uint8:
-            raise UsageError(f"is {picture.dtype} of shape {picture.shape}", field="picture")
-        height, width = picture.shape[:2]
+        if image.ndim != 3 or image.shape[2] != 3 or image.dtype != np.uint8:
+            raise UsageError(f"is {image.dtype} of shape {image.shape}", field="image")
+        height, width = image.shape[:2]
         if height * width == 0:
-            raise UsageError("has no pixel", field="picture")
+            raise UsageError("has no pixel", field="image")
         edge = max(1, round(math.sqrt(height * width / self.count)))
-        lab = cv2.cvtColor(np.ascontiguousarray(picture), cv2.COLOR_RGB2Lab)
-        # A picture narrower than a superpixel makes OpenCV read beyond its end.
+        lab = cv2.cvtColor(np.ascontiguousarray(image), cv2.COLOR_RGB2Lab)
+        # An image narrower than a superpixel makes OpenCV read beyond its end.
         below, right = max(0, 2 * edge - height), max(0, 2 * edge - width)
         lab = cv2.copyMakeBorder(lab, 0, below, 0, right, cv2.BORDER_REPLICATE)
         slic = cv2.ximgproc.createSuperpixelSLIC(lab, cv2.ximgproc.SLIC, edge, self.compactness)
@@ -81,18 +81,18 @@ class Superpixels:
 
 
 class Segmenter(Protocol):
-    """What cuts pictures into regions."""
+    """A way to cut images into regions."""
 
     @property
     def identity(self) -> str:
-        """Digest of everything that the regions of a picture depend on."""
+        """Digest of everything that the regions of an image depend on."""
 
-    def regions(self, picture: np.ndarray) -> FrameRegions:
-        """Cut an (H, W, 3) uint8 sRGB picture."""
+    def regions(self, image: np.ndarray) -> FrameRegions:
+        """Cut an (H, W, 3) uint8 sRGB image."""
 
 
 class RegionCache:
-    """Regions by picture and segmenter.
+    """Regions by image and segmenter.
 
     A damaged file counts as absent. A folder that cannot be written to means that nothing is
     kept, no error.
@@ -106,25 +106,25 @@ class RegionCache:
         self.folder = cache_root() / "wildghand" / "regions" if folder is None else folder
         self.max_bytes = max_bytes
 
-    def regions(self, picture: np.ndarray, segmenter: Segmenter) -> FrameRegions:
-        """Regions of one picture, from the disk or made now.
+    def regions(self, image: np.ndarray, segmenter: Segmenter) -> FrameRegions:
+        """Regions of one image, from the disk or made now.
 
         Args:
-            picture: (H, W, 3) uint8 sRGB.
+            image: (H, W, 3) uint8 sRGB.
             segmenter: makes them.
         """
-        path = self.folder / f"{sha256_json([pixel_digest(picture), segmenter.identity])}.npz"
-        kept = _load(path, picture.shape[:2])
+        path = self.folder / f"{sha256_json([pixel_digest(image), segmenter.identity])}.npz"
+        kept = _load(path, image.shape[:2])
         if kept is not None:
             return kept
-        made = segmenter.regions(picture)
+        made = segmenter.regions(image)
         with contextlib.suppress(HwpError):
             _store(path, made)
         return made
 
-    def clip(self, pictures: Iterable[np.ndarray], segmenter: Segmenter) -> list[FrameRegions]:
-        """Regions of every picture of a clip; the cache is pruned at the end."""
-        made = [self.regions(picture, segmenter) for picture in pictures]
+    def clip(self, images: Iterable[np.ndarray], segmenter: Segmenter) -> list[FrameRegions]:
+        """Regions of every image of a clip; the cache is pruned at the end."""
+        made = [self.regions(image, segmenter) for image in images]
         self.prune()
         return made
 

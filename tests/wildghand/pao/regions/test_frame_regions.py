@@ -1,4 +1,4 @@
-"""Regions. Oracle: sums and pictures made mask by mask in numpy."""
+"""Regions. Oracle: sums and images made mask by mask in numpy."""
 
 from __future__ import annotations
 

@@ -12,22 +12,22 @@ from wildghand.pao.regions import FrameRegions, RegionCache, overlapping, partit
 
 
 class Counting:
-    """Gives regions that differ between pictures."""
+    """Gives regions that differ between images."""
 
     def __init__(self, overlap: bool = False, identity: str = "a") -> None:
         self.asked = 0
         self.overlap = overlap
         self.identity = identity
 
-    def regions(self, picture: np.ndarray) -> FrameRegions:
+    def regions(self, image: np.ndarray) -> FrameRegions:
         self.asked += 1
-        bright = picture[..., 0] > 127
+        bright = image[..., 0] > 127
         if self.overlap:
             return overlapping(np.stack([bright, ~bright, np.ones_like(bright)]))
         return partition(bright.astype(int))
 
 
-def pictures(count: int = 3) -> list[np.ndarray]:
+def images(count: int = 3) -> list[np.ndarray]:
     random = np.random.default_rng(0)
     return [random.integers(0, 256, (9, 7, 3), dtype=np.uint8) for _ in range(count)]
 
@@ -35,8 +35,8 @@ def pictures(count: int = 3) -> list[np.ndarray]:
 @pytest.mark.parametrize("overlap", [False, True])
 def test_regions_are_made_once_for_each_content(tmp_path: Path, overlap: bool) -> None:
     segmenter = Counting(overlap)
-    made = RegionCache(tmp_path).clip(pictures(), segmenter)
-    again = RegionCache(tmp_path).clip(pictures(), segmenter)
+    made = RegionCache(tmp_path).clip(images(), segmenter)
+    again = RegionCache(tmp_path).clip(images(), segmenter)
     assert segmenter.asked == 3
     for first, second in zip(made, again, strict=True):
         assert np.array_equal(first.labels, second.labels)
@@ -44,7 +44,7 @@ def test_regions_are_made_once_for_each_content(tmp_path: Path, overlap: bool) -
         assert (first.membership is None) == (second.membership is None)
         if overlap:
             assert np.array_equal(first.membership, second.membership)
-    RegionCache(tmp_path).regions(pictures()[0], Counting(identity="b"))
+    RegionCache(tmp_path).regions(images()[0], Counting(identity="b"))
     assert len(list(tmp_path.iterdir())) == 4
 
 
@@ -52,9 +52,9 @@ def test_regions_are_made_once_for_each_content(tmp_path: Path, overlap: bool) -
 def test_a_damaged_file_is_made_again(tmp_path: Path, damage: bytes) -> None:
     segmenter = Counting()
     cache = RegionCache(tmp_path)
-    made = cache.regions(pictures()[0], segmenter)
+    made = cache.regions(images()[0], segmenter)
     next(tmp_path.iterdir()).write_bytes(damage)
-    again = cache.regions(pictures()[0], segmenter)
+    again = cache.regions(images()[0], segmenter)
     assert segmenter.asked == 2
     assert np.array_equal(made.labels, again.labels)
 
@@ -62,7 +62,7 @@ def test_a_damaged_file_is_made_again(tmp_path: Path, damage: bytes) -> None:
 def test_a_forged_file_is_made_again(tmp_path: Path) -> None:
     segmenter = Counting(overlap=True)
     cache = RegionCache(tmp_path)
-    cache.regions(pictures()[0], segmenter)
+    cache.regions(images()[0], segmenter)
     path = next(tmp_path.iterdir())
     forged = [
         {"labels": np.full((9, 7), 9, np.uint16), "membership": np.ones((2, 3), bool)},
@@ -71,33 +71,33 @@ def test_a_forged_file_is_made_again(tmp_path: Path) -> None:
     ]
     for arrays in forged:
         np.savez(path, **arrays)
-        assert cache.regions(pictures()[0], segmenter).count == 3
+        assert cache.regions(images()[0], segmenter).count == 3
     assert segmenter.asked == 4
 
 
 def test_the_oldest_files_go_first(tmp_path: Path) -> None:
     segmenter = Counting()
     cache = RegionCache(tmp_path)
-    for age, picture in enumerate(pictures()):
-        cache.regions(picture, segmenter)
+    for age, image in enumerate(images()):
+        cache.regions(image, segmenter)
         for path in tmp_path.iterdir():
             if path.stat().st_mtime > 1e6:
                 os.utime(path, (100 + age, 100 + age))
     size = max(path.stat().st_size for path in tmp_path.iterdir())
-    cache.regions(pictures()[0], segmenter)
+    cache.regions(images()[0], segmenter)
     RegionCache(tmp_path, max_bytes=2 * size).prune()
     assert segmenter.asked == 3
     assert len(list(tmp_path.iterdir())) == 2
-    cache.regions(pictures()[0], segmenter)
+    cache.regions(images()[0], segmenter)
     assert segmenter.asked == 3
-    cache.regions(pictures()[1], segmenter)
+    cache.regions(images()[1], segmenter)
     assert segmenter.asked == 4
 
 
 def test_nothing_is_kept_where_nothing_can_be_written(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     segmenter = Counting()
-    made = RegionCache(tmp_path / "file" / "folder").clip(pictures(), segmenter)
+    made = RegionCache(tmp_path / "file" / "folder").clip(images(), segmenter)
     assert segmenter.asked == len(made) == 3
 
 
@@ -105,5 +105,5 @@ def test_the_default_folder_is_in_the_toolkits_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("HWP_CACHE", str(tmp_path))
-    RegionCache().regions(pictures()[0], Counting())
+    RegionCache().regions(images()[0], Counting())
     assert len(list((tmp_path / "wildghand" / "regions").iterdir())) == 1

@@ -21,8 +21,8 @@ def drawn(shift: int, size: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarra
     noise = np.random.default_rng(shift).normal(0.0, 3.0, (size, size, 3))
     colour = np.where(skin[..., None], (205, 150, 125), (50, 80, 95))
     colour = np.where(covered[..., None], (40, 160, 60), colour)
-    picture = (colour + noise).clip(0, 255).astype(np.uint8)
-    return picture, skin, np.roll(whole, 2, axis=1)
+    image = (colour + noise).clip(0, 255).astype(np.uint8)
+    return image, skin, np.roll(whole, 2, axis=1)
 
 
 def test_graph_cut_finds_the_visible_hand() -> None:
@@ -35,12 +35,12 @@ def test_graph_cut_finds_the_visible_hand() -> None:
 
 
 def test_no_hand_no_mask() -> None:
-    picture, _, silhouette = drawn(0)
-    masks = list(graph_cut_hands([picture] * 2, [np.zeros_like(silhouette)] * 2))
+    image, _, silhouette = drawn(0)
+    masks = list(graph_cut_hands([image] * 2, [np.zeros_like(silhouette)] * 2))
     assert not any(mask.any() for mask in masks)
     assert list(graph_cut_hands([], [])) == []
     with pytest.raises(ShapeMismatch, match="silhouettes"):
-        list(graph_cut_hands([picture], [silhouette[1:]]))
+        list(graph_cut_hands([image], [silhouette[1:]]))
 
 
 def test_a_captures_mask_is_hand_above_a_half() -> None:

@@ -16,8 +16,8 @@ from wildghand.pao.regions import RegionCache, SegmentAnything, open_sam
 PICTURE = np.random.default_rng(0).integers(0, 256, (40, 48, 3), dtype=np.uint8)
 
 
-def halves(picture: np.ndarray) -> np.ndarray:
-    masks = np.zeros((2, *picture.shape[:2]), bool)
+def halves(image: np.ndarray) -> np.ndarray:
+    masks = np.zeros((2, *image.shape[:2]), bool)
     masks[0, :, :24] = True
     masks[1, :20] = True
     return masks
@@ -26,9 +26,9 @@ def halves(picture: np.ndarray) -> np.ndarray:
 def test_masks_become_regions_and_the_root_prompts_the_hand(tmp_path: Path) -> None:
     asked = []
 
-    def at(picture: np.ndarray, root: tuple[float, float]) -> np.ndarray:
+    def at(image: np.ndarray, root: tuple[float, float]) -> np.ndarray:
         asked.append(root)
-        return halves(picture)[0]
+        return halves(image)[0]
 
     sam = SegmentAnything("x", halves, at)
     regions = RegionCache(tmp_path).regions(PICTURE, sam)
@@ -58,10 +58,10 @@ def test_a_checkpoint_of_the_original_package(
     package = ModuleType("segment_anything")
     package.sam_model_registry = {"vit_b": lambda: torch.nn.Linear(2, 1)}
     package.SamAutomaticMaskGenerator = lambda model: SimpleNamespace(
-        generate=lambda picture: [{"segmentation": mask} for mask in halves(picture)]
+        generate=lambda image: [{"segmentation": mask} for mask in halves(image)]
     )
     package.SamPredictor = lambda model: SimpleNamespace(
-        set_image=lambda picture: None,
+        set_image=lambda image: None,
         predict=lambda **_: (halves(PICTURE), np.array([0.1, 0.9]), None),
     )
     monkeypatch.setitem(sys.modules, "segment_anything", package)

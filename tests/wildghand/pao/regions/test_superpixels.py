@@ -1,4 +1,4 @@
-"""Superpixels. Oracles: connected components (scipy), drawn pictures with known edges."""
+"""Superpixels. Oracles: connected components (scipy), drawn images with known edges."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from hwp_bench.base.errors import UsageError
 from wildghand.pao.regions import Superpixels
 
 
-def picture(height: int = 96, width: int = 96, seed: int = 0) -> np.ndarray:
+def disc_image(height: int = 96, width: int = 96, seed: int = 0) -> np.ndarray:
     """A bright disc before a darker, noisy ground."""
     rows, columns = np.mgrid[:height, :width]
     disc = (rows - height / 2) ** 2 + (columns - width / 2) ** 2 < (height / 3) ** 2
@@ -25,7 +25,7 @@ def picture(height: int = 96, width: int = 96, seed: int = 0) -> np.ndarray:
 
 
 def test_superpixels_are_connected_follow_edges_and_repeat() -> None:
-    image = picture()
+    image = disc_image()
     regions = Superpixels(count=64).regions(image)
     assert 32 <= regions.count <= 128
     disc = image[..., 0] > 135
@@ -64,5 +64,5 @@ def test_identity_tells_settings_apart_and_bad_ones_are_named() -> None:
         with pytest.raises(UsageError, match=next(iter(bad))):
             Superpixels(**bad)
     for image in (np.zeros((4, 4), np.uint8), np.zeros((4, 4, 3)), np.zeros((0, 4, 3), np.uint8)):
-        with pytest.raises(UsageError, match="picture"):
+        with pytest.raises(UsageError, match="image"):
             Superpixels().regions(image)
