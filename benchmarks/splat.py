@@ -1,12 +1,12 @@
-"""How long the rasterizer takes: beside the PyTorch reference, the study, gsplat and others.
+"""Times of the rasterizer, compared with the PyTorch reference, gsplat and others.
 
 Run from the repository: `python -m benchmarks.splat [--rounds 30] [--scaling] [--out FOLDER]`.
 All contenders take turns in one run, so that other work on the machine slows them alike; the
-processor time says what they cost whatever else runs. The floor is what the blended pairs would
-take if the processor did nothing but multiply and add, as fast as it is measured to.
+processor time is what they cost whatever else runs. The floor is the time that the blended pairs
+would take if the processor did nothing but multiply and add, as fast as it is measured to.
 
-`--prototype FOLDER` adds the study's numba code; `--other MODULE:FUNCTION` adds any function
-(means, quats, scales, opacities, colors, viewmats, Ks, width, height, backgrounds) -> images.
+`--other MODULE:FUNCTION` adds any function (means, quats, scales, opacities, colors, viewmats, Ks,
+width, height, backgrounds) -> images.
 """
 
 from __future__ import annotations
@@ -77,25 +77,6 @@ def bare_gsplat(tensors: dict[str, torch.Tensor], size: int) -> torch.Tensor:
     return gsplat.rasterization(**tensors, width=size, height=size, packed=False)[0]
 
 
-def prototype(folder: str) -> Draw:
-    """The study's numba rasterizer; draws one view."""
-    sys.path.insert(0, folder)
-    kernels = importlib.import_module("splat_numba")
-    render = importlib.import_module("splat_autograd").render
-    import numba
-
-    numba.set_num_threads(torch.get_num_threads())
-
-    def draw(tensors: dict[str, torch.Tensor], size: int) -> torch.Tensor:
-        names = ("means", "quats", "scales", "opacities", "colors")
-        views = (tensors[name][0] for name in ("viewmats", "Ks"))
-        background = tensors["backgrounds"][0]
-        gaussians = (tensors[name] for name in names)
-        return render(*gaussians, *views, size, size, background, kernels)[0][None]
-
-    return draw
-
-
 def other(source: str) -> Contender:
     module, _, function = source.partition(":")
     call = getattr(importlib.import_module(module), function)
@@ -111,8 +92,6 @@ def contenders(args: argparse.Namespace) -> list[Contender]:
         ]
     else:
         found = [Contender("numba", ours("numba")), Contender("numba, 4 views", ours("numba"), 4)]
-        if args.prototype:
-            found.append(Contender("study's prototype", prototype(args.prototype)))
         found.append(Contender("PyTorch reference", ours("reference")))
     return found + [other(source) for source in args.other]
 
@@ -188,7 +167,7 @@ def operations_per_second(threads: int) -> float:
 
 
 def memory_mib(name: str, threads: int) -> float | None:
-    """Peak memory of a forward and backward pass above what is there before, in a new process."""
+    """Peak memory of a forward and backward pass above the memory before it, in a new process."""
     if not Path("/proc/self/clear_refs").exists():
         return None
     words = ["--memory-of", name, "--threads", str(threads)]
@@ -310,7 +289,6 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=30, help="turns of each contender (30)")
     parser.add_argument("--threads", type=int, default=torch.get_num_threads(), help="CPU threads")
     parser.add_argument("--device", choices=("cpu", "cuda"), default="cpu")
-    parser.add_argument("--prototype", metavar="FOLDER", help="the study's code")
     parser.add_argument("--other", action="append", default=[], metavar="MODULE:FUNCTION")
     parser.add_argument("--scaling", action="store_true", help="1k-1M Gaussians, 64-2048 px")
     parser.add_argument("--out", type=Path, metavar="FOLDER", help="keep table, numbers, plot here")

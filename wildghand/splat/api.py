@@ -14,9 +14,9 @@ import torch
 from hwp_bench.base.errors import UsageError
 from wildghand.splat.conventions import MAX_COLOR
 from wildghand.splat.layout import check_options, flatten
-from wildghand.splat.scene import Options, Scene, unflattened
+from wildghand.splat.scene import FlatScene, Options, unflattened
 
-#: What `backend` may be.
+#: Values of `backend`.
 BACKENDS = ("auto", "numba", "gsplat", "reference")
 
 _Result = tuple[torch.Tensor, torch.Tensor, dict[str, Any]]
@@ -47,7 +47,7 @@ def rasterize(
     The arguments are those of `gsplat.rasterization`. Gradients flow to `means`, `quats`,
     `scales`, `opacities`, `colors`, `backgrounds` and `viewmats`; as in gsplat, not to `Ks`.
 
-    Leading dimensions `...` are sets of Gaussians, each with C cameras. Beside gsplat's shapes,
+    Leading dimensions `...` are sets of Gaussians, each with C cameras. Besides gsplat's shapes,
     `viewmats` (C, 4, 4) with `means` (C, N, 3) pairs each camera with Gaussians of its own, and
     `quats`, `scales`, `opacities` and `colors` may leave `...` out: all sets share them.
 
@@ -115,8 +115,8 @@ def rasterize(
         ((1, 32, 32, 3), (1, 32, 32, 1))
     """
     options = Options(
-        width=_whole(width),
-        height=_whole(height),
+        width=_as_int(width),
+        height=_as_int(height),
         near_plane=float(near_plane),
         far_plane=float(far_plane),
         eps2d=float(eps2d),
@@ -153,16 +153,16 @@ def rasterize(
     return unflattened(channels, scene), unflattened(alphas, scene), info
 
 
-def _whole(number: Any) -> Any:
-    """An int of any other whole-number type, such as numpy's; what is none stays as it is."""
+def _as_int(number: Any) -> Any:
+    """An int from any integer type, such as numpy's; anything else is returned as it is."""
     try:
         return operator.index(number)
     except TypeError:
         return number
 
 
-def _backend(name: str, device: torch.device) -> tuple[str, Callable[[Scene], _Result]]:
-    """The backend's name and function; imported only now, since each brings its own world."""
+def _backend(name: str, device: torch.device) -> tuple[str, Callable[[FlatScene], _Result]]:
+    """The backend's name and function; imported only now, with its own dependencies."""
     if name not in BACKENDS:
         raise UsageError(
             f"is {name!r}", field="backend", remedy=f"Use one of {', '.join(BACKENDS)}"
@@ -189,7 +189,7 @@ def _backend(name: str, device: torch.device) -> tuple[str, Callable[[Scene], _R
     return name, rasterize_numba
 
 
-def _one_dtype(scene: Scene, backend: str) -> Scene:
+def _one_dtype(scene: FlatScene, backend: str) -> FlatScene:
     """The scene in the dtype that the backend computes in."""
     tensors = {name: value for name, value in vars(scene).items() if torch.is_tensor(value)}
     if backend == "reference":
@@ -202,13 +202,13 @@ def _one_dtype(scene: Scene, backend: str) -> Scene:
     return replace(scene, **converted)
 
 
-def _usable_views(scene: Scene) -> Scene:
+def _usable_views(scene: FlatScene) -> FlatScene:
     """Warns of cameras that see nothing; makes backgrounds that are not finite black."""
-    if scene.means.is_cuda:  # the backend does so without a second look from the host
+    if scene.means.is_cuda:  # the backend does so without another copy to the host
         return scene
     finite = math.isfinite(scene.viewmats.detach().sum() + scene.Ks.detach().sum())
     if not finite and not (scene.viewmats.isfinite().all() and scene.Ks.isfinite().all()):
-        warnings.warn("rasterize: a camera is not finite; its image shows the background alone")
+        warnings.warn("rasterize: a camera is not finite; its image shows only the background")
     elif not scene.Ks.detach()[:, (0, 1), (0, 1)].amin() > 0:
         warnings.warn("rasterize: a camera has no positive focal length; it sees nothing")
     if scene.backgrounds is None:

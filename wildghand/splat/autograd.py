@@ -1,7 +1,7 @@
 """The CPU stages as two steps that autograd knows: project, then blend.
 
-Two, so that what lies between, the means on the image plane and the depths, are tensors of the
-graph: users of gsplat read the gradient of `info["means2d"]` to densify.
+They are two so that the means on the image plane and the depths are tensors of the graph: users of
+gsplat read the gradient of `info["means2d"]` to densify.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ from wildghand.splat.stages import (
 
 @dataclass
 class Call:
-    """What one call of `rasterize` keeps for its backward pass; nobody else has it.
+    """The data that one call of `rasterize` keeps for its backward pass; it is not shared.
 
-    The forward steps fill in what they make, in this order.
+    The forward steps fill in their results, in this order.
     """
 
     options: Options
@@ -61,7 +61,7 @@ class Project(torch.autograd.Function):
         colors: torch.Tensor,
         call: Call,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Flat contiguous float32 tensors of a `Scene`; `call` gets `projected`."""
+        """Flat contiguous float32 tensors of a `FlatScene`; `call` gets `projected`."""
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(means, quats, scales, viewmats)
         ctx.call = call
@@ -92,7 +92,7 @@ class Project(torch.autograd.Function):
         v_means2d, v_shapes, v_depths, v_compensations = (
             None if v is None else _gaussians(v.contiguous()) for v in upstream
         )
-        wanted = [_like_gaussians(tensor) for tensor in (means, quats, scales)]
+        made = [_like_gaussians(tensor) for tensor in (means, quats, scales)]
         rows = project_backward_stage(
             Ellipsoids(_gaussians(means), _gaussians(quats), _gaussians(scales)),
             call.cameras,
@@ -105,7 +105,7 @@ class Project(torch.autograd.Function):
             ),
             call.options,
             ctx.needs_input_grad[3],
-            Ellipsoids(*(_array(tensor) for tensor in wanted)),
+            Ellipsoids(*(_array(tensor) for tensor in made)),
         )
         v_viewmats = None
         if ctx.needs_input_grad[3]:
@@ -113,7 +113,7 @@ class Project(torch.autograd.Function):
             v_viewmats[:, :3, :3] = torch.from_numpy(rows[:, :9].reshape(-1, 3, 3))
             v_viewmats[:, :3, 3] = torch.from_numpy(rows[:, 9:])
         count = means.shape[1]
-        return (*(v[:, :count] for v in wanted), v_viewmats, None, None, None)
+        return (*(v[:, :count] for v in made), v_viewmats, None, None, None)
 
 
 class Blend(torch.autograd.Function):
@@ -129,7 +129,7 @@ class Blend(torch.autograd.Function):
         backgrounds: torch.Tensor,
         call: Call,
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """What `Project` returned for `call`, then flat contiguous tensors to blend."""
+        """The results of `Project` for `call`, then flat contiguous tensors to blend."""
         ctx.set_materialize_grads(False)
         options = call.options
         shape = (len(backgrounds), options.height, options.width)
@@ -207,7 +207,7 @@ def _like_gaussians(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def _refuse_second_order() -> None:
-    """Second derivatives are not there, and silence would make them wrong.
+    """Refuse second derivatives, which would be silently wrong.
 
     Raises:
         HwpError: the backward pass itself is being recorded.

@@ -120,7 +120,7 @@ def project_backward_stage(
     Args:
         ellipsoids, cameras: as projected.
         projected: from the forward pass.
-        upstream: gradients of the loss by what was projected.
+        upstream: gradients of the loss by the projected Gaussians.
         options: of the call.
         want_cameras: whether the result is needed.
         gradients: overwritten.

@@ -5,9 +5,7 @@ They are those of gsplat's CUDA kernels (pixel centres at +0.5, OpenCV camera ax
 
 from __future__ import annotations
 
-import math
-
-#: A splat leaves a pixel alone where its alpha is below this.
+#: A splat does not change a pixel where its alpha is below this.
 MIN_ALPHA = 1.0 / 255.0
 #: Alpha is clamped here, so that the transmittance behind a splat is never zero.
 MAX_ALPHA = 0.99
@@ -21,8 +19,6 @@ FRUSTUM_MARGIN = 0.15
 #: A colour beyond this counts as not finite: sums over a pixel must fit into a float32, and
 #: so must the gradients of a loss that is quadratic in the colours.
 MAX_COLOR = 1e15
-#: Natural logarithm of 255: the exponent at which an opaque splat ends.
-LOG_255 = math.log(255.0)
 
 #: Values of `render_mode`, as in gsplat.
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")

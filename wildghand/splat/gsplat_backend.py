@@ -1,4 +1,4 @@
-"""CUDA backend: gsplat's kernels, behind the same signature and with the same manners.
+"""CUDA backend: gsplat's kernels, behind the same signature and with the same checks.
 
 gsplat computes in float32 throughout and does not look for values that are not finite: one NaN
 quaternion makes every gradient NaN. So one number is read back from the device before the call; if
@@ -16,7 +16,7 @@ import torch
 
 from hwp_bench.base.errors import MissingDependency
 from wildghand.splat import conventions as rules
-from wildghand.splat.scene import Scene, channels_with_depth
+from wildghand.splat.scene import FlatScene, channels_with_depth
 
 #: Beyond this, squares of lengths leave float32 inside gsplat.
 _MAX_LENGTH = 1e15
@@ -27,7 +27,7 @@ _LEAST_NEAR_PLANE = 1e-6
 _BATCHES_SINCE = (1, 5, 2)
 
 
-def rasterize_gsplat(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+def rasterize_gsplat(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Draws the scene, float32 on a CUDA device; see `wildghand.splat.rasterize`.
 
     Returns:
@@ -52,8 +52,8 @@ def rasterize_gsplat(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str
     return channels.flatten(0, -4), alphas.flatten(0, -4), _info(scene, meta)
 
 
-def _nothing(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """Images of no Gaussian at all, for which gsplat's kernels cannot be started."""
+def _nothing(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Images without any Gaussian, for which gsplat's kernels cannot be started."""
     options = scene.options
     depths = scene.means.new_zeros(scene.images, 0)
     channels, backgrounds = channels_with_depth(scene.colors, depths, scene)
@@ -70,7 +70,7 @@ def _nothing(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     return images, scene.means.new_zeros(*shape, 1), _info(scene, meta)
 
 
-def _info(scene: Scene, meta: dict[str, Any]) -> dict[str, Any]:
+def _info(scene: FlatScene, meta: dict[str, Any]) -> dict[str, Any]:
     count = scene.gaussians
     info = {}
     for name, tail in (("means2d", (count, 2)), ("depths", (count,)), ("radii", (count, 2))):
@@ -99,7 +99,7 @@ def _gsplat() -> tuple[Callable[..., Any], bool]:
     return gsplat.rasterization, version >= _BATCHES_SINCE
 
 
-def _harmless(scene: Scene) -> dict[str, torch.Tensor]:
+def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     """The scene's tensors, with everything that gsplat cannot take made invisible."""
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
     tensors = {name: getattr(scene, name) for name in names}
@@ -112,7 +112,7 @@ def _harmless(scene: Scene) -> dict[str, torch.Tensor]:
     return tensors if bool(usual) else _sanitised(scene, tensors)
 
 
-def _sanitised(scene: Scene, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
+def _sanitised(scene: FlatScene, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     def within(tensor: torch.Tensor, bound: float) -> torch.Tensor:
         return (tensor.detach().abs() <= bound).all(-1)
 
@@ -186,7 +186,7 @@ def _batch(tensors: dict[str, torch.Tensor], groups: int) -> dict[str, torch.Ten
 
 
 def _draw(
-    rasterization: Callable[..., Any], scene: Scene, tensors: dict[str, torch.Tensor]
+    rasterization: Callable[..., Any], scene: FlatScene, tensors: dict[str, torch.Tensor]
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     options = scene.options
     return rasterization(
@@ -204,7 +204,7 @@ def _draw(
 
 def _one_by_one(
     rasterization: Callable[..., Any],
-    scene: Scene,
+    scene: FlatScene,
     tensors: dict[str, torch.Tensor],
     groups: int,
 ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:

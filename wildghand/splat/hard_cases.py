@@ -16,7 +16,7 @@ from hwp_bench.stability import Case, Context, Measured
 from wildghand.splat.hard_scenes import (
     DIFFERENTIABLE,
     PER_GAUSSIAN,
-    Drawing,
+    DrawnScene,
     HardScene,
     clear_pixels,
     difference,
@@ -92,7 +92,7 @@ def _culled() -> Iterator[_Entry]:
 
 
 def _views() -> Iterator[_Entry]:
-    """Bad values in what belongs to a camera: the other camera's image must not change."""
+    """Bad values in the arguments of one camera: the other camera's image must not change."""
     for argument in ("viewmats", "Ks", "backgrounds"):
         for kind, value in _BAD.items():
             scene = hand_scene(cameras=2)
@@ -231,7 +231,7 @@ def _finite(name: str, scene: HardScene) -> _Entry:
     return name, "image and gradients finite", functools.partial(_run_finite, scene)
 
 
-def _draw(scene: HardScene, context: Context, weights: torch.Tensor | None = None) -> Drawing:
+def _draw(scene: HardScene, context: Context, weights: torch.Tensor | None = None) -> DrawnScene:
     dtype = torch.float64 if context.backend == "reference" else torch.float32
     return draw(scene, context.backend, dtype, weights)
 
@@ -276,8 +276,8 @@ def _run_bad_view(scene: HardScene, context: Context) -> Measured:
         name: scene.arguments[name][:1] if name in ("viewmats", "Ks", "backgrounds") else tensor
         for name, tensor in scene.arguments.items()
     }
-    alone = _draw(HardScene(good), context)
-    change = difference(drawing.image[:1], alone.image)
+    single = _draw(HardScene(good), context)
+    change = difference(drawing.image[:1], single.image)
     bad = drawing.image[1]
     if scene.arguments["backgrounds"].isfinite().all():
         shown = difference(bad, scene.arguments["backgrounds"][1].float().double().expand_as(bad))

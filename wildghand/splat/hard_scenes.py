@@ -1,4 +1,4 @@
-"""Scenes at the limits of arithmetic, and what drawing one gives."""
+"""Scenes at the limits of arithmetic, and the result of drawing one."""
 
 from __future__ import annotations
 
@@ -45,8 +45,8 @@ class HardScene:
 
 
 @dataclass(frozen=True)
-class Drawing:
-    """What drawing a scene gave, in float64 on the CPU."""
+class DrawnScene:
+    """The result of drawing a scene, in float64 on the CPU."""
 
     image: torch.Tensor  # (C, H, W, D)
     alpha: torch.Tensor  # (C, H, W, 1)
@@ -97,18 +97,18 @@ def hand_scene(
         "Ks": K.double().repeat(cameras, 1, 1),
         "backgrounds": uniform(cameras, 3),
     }
-    # What float32 cannot hold is no fault of the backend.
+    # Values that float32 cannot hold must not count against the backend.
     rounded = {name: tensor.float().double() for name, tensor in arguments.items()}
     return HardScene(rounded, width, height)
 
 
 def draw(
     scene: HardScene, backend: str, dtype: torch.dtype, weights: torch.Tensor | None = None
-) -> Drawing:
+) -> DrawnScene:
     """Draws a scene and takes the gradients of a fixed random linear loss.
 
     Args:
-        scene: what to draw.
+        scene: to draw.
         backend: as for `rasterize`.
         dtype: of the arguments.
         weights: (C, H, W), by which the loss of each pixel is multiplied.
@@ -130,7 +130,7 @@ def draw(
         for name, tensor in arguments.items()
         if name in DIFFERENTIABLE
     }
-    return Drawing(image.detach().cpu().double(), alpha.detach().cpu().double(), gradients)
+    return DrawnScene(image.detach().cpu().double(), alpha.detach().cpu().double(), gradients)
 
 
 def clear_pixels(scene: HardScene) -> torch.Tensor:
@@ -161,7 +161,9 @@ def difference(measured: torch.Tensor, truth: torch.Tensor) -> float:
     return float((measured - truth).norm()) / (size if size > 0 else 1.0)
 
 
-def gradient_differences(measured: Mapping[str, torch.Tensor], truth: Drawing) -> dict[str, float]:
+def gradient_differences(
+    measured: Mapping[str, torch.Tensor], truth: DrawnScene
+) -> dict[str, float]:
     """`difference` of every gradient."""
     return {name: difference(measured[name], value) for name, value in truth.gradients.items()}
 

@@ -1,4 +1,4 @@
-"""Checks the arguments of `rasterize` and brings them to the flat shapes of a `Scene`."""
+"""Checks the arguments of `rasterize` and brings them to the flat shapes of a `FlatScene`."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ import torch
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from wildghand.splat.conventions import RASTERIZE_MODES, RENDER_MODES
-from wildghand.splat.scene import Options, Scene
+from wildghand.splat.scene import FlatScene, Options
 
 
 def flatten(
     tensors: dict[str, torch.Tensor],
     backgrounds: torch.Tensor | None,
     options: Options,
-) -> Scene:
-    """One `Scene` from the arguments as the caller gave them.
+) -> FlatScene:
+    """One `FlatScene` from the arguments as the caller gave them.
 
     Args:
         tensors: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`.
@@ -63,15 +63,15 @@ def flatten(
     flat_backgrounds = None
     if backgrounds is not None:
         shape = tuple(backgrounds.shape)
-        wanted = (*image_dims, channels)
+        full = (*image_dims, channels)
         _require(
-            shape in (wanted, (channels,)),
+            shape in (full, (channels,)),
             "backgrounds",
             backgrounds,
-            f"{_show(wanted)} or ({channels},)",
+            f"{_show(full)} or ({channels},)",
         )
-        flat_backgrounds = backgrounds.expand(wanted).reshape(images, channels)
-    return Scene(
+        flat_backgrounds = backgrounds.expand(full).reshape(images, channels)
+    return FlatScene(
         **flat,
         viewmats=viewmats.reshape(images, 4, 4),
         Ks=Ks.reshape(images, 3, 3),
@@ -85,7 +85,7 @@ def check_options(options: Options, rasterize_mode: str) -> None:
     """Refuses settings that make no sense.
 
     Raises:
-        UsageError: names the argument and says what it may be.
+        UsageError: names the argument and says which values it may have.
     """
     for name, choices, value in (
         ("render_mode", RENDER_MODES, options.render_mode),
@@ -96,7 +96,7 @@ def check_options(options: Options, rasterize_mode: str) -> None:
     for name, size in (("width", options.width), ("height", options.height)):
         if not isinstance(size, int) or not 1 <= size <= 32768:
             raise UsageError(
-                f"is {size!r}", field=name, remedy="Use a whole number of pixels, 1 to 32768"
+                f"is {size!r}", field=name, remedy="Use an integer number of pixels, 1 to 32768"
             )
     if not 0.0 <= options.near_plane < options.far_plane:
         raise UsageError(
@@ -139,10 +139,10 @@ def _check_kind(tensors: dict[str, torch.Tensor]) -> None:
             )
 
 
-def _require(holds: bool, name: str, tensor: torch.Tensor, wanted: str) -> None:
+def _require(holds: bool, name: str, tensor: torch.Tensor, expected: str) -> None:
     if not holds:
         raise ShapeMismatch(
-            f"has shape {_show(tuple(tensor.shape))}", field=name, remedy=f"It must be {wanted}"
+            f"has shape {_show(tuple(tensor.shape))}", field=name, remedy=f"It must be {expected}"
         )
 
 

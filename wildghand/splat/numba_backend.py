@@ -8,7 +8,7 @@ import torch
 
 from wildghand.splat.autograd import Blend, Call, Project
 from wildghand.splat.scene import (
-    Scene,
+    FlatScene,
     channels_with_depth,
     expected_depth,
     per_image,
@@ -18,7 +18,7 @@ from wildghand.splat.stages import camera_rows
 from wildghand.splat.warmup import warm_up
 
 
-def rasterize_numba(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+def rasterize_numba(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Draws the scene, float32 on the CPU; see `wildghand.splat.rasterize`.
 
     Returns:

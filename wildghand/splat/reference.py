@@ -12,8 +12,8 @@ import torch
 
 from wildghand.splat import conventions as rules
 from wildghand.splat.scene import (
+    FlatScene,
     Options,
-    Scene,
     channels_with_depth,
     expected_depth,
     per_image,
@@ -24,7 +24,7 @@ from wildghand.splat.scene import (
 CHUNK = 1 << 22
 
 
-def rasterize_reference(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+def rasterize_reference(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
     """Draws the scene; see `wildghand.splat.rasterize` for shapes and units.
 
     Returns:
@@ -83,7 +83,7 @@ def rasterize_reference(scene: Scene) -> tuple[torch.Tensor, torch.Tensor, dict[
     return expected_depth(image, alpha, options.render_mode), alpha, info
 
 
-def _project_some(scene: Scene, image: int, index: torch.Tensor) -> dict[str, torch.Tensor]:
+def _project_some(scene: FlatScene, image: int, index: torch.Tensor) -> dict[str, torch.Tensor]:
     means, quats, scales, opacities = (
         per_image(tensor, scene.images)[image][index]
         for tensor in (scene.means, scene.quats, scene.scales, scene.opacities)

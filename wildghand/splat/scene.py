@@ -1,4 +1,4 @@
-"""What a backend is given: the tensors of one call, checked and brought to flat shapes."""
+"""The input of a backend: the tensors of one call, checked and brought to flat shapes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Options:
 
 
 @dataclass(frozen=True)
-class Scene:
+class FlatScene:
     """I images of N Gaussians each.
 
     A tensor whose leading size S is smaller than I is shared: image i reads its entry
@@ -61,7 +61,7 @@ class Scene:
         return self.means.shape[1]
 
 
-def unflattened(tensor: torch.Tensor, scene: Scene) -> torch.Tensor:
+def unflattened(tensor: torch.Tensor, scene: FlatScene) -> torch.Tensor:
     """(I, ...) to (*image_dims, ...)."""
     return tensor.reshape(scene.image_dims + tuple(tensor.shape[1:]))
 
@@ -76,7 +76,7 @@ def per_image(tensor: torch.Tensor, images: int) -> torch.Tensor:
 
 
 def channels_with_depth(
-    colors: torch.Tensor, depths: torch.Tensor, scene: Scene
+    colors: torch.Tensor, depths: torch.Tensor, scene: FlatScene
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
     """The channels to blend and their backgrounds, for the scene's render mode.
 

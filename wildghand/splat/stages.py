@@ -1,6 +1,6 @@
 """The stages of the CPU backend's forward pass, from arrays to arrays.
 
-Each call owns what it makes; nothing here knows of torch.
+Each call owns what it makes; nothing here uses torch.
 """
 
 from __future__ import annotations
@@ -24,9 +24,9 @@ from wildghand.splat.threads import even_jobs, run, thread_count, weighted_jobs
 
 #: Numbers of channels for which the blending kernels are compiled unrolled.
 UNROLLED = (3,)
-#: Memory of a (Gaussian, tile) pair: its entry, and what the backward pass adds at least.
+#: Memory of a (Gaussian, tile) pair: its entry, and the least that the backward pass adds.
 _BYTES_PER_ENTRY = 12
-#: Bytes that are taken without a look at what the machine has.
+#: Bytes that are allocated without asking how much the machine has.
 _LITTLE = 1 << 30
 #: Most chunks: each has a counter for every tile.
 _MOST_CHUNKS = 32
@@ -44,7 +44,7 @@ class Lists:
 
 @dataclass(frozen=True)
 class Drawn:
-    """What is left of blending, beside images and alphas."""
+    """The results of blending besides images and alphas."""
 
     remaining: np.ndarray  # (I, H, W) float32, transmittance
     stops: np.ndarray  # (tiles,) int64, where each list was left because of saturation

@@ -2,9 +2,9 @@
 
 Kernels release the interpreter lock and share out their jobs themselves (see `kernels.jobs`), so
 any threads do. The best are those of torch's own OpenMP: after an operation of torch they spin
-for some milliseconds in wait for the next one, and threads of ours would have to compete with
+for some milliseconds to wait for the next one, and threads of ours would have to compete with
 them for the cores. Where torch has no OpenMP, in a forked child, whose OpenMP is dead, and on a
-machine that is busy otherwise, plain threads take their place. Numba's own layers are no choice:
+machine that is busy otherwise, plain threads take their place. Numba's own layers cannot be used:
 they forbid two callers at once or end the process on a fork.
 
 How many threads: `torch.get_num_threads()`. Results do not depend on it.
@@ -106,7 +106,7 @@ def _crowded(second: int) -> bool:
     """Whether other processes want the cores, asked at most once a second.
 
     Threads that spin then take time from those that they wait for: a step of 5 ms took 100 ms
-    beside one busy process of two threads.
+    next to one busy process of two threads.
     """
     try:
         return os.getloadavg()[0] > (os.cpu_count() or 1) + 0.5
@@ -118,8 +118,8 @@ def _crowded(second: int) -> bool:
 def _openmp() -> Callable[[Callable[[int], None], int], None] | None:
     """Runs a function on a team of torch's OpenMP threads; None if there is none.
 
-    `GOMP_parallel` is what compilers make of `#pragma omp parallel`; GNU's, LLVM's and Intel's
-    runtimes have it. Only one that torch has loaded already is looked for.
+    `GOMP_parallel` is the call that compilers make of `#pragma omp parallel`; GNU's, LLVM's and
+    Intel's runtimes have it. Only a runtime that torch has already loaded is used.
     """
     if not torch.backends.openmp.is_available() or not hasattr(os, "RTLD_NOLOAD"):
         return None

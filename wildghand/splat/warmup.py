@@ -21,7 +21,7 @@ from wildghand.splat.scene import Options
 _log = logging.getLogger("wildghand.splat")
 _lock = threading.Lock()
 
-#: What a damaged or full cache may raise.
+#: Errors that a damaged or full cache may raise.
 _CACHE_ERRORS = (OSError, EOFError, pickle.PickleError, ImportError, AttributeError, IndexError)
 
 
@@ -50,7 +50,7 @@ def _warm_up() -> None:
         for kernel in kernels:
             kernel.forget_cache()
         _run_all()
-    if any(kernel.compiled_anew() for kernel in kernels):
+    if any(kernel.compiled_here() for kernel in kernels):
         _log.warning("compiled the CPU rasterizer in %.1f s", time.perf_counter() - start)
 
 

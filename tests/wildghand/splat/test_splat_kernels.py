@@ -178,7 +178,7 @@ def test_the_first_call_says_that_it_compiles(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     monkeypatch.setattr(jit.Kernel, "on_disk", lambda self: False)
-    monkeypatch.setattr(jit.Kernel, "compiled_anew", lambda self: 1)
+    monkeypatch.setattr(jit.Kernel, "compiled_here", lambda self: 1)
     monkeypatch.setattr(warmup, "_run_all", lambda: None)
     warmup._warm_up.cache_clear()
     with caplog.at_level(logging.WARNING):

@@ -79,7 +79,7 @@ def exp2(x):
 
 @inline
 def enter_tile(geom, row, tile_x, tile_y, offsets, to):
-    """What a splat looks like from a tile.
+    """A splat relative to a tile.
 
     Writes u and e (see `geometry`) of the first pixel of each block to `offsets` from `to` on,
     first all u, then all e.

@@ -21,8 +21,8 @@ from wildghand.splat.kernels.lanes import prefetch
 from wildghand.splat.kernels.tiles import LOG2_MIN_ALPHA, TILE_HEIGHT, TILE_WIDTH
 
 _LOG2_MIN_ALPHA = float(LOG2_MIN_ALPHA)
-#: Pixels by which the bounds are widened against rounding: costs nothing, since what lies
-#: outside the splat is found out pixel by pixel.
+#: Pixels by which the bounds are widened against rounding: costs nothing, since every
+#: pixel is tested against the splat itself.
 _SLACK = 2e-3
 _AHEAD = 12
 _BATCH = 32
@@ -98,7 +98,7 @@ def count_tiles(
         number[:] = 0
         span = image_spans[i] + chunk_rows[i, c]
         stop = (c + 1) * visible[i] // chunks
-        # In batches: a loop whose length hangs on a square root just taken would stall.
+        # In batches: a loop whose length depends on a square root just taken would stall.
         for start in range(c * visible[i] // chunks, stop, _BATCH):
             end = min(start + _BATCH, stop)
             filled = span

@@ -23,7 +23,7 @@ from wildghand.splat.kernels.simd import intrinsic
 from wildghand.splat.kernels.tiles import LANES, PIXELS, fill_pixels, load_pixels
 
 _ZERO = np.float32(0.0)
-#: Sums over pixels that the geometry's gradient needs, beside one for each channel.
+#: Sums over pixels that the geometry's gradient needs, besides one for each channel.
 MOMENTS = 6
 
 

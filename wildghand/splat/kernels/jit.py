@@ -10,7 +10,7 @@ from typing import Any
 
 import numba
 
-#: Untyped: what numba says of its own types differs between its versions.
+#: Untyped: the types that numba declares differ between its versions.
 _njit: Any = numba.njit
 _OPTIONS: dict[str, Any] = {"nogil": True, "boundscheck": False, "error_model": "numpy"}
 
@@ -18,7 +18,7 @@ _OPTIONS: dict[str, Any] = {"nogil": True, "boundscheck": False, "error_model": 
 class Kernel:
     """A compiled function that Python calls; it releases the interpreter lock.
 
-    The machine code is kept beside the module or, where that folder is read-only, in the user's
+    The machine code is kept next to the module or, where that folder is read-only, in the user's
     cache folder (`NUMBA_CACHE_DIR` names another). Where neither can be written, every process
     compiles for itself.
     """
@@ -32,8 +32,8 @@ class Kernel:
             self.dispatcher = _njit(**_OPTIONS)(function)
         self._index: Any = getattr(getattr(self.dispatcher, "_cache", None), "_cache_file", None)
         if self._index is not None and hasattr(self._index, "_source_stamp"):
-            # Numba looks at the module of the kernel alone, and at its date rather than its
-            # text, so it would run stale code after a change to what the kernel calls.
+            # Numba checks only the kernel's own module, and its date rather than its text, so it
+            # would run stale code after a change to a function that the kernel calls.
             self._index._source_stamp = sources_digest()
 
     def __call__(self, *args: Any) -> Any:
@@ -47,7 +47,7 @@ class Kernel:
         except Exception:  # no cache, an unreadable one, or another numba inside
             return False
 
-    def compiled_anew(self) -> int:
+    def compiled_here(self) -> int:
         """How many versions this process had to compile."""
         return len(self.dispatcher.signatures) - sum(self.dispatcher.stats.cache_hits.values())
 

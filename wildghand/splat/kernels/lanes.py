@@ -231,7 +231,7 @@ def split_exponent(typingctx: Any, value: Any) -> Any:
 
 @intrinsic
 def atomic_add_one(typingctx: Any, array: Any, index: Any) -> Any:
-    """Adds one to an element of an int64 array that threads share, and returns what it was."""
+    """Adds one to an element of an int64 array that threads share, and returns the value before."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
         pointer = _pointer(context, builder, sig.args[0], *args)

@@ -157,7 +157,7 @@ def project_group(mean, quat, size, alpha, usable, camera, view, projected, to):
 
 @inline
 def store_visible(seen, z, log_alpha, plane, camera, view, projected, to):
-    """Culls what is off screen, or too large or thin, and writes the rest; zeros if culled."""
+    """Culls Gaussians off screen, too large or too thin; writes the others, and zeros if culled."""
     A, B, C = plane.A, plane.B, plane.C
     reach = (log_alpha + _LOG2_255) * _SQUARED_REACH
     reach_x = square_root(reach * A)

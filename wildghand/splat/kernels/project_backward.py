@@ -29,7 +29,7 @@ from wildghand.splat.kernels.rows import (
 
 
 class PlaneGradients(NamedTuple):
-    """Gradients of the loss by what was projected."""
+    """Gradients of the loss by the projected Gaussians."""
 
     means2d: np.ndarray  # (I, N, 2) float32
     shapes: np.ndarray  # (I, N, 3) float32, see `reduce`
@@ -74,7 +74,7 @@ def project_backward(
             for start in range(begin, stop, GROUP):
                 first = min(start, stop - GROUP)
                 (depth,) = load1(depths, i * gaussians + first)
-                # The last group of a piece reaches back; what it saw before counts once.
+                # The last group of a piece reaches back; those that it repeats count once.
                 seen = (depth > 0.0) & (lane_index() >= np.float64(start - first))
                 mean = load3(ellipsoids.means, (of_means + first) * 3)
                 plane, moved, v_quat, v_size, v_t = group_backward(

@@ -29,7 +29,7 @@ _TWO_LN2 = 2.0 * math.log(2.0)
 
 
 class BlendGradients(NamedTuple):
-    """Gradients of the loss by what was blended.
+    """Gradients of the loss by the blended splats.
 
     `shapes`: with the exponent -1/2 (a u^2 + c e^2), u = dx + s dy, e = dy, they are the gradient
     of log a, of log c, and of s times sqrt(c / a). They have no unit, so they fit into float32 for
@@ -46,7 +46,7 @@ class BlendGradients(NamedTuple):
 def reduce_slots(
     worker, counters, ends, geom, depths, opacities, first_entry, slot_of, slots, gradients
 ):
-    """Gradients of the projected Gaussians, summed over images for what images share.
+    """Gradients of the projected Gaussians, summed over images where images share them.
 
     Args:
         worker, counters, ends: see `next_job`; a job is a piece of Gaussians.

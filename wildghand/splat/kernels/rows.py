@@ -64,7 +64,7 @@ load1, load2, load3, load4 = (make_load_columns(columns) for columns in range(1,
 
 
 def _saturated(builder: Any, value: ir.Value) -> ir.Value:
-    """float32 of float64 lanes; what is too large becomes the largest float32."""
+    """float32 of float64 lanes; values that are too large become the largest float32."""
     for sign, bound in (("<", _LARGEST), (">", -_LARGEST)):
         limit = ir.Constant(value.type, [bound] * value.type.count)
         beyond = builder.fcmp_ordered(sign, limit, value)
@@ -157,7 +157,7 @@ def store_column(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
 
 @intrinsic
 def floor(typingctx: Any, value: Any) -> Any:
-    """The largest whole number not above, in every lane."""
+    """The largest integer not above, in every lane."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
         return call(builder, "floor", value, args)
@@ -167,7 +167,7 @@ def floor(typingctx: Any, value: Any) -> Any:
 
 @intrinsic
 def ceil(typingctx: Any, value: Any) -> Any:
-    """The smallest whole number not below, in every lane."""
+    """The smallest integer not below, in every lane."""
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
         return call(builder, "ceil", value, args)

@@ -1,4 +1,4 @@
-"""Vectors of lanes inside numba: what the kernels are written in.
+"""Vectors of lanes inside numba: the types that the kernels are written in.
 
 Numba has no vector type and leaves vectorisation to chance: a signed index or a branch is
 enough for a loop to fall back to one lane, ten times slower. Here a vector is a value of its
@@ -23,7 +23,7 @@ from numba.core.typing.templates import AbstractTemplate, infer_global, signatur
 from numba.extending import intrinsic as numba_intrinsic
 from numba.extending import lower_builtin, models, register_model
 
-#: Untyped: what numba says of its own types differs between its versions.
+#: Untyped: the types that numba declares differ between its versions.
 intrinsic: Any = numba_intrinsic
 
 _LLVM = {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}

@@ -44,8 +44,7 @@ TILE_HEIGHT = BLOCKS // BLOCK_COLUMNS * BLOCK_HEIGHT
 
 #: A vector with one lane for each pixel of a block.
 PIXELS = Vector(types.float32, LANES)
-#: Vectors with one lane for each block of a tile.
-PER_BLOCK = Vector(types.float32, BLOCKS)
+#: A vector with one lane for each block of a tile.
 PER_BLOCK_EXACT = Vector(types.float64, BLOCKS)
 
 fill_pixels = make_fill(PIXELS)
