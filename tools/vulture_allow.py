@@ -32,6 +32,4 @@ _.sharpness  # a field of the pre-pass's judgement file
 _.blur_deviation  # a field of the pre-pass's judgement file
 _.misplacement_deviation  # a field of the pre-pass's judgement file
 _.hidden_deviation  # a field of the pre-pass's judgement file
-LOG_255  # for now: a constant of the rasterizer
-REACH_X  # for now: a row of the rasterizer's records
-PER_BLOCK  # for now: a vector type of the rasterizer's kernels
+REACH_X  # a row of the rasterizer's records, named for the order of the rows
