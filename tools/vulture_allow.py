@@ -26,10 +26,10 @@ _.provenance  # read by the report's template
 _.exact_masks  # a field of result files
 _.holistic  # a fact of the paper's taxonomy, for readers of the API
 _.perfect  # a fact of a metric, which tests compare the score of the truth with
-_.gain_deviation  # a field of the pre-pass's judgement file
-_.residual_deviation  # a field of the pre-pass's judgement file
-_.sharpness  # a field of the pre-pass's judgement file
-_.blur_deviation  # a field of the pre-pass's judgement file
-_.misplacement_deviation  # a field of the pre-pass's judgement file
-_.hidden_deviation  # a field of the pre-pass's judgement file
+_.gain_deviation  # the table CUES names it; getattr reads it
+_.residual_deviation  # a measured cue of the pre-pass, for tests and benchmarks
+_.sharpness  # a measured cue of the pre-pass, for tests and benchmarks
+_.blur_deviation  # the table CUES names it; getattr reads it
+_.misplacement_deviation  # the table CUES names it; getattr reads it
+_.hidden_deviation  # the table CUES names it; getattr reads it
 REACH_X  # a row of the rasterizer's records, named for the order of the rows
