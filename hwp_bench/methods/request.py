@@ -145,8 +145,8 @@ def training_material(capture: Capture, split: Split, choice: str) -> Material:
             where=capture.root,
             remedy="Only simulated captures do; use --frames perturbed.",
         )
-    mended = {side: _mended(hand, truth[side], perturbed) for side, hand in hands.items()}
-    return Material(split.train, "clean", "clean_masks", mended)
+    repaired = {side: _repaired(hand, truth[side], perturbed) for side, hand in hands.items()}
+    return Material(split.train, "clean", "clean_masks", repaired)
 
 
 def _perturbed(capture: Capture) -> np.ndarray:
@@ -163,7 +163,7 @@ def _perturbed(capture: Capture) -> np.ndarray:
     return acts
 
 
-def _mended(
+def _repaired(
     estimate: HandParameters, truth: HandParameters, perturbed: np.ndarray
 ) -> HandParameters:
     return replace(

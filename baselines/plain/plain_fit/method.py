@@ -38,7 +38,7 @@ class PlainMethod:
         self.seed = seed
         self.device = choose_device(self.settings.device)
         if self.device.type == "cpu":
-            # Compiling takes some ten seconds once on a machine; it is no part of a fit.
+            # Compiling takes some ten seconds once on a machine; it is not part of a fit.
             warm_up()
             warm_up_loss()
 

@@ -24,7 +24,7 @@ class PlainSettings:
     shading_degree: int = number(2, 0, MAX_DEGREE)
     #: Share of D-SSIM in the loss; the rest is L1.
     dssim_weight: float = number(0.2, 0.0, 1.0)
-    #: Weight of a pixel outside the visible-hand mask, beside 1 inside.
+    #: Weight of a pixel outside the visible-hand mask; 1 inside.
     outside_weight: float = number(0.03, 0.0, 1.0)
     #: Opacity of every Gaussian at the start.
     initial_opacity: float = number(0.9, 0.01, 0.99)
