@@ -103,4 +103,4 @@ class MissingDependency(HwpError):
 
 
 class DidNotConverge(HwpError):
-    """An optimisation left the range of finite or sensible values."""
+    """An optimization left the range of finite or sensible values."""
