@@ -104,7 +104,7 @@ def plain(training: TrainingCapture, frames: TrainingFrames, count: int) -> Cont
     """Free attributes of every Gaussian, as the plain baseline fits them."""
     sys.path.insert(0, str(find_method("plain")))
     from plain_fit.model import make_model
-    from plain_fit.optimise import learning_rates
+    from plain_fit.optimize import learning_rates
     from plain_fit.settings import PlainSettings
 
     settings = PlainSettings()

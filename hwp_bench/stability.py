@@ -60,7 +60,7 @@ class Case:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class CaseOutcome:
     """One case, run on one backend."""
 
     case: Case
@@ -104,7 +104,7 @@ def find_cases(groups: Sequence[str] = (), providers: Sequence[str] = ()) -> lis
 
 def run_cases(
     cases: Iterable[Case], backends: Sequence[str] = (), clock: Callable[[], float] = time.monotonic
-) -> Iterator[Outcome]:
+) -> Iterator[CaseOutcome]:
     """Run cases one by one, each on every backend that it has, and yield each outcome.
 
     Args:
@@ -121,7 +121,7 @@ def run_cases(
                 measured = case.run(Context(backend))
             except Exception as error:  # an exception is a result too
                 measured = Measured(False, f"raised {type(error).__name__}: {error}")
-            yield Outcome(case, backend, measured, clock() - start)
+            yield CaseOutcome(case, backend, measured, clock() - start)
 
 
 def _load(source: str) -> list[Case]:

@@ -35,7 +35,7 @@ TURNS = {
     r"\bhangs? on\b": "depends on",
     r"\bmended\b": "corrected, repaired",
     r"\boptimis": "optimiz",
-    r'"""What (?:is|was|are|were|the|a|an|it|they|every|one|each|methods|people)\b': "say the thing itself",
+    r'"""What (?:is|was|are|were|the|an?|it|they|every|one|each)\b': "say the thing itself",
 }
 
 

@@ -62,7 +62,7 @@ def test_the_reference_has_every_public_name(site: Path, package: str) -> None:
 
 def test_fields_of_records_are_documented(site: Path) -> None:
     page = (site / "api" / "hwp_bench.methods.html").read_text(encoding="utf-8")
-    assert "Optimiser steps; None keeps the method" in page
+    assert "Optimizer steps; None keeps the method" in page
 
 
 def test_no_page_loads_anything_from_elsewhere(site: Path) -> None:

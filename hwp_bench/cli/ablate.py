@@ -35,7 +35,7 @@ method failed on a capture or left out frames.
 #: Flags of the reference method's switches.
 _FLAGS = {
     "dpd": "take out the dynamic perturbation disentanglement",
-    "pao": "take out the perturbation-aware optimisation",
+    "pao": "take out the perturbation-aware optimization",
     "heads": "take out heads (iii) and (iv)",
 }
 

@@ -78,7 +78,7 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         help="training frames to use; all but the first are oracles on simulated captures",
     )
     parser.add_argument("--budget", type=float, metavar="SECONDS", help="limit of the fit's time")
-    parser.add_argument("--steps", type=int, help="limit of the fit's optimiser steps")
+    parser.add_argument("--steps", type=int, help="limit of the fit's optimizer steps")
     parser.add_argument(
         "--time-limit",
         type=float,

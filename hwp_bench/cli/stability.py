@@ -8,7 +8,7 @@ import sys
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hwp_bench.stability import Case, Outcome
+    from hwp_bench.stability import Case, CaseOutcome
 
 _EXAMPLES = """examples:
   hwp-bench stability
@@ -76,7 +76,7 @@ def _check_backends(cases: list[Case], asked: list[str]) -> None:
             )
 
 
-def _as_object(outcome: Outcome) -> dict[str, Any]:
+def _as_object(outcome: CaseOutcome) -> dict[str, Any]:
     return {
         "group": outcome.case.group,
         "case": outcome.case.name,
@@ -88,7 +88,7 @@ def _as_object(outcome: Outcome) -> dict[str, Any]:
     }
 
 
-def _print(outcomes: list[Outcome]) -> None:
+def _print(outcomes: list[CaseOutcome]) -> None:
     from hwp_bench.base.tables import Column, Table, print_table
 
     titles = ("case", "backend", "what must hold", "measured", "pass")

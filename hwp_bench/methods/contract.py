@@ -100,7 +100,7 @@ class Budget:
 
     #: Seconds on the method's clock, which stands still while checkpoints are scored.
     seconds: float | None = None
-    #: Optimiser steps; None keeps the method's preset.
+    #: Optimizer steps; None keeps the method's preset.
     steps: int | None = None
 
 

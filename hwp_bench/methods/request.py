@@ -96,7 +96,7 @@ def open_request(path: str | os.PathLike[str]) -> TrainingCapture:
 
 
 @dataclass(frozen=True, eq=False)
-class Material:
+class TrainingMaterial:
     """Where the training part of a request comes from."""
 
     #: Indices of the training frames.
@@ -109,7 +109,7 @@ class Material:
     hands: dict[str, HandParameters]
 
 
-def training_material(capture: Capture, split: Split, choice: str) -> Material:
+def training_material(capture: Capture, split: Split, choice: str) -> TrainingMaterial:
     """Return the training part that a method is given of a capture.
 
     Args:
@@ -126,13 +126,13 @@ def training_material(capture: Capture, split: Split, choice: str) -> Material:
         raise UsageError(f"{choice!r} is not one of {', '.join(FRAME_CHOICES)}", field="frames")
     hands = dict(capture.hands)
     if choice == "perturbed":
-        return Material(split.train, "frames", "masks", hands)
+        return TrainingMaterial(split.train, "frames", "masks", hands)
     perturbed = _perturbed(capture)
     if choice == "unperturbed-only":
         train = split.train[~perturbed[split.train]]
         if not len(train):
             raise UsageError("has no unperturbed training frame", where=capture.root)
-        return Material(train, "frames", "masks", hands)
+        return TrainingMaterial(train, "frames", "masks", hands)
     truth = capture.true_hands
     missing = [
         kind
@@ -146,7 +146,7 @@ def training_material(capture: Capture, split: Split, choice: str) -> Material:
             remedy="Only simulated captures do; use --frames perturbed.",
         )
     repaired = {side: _repaired(hand, truth[side], perturbed) for side, hand in hands.items()}
-    return Material(split.train, "clean", "clean_masks", repaired)
+    return TrainingMaterial(split.train, "clean", "clean_masks", repaired)
 
 
 def _perturbed(capture: Capture) -> np.ndarray:

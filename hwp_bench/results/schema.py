@@ -42,7 +42,7 @@ class FrameResult:
 class CurvePoint:
     """The state of a fit at one checkpoint."""
 
-    #: Optimiser steps done.
+    #: Optimizer steps done.
     step: int
     #: Seconds on the method's clock.
     seconds: float
@@ -84,7 +84,7 @@ class CaptureResult:
     score_seconds: float
     #: Seconds of the method's process from start to end.
     wall_seconds: float
-    #: Optimiser steps.
+    #: Optimizer steps.
     steps: int | None
     #: Peak memory of the method's process, bytes.
     peak_memory: int | None

@@ -33,7 +33,7 @@ MAX_BYTES = 10 * 1024 * 1024
 class Checkpoint:
     """One recorded moment of a fit."""
 
-    #: Optimiser steps done.
+    #: Optimizer steps done.
     step: int
     #: Seconds on the method's clock.
     seconds: float
@@ -51,7 +51,7 @@ class RunFacts:
     render_seconds: float | None = None
     #: Seconds spent on checkpoints, outside the method's clock.
     curve_seconds: float | None = None
-    #: Optimiser steps.
+    #: Optimizer steps.
     steps: int | None = None
     #: Peak memory of the process, bytes.
     peak_memory: int | None = None

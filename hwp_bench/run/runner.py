@@ -24,7 +24,7 @@ from hwp_bench.run.sandbox.confinement import (
 from hwp_bench.run.sandbox.supervise import (
     MAX_PROCESSES,
     Limits,
-    Outcome,
+    ProcessOutcome,
     Program,
     remove_odd_files,
     run_confined,
@@ -136,7 +136,7 @@ def _run(
     confinement: Confinement,
     limits: Limits,
     on_progress: Callable[[int, int], None] | None,
-) -> tuple[Outcome, str]:
+) -> tuple[ProcessOutcome, str]:
     """Run in the best sandbox that is asked for and possible; says which it was."""
     command = _command(manifest, request, output)
 

@@ -34,7 +34,7 @@ class FitRecord:
     clean: list[float] = field(default_factory=list)
     #: Weight of each in the fit.
     frame_weights: list[float] = field(default_factory=list)
-    #: Optimiser steps.
+    #: Optimizer steps.
     steps: int = 0
     #: Seconds of fitting.
     seconds: float = 0.0
@@ -107,7 +107,7 @@ class WildGHandAvatar:
 
     @property
     def steps(self) -> int:
-        """Optimiser steps behind it."""
+        """Optimizer steps behind it."""
         return self.record.steps
 
     @property

@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--hand", default="anny", metavar="MODEL", help="hand model for a video: anny or mano:PATH"
     )
-    parser.add_argument("--steps", type=int, help="optimiser steps")
+    parser.add_argument("--steps", type=int, help="optimizer steps")
     parser.add_argument("--seconds", type=float, help="most seconds of fitting")
     parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
     parser.add_argument(

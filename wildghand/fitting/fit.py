@@ -179,7 +179,7 @@ class Fit:
         """The avatar as it stands; it goes on changing with the fit.
 
         Args:
-            steps: optimiser steps behind it.
+            steps: optimizer steps behind it.
             seconds: of fitting.
             final: also record the temporal weights and weight masks of all frames.
         """

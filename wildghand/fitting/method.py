@@ -8,7 +8,7 @@ from typing import Any
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimise import optimise, ready_device
+from wildghand.fitting.optimize import optimize, ready_device
 from wildghand.model.settings import read_settings
 
 
@@ -42,4 +42,4 @@ class WildGHandMethod:
             BadInput: no training frame can be used.
             DidNotConverge: the fit diverged at once.
         """
-        return optimise(Fit(training, self.settings, self.seed, self.device), budget, report)
+        return optimize(Fit(training, self.settings, self.seed, self.device), budget, report)

@@ -13,7 +13,7 @@ import torch
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import atomic_write
-from wildghand.fitting.optimise import Watchers
+from wildghand.fitting.optimize import Watchers
 
 #: Version of the file.
 SCHEMA = "wildghand-fit/1"
@@ -50,7 +50,7 @@ def save_state(
     Args:
         path: the file; it is replaced whole.
         fit, watchers: the fit and what watches it.
-        step: optimiser steps so far.
+        step: optimizer steps so far.
         seconds: of fitting so far.
         digest: of what is fitted and how; another one is refused when read.
     """

@@ -22,7 +22,7 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import save_avatar
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimise import Watchers, optimise, ready_device
+from wildghand.fitting.optimize import Watchers, optimize, ready_device
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.model.settings import WildGHandSettings, read_settings
@@ -155,7 +155,7 @@ def _fit_in(
                 save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
                 saved = time.perf_counter()
 
-        return optimise(
+        return optimize(
             fit, run.budget, clock, start=start, watchers=watchers, after_step=after_step
         )
 

@@ -11,7 +11,7 @@ from torch import Tensor
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit, make_optimizer
-from wildghand.fitting.optimise import Watchers
+from wildghand.fitting.optimize import Watchers
 from wildghand.gaussians.fit_loop import batches
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import PredictionNetwork

@@ -15,7 +15,7 @@ from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.methods.contract import REQUEST, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
-from wildghand.fitting.optimise import Watchers, ready_device
+from wildghand.fitting.optimize import Watchers, ready_device
 from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.fitting.session import SAVE_EVERY, STATE, every_frame
 from wildghand.model.settings import WildGHandSettings, read_settings
@@ -43,7 +43,7 @@ def pretrain(
         out: the folder to make.
         settings: overrides of the defaults of a fit; it starts from random weights unless they
             name a prior.
-        steps: optimiser steps over all captures; None: the settings' number for each capture.
+        steps: optimizer steps over all captures; None: the settings' number for each capture.
         seed: of everything random.
         overwrite: replace a prior that is there.
 

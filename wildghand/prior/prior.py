@@ -35,7 +35,7 @@ class PriorRecord:
     settings: dict[str, Any]
     #: Its seed.
     seed: int
-    #: Its optimiser steps.
+    #: Its optimizer steps.
     steps: int
     #: SHA-256 of the file of weights, hex.
     weights: str

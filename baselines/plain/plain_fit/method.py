@@ -12,7 +12,7 @@ from typing import Any
 
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from plain_fit.model import PlainAvatar, make_model
-from plain_fit.optimise import fit_model
+from plain_fit.optimize import fit_model
 from plain_fit.settings import read_settings
 from wildghand.gaussians.fit_loop import choose_device
 from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss

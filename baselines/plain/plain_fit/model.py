@@ -135,7 +135,7 @@ class PlainAvatar:
 
     Args:
         model: what to draw. While the fit goes on it may be the live one.
-        steps: optimiser steps behind it.
+        steps: optimizer steps behind it.
     """
 
     def __init__(self, model: PlainModel, steps: int) -> None:

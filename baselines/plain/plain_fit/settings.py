@@ -16,7 +16,7 @@ class PlainSettings:
 
     #: Gaussians on each hand.
     gaussians: int = number(12_000, 1, 1_000_000)
-    #: Optimiser steps unless the budget says otherwise.
+    #: Optimizer steps unless the budget says otherwise.
     steps: int = number(2_000, 1, 10_000_000)
     #: Frames in each step.
     batch: int = number(1, 1, 64)

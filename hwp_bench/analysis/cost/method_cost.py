@@ -51,7 +51,7 @@ class MethodCost:
     area: float | None
     #: Seconds of fitting.
     fit_seconds: float | None
-    #: Optimiser steps.
+    #: Optimizer steps.
     steps: float | None
     #: Seconds to render one frame.
     render_seconds: float | None

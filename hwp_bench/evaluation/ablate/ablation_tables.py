@@ -168,7 +168,7 @@ def effect_table(effects: Sequence[ScoreEffect]) -> Table:
 
 def cost_table(costs: Sequence[CostEffect]) -> Table:
     """Return one row a component and quantity."""
-    names = {"step": "optimiser step", "fit": "whole fit", "render": "rendered frame"}
+    names = {"step": "optimizer step", "fit": "whole fit", "render": "rendered frame"}
     columns = (
         Column("Component"),
         Column("Of a"),

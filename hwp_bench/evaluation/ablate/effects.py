@@ -45,7 +45,7 @@ class CostEffect:
 
     #: Title of the effect.
     effect: str
-    #: `step` (seconds per optimiser step), `fit` (seconds of the whole fit) or `render`
+    #: `step` (seconds per optimizer step), `fit` (seconds of the whole fit) or `render`
     #: (seconds per rendered frame).
     quantity: str
     #: Seconds with it, geometric mean over captures, seeds, and the other components.

@@ -63,7 +63,7 @@ class Limits:
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ProcessOutcome:
     """How a program ended."""
 
     #: Exit status, below 0 a signal's number; None where it was stopped or never started.
@@ -76,7 +76,7 @@ class Outcome:
 
 def run_confined(
     program: Program, limits: Limits, on_poll: Callable[[], None] | None = None
-) -> Outcome:
+) -> ProcessOutcome:
     """Run a program to its end; whatever ends it, no process of it is left.
 
     Args:
@@ -115,17 +115,17 @@ def run_confined(
             drain.join(timeout=5)
         text = report.read()
     if stopped is not None:
-        return Outcome(None, stopped)
+        return ProcessOutcome(None, stopped)
     answer: dict[str, Any] = json.loads(text) if text else {"status": process.returncode}
     if answer.get("stage") == "sandbox":
-        return Outcome(None, refused=answer["problem"])
+        return ProcessOutcome(None, refused=answer["problem"])
     if answer.get("stage") == "command":
         raise MethodFailed(
             f"cannot be started ({answer['problem']})",
             where=program.command[0],
             field="entry.command",
         )
-    return Outcome(answer["status"])
+    return ProcessOutcome(answer["status"])
 
 
 def remove_odd_files(folder: Path) -> None:

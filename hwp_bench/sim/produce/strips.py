@@ -15,7 +15,7 @@ from hwp_bench.base.progress import track
 from hwp_bench.sim.effects.base import registered
 from hwp_bench.sim.effects.plan import hands_at
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.render.frame import FrameResult, render_frame
+from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.scene.motion import hand_parameters
 from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
 from hwp_bench.sim.scene.reader import load_scene, scene_names
@@ -87,7 +87,7 @@ def write_gallery(folder: Path) -> list[Path]:
     return paths
 
 
-def _capture_strip(scene: Scene) -> list[FrameResult]:
+def _capture_strip(scene: Scene) -> list[SimulatedFrame]:
     """The middle of the first episodes of each effect in turn, between clean frames."""
     busy = [
         0.5 * (part.start + part.end)
@@ -101,13 +101,13 @@ def _capture_strip(scene: Scene) -> list[FrameResult]:
     return [render_frame(scene, frame, scene.frame_count, GALLERY_SIZE) for frame in frames]
 
 
-def _severity_strip(scene: Scene, kind: str) -> list[FrameResult]:
+def _severity_strip(scene: Scene, kind: str) -> list[SimulatedFrame]:
     """One frame at severity 0 to 5, with nothing else acting."""
     call = scene.effect(kind)
     assert call is not None
     part = call.episodes[0]
     frame = int(0.5 * (part.start + part.end) * scene.frame_count)
-    results: list[FrameResult] = []
+    results: list[SimulatedFrame] = []
     for severity in range(1, MAX_SEVERITY + 1):
         alone = with_severity(with_effects(scene, [kind]), severity)
         result = render_frame(alone, frame, scene.frame_count, GALLERY_SIZE)
@@ -117,12 +117,12 @@ def _severity_strip(scene: Scene, kind: str) -> list[FrameResult]:
     return results
 
 
-def _clean_twin(result: FrameResult) -> FrameResult:
+def _clean_twin(result: SimulatedFrame) -> SimulatedFrame:
     none = dict.fromkeys(result.plan.severity, 0)
     return replace(result, rgb=result.clean, plan=replace(result.plan, severity=none))
 
 
-def _with_estimate(scene: Scene, call: EffectCall, result: FrameResult) -> FrameResult:
+def _with_estimate(scene: Scene, call: EffectCall, result: SimulatedFrame) -> SimulatedFrame:
     """The frame with the joints where an estimator of this severity sees them."""
     import cv2
     import torch
@@ -151,7 +151,7 @@ def _with_estimate(scene: Scene, call: EffectCall, result: FrameResult) -> Frame
     return replace(result, rgb=image)
 
 
-def strip(results: list[FrameResult], columns: int) -> np.ndarray:
+def strip(results: list[SimulatedFrame], columns: int) -> np.ndarray:
     """Frames in rows, left to right, each with its number and what perturbs it."""
     cells = [_captioned(result) for result in results]
     blank = np.zeros_like(cells[0])
@@ -163,7 +163,7 @@ def strip(results: list[FrameResult], columns: int) -> np.ndarray:
     return np.concatenate(rows, axis=0)
 
 
-def _captioned(result: FrameResult) -> np.ndarray:
+def _captioned(result: SimulatedFrame) -> np.ndarray:
     import cv2
 
     image = result.rgb.copy()
@@ -178,7 +178,7 @@ def _captioned(result: FrameResult) -> np.ndarray:
     return image
 
 
-def _animation(results: list[FrameResult]) -> bytes:
+def _animation(results: list[SimulatedFrame]) -> bytes:
     from PIL import Image
 
     frames = [

@@ -21,7 +21,7 @@ SUPERSAMPLING = 2
 
 
 @dataclass(frozen=True, eq=False)
-class FrameResult:
+class SimulatedFrame:
     """Everything that is known about a rendered frame."""
 
     #: (S, S, 3) uint8 sRGB, with its perturbations.
@@ -38,7 +38,7 @@ class FrameResult:
     cost: RenderCost
 
 
-def render_frame(scene: Scene, frame: int, frame_count: int, size: int) -> FrameResult:
+def render_frame(scene: Scene, frame: int, frame_count: int, size: int) -> SimulatedFrame:
     """Render one frame and its clean version.
 
     Args:
@@ -51,7 +51,7 @@ def render_frame(scene: Scene, frame: int, frame_count: int, size: int) -> Frame
     return carry_out(scene, recipe, size)
 
 
-def carry_out(scene: Scene, recipe: FramePlan, size: int) -> FrameResult:
+def carry_out(scene: Scene, recipe: FramePlan, size: int) -> SimulatedFrame:
     """Render a frame by its recipe."""
     cost = RenderCost()
     stage = Stage(scene, cost)
@@ -77,7 +77,7 @@ def carry_out(scene: Scene, recipe: FramePlan, size: int) -> FrameResult:
             things = stage.things(objects_at(scene, recipe, recipe.seconds), hands)
         disturbed = render_instant(scene, lens, body, things, lights_at(scene, recipe), cost)
     images = _developed(scene, recipe, (clean,) if disturbed is clean else (clean, disturbed), cost)
-    return FrameResult(
+    return SimulatedFrame(
         rgb=images[-1],
         clean=images[0],
         coverage=disturbed.coverage,

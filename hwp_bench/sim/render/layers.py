@@ -18,7 +18,7 @@ from hwp_bench.base.errors import HwpError
 from hwp_bench.sim.effects.plan import hands_at, lights_at, objects_at
 from hwp_bench.sim.geometry.raycast import RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import Surface, join
-from hwp_bench.sim.render.frame import FrameResult
+from hwp_bench.sim.render.frame import SimulatedFrame
 from hwp_bench.sim.render.instant import Lens, render_instant
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.optics import intrinsics, pixel_rays, viewmat
@@ -30,7 +30,7 @@ CHANNELS = ("R", "G", "B", "Z", "N.X", "N.Y", "N.Z", "id", "motion.X", "motion.Y
 _RIGHT, _LEFT, _SLEEVE, _OBJECT = 1, 2, 3, 4
 
 
-def frame_layers(scene: Scene, result: FrameResult, frame_count: int, size: int) -> np.ndarray:
+def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: int) -> np.ndarray:
     """Compute the layers of a frame: (S, S, 10) float32 in the order of `CHANNELS`."""
     recipe = result.plan
     stage = Stage(scene, RenderCost())
@@ -72,7 +72,7 @@ def frame_layers(scene: Scene, result: FrameResult, frame_count: int, size: int)
 
 
 def write_layers(
-    path: Path, scene: Scene, result: FrameResult, frame_count: int, size: int
+    path: Path, scene: Scene, result: SimulatedFrame, frame_count: int, size: int
 ) -> None:
     """Write the layers of a frame as OpenEXR (32-bit floats, zip).
 

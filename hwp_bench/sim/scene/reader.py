@@ -18,12 +18,12 @@ from hwp_bench.sim.scene.episodes import clean_share
 from hwp_bench.sim.scene.schema import (
     CLEAN_FROM,
     MIN_CLEAN_SHARE,
-    Camera,
     EffectCall,
     Episode,
     HandKey,
     Light,
     Scene,
+    SceneCamera,
     Seed,
     Sensor,
     Subject,
@@ -137,7 +137,7 @@ class _SceneFile:
     fps: Annotated[float, Meta(ge=1.0, le=240.0)]
     seed: Seed
     subject: Subject
-    camera: Camera
+    camera: SceneCamera
     light: Light
     background: Words
     track: _TrackTable

@@ -62,7 +62,7 @@ class Subject:
 
 
 @dataclass(frozen=True)
-class Camera:
+class SceneCamera:
     """The camera."""
 
     #: Held in a hand (sways and drifts) or standing still.
@@ -184,7 +184,7 @@ class Scene:
     #: Whose hands.
     subject: Subject
     #: The camera.
-    camera: Camera
+    camera: SceneCamera
     #: The light where no effect changes it.
     light: Light
     #: Name of a backdrop.

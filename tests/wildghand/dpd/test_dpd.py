@@ -72,7 +72,7 @@ def test_at_the_start_nothing_changes() -> None:
 def test_learning_starts_although_nothing_changes_at_the_start() -> None:
     torch.manual_seed(0)
     module = DynamicPerturbation(4, 32)
-    optimiser = torch.optim.Adam(module.parameters(), 3e-2)
+    optimizer = torch.optim.Adam(module.parameters(), 3e-2)
     raw = attributes(4, 20)
     target = torch.tensor([0.0, 0.0, 0.3, -0.3])[:, None, None]
     losses = []
@@ -80,12 +80,12 @@ def test_learning_starts_although_nothing_changes_at_the_start() -> None:
         temporal = module.temporal(torch.arange(4))
         colors = module.biases(raw, temporal.z, temporal.omega).logit_colors
         loss = (colors - target).square().mean()
-        optimiser.zero_grad()
+        optimizer.zero_grad()
         loss.backward()
         if not losses:
             assert module.psi.weight.grad.abs().max() > 0.0
             assert module.varphi["logit_colors"].weight.grad.abs().max() == 0.0
-        optimiser.step()
+        optimizer.step()
         losses.append(loss.item())
     assert losses[-1] < 0.05 * losses[0]
 

@@ -26,7 +26,7 @@ from wildghand.fitting import parallel
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.fitting.objective import Objective
-from wildghand.fitting.optimise import Watchers, optimise
+from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, join, run_in_world
 from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
@@ -55,7 +55,7 @@ def fitted(request: Path, changes: dict[str, Any], world: World) -> State:
     settings = read_settings({**TINY, **changes})
     fit = Fit(open_request(request), settings, 0, CPU, world)
     fit.require_same(0)
-    return optimise(fit, Budget(), SilentReport()).model.snapshot()
+    return optimize(fit, Budget(), SilentReport()).model.snapshot()
 
 
 def resumed(request: Path, world: World, state: Path) -> State:
@@ -67,12 +67,12 @@ def resumed(request: Path, world: World, state: Path) -> State:
         if step == 2 and world.is_main:
             save_state(state, half, watched, step=step, seconds=0.0, digest="d")
 
-    optimise(half, Budget(), SilentReport(), watchers=watchers, after_step=save)
+    optimize(half, Budget(), SilentReport(), watchers=watchers, after_step=save)
     world.wait_for_main()
     rest, watchers = Fit(open_request(request), settings, 0, CPU, world), Watchers(0)
     start, _ = load_state(state, rest, watchers, "d")
     rest.require_same(start)
-    return optimise(rest, Budget(), SilentReport(), start=start, watchers=watchers).model.snapshot()
+    return optimize(rest, Budget(), SilentReport(), start=start, watchers=watchers).model.snapshot()
 
 
 class NanObjective(Objective):

@@ -26,7 +26,7 @@ from wildghand.cli.main import main
 from wildghand.fitting import fit_capture
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import WildGHandMethod
-from wildghand.fitting.optimise import Watchers, optimise
+from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.parallel import World
 from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
@@ -120,14 +120,14 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
             raise Stopped
 
     report = SilentReport()
-    whole = optimise(Fit(training, settings, 0, device), Budget(), report)
+    whole = optimize(Fit(training, settings, 0, device), Budget(), report)
     assert [step for step, _ in report.offers] == list(range(31))
     half = Fit(training, settings, 0, device)
     with pytest.raises(Stopped):
-        optimise(half, Budget(), SilentReport(), after_step=stop)
+        optimize(half, Budget(), SilentReport(), after_step=stop)
     rest, watchers = Fit(training, settings, 0, device), Watchers(0)
     assert load_state(tmp_path / "state", rest, watchers, "of this fit") == (17, 1.5)
-    resumed = optimise(rest, Budget(), SilentReport(), start=17, watchers=watchers)
+    resumed = optimize(rest, Budget(), SilentReport(), start=17, watchers=watchers)
     expected, found = whole.model.snapshot(), resumed.model.snapshot()
     assert all(torch.equal(expected[name], found[name]) for name in expected)
     with pytest.raises(BadInput, match="another capture"):

@@ -28,7 +28,7 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimise import Watchers
+from wildghand.fitting.optimize import Watchers
 from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.network import network_settings

@@ -87,8 +87,8 @@ def test_effects_are_those_that_were_put_in(tables) -> None:
 
 def test_costs_are_those_that_were_put_in(tables) -> None:
     found = {(row[0], row[1]): row for row in rows(tables["component_cost"])}
-    assert found["DPD", "optimiser step"][4] == pytest.approx(50)
-    assert found["PAO", "optimiser step"][4] == pytest.approx(10)
+    assert found["DPD", "optimizer step"][4] == pytest.approx(50)
+    assert found["PAO", "optimizer step"][4] == pytest.approx(10)
     assert found["PAO", "whole fit"][2] == pytest.approx(1000 * (11 * 16.5) ** 0.5)
     assert found["DPD", "rendered frame"][4] == pytest.approx(0)
 

@@ -17,7 +17,7 @@ from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SINGLE
 from hwp_bench.base.tables import to_markdown
 from hwp_bench.sim.effects.plan import SUBFRAME_STEP, plan
 from hwp_bench.sim.produce.forecast import forecast, plan_table
-from hwp_bench.sim.render.frame import FrameResult, render_frame
+from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.scene.schema import Scene, Sensor, with_effects
 
 SceneMaker = Callable[..., Scene]
@@ -25,12 +25,12 @@ COUNT, SIZE = 40, 48
 
 
 @pytest.fixture
-def render(make_scene: SceneMaker) -> Callable[[int], FrameResult]:
+def render(make_scene: SceneMaker) -> Callable[[int], SimulatedFrame]:
     scene = make_scene()
     return lambda frame: render_frame(scene, frame, COUNT, SIZE)
 
 
-def test_a_frame_shows_a_hand(render: Callable[[int], FrameResult]) -> None:
+def test_a_frame_shows_a_hand(render: Callable[[int], SimulatedFrame]) -> None:
     result = render(CLEAN)
     assert result.rgb.shape == (SIZE, SIZE, 3)
     assert 0.1 < result.coverage.mean() < 0.6
@@ -41,7 +41,7 @@ def test_a_frame_shows_a_hand(render: Callable[[int], FrameResult]) -> None:
 
 
 def test_an_unperturbed_frame_is_its_clean_version(
-    render: Callable[[int], FrameResult],
+    render: Callable[[int], SimulatedFrame],
 ) -> None:
     result = render(CLEAN)
     assert result.plan.passes == ("hands", "shadow", "sky", "backdrop", "sensor")
@@ -75,7 +75,7 @@ def test_an_effect_changes_its_frames_and_no_other(
         assert before.cost.rays == after.cost.rays
 
 
-def test_rays_are_those_of_the_passes(render: Callable[[int], FrameResult]) -> None:
+def test_rays_are_those_of_the_passes(render: Callable[[int], SimulatedFrame]) -> None:
     clean, thing, blurred = (render(frame).cost.rays for frame in (CLEAN, OBJECT, BLUR))
     assert clean["objects"] == blurred["objects"] == 0 < thing["objects"]
     assert thing["sky"] == clean["sky"] == blurred["sky"]
@@ -114,7 +114,7 @@ def test_blur_moves_light_but_makes_none(make_scene: SceneMaker) -> None:
     assert partial.sum() > clean_partial.sum()
 
 
-def test_an_object_covers_what_the_mask_loses(render: Callable[[int], FrameResult]) -> None:
+def test_an_object_covers_what_the_mask_loses(render: Callable[[int], SimulatedFrame]) -> None:
     result = render(OBJECT)
     lost = result.clean_coverage - result.coverage
     assert lost.min() > -1e-9

@@ -20,7 +20,7 @@ from hwp_bench.sim.effects.plan import plan
 from hwp_bench.sim.geometry.raycast import RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import Surface, plain
 from hwp_bench.sim.render.exposure import knots, row_by_row
-from hwp_bench.sim.render.frame import FrameResult, render_frame
+from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.render.instant import Lens, render_instant
 from hwp_bench.sim.render.stage import Body
 from hwp_bench.sim.scene.optics import steady_light
@@ -43,7 +43,7 @@ def with_sensor(make_scene: SceneMaker) -> Callable[[str], Scene]:
     return make
 
 
-def _same(one: FrameResult, other: FrameResult) -> None:
+def _same(one: SimulatedFrame, other: SimulatedFrame) -> None:
     for name in ("rgb", "clean", "coverage", "clean_coverage"):
         np.testing.assert_array_equal(getattr(one, name), getattr(other, name))
     assert one.cost.rays == other.cost.rays

@@ -1,4 +1,4 @@
-"""The optimisation of the plain avatar: Adam over random batches of frames."""
+"""The optimization of the plain avatar: Adam over random batches of frames."""
 
 from __future__ import annotations
 

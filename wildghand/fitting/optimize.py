@@ -61,7 +61,7 @@ def ready_device(name: str) -> torch.device:
     return device
 
 
-def optimise(
+def optimize(
     fit: Fit,
     budget: Budget,
     report: Report,
