@@ -32,7 +32,7 @@ _HOMES = {
     "evaluate": "hwp_bench.api",
     "open_capture": "hwp_bench.capture",
     "read_results": "hwp_bench.results",
-    "render_capture": "hwp_bench.sim",
+    "render_capture": "hwp_bench.sim.produce.production",
     "score": "hwp_bench.api",
 }
 
