@@ -92,8 +92,9 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError(f"{args.seeds} is not between 1 and 100", field="--seeds")
     args.seed = 0
     settings = evaluation_settings(args)
-    # A wrong method or switch must be said before a suite is rendered for it.
+    # A wrong method, setting or switch must be reported before a suite is rendered for it.
     manifest = read_manifest(find_method(args.method))
+    manifest.check_setting_names(settings.run.settings, "--set")
     design = make_design(manifest, args.thrown or [], args.only)
     out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}")
     splits = read_splits(args.splits) if args.splits else None

@@ -126,7 +126,7 @@ def run(args: argparse.Namespace) -> int:
     if sealed is not None:
         settings = replace(settings, suite=f"sealed-{sealed.commitment[:12]}")
     # A wrong method directory is reported before a suite is rendered for it.
-    read_manifest(find_method(args.method))
+    read_manifest(find_method(args.method)).check_setting_names(settings.run.settings, "--set")
     method = Path(args.method.rstrip("/")).name
     oracle = "" if args.frames == "perturbed" else f"-{args.frames}"
     out = Path(args.out or f"runs/{method}-{settings.suite}{oracle}")

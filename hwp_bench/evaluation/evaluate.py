@@ -149,12 +149,14 @@ def make_plan(
         networks: LPIPS by backbone; None loads those whose weights are there.
 
     Raises:
-        BadMethod: there is no such preset, or an override is not a plain value.
+        BadMethod: there is no such preset, or an override is not a plain value or not a setting
+            of the method.
     """
     preset = manifest.preset(settings.preset, settings.suite)
     check_json_values(
         dict(settings.run.settings), where=manifest.name, field="settings", error=BadMethod
     )
+    manifest.check_setting_names(settings.run.settings)
     chosen = {**manifest.presets.get(preset, {}), **settings.run.settings}
     run = replace(settings.run, settings=chosen)
     known = load_available() if networks is None else networks

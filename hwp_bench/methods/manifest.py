@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import difflib
+import itertools
 import os
 import tomllib
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -98,6 +100,38 @@ class MethodManifest:
     licence: str = ""
     #: Its page; empty where the file does not say.
     url: str = ""
+    #: Names of its settings, dotted within tables; empty where the file does not say. A name
+    #: stands for everything below it.
+    settings: tuple[str, ...] = ()
+
+    def check_setting_names(self, values: Mapping[str, Any], field: str = "settings") -> None:
+        """Refuse a setting that the method does not have, before anything runs.
+
+        Methods that do not list their settings take any; the values are the method's to check.
+
+        Args:
+            values: settings by name; `a.b` and tables within tables are the same.
+            field: where they come from, for the message.
+
+        Raises:
+            BadMethod: a name is not in `settings`; the message says which one is close.
+        """
+        known, tables = set(self.settings), {name.rpartition(".")[0] for name in self.settings}
+        for name in _names(values) if self.settings else ():
+            above = itertools.accumulate(name.split("."), "{}.{}".format)
+            if name in tables or not known.isdisjoint(above):
+                continue
+            last = {other.rpartition(".")[2]: other for other in self.settings}
+            close = difflib.get_close_matches(name, self.settings, n=1, cutoff=0.75)
+            close = close or [last[word] for word in difflib.get_close_matches(name, last, n=1)]
+            raise BadMethod(
+                f"{name[:100]!r} is not a setting of {self.name}",
+                where=self.root / MANIFEST,
+                field=field,
+                remedy=f"Did you mean {close[0]!r}?"
+                if close
+                else f"Known: {', '.join(self.settings)}.",
+            )
 
     def preset(self, name: str | None, suite: str = "") -> str:
         """Return the name of the preset to use.
@@ -187,7 +221,7 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
     if table.entry.predictions is not None:
         inside(root, table.entry.predictions)
     _check_plain(table.presets, where, "presets")
-    return MethodManifest(
+    manifest = MethodManifest(
         root=root,
         name=table.name,
         title=table.name if table.title is None else table.title,
@@ -199,7 +233,22 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         authors=table.authors,
         licence=table.licence,
         url=table.url,
+        settings=tuple(table.settings),
     )
+    for name, preset in manifest.presets.items():
+        manifest.check_setting_names(preset, f"presets.{name}")
+    for name, switch in manifest.switches.items():
+        manifest.check_setting_names(switch.settings, f"switches.{name}")
+    return manifest
+
+
+def _names(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
+    """The dotted names of all values in tables within tables."""
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value:
+            yield from _names(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}"
 
 
 def _switches(tables: Mapping[str, _SwitchTable], where: Path) -> dict[str, Switch]:
@@ -271,5 +320,6 @@ class _Manifest:
     authors: Line = ""
     licence: Line = ""
     url: Line = ""
+    settings: list[_SettingName] = field(default_factory=list)
     presets: dict[str, dict[str, Any]] = field(default_factory=dict)
     switches: dict[_SwitchName, _SwitchTable] = field(default_factory=dict)

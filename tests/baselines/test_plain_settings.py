@@ -68,3 +68,8 @@ def test_every_setting_has_a_line_of_documentation() -> None:
     for field in dataclasses.fields(PlainSettings):
         row = next(i for i, line in enumerate(lines) if line.startswith(f"    {field.name}:"))
         assert lines[row - 1].strip().startswith("#:"), field.name
+
+
+def test_the_manifest_lists_every_setting() -> None:
+    listed = read_manifest(find_method("plain")).settings
+    assert list(listed) == [field.name for field in dataclasses.fields(PlainSettings)]

@@ -142,8 +142,17 @@ class WildGHandAvatar:
         rgba = torch.cat((image, coverage), dim=-1)[0]
         return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
 
+    @property
+    def gaussians(self) -> PosedGaussians:
+        """The Gaussians in the rest pose of the hand model, one hand after the other."""
+        rest = {
+            side: HandPose(side, np.zeros((16, 3)), betas, np.zeros(3))
+            for side, betas in self.betas.items()
+        }
+        return self.pose(rest)
+
     @torch.no_grad()
-    def gaussians(self, hands: Mapping[str, HandPose]) -> PosedGaussians:
+    def pose(self, hands: Mapping[str, HandPose]) -> PosedGaussians:
         """Pose the Gaussians of the given hands, one hand after the other.
 
         Args:

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
             for side, hand in capture.hands.items()
             if side in avatar.sides
         }
-    posed = avatar.gaussians(hands)
+    posed = avatar.pose(hands)
     write_ply(args.ply, posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
     print(f"{args.ply}: {len(posed)} Gaussians")
     return 0

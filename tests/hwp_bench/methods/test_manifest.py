@@ -200,3 +200,40 @@ def test_faults_of_switches_are_named(tmp_path: Path, old: str, new: str, proble
     with pytest.raises(BadMethod) as caught:
         read_manifest(_write(tmp_path, GOOD + SWITCHES.replace(old, new)))
     assert problem in str(caught.value)
+
+
+def test_a_wrong_setting_is_refused_by_the_list_of_the_method(tmp_path: Path) -> None:
+    (tmp_path / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "listed"\nsettings = ["steps", "light.degree", "former"]\n'
+        '[entry]\npython = "a:b"\n[presets.default]\nlight.degree = 2\n'
+    )
+    manifest = read_manifest(tmp_path)
+    manifest.check_setting_names({"steps": 3, "light.degree": 1, "former.name": 0})
+    manifest.check_setting_names({"light": {"degree": 1}})
+    with pytest.raises(BadMethod, match=r"--set: 'step' is not a setting.*Did you mean 'steps'"):
+        manifest.check_setting_names({"step": 3}, "--set")
+    with pytest.raises(BadMethod, match=r"'light.degre' is not .*Did you mean 'light.degree'"):
+        manifest.check_setting_names({"light": {"degre": 1}})
+    with pytest.raises(BadMethod, match=r"'degree' is not .*Did you mean 'light.degree'"):
+        manifest.check_setting_names({"degree": 1})
+    with pytest.raises(BadMethod, match=r"Known: steps, light.degree, former"):
+        manifest.check_setting_names({"xyz": 1})
+
+
+def test_presets_and_switches_must_have_listed_settings(tmp_path: Path) -> None:
+    head = 'schema = "hwp-method/1"\nname = "listed"\nsettings = ["steps"]\n'
+    entry = '[entry]\npython = "a:b"\n'
+    for table, field in (
+        ("[presets.quick]\nstep = 3\n", "presets.quick"),
+        ("[switches.few]\nsettings_on = { step = 3 }\n", "switches.few"),
+    ):
+        (tmp_path / "method.toml").write_text(head + entry + table)
+        with pytest.raises(BadMethod, match=f"{field}: 'step' is not a setting"):
+            read_manifest(tmp_path)
+
+
+def test_a_method_without_a_list_takes_any_setting(tmp_path: Path) -> None:
+    (tmp_path / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "free"\n[entry]\npython = "a:b"\n'
+    )
+    read_manifest(tmp_path).check_setting_names({"anything": {"at": "all"}})

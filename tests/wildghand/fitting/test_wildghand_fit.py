@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.spatial
 import torch
 from painted import FRAMES, SIZE, SilentReport
 
@@ -235,7 +236,7 @@ def test_posed_gaussians_are_what_is_drawn(hands: str, make_training: TrainingMa
     training = make_training(hands)
     avatar = fitted(training, steps=2)
     poses, camera = training.hand_poses(3), training.camera(3)
-    posed = avatar.gaussians(poses)
+    posed = avatar.pose(poses)
     count = len(training.sides) * QUICK["gaussians"]
     assert len(posed) == count
     shapes = [np.shape(array) for array in (posed.means, posed.quats, posed.scales, posed.colors)]
@@ -254,6 +255,11 @@ def test_posed_gaussians_are_what_is_drawn(hands: str, make_training: TrainingMa
     )
     drawn = torch.cat((image, coverage), dim=-1)[0].clamp(0.0, 1.0).numpy()
     np.testing.assert_allclose(drawn, avatar.render(poses, camera), atol=1e-6)
+    rest = avatar.gaussians
+    assert len(rest) == count
+    # At rest every Gaussian lies near the template, whose shape `betas` moves by millimetres.
+    vertices = np.concatenate([training.template(side).vertices for side in training.sides])
+    assert scipy.spatial.cKDTree(vertices).query(rest.means)[0].max() < 0.02
 
 
 def test_settings_of_presets_and_switches() -> None:

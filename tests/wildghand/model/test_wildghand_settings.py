@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from hwp_bench.base.errors import BadMethod
+from hwp_bench.methods.manifest import find_method, read_manifest
 from wildghand.model.former_settings import NAMES, TABLES, flattened
 from wildghand.model.settings import (
     MODES,
@@ -252,3 +253,9 @@ def test_stored_settings_of_version_1_say_what_ran(
     changes: dict[str, Any], today: dict[str, Any]
 ) -> None:
     assert read_version_1(version_1(**changes)) == read_settings(today)
+
+
+@pytest.mark.parametrize("name", ["wildghand", "interaction-gaussian"])
+def test_the_manifest_lists_every_setting_and_every_former_name(name: str) -> None:
+    listed = read_manifest(find_method(name)).settings
+    assert list(listed) == ["mode", *EVERY, *NAMES, "binary_mask", *TABLES]
