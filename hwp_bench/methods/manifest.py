@@ -121,17 +121,25 @@ class MethodManifest:
             above = itertools.accumulate(name.split("."), "{}.{}".format)
             if name in tables or not known.isdisjoint(above):
                 continue
-            last = {other.rpartition(".")[2]: other for other in self.settings}
-            close = difflib.get_close_matches(name, self.settings, n=1, cutoff=0.75)
-            close = close or [last[word] for word in difflib.get_close_matches(name, last, n=1)]
             raise BadMethod(
                 f"{name[:100]!r} is not a setting of {self.name}",
                 where=self.root / MANIFEST,
                 field=field,
-                remedy=f"Did you mean {close[0]!r}?"
-                if close
-                else f"Known: {', '.join(self.settings)}.",
+                remedy=self._nearest_settings(name),
             )
+
+    def _nearest_settings(self, wrong: str) -> str:
+        """Say which setting was probably meant, or which there are in its place."""
+        last = {name.rpartition(".")[2]: name for name in self.settings}
+        close = difflib.get_close_matches(wrong, self.settings, n=1, cutoff=0.75)
+        close = close or [last[word] for word in difflib.get_close_matches(wrong, last, n=1)]
+        if close:
+            return f"Did you mean {close[0]!r}?"
+        table = wrong.rpartition(".")[0]
+        known = [name for name in self.settings if name.rpartition(".")[0] == table]
+        if not table or not known:
+            known = list(dict.fromkeys(name.partition(".")[0] for name in self.settings))
+        return f"Known: {', '.join(known)}."
 
     def preset(self, name: str | None, suite: str = "") -> str:
         """Return the name of the preset to use.

@@ -216,8 +216,10 @@ def test_a_wrong_setting_is_refused_by_the_list_of_the_method(tmp_path: Path) ->
         manifest.check_setting_names({"light": {"degre": 1}})
     with pytest.raises(BadMethod, match=r"'degree' is not .*Did you mean 'light.degree'"):
         manifest.check_setting_names({"degree": 1})
-    with pytest.raises(BadMethod, match=r"Known: steps, light.degree, former"):
+    with pytest.raises(BadMethod, match=r"Known: steps, light, former"):
         manifest.check_setting_names({"xyz": 1})
+    with pytest.raises(BadMethod, match=r"Known: light.degree\.$"):
+        manifest.check_setting_names({"light.xyz": 1})
 
 
 def test_presets_and_switches_must_have_listed_settings(tmp_path: Path) -> None:
