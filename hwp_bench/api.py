@@ -7,17 +7,20 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping, Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 
 from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
+from hwp_bench.base.progress import JobsView
 from hwp_bench.base.tables import write_tables
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.evaluate import EvaluationSettings
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
 from hwp_bench.methods.contract import Budget, RunSettings
+from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.evaluation_tables import HEADLINE, all_tables
 from hwp_bench.results import Results, read_all
@@ -65,6 +68,7 @@ def evaluate(
 
     Returns:
         The results, which `out/results.json` then holds; tables are written to `out/tables`.
+        Progress is shown on standard error.
 
     Raises:
         BadMethod: the method directory or a setting is wrong.
@@ -75,8 +79,10 @@ def evaluate(
     name = Path(os.fspath(method)).name
     suite = captures if isinstance(captures, str) and captures in suite_names() else "captures"
     folder = Path(out) if out is not None else Path("runs") / f"{name}-{suite}"
-    engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs)
-    with engine:
+    read_manifest(find_method(os.fspath(method))).check_setting_names(settings or {})
+    view = JobsView()
+    engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
+    with engine, view if engine.in_turn else nullcontext():
         paths = ensure_suite(suite, engine=engine) if suite != "captures" else _folders(captures)
         results = evaluate_method(
             os.fspath(method),
@@ -87,6 +93,7 @@ def evaluate(
                 preset=preset,
                 run=RunSettings(dict(settings or {}), seed, Budget(seconds, steps), frames),
             ),
+            on_capture=view.turn if engine.in_turn else None,
             engine=engine,
         )
     write_tables(folder / "tables", all_tables([results]))

@@ -14,7 +14,7 @@ from typing import Any
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import canonical_json, inside, read_json, write_json
 from hwp_bench.base.records import parse_record, without_schema
-from hwp_bench.metrics.aggregate import CaptureScores
+from hwp_bench.metrics.aggregate import CaptureScores, Scores, aggregate
 
 #: Version of the result file.
 SCHEMA = "hwp-results/1"
@@ -122,7 +122,7 @@ class MethodId:
     settings: dict[str, Any]
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Results:
     """One evaluation: a method on a set of captures."""
 
@@ -147,6 +147,26 @@ class Results:
     captures: list[CaptureResult]
     #: Version of the toolkit.
     toolkit: str
+
+    def __repr__(self) -> str:
+        count, failed = len(self.captures), sum(item.failed_frames for item in self.captures)
+        psnr = self.scores.get("psnr")
+        parts = [
+            f"{self.method.title} on {self.suite}",
+            f"{count} capture{'' if count == 1 else 's'}",
+            f"seed {self.seed}",
+            *([] if psnr is None else [f"PSNR {psnr:.2f} dB"]),
+            *([f"{failed} failed frames"] if failed else []),
+        ]
+        return f"Results({', '.join(parts)})"
+
+    @property
+    def scores(self) -> Scores:
+        """Mean of each metric over the perturbations; over the captures where there is none."""
+        if not self.captures:
+            return {}
+        overall = aggregate(score_rows(self)).overall
+        return overall.macro or overall.capture_mean
 
     @property
     def metrics(self) -> list[str]:

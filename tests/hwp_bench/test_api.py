@@ -95,6 +95,22 @@ def test_evaluate_takes_captures_and_folders_and_resumes(
     )
     assert again.captures == results.captures
     assert hwp_bench.read_results(tmp_path / "out") == again
+    psnr = results.captures[0].frames[0].scores["psnr"]
+    assert results.scores["psnr"] == pytest.approx(psnr, abs=1.0)
+    assert repr(results).startswith("Results(gray on captures, 1 capture, seed 0, PSNR ")
+    with pytest.raises(hwp_bench.HwpError, match="is not a setting of plain"):
+        hwp_bench.evaluate("plain", "mini", settings={"stps": 3})
+
+
+def test_a_table_that_is_given_in_part_keeps_the_rest(
+    gray_method: Path, make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    manifest = gray_method / "method.toml"
+    manifest.write_text(manifest.read_text() + "light = { degree = 2, rate = 0.1 }\n")
+    capture = make_capture(frames=20, size=48)
+    changes = {"light": {"rate": 0.2}}
+    results = hwp_bench.evaluate(gray_method, capture, tmp_path / "out", settings=changes)
+    assert results.method.settings == {"gray": 0.5, "light": {"degree": 2, "rate": 0.2}}
 
 
 def test_score_takes_float_images(make_capture: CaptureMaker) -> None:
