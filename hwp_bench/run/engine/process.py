@@ -180,7 +180,7 @@ def main() -> int:
     work, inputs, output, messages, parent, folders = pickle.load(sys.stdin.buffer)
     threading.Thread(target=_watch, args=(parent, folders), daemon=True).start()
     try:
-        work(inputs, output, _Note(messages / PROGRESS))
+        work(inputs, output, _Note(messages / PROGRESS, parent))
     except HwpError as error:
         write_json(messages / FAILURE, error_record(error))
         return 1
@@ -193,13 +193,16 @@ def main() -> int:
 
 
 class _Note:
-    """Writes down how far the job is, not too often."""
+    """Writes down how far the job is, not too often; an orphan is stopped at its next step."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, parent: int) -> None:
         self._path = path
+        self._parent = parent
         self._next = 0.0
 
     def __call__(self, done: int, total: int) -> None:
+        if os.getppid() != self._parent:
+            raise KeyboardInterrupt
         if (now := time.monotonic()) >= self._next:
             self._next = now + LOOK_SECONDS
             with contextlib.suppress(HwpError):
