@@ -16,7 +16,10 @@ def command_tree() -> Command:
         "interhand26m": Command("make a capture of InterHand2.6M", f"{here}.import_interhand"),
         "video": Command("make a capture of a video", f"{here}.import_video"),
     }
-    hands = {"convert": Command("express hands in another hand model", f"{here}.hands_convert")}
+    hands = {
+        "convert": Command("express hands in another hand model", f"{here}.hands_convert"),
+        "export": Command("write the hands of a frame as a mesh", f"{here}.hands_export"),
+    }
     data = {
         "check": Command("check a capture and say what is wrong", f"{here}.data_check"),
         "show": Command("draw a contact sheet of a capture", f"{here}.data_show"),
