@@ -17,6 +17,7 @@ from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
 from wildghand.fitting.weighting import Weighting, assess_frames
+from wildghand.gaussians.fit_loop import repeatable
 from wildghand.gaussians.training import TrainingClip, load_frames
 from wildghand.model.assemble import make_model
 from wildghand.model.model import RenderedFrames, WildGHandModel
@@ -99,7 +100,8 @@ class Fit:
         if not math.isfinite(value):
             return value
         self.optimizer.zero_grad(set_to_none=True)
-        loss.backward()
+        with repeatable(self.device):
+            loss.backward()
         average_gradients(
             (tensor for group in self.optimizer.param_groups for tensor in group["params"]), world
         )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import importlib.util
 import math
 from collections.abc import Iterator
@@ -38,6 +39,29 @@ def choose_device(name: str) -> torch.device:
             remedy="Use device = auto or cpu, or install the extra `cuda`.",
         )
     return torch.device("cuda" if ready else "cpu")
+
+
+@contextlib.contextmanager
+def repeatable(device: torch.device) -> Iterator[None]:
+    """Make gradients on the CPU the same bit for bit every time, on several threads too.
+
+    Where a tensor is read through an index, PyTorch adds up the gradient of large tensors with
+    atomic additions, in whatever order its threads come. On CUDA this does nothing.
+    """
+    if device.type != "cpu":
+        yield
+        return
+    filling: Any = torch.utils.deterministic
+    before = torch.are_deterministic_algorithms_enabled(), filling.fill_uninitialized_memory
+    warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
+    torch.use_deterministic_algorithms(True)
+    # Filling new memory with NaN costs time and changes no result.
+    filling.fill_uninitialized_memory = False
+    try:
+        yield
+    finally:
+        torch.use_deterministic_algorithms(before[0], warn_only=warn_only)
+        filling.fill_uninitialized_memory = before[1]
 
 
 def spent(step: int, steps: int, budget: Budget, report: Report) -> float:

@@ -10,7 +10,7 @@ from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from plain_fit.model import PlainAvatar, PlainModel
 from plain_fit.settings import PlainSettings
-from wildghand.gaussians.fit_loop import Guard, batches, spent
+from wildghand.gaussians.fit_loop import Guard, batches, repeatable, spent
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
 
@@ -77,7 +77,8 @@ def fit_model(
             notice(f"The fit diverged at step {step}; the state of step {guard.step} is kept.")
             return PlainAvatar(model, guard.step)
         optimizer.zero_grad()
-        loss.backward()
+        with repeatable(device):
+            loss.backward()
         optimizer.step()
         _clamp(model)
         step += 1

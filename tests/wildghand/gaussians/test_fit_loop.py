@@ -10,7 +10,7 @@ from painted import painted_avatar
 
 from hwp_bench.base.errors import DidNotConverge
 from plain_fit.model import PlainModel
-from wildghand.gaussians.fit_loop import MAX_RISE, WINDOW, Guard
+from wildghand.gaussians.fit_loop import MAX_RISE, WINDOW, Guard, repeatable
 
 
 @pytest.fixture(scope="module")
@@ -63,3 +63,28 @@ def test_a_parameter_that_is_no_number_is_divergence(model: PlainModel) -> None:
 def test_without_any_good_state_there_is_only_the_error() -> None:
     with pytest.raises(DidNotConverge, match="first 50 steps"):
         Guard().best()
+
+
+def test_gradients_of_large_reads_repeat_on_several_threads() -> None:
+    # Oracle: one thread. Many readers of few rows, so that threads meet at every row.
+    generator = torch.Generator().manual_seed(0)
+    values = torch.randn(64, 32, generator=generator)
+    index = torch.randint(64, (200_000,), generator=generator)
+    weights = torch.randn(200_000, 32, generator=generator)
+
+    def gradient() -> torch.Tensor:
+        table = values.clone().requires_grad_()
+        with repeatable(table.device):
+            (table[index] * weights).sum().backward()
+        assert table.grad is not None
+        return table.grad
+
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(1)
+        expected = gradient()
+        torch.set_num_threads(4)
+        assert all(torch.equal(gradient(), expected) for _ in range(5))
+    finally:
+        torch.set_num_threads(threads)
+    assert not torch.are_deterministic_algorithms_enabled()
