@@ -191,8 +191,10 @@ def _expected(kind: Any, metas: tuple[Any, ...]) -> str:
         return f"a list of {len(parts)}"
     words = {bool: "true or false", int: "an integer", float: "a finite number", str: "a text"}
     words |= {list: "a list", tuple: "a list", dict: "a table", type(None): "null"}
-    if kind is str and "max_length" in rules:
-        return f"a text of {rules.get('min_length', 0)} to {rules['max_length']:,} characters"
+    least, most = rules.get("min_length", 0), rules.get("max_length")
+    if least or most is not None:
+        size = f"at least {least:,}" if most is None else f"{least:,} to {most:,}"
+        return f"{words[origin or kind]} of {size} {'characters' if kind is str else 'entries'}"
     sides = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
     limits = {name: value for name, value in rules.items() if abs(value) < _LARGEST}
     if {"ge", "le"} == limits.keys():

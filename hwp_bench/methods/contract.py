@@ -6,12 +6,14 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 
 import numpy as np
+from msgspec import Meta
 
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import read_gray, read_rgb
+from hwp_bench.base.records import Line
 from hwp_bench.capture.schema import CAMERAS, HANDS, SIDES, HandModelId, image_path
 from hwp_bench.capture.splits import Split
 from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 REQUEST = "request.json"
 #: Training frames as they were captured; their clean versions; only those without perturbation.
 FRAME_CHOICES = ("perturbed", "clean", "unperturbed-only")
+
+_Pixels = Annotated[int, Meta(ge=1, le=65_536)]
 
 
 class Method(Protocol):
@@ -118,6 +122,36 @@ class RunSettings:
     frames: str = FRAME_CHOICES[0]
 
 
+@dataclass(frozen=True)
+class RequestRecord:
+    """The fields of `request.json`, but for its schema."""
+
+    #: Id of the capture.
+    id: Line
+    #: The hands that it shows.
+    hands: Literal["right", "left", "both"]
+    #: Frame width, px.
+    width: _Pixels
+    #: Frame height, px.
+    height: _Pixels
+    #: Frames per second.
+    fps: Annotated[float, Meta(gt=0.0)]
+    #: The hand model that the parameters belong to.
+    hand_model: HandModelId
+    #: The split; `Split.from_json` checks it.
+    split: Any
+    #: Settings of the method.
+    settings: dict[str, Any]
+    #: Seed of everything random.
+    seed: int
+    #: When to stop fitting.
+    budget: Budget
+    #: Which training frames are given.
+    frames: Line
+    #: Indices of the training frames.
+    train: list[Annotated[int, Meta(ge=0)]]
+
+
 class TrainingCapture:
     """The part of a capture that a method sees.
 
@@ -135,23 +169,24 @@ class TrainingCapture:
         run: settings, seed and budget.
     """
 
-    def __init__(self, root: Path, value: Mapping[str, Any]) -> None:
+    def __init__(self, root: Path, record: RequestRecord) -> None:
         self.root = root
-        self.id: str = value["id"]
-        self.sides: tuple[str, ...] = SIDES[value["hands"]]
-        self.width: int = value["width"]
-        self.height: int = value["height"]
-        self.fps: float = value["fps"]
-        self.hand_model = HandModelId(**value["hand_model"])
-        self.split = Split.from_json(value["split"], where=os.fspath(root / REQUEST))
+        self.id = record.id
+        self.sides: tuple[str, ...] = SIDES[record.hands]
+        self.width, self.height = record.width, record.height
+        self.fps = record.fps
+        self.hand_model = record.hand_model
+        self.split = Split.from_json(record.split, where=os.fspath(root / REQUEST))
         self.hands: dict[str, HandParameters] = read_hands(
             root / HANDS, self.sides, self.split.frame_count
         )
         self.cameras: Cameras = read_cameras(root / CAMERAS, self.split.frame_count)
-        self.run = RunSettings(
-            value["settings"], value["seed"], Budget(**value["budget"]), value["frames"]
-        )
-        self._train = np.array(value["train"], dtype=np.int64)
+        self.run = RunSettings(record.settings, record.seed, record.budget, record.frames)
+        self._train = np.array(record.train, dtype=np.int64)
+        if not np.isin(self._train, self.split.train).all():
+            raise BadInput(
+                "has a frame that the split does not train on", where=root / REQUEST, field="train"
+            )
 
     @property
     def train(self) -> np.ndarray:

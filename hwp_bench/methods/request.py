@@ -22,11 +22,18 @@ import numpy as np
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, read_rgb
+from hwp_bench.base.records import parse_record, without_schema
 from hwp_bench.capture.schema import CAMERAS, HANDS, IMAGE_FOLDERS, image_path
 from hwp_bench.capture.splits import Split
 from hwp_bench.capture.tracks import write_cameras, write_hands
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.methods.contract import FRAME_CHOICES, REQUEST, RunSettings, TrainingCapture
+from hwp_bench.methods.contract import (
+    FRAME_CHOICES,
+    REQUEST,
+    RequestRecord,
+    RunSettings,
+    TrainingCapture,
+)
 
 if TYPE_CHECKING:
     from hwp_bench.capture import Capture
@@ -86,13 +93,9 @@ def open_request(path: str | os.PathLike[str]) -> TrainingCapture:
         BadInput: it is not a request of this version, or damaged.
     """
     root = Path(path)
-    value = read_json(root / REQUEST)
-    if not isinstance(value, dict) or value.get("schema") != SCHEMA:
-        raise BadInput(f"is not a request of schema {SCHEMA}", where=root / REQUEST)
-    try:
-        return TrainingCapture(root, value)
-    except (KeyError, TypeError) as error:
-        raise BadInput(f"lacks or has a wrong field ({error})", where=root / REQUEST) from error
+    where = root / REQUEST
+    value = without_schema(read_json(where), SCHEMA, where=where, error=BadInput)
+    return TrainingCapture(root, parse_record(RequestRecord, value, where=where, error=BadInput))
 
 
 @dataclass(frozen=True, eq=False)

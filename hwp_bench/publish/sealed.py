@@ -6,10 +6,13 @@ import os
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import read_json
+from hwp_bench.base.records import Line, Record, parse_record, without_schema
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.schema import check_id
 from hwp_bench.capture.splits import Split
@@ -49,19 +52,16 @@ def open_sealed(
     root = Path(path)
     root = root / "sealed" if (root / "sealed" / KEY).is_file() else root
     key = root / KEY
-    value = _read(key, SEALED_SCHEMA)
-    salt = value.get("salt")
-    if not isinstance(salt, str) or len(salt) < 2 * SALT_BYTES:
-        raise BadInput("is missing or too short", where=key, field="salt")
+    record = _read(key, SEALED_SCHEMA, _SealedKey)
     captures, splits, commitments = [], {}, []
-    for entry in _entries(value, key):
-        name, split = entry["id"], Split.from_json(entry.get("split"), where=os.fspath(key))
+    for entry in record.captures:
+        name, split = entry.id, Split.from_json(entry.split, where=os.fspath(key))
         check_id(name, os.fspath(key))
         capture = open_capture(root / name)
         if capture.info.id != name or split.capture != name or len(capture) != split.frame_count:
             raise BadInput("split and capture do not belong together", where=key, field=name)
-        committed = commitment(target_content(capture, split), salt)
-        if committed != entry.get("commitment"):
+        committed = commitment(target_content(capture, split), record.salt)
+        if committed != entry.commitment:
             raise BadInput(
                 "is not what was committed to: its test frames, masks, split or salt were changed",
                 where=key,
@@ -72,21 +72,19 @@ def open_sealed(
         splits[name] = split
         commitments.append(committed)
     joint = joint_commitment(commitments)
-    _compare_public(root, manifest, joint, value)
+    if record.commitment != joint:
+        raise BadInput("does not match the captures", where=key, field="commitment")
+    _compare_public(root, manifest, joint)
     return SealedPart(tuple(captures), splits, joint)
 
 
-def _compare_public(
-    root: Path, manifest: str | os.PathLike[str] | None, joint: str, value: Mapping[str, Any]
-) -> None:
-    if value.get("commitment") != joint:
-        raise BadInput("does not match the captures", where=root / KEY, field="commitment")
+def _compare_public(root: Path, manifest: str | os.PathLike[str] | None, joint: str) -> None:
     default = root.parent / "public" / MANIFEST
     if manifest is None and not default.is_file():
         return
     path = default if manifest is None else Path(manifest)
     path = path / MANIFEST if path.is_dir() else path
-    if _read(path, PUBLIC_SCHEMA).get("commitment") != joint:
+    if _read(path, PUBLIC_SCHEMA, _PublicManifest).commitment != joint:
         raise BadInput(
             "publishes a commitment that is not this sealed part's",
             where=path,
@@ -95,17 +93,32 @@ def _compare_public(
         )
 
 
-def _read(path: Path, schema: str) -> dict[str, Any]:
-    value = read_json(path)
-    if not isinstance(value, dict) or value.get("schema") != schema:
-        raise BadInput(f"is not a file of schema {schema}", where=path)
-    return value
+def _read(path: Path, schema: str, kind: type[Record]) -> Record:
+    value = without_schema(read_json(path), schema, where=path, error=BadInput)
+    return parse_record(kind, value, where=path, error=BadInput, ignore_unknown=True)
 
 
-def _entries(value: Mapping[str, Any], where: Path) -> list[dict[str, Any]]:
-    entries = value.get("captures")
-    if not isinstance(entries, list) or not entries:
-        raise BadInput("is not a list of captures", where=where, field="captures")
-    if not all(isinstance(e, dict) and isinstance(e.get("id"), str) for e in entries):
-        raise BadInput("holds a capture without an id", where=where, field="captures")
-    return entries
+@dataclass(frozen=True)
+class _CommittedCapture:
+    """One capture in a sealed part's key file."""
+
+    id: Line
+    #: `Split.from_json` checks it.
+    split: Any
+    commitment: Line
+
+
+@dataclass(frozen=True)
+class _PublicManifest:
+    """The fields of the public manifest that are compared."""
+
+    commitment: Line
+
+
+@dataclass(frozen=True)
+class _SealedKey:
+    """The fields of a sealed part's key file."""
+
+    salt: Annotated[str, Meta(min_length=2 * SALT_BYTES, max_length=10_000)]
+    commitment: Line
+    captures: Annotated[list[_CommittedCapture], Meta(min_length=1)]

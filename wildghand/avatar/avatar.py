@@ -14,6 +14,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture.schema import HandModelId
+from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
@@ -145,11 +146,19 @@ class WildGHandAvatar:
     @property
     def gaussians(self) -> PosedGaussians:
         """The Gaussians in the rest pose of the hand model, one hand after the other."""
-        rest = {
-            side: HandPose(side, np.zeros((16, 3)), betas, np.zeros(3))
-            for side, betas in self.betas.items()
-        }
-        return self.pose(rest)
+        return self.pose(self.rest_poses())
+
+    def rest_poses(self) -> dict[str, HandPose]:
+        """Return every hand at rest; two hands lie side by side."""
+        hands = {}
+        for side in self.sides:
+            shift = np.zeros(3)
+            if len(self.sides) > 1:
+                vertices = load_template(self.hand_model.source, side).vertices
+                width = float(np.ptp(vertices[:, 2]))
+                shift[2] = width if side == "right" else -width
+            hands[side] = HandPose(side, np.zeros((16, 3)), self.betas[side], shift)
+        return hands
 
     @torch.no_grad()
     def pose(self, hands: Mapping[str, HandPose]) -> PosedGaussians:

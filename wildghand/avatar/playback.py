@@ -13,8 +13,6 @@ from hwp_bench.base.files import atomic_folder
 from hwp_bench.base.images import write_image
 from hwp_bench.base.progress import track
 from hwp_bench.capture import Capture
-from hwp_bench.hands import load_template
-from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.avatar.avatar import WildGHandAvatar
 
 
@@ -61,18 +59,12 @@ def render_clip(
             where=capture.root,
             remedy="Convert them with `hwp-bench hands convert`.",
         )
-    info, seconds, images = capture.info, 0.0, []
+    seconds, images = 0.0, []
     with atomic_folder(out, overwrite=overwrite) as folder:
         for frame in track(frames, "Drawing"):
-            camera = Camera(
-                capture.cameras.Ks[frame], capture.cameras.viewmats[frame], info.width, info.height
-            )
-            hands = {}
-            for side in sides:
-                given = capture.hands[side]
-                hands[side] = HandPose(side, given.pose[frame], given.betas, given.transl[frame])
+            poses, camera = capture.hand_poses(frame), capture.camera(frame)
             started = time.perf_counter()
-            rgba = avatar.render(hands, camera)
+            rgba = avatar.render({side: poses[side] for side in sides}, camera)
             seconds += time.perf_counter() - started
             behind = (1.0 - rgba[..., 3:]) * (background / 255.0)
             image = np.rint(255.0 * (rgba[..., :3] + behind)).clip(0, 255).astype(np.uint8)
@@ -80,21 +72,8 @@ def render_clip(
             if video is not None:
                 images.append(image)
     if video is not None:
-        _write_video(video, images, info.fps)
+        _write_video(video, images, capture.info.fps)
     return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
-
-
-def rest_poses(avatar: WildGHandAvatar) -> dict[str, HandPose]:
-    """Every hand of an avatar at rest, side by side where there are two."""
-    hands = {}
-    for side in avatar.sides:
-        template = load_template(avatar.hand_model.source, side)
-        width = float(np.ptp(template.vertices[:, 2]))
-        shift = np.zeros(3)
-        if len(avatar.sides) > 1:
-            shift[2] = width if side == "right" else -width
-        hands[side] = HandPose(side, np.zeros((16, 3)), avatar.betas[side], shift)
-    return hands
 
 
 def _write_video(path: Path, images: list[np.ndarray], fps: float) -> None:

@@ -26,26 +26,16 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.errors import UsageError
     from hwp_bench.capture import open_capture
-    from hwp_bench.methods.contract import HandPose
     from wildghand.avatar.files import load_avatar
-    from wildghand.avatar.playback import rest_poses
     from wildghand.avatar.ply import write_ply
 
     avatar = load_avatar(args.avatar, hand=args.hand)
-    hands = rest_poses(avatar)
+    hands = avatar.rest_poses()
     if args.poses is not None:
         capture = open_capture(args.poses)
-        if not 0 <= args.frame < capture.info.frame_count:
-            raise UsageError(
-                f"there is no frame {args.frame} of {capture.info.frame_count}", field="--frame"
-            )
-        hands = {
-            side: HandPose(side, hand.pose[args.frame], hand.betas, hand.transl[args.frame])
-            for side, hand in capture.hands.items()
-            if side in avatar.sides
-        }
+        poses = capture.hand_poses(args.frame)
+        hands = {side: pose for side, pose in poses.items() if side in avatar.sides}
     posed = avatar.pose(hands)
     write_ply(args.ply, posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
     print(f"{args.ply}: {len(posed)} Gaussians")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, make_dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
 import pytest
@@ -175,3 +175,27 @@ def test_values_that_json_cannot_hold_are_refused(value: Any, message: str) -> N
     check_json_values({"a": [1, "b", True, 0.5]}, where="f", field="s")
     with pytest.raises(BadResult, match=message):
         check_json_values(value, where="f", field="s", depth=4)
+
+
+@pytest.mark.parametrize(
+    ("kind", "value", "expected"),
+    [
+        (Annotated[list[int], Meta(min_length=2)], [1], "a list of at least 2 entries"),
+        (Annotated[list[int], Meta(max_length=2)], [1, 2, 3], "a list of 0 to 2 entries"),
+        (Annotated[list[int], Meta(min_length=1, max_length=2)], [], "a list of 1 to 2 entries"),
+        (Annotated[dict[str, int], Meta(min_length=1)], {}, "a table of at least 1 entries"),
+        (Annotated[dict[str, int], Meta(max_length=1)], {"a": 1, "b": 2}, "a table of 0 to 1"),
+        (Annotated[str, Meta(min_length=2)], "a", "a text of at least 2 characters"),
+        (Annotated[str, Meta(max_length=2)], "abc", "a text of 0 to 2 characters"),
+        (Annotated[int, Meta(ge=1)], 0, "an integer at least 1"),
+        (Annotated[int, Meta(gt=1)], 1, "an integer above 1"),
+        (Annotated[int, Meta(ge=1, le=3)], 4, "an integer from 1 to 3"),
+        (Annotated[float, Meta(lt=1.0)], 1.0, "a finite number .*below 1"),
+        (Annotated[float, Meta(gt=0.0, lt=1.0)], 0.0, "a finite number above 0 and below 1"),
+    ],
+    ids=str,
+)
+def test_every_kind_of_bound_has_its_words(kind: Any, value: Any, expected: str) -> None:
+    bounded = make_dataclass("Bounded", [("field", kind)], frozen=True)
+    with pytest.raises(BadResult, match=f"file: field: is .*, expected {expected}"):
+        parse_record(bounded, {"field": value}, where="file")

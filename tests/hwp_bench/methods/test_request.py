@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from small_captures import CaptureMaker
 
-from hwp_bench.base.errors import BadImage, BadInput, HwpError, UsageError
+from hwp_bench.base.errors import BadImage, BadInput, UsageError
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
@@ -66,8 +68,36 @@ def test_a_request_that_is_none_is_refused(make_capture: CaptureMaker, tmp_path:
     with pytest.raises(BadInput, match="does not exist"):
         open_request(tmp_path)
     (tmp_path / "request.json").write_text('{"schema": "hwp-request/1"}')
-    with pytest.raises(HwpError, match="lacks or has a wrong field"):
+    with pytest.raises(BadInput, match=r"request\.json: \w+: is missing"):
         open_request(tmp_path)
+    (tmp_path / "request.json").write_text('{"schema": "hwp-request/2"}')
+    with pytest.raises(BadInput, match="schema: is 'hwp-request/2' where 'hwp-request/1' is read"):
+        open_request(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"width": "wide"}, "width: is 'wide', expected an integer"),
+        ({"width": 0}, "width: is 0"),
+        ({"hands": "three"}, "hands: is 'three'"),
+        ({"budget": {"seconds": "long"}}, "budget.seconds: is 'long'"),
+        ({"hand_model": {"name": "anny-1"}}, "hand_model.digest: is missing"),
+        ({"settings": []}, "settings: "),
+        ({"train": [0, 19]}, "train: has a frame that the split does not train on"),
+        ({"train": [-1]}, r"train\[0\]: is -1"),
+        ({"extra": 1}, "extra: is not known"),
+    ],
+)
+def test_a_wrong_field_is_named(
+    change: dict[str, Any], problem: str, make_capture: CaptureMaker, tmp_path: Path
+) -> None:
+    split = contiguous_split("tiny", 20)
+    root = write_request(tmp_path / "request", make_capture(frames=20), split, RUN)
+    value = json.loads((root / "request.json").read_text())
+    (root / "request.json").write_text(json.dumps({**value, **change}))
+    with pytest.raises(BadInput, match=problem):
+        open_request(root)
 
 
 def test_the_oracles_choose_what_they_say(make_capture: CaptureMaker, tmp_path: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -169,3 +170,22 @@ def test_what_cannot_be_published_is_refused(captures: list[Capture], tmp_path: 
     with pytest.raises(BadInput, match="empty"):
         publish([captures[0].root], tmp_path / "p")
     assert not (tmp_path / "p").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "problem"),
+    [
+        ({"salt": "5a"}, "salt: "),
+        ({"captures": []}, r"captures: is \[\], expected a list of at least 1 entries"),
+        ({"captures": [{"split": {}, "commitment": "0"}]}, r"captures\[0\].id: is missing"),
+        ({"commitment": None}, "commitment: "),
+        ({"schema": "hwp-sealed/2"}, "schema: is 'hwp-sealed/2' where 'hwp-sealed/1' is read"),
+    ],
+)
+def test_a_wrong_field_of_the_key_file_is_named(
+    publication: Publication, change: dict[str, Any], problem: str
+) -> None:
+    key = publication.sealed / "sealed.json"
+    key.write_text(json.dumps({**json.loads(key.read_text()), **change}))
+    with pytest.raises(BadInput, match=rf"sealed\.json: {problem}"):
+        open_sealed(publication.sealed)
