@@ -6,11 +6,9 @@ makes every hand half a pixel too thick.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
-
-import numba
 import numpy as np
+
+from hwp_bench.base.compiled import compiled
 
 # Faces with a corner nearer to the camera than this, m, are left out.
 _NEAR = 1e-3
@@ -89,16 +87,7 @@ def overlap(first: np.ndarray, second: np.ndarray) -> float:
     return 1.0 if union == 0 else np.count_nonzero(first & second) / union
 
 
-def _compile(function: Callable[..., Any]) -> Any:
-    """Compile a function; the machine code is kept on disk where that works."""
-    options: dict[str, Any] = {"boundscheck": False, "error_model": "numpy", "nogil": True}
-    try:
-        return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # numba found no folder to write to
-        return numba.njit(**options)(function)
-
-
-@_compile
+@compiled(nogil=True)
 def _draw(
     pixels: np.ndarray,
     depth: np.ndarray,
@@ -147,7 +136,7 @@ def _draw(
                     mix[row, column, 1] = third
 
 
-@_compile
+@compiled(nogil=True)
 def _mix(
     values: np.ndarray, faces: np.ndarray, face: np.ndarray, mix: np.ndarray, result: np.ndarray
 ) -> None:

@@ -6,22 +6,13 @@ over the same images some forty times.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import cv2
-import numba
 import numpy as np
 import torch
 
-
-def _compile(function: Callable[..., None]) -> Any:
-    """Compile a function; the machine code is kept on disk where that works."""
-    options: dict[str, Any] = {"boundscheck": False, "error_model": "numpy"}
-    try:
-        return numba.njit(cache=True, **options)(function)
-    except RuntimeError:  # numba found no folder to write to
-        return numba.njit(**options)(function)
+from hwp_bench.base.compiled import compiled
 
 
 class PhotometricCpu(torch.autograd.Function):
@@ -128,7 +119,7 @@ def _one_image(
         _gather(blur(factors).reshape(factors.shape), x, y, direct, gradient)
 
 
-@_compile
+@compiled()
 def _multiply(x: np.ndarray, y: np.ndarray, moments: np.ndarray) -> None:
     height, width, channels = x.shape
     for row in range(height):
@@ -143,7 +134,7 @@ def _multiply(x: np.ndarray, y: np.ndarray, moments: np.ndarray) -> None:
                 moments[row, column, 4 * channels + c] = a * b
 
 
-@_compile
+@compiled()
 def _compare(
     moments: np.ndarray,
     x: np.ndarray,
@@ -194,7 +185,7 @@ def _compare(
             errors[row, column] = total
 
 
-@_compile
+@compiled()
 def _gather(
     blurred: np.ndarray, x: np.ndarray, y: np.ndarray, direct: np.ndarray, gradient: np.ndarray
 ) -> None:
