@@ -6,9 +6,9 @@ torch. `docs/python.md` shows them at work.
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
+from hwp_bench.base.lazy_names import lazy_names
 from hwp_bench.base.version import __version__
 
 if TYPE_CHECKING:
@@ -22,8 +22,6 @@ if TYPE_CHECKING:
     from hwp_bench.results import read_results as read_results
     from hwp_bench.sim.produce.production import render_capture as render_capture
 
-# Not through lazy_loader: the launcher of the sandbox imports this package in an interpreter that
-# has only the standard library.
 _HOMES = {
     "Capture": "hwp_bench.capture",
     "HwpError": "hwp_bench.base.errors",
@@ -38,14 +36,4 @@ _HOMES = {
 
 __all__ = [*_HOMES, "__version__"]
 
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = getattr(import_module(_HOMES[name]), name)
-    globals()[name] = value
-    return value
-
-
-def __dir__() -> list[str]:
-    return sorted(__all__)
+__getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -6,8 +6,6 @@ an entry that is not needed any more.
 
 PlainMethod  # the entry of baselines/plain/method.toml
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/interaction-gaussian
-_.__dir__  # Python calls it for completion of a package's lazy names
-_.__getattr__  # Python calls it for a package's lazy names
 modified  # part of the cache's key: a changed file is read again
 _.maxlong  # reprlib reads it
 _.maxother  # reprlib reads it

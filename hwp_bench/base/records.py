@@ -162,14 +162,19 @@ def unfold(values: Mapping[str, Any]) -> dict[str, Any]:
         head, dot, rest = str(name).partition(".")
         if dot:
             value = {rest: value}
-        tree[head] = _merged(tree.get(head), unfold(value) if isinstance(value, Mapping) else value)
+        tree = merged(tree, {head: unfold(value) if isinstance(value, Mapping) else value})
     return tree
 
 
-def _merged(before: Any, after: Any) -> Any:
-    if not isinstance(before, dict) or not isinstance(after, dict):
-        return after
-    return {**before, **{name: _merged(before.get(name), item) for name, item in after.items()}}
+def merged(tables: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
+    """Return tables within tables, some values changed; a table given in part keeps the rest."""
+    whole = dict(tables)
+    for name, value in changes.items():
+        before = whole.get(name)
+        if isinstance(before, Mapping) and isinstance(value, Mapping):
+            value = merged(before, value)
+        whole[name] = value
+    return whole
 
 
 def check_json_values(

@@ -6,11 +6,10 @@ import datetime
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 from hwp_bench.base.errors import BadCapture, BadMethod
 from hwp_bench.base.locks import exclusive
-from hwp_bench.base.records import check_json_values
+from hwp_bench.base.records import check_json_values, merged
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
@@ -158,7 +157,7 @@ def make_plan(
         dict(settings.run.settings), where=manifest.name, field="settings", error=BadMethod
     )
     manifest.check_setting_names(settings.run.settings)
-    chosen = _merged(manifest.presets.get(preset, {}), settings.run.settings)
+    chosen = merged(manifest.presets.get(preset, {}), settings.run.settings)
     run = replace(settings.run, settings=chosen)
     known = load_available() if networks is None else networks
     evaluations = tuple(
@@ -169,17 +168,6 @@ def make_plan(
     )
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
     return Plan(manifest, settings.suite, preset, run, evaluations, started)
-
-
-def _merged(tables: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables within tables, some values changed; a table given in part keeps its other values."""
-    merged = dict(tables)
-    for name, value in changes.items():
-        before = merged.get(name)
-        if isinstance(before, Mapping) and isinstance(value, Mapping):
-            value = _merged(before, value)
-        merged[name] = value
-    return merged
 
 
 def open_captures(

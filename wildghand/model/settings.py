@@ -14,6 +14,7 @@ from types import MappingProxyType
 from typing import Any
 
 from hwp_bench.base.errors import BadMethod
+from hwp_bench.base.records import merged
 from hwp_bench.methods.settings import choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.model.former_settings import current_names, flattened
@@ -164,7 +165,7 @@ def read_settings(values: Mapping[str, Any]) -> WildGHandSettings:
     network = changes.get("network")
     if isinstance(network, Mapping) and network.get("size") == "paper":
         start["network"] = network_settings("paper").to_json()
-    chosen = _merged(_merged(start, MODES[mode]), changes)
+    chosen = merged(merged(start, MODES[mode]), changes)
     return _without_idle_parts(settings_from(WildGHandSettings, chosen, WHERE))
 
 
@@ -181,14 +182,14 @@ def read_version_1(values: Mapping[str, Any]) -> WildGHandSettings:
     paper = _mode_of(tree) == "paper"
     if paper:
         named = tree.get("prior")
-        tree = _merged(tree, MODES["paper"])
+        tree = merged(tree, MODES["paper"])
         tree["prior"] = "" if named in (None, "shipped") else named
     # In the mode `default`, `weights.variant` had no effect.
     weights = values.get("weights")
     printed = weights.get("variant") if isinstance(weights, Mapping) else None
     binary = values.get("binary_mask") is True or (paper and printed == "binary")
     variant = "binary" if binary else "paper" if paper else "judged"
-    return read_settings(_merged(tree, {"pao": {"variant": variant}}))
+    return read_settings(merged(tree, {"pao": {"variant": variant}}))
 
 
 def _mode_of(changes: dict[str, Any]) -> str:
@@ -202,17 +203,6 @@ def _mode_of(changes: dict[str, Any]) -> str:
             remedy=f"Use one of {', '.join(MODES)}.",
         )
     return mode
-
-
-def _merged(tables: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:
-    """Tables within tables, some values changed."""
-    merged = dict(tables)
-    for name, value in changes.items():
-        before = merged.get(name)
-        if isinstance(before, Mapping) and isinstance(value, Mapping):
-            value = _merged(before, value)
-        merged[name] = value
-    return merged
 
 
 def _check_names(changes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
