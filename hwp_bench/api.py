@@ -17,7 +17,7 @@ from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
 from hwp_bench.base.progress import JobsView
 from hwp_bench.base.tables import write_tables
 from hwp_bench.capture import Capture
-from hwp_bench.evaluation.evaluate import EvaluationSettings
+from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
@@ -56,7 +56,7 @@ def evaluate(
         method: method directory, or the name of one that ships: `plain`, `wildghand`.
         captures: a suite (`smoke`, `mini`, `full`; rendered on first use), a capture or its
             folder, or a list of these.
-        out: results folder; `runs/METHOD-SUITE` if None.
+        out: results folder; `runs/METHOD-SUITE` if None, with the oracle's name behind it.
         preset: preset of the method; the suite's, else `default`, if None.
         settings: settings that override the preset, such as `{"dpd.enabled": False}`.
         seed: seed of everything random.
@@ -76,9 +76,13 @@ def evaluate(
         UsageError: there is no such suite.
         HwpError: another evaluation is writing to `out`, or `out` cannot be written.
     """
-    name = Path(os.fspath(method)).name
     suite = captures if isinstance(captures, str) and captures in suite_names() else "captures"
-    folder = Path(out) if out is not None else Path("runs") / f"{name}-{suite}"
+    plan = EvaluationSettings(
+        suite=suite,
+        preset=preset,
+        run=RunSettings(dict(settings or {}), seed, Budget(seconds, steps), frames),
+    )
+    folder = Path(out) if out is not None else default_folder(os.fspath(method), plan)
     read_manifest(find_method(os.fspath(method))).check_setting_names(settings or {})
     view = JobsView()
     engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
@@ -88,11 +92,7 @@ def evaluate(
             os.fspath(method),
             paths,
             folder,
-            EvaluationSettings(
-                suite=suite,
-                preset=preset,
-                run=RunSettings(dict(settings or {}), seed, Budget(seconds, steps), frames),
-            ),
+            plan,
             on_capture=view.turn if engine.in_turn else None,
             engine=engine,
         )

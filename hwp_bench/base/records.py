@@ -33,7 +33,7 @@ from __future__ import annotations
 import dataclasses
 import math
 import os
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from typing import Annotated, Any, TypeVar, cast
 
 import msgspec
@@ -45,6 +45,9 @@ from hwp_bench.base.record_types import Rules, brief, explain, join, strict_twin
 from hwp_bench.base.text import ODD_CHARACTERS, shown
 
 Record = TypeVar("Record")
+
+#: Deepest table in a table that `flattened` looks into.
+MAX_DEPTH = 8
 
 #: Longest piece of a name or value that a message repeats.
 _SHOWN = 100
@@ -164,6 +167,18 @@ def unfold(values: Mapping[str, Any]) -> dict[str, Any]:
             value = {rest: value}
         tree = merged(tree, {head: unfold(value) if isinstance(value, Mapping) else value})
     return tree
+
+
+def flattened(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
+    """Yield every value with its name, `table.field`; the inverse of `unfold`.
+
+    An empty table is a value, and so is one that lies deeper than `MAX_DEPTH` tables.
+    """
+    for name, value in values.items():
+        if isinstance(value, Mapping) and value and prefix.count(".") < MAX_DEPTH:
+            yield from flattened(value, f"{prefix}{name}.")
+        else:
+            yield f"{prefix}{name}", value
 
 
 def merged(tables: Mapping[str, Any], changes: Mapping[str, Any]) -> dict[str, Any]:

@@ -116,7 +116,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.progress import JobsView
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.capture.splits import read_splits
-    from hwp_bench.evaluation.evaluate import evaluate
+    from hwp_bench.evaluation.evaluate import default_folder, evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.run.engine.options import engine_for, needs_of
@@ -127,9 +127,7 @@ def run(args: argparse.Namespace) -> int:
         settings = replace(settings, suite=f"sealed-{sealed.commitment[:12]}")
     # A wrong method directory is reported before a suite is rendered for it.
     read_manifest(find_method(args.method)).check_setting_names(settings.run.settings, "--set")
-    method = Path(args.method.rstrip("/")).name
-    oracle = "" if args.frames == "perturbed" else f"-{args.frames}"
-    out = Path(args.out or f"runs/{method}-{settings.suite}{oracle}")
+    out = Path(args.out) if args.out else default_folder(args.method, settings)
     splits = read_splits(args.splits) if args.splits else None
     if sealed is not None:
         splits = sealed.splits

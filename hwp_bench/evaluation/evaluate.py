@@ -18,7 +18,7 @@ from hwp_bench.evaluation.capture_evaluation import (
     evaluation_job,
     read_result,
 )
-from hwp_bench.methods.contract import RunSettings
+from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
@@ -48,6 +48,13 @@ class EvaluationSettings:
     time_limit: float = DEFAULT_TIME_LIMIT
     #: How its process is confined, and its memory limit.
     confinement: Confinement = field(default_factory=Confinement)
+
+
+def default_folder(method: str, settings: EvaluationSettings) -> Path:
+    """Return the results folder of an evaluation that names none; an oracle has its own."""
+    frames = settings.run.frames
+    oracle = "" if frames == FRAME_CHOICES[0] else f"-{frames}"
+    return Path("runs") / f"{Path(method).name}-{settings.suite}{oracle}"
 
 
 def evaluate(

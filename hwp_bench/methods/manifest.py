@@ -6,7 +6,7 @@ import difflib
 import itertools
 import os
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +16,13 @@ from msgspec import Meta
 from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.base.files import inside
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.base.records import Line, check_json_values, parse_record, without_schema
+from hwp_bench.base.records import (
+    Line,
+    check_json_values,
+    flattened,
+    parse_record,
+    without_schema,
+)
 from hwp_bench.methods.contents import method_digest
 
 #: Version of the method contract.
@@ -117,7 +123,7 @@ class MethodManifest:
             BadMethod: a name is not in `settings`; the message says which one is close.
         """
         known, tables = set(self.settings), {name.rpartition(".")[0] for name in self.settings}
-        for name in _names(values) if self.settings else ():
+        for name, _ in flattened(values) if self.settings else ():
             above = itertools.accumulate(name.split("."), "{}.{}".format)
             if name in tables or not known.isdisjoint(above):
                 continue
@@ -248,15 +254,6 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
     for name, switch in manifest.switches.items():
         manifest.check_setting_names(switch.settings, f"switches.{name}")
     return manifest
-
-
-def _names(values: Mapping[str, Any], prefix: str = "") -> Iterator[str]:
-    """The dotted names of all values in tables within tables."""
-    for name, value in values.items():
-        if isinstance(value, Mapping) and value:
-            yield from _names(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}"
 
 
 def _switches(tables: Mapping[str, _SwitchTable], where: Path) -> dict[str, Switch]:

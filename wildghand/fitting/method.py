@@ -8,7 +8,8 @@ from typing import Any
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import optimize, ready_device
+from wildghand.fitting.optimize import optimize
+from wildghand.gaussians.fit_loop import ready_device
 from wildghand.model.settings import read_settings
 
 

@@ -13,9 +13,7 @@ from hwp_bench.methods.contract import Budget, Report
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.parallel import World
-from wildghand.gaussians.fit_loop import Guard, batches, choose_device, spent
-from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
-from wildghand.splat.warmup import warm_up
+from wildghand.gaussians.fit_loop import Guard, batches, spent
 
 #: Fall of the mean loss from window to window, as a share, that still counts as progress.
 PROGRESS = 1e-3
@@ -40,25 +38,6 @@ class Watchers:
         """Go on from a saved state."""
         self.guard.load_state_dict(state["guard"])
         self.plateau.load_state_dict(state["plateau"])
-
-
-def ready_device(name: str) -> torch.device:
-    """Choose the device, and compile for it what a fit needs.
-
-    Compiling takes some ten seconds, once on a machine. It is not a part of a fit, so this goes
-    before its clock.
-
-    Args:
-        name: `auto`, `cpu` or `cuda`.
-
-    Raises:
-        MissingDependency: CUDA was asked for and is not there.
-    """
-    device = choose_device(name)
-    if device.type == "cpu":
-        warm_up()
-        warm_up_loss()
-    return device
 
 
 def optimize(

@@ -22,9 +22,10 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import save_avatar
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import Watchers, optimize, ready_device
+from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.gaussians.fit_loop import ready_device
 from wildghand.model.settings import WildGHandSettings, read_settings
 
 #: Seconds between two saved states.

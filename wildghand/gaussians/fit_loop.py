@@ -13,6 +13,8 @@ import torch
 
 from hwp_bench.base.errors import DidNotConverge, MissingDependency
 from hwp_bench.methods.contract import Budget, Report
+from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
+from wildghand.splat.warmup import warm_up
 
 #: Steps over which the loss is averaged before it is judged.
 WINDOW = 50
@@ -39,6 +41,25 @@ def choose_device(name: str) -> torch.device:
             remedy="Use device = auto or cpu, or install the extra `cuda`.",
         )
     return torch.device("cuda" if ready else "cpu")
+
+
+def ready_device(name: str) -> torch.device:
+    """Choose the device, and compile for it what a fit needs.
+
+    Compiling takes some ten seconds, once on a machine. It is not a part of a fit, so this goes
+    before its clock.
+
+    Args:
+        name: `auto`, `cpu` or `cuda`.
+
+    Raises:
+        MissingDependency: CUDA was asked for and is not there.
+    """
+    device = choose_device(name)
+    if device.type == "cpu":
+        warm_up()
+        warm_up_loss()
+    return device
 
 
 @contextlib.contextmanager

@@ -10,8 +10,8 @@ from collections.abc import Iterator, Mapping
 from types import MappingProxyType
 from typing import Any
 
-#: Deepest table in a table that is looked into.
-MAX_DEPTH = 8
+from hwp_bench.base.records import flattened
+
 #: Components that were one setting, true or false; today `NAME.enabled`.
 SWITCHES = ("dpd", "pao", "heads", "prepass")
 
@@ -67,15 +67,6 @@ def current_names(values: Mapping[str, Any]) -> dict[str, Any]:
                 place = inner
             place[field] = meant
     return tree
-
-
-def flattened(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, Any]]:
-    """Every value with its name, `table.field`; an empty table is a value."""
-    for name, value in values.items():
-        if isinstance(value, Mapping) and value and prefix.count(".") < MAX_DEPTH:
-            yield from flattened(value, f"{prefix}{name}.")
-        else:
-            yield f"{prefix}{name}", value
 
 
 def _today(name: str, value: Any) -> Iterator[tuple[str, Any]]:

@@ -14,10 +14,10 @@ from types import MappingProxyType
 from typing import Any
 
 from hwp_bench.base.errors import BadMethod
-from hwp_bench.base.records import merged
+from hwp_bench.base.records import flattened, merged
 from hwp_bench.methods.settings import choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
-from wildghand.model.former_settings import current_names, flattened
+from wildghand.model.former_settings import current_names
 from wildghand.model.terms import PAPER_TERMS, TermWeights
 from wildghand.network.settings import NetworkSettings, network_settings
 from wildghand.pao.pao import PaoSettings

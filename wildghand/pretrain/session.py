@@ -15,9 +15,10 @@ from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.methods.contract import REQUEST, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
-from wildghand.fitting.optimize import Watchers, ready_device
+from wildghand.fitting.optimize import Watchers
 from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.fitting.session import SAVE_EVERY, STATE, every_frame
+from wildghand.gaussians.fit_loop import ready_device
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.pretrain.joint import JointFit, take_steps
 from wildghand.prior.files import save_prior

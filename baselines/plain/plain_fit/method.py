@@ -14,10 +14,8 @@ from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from plain_fit.model import PlainAvatar, make_model
 from plain_fit.optimize import fit_model
 from plain_fit.settings import read_settings
-from wildghand.gaussians.fit_loop import choose_device
-from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
+from wildghand.gaussians.fit_loop import ready_device
 from wildghand.gaussians.training import load_frames
-from wildghand.splat.warmup import warm_up
 
 
 class PlainMethod:
@@ -36,11 +34,7 @@ class PlainMethod:
     def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
         self.settings = read_settings(settings)
         self.seed = seed
-        self.device = choose_device(self.settings.device)
-        if self.device.type == "cpu":
-            # Compiling takes some ten seconds once on a machine; it is not part of a fit.
-            warm_up()
-            warm_up_loss()
+        self.device = ready_device(self.settings.device)
 
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> PlainAvatar:
         """Fit an avatar to the training frames (the validation frames are left alone).

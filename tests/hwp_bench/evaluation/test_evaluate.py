@@ -14,7 +14,7 @@ from hwp_bench.base.errors import BadCapture, BadImage, BadSplit
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
+from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder, evaluate
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric, penalty
 from hwp_bench.results import Results, read_results
@@ -237,3 +237,18 @@ def test_faults_of_the_capture_are_errors_before_the_method_runs(
     with pytest.raises(BadImage, match=r"000018\.png: is empty"):
         run(method, [single], tmp_path / "out")
     assert not (method / "fits.log").exists()
+
+
+@pytest.mark.parametrize(
+    ("method", "suite", "frames", "expected"),
+    [
+        ("baselines/plain/", "mini", "perturbed", "runs/plain-mini"),
+        ("plain", "smoke", "clean", "runs/plain-smoke-clean"),
+        ("my/method", "captures", "unperturbed-only", "runs/method-captures-unperturbed-only"),
+    ],
+)
+def test_an_oracle_has_a_results_folder_of_its_own(
+    method: str, suite: str, frames: str, expected: str
+) -> None:
+    settings = EvaluationSettings(suite=suite, run=RunSettings(frames=frames))
+    assert default_folder(method, settings) == Path(expected)

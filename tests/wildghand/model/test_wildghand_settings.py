@@ -8,8 +8,9 @@ from typing import Any
 import pytest
 
 from hwp_bench.base.errors import BadMethod
+from hwp_bench.base.records import flattened
 from hwp_bench.methods.manifest import find_method, read_manifest
-from wildghand.model.former_settings import NAMES, TABLES, flattened
+from wildghand.model.former_settings import NAMES, TABLES
 from wildghand.model.settings import (
     MODES,
     WildGHandSettings,
