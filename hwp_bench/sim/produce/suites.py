@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import threading
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
@@ -95,13 +95,39 @@ def ensure_suite(
         UsageError: there is no such suite.
         HwpError: a render failed; captures that were finished stay.
     """
+    return ensure_captures(suite(name), cache, workers, engine=engine, needs=needs)
+
+
+def ensure_captures(
+    items: Sequence[SuiteItem],
+    cache: str | os.PathLike[str] | None = None,
+    workers: int | None = None,
+    *,
+    engine: Engine | None = None,
+    needs: Needs | None = None,
+) -> list[Path]:
+    """Render captures that are not in the cache yet, such as some of a suite.
+
+    Args:
+        items: the captures.
+        cache: folder of captures; the toolkit's cache if None.
+        workers: processes for each render.
+        engine: where captures are rendered; one after another in this process if None.
+        needs: what one render takes of a machine.
+
+    Returns:
+        The capture folders, in the order of `items`.
+
+    Raises:
+        HwpError: a render failed; captures that were finished stay.
+    """
     from hwp_bench.sim.produce.production import render_key
 
     engine, needs = engine or LocalEngine(), needs or Needs()
     root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
     each = workers_each(workers, engine, needs)
     jobs = []
-    for item in suite(name):
+    for item in items:
         key = render_key(item.scene, item.frame_count, item.size)
         folder = root / f"{item.scene.id}-{item.frame_count}x{item.size}-{key[:12]}"
         work = RenderCapture(

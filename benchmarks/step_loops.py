@@ -1,0 +1,154 @@
+"""The loops of two fits that take turns, so that other work on the machine slows both alike.
+
+The plain baseline's own loop runs from its first step to its last; whenever it reports that it has
+taken a block of steps, blocks of WildGHand's loop are taken before it goes on. Both are what a user
+runs, with everything that they do between steps.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import torch
+
+from hwp_bench.methods.contract import Budget, TrainingCapture
+from hwp_bench.methods.manifest import find_method
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.optimize import Watchers, optimize
+from wildghand.gaussians.fit_loop import ready_device
+from wildghand.model.settings import read_settings
+
+#: Steps of a block. The first is not counted: it finds the caches as the other fit left them.
+BLOCK = 6
+#: Wall-clock and processor seconds of a step; the processor's of all threads.
+Spent = tuple[float, float]
+#: Steps that the budget of a fit is made of; its loop is left long before.
+BUDGET = 1_000_000
+
+
+class _Enough(Exception):
+    """Leaves a loop."""
+
+
+class _Clock:
+    """A report that takes the time of every step (see `hwp_bench.methods.contract.Report`)."""
+
+    elapsed = 0.0
+
+    def __init__(self, after_step: Callable[[int], None]) -> None:
+        self.seconds: list[Spent] = []
+        self._after_step = after_step
+        self._last: Spent | None = None
+
+    def __call__(self, step: int, avatar: object) -> None:
+        wall, processor = _now()
+        if self._last is not None:
+            self.seconds.append((wall - self._last[0], processor - self._last[1]))
+            self._after_step(len(self.seconds))
+        self._last = _now()
+
+    def progress(self, done: int, total: int) -> None:
+        pass
+
+
+def _now() -> Spent:
+    return time.perf_counter(), time.process_time()
+
+
+class WildGHandLoop:
+    """The loop of WildGHand's fit, taken a block of steps at a time.
+
+    Args:
+        training: what it may see.
+        settings: of the method.
+    """
+
+    def __init__(self, training: TrainingCapture, settings: Mapping[str, Any]) -> None:
+        chosen = read_settings({"device": "cpu", **settings})
+        self._fit = Fit(training, chosen, 0, ready_device("cpu"))
+        self._watchers = Watchers(0)
+        self._taken = 0
+
+    def block(self, steps: int = BLOCK) -> list[Spent]:
+        """Take steps; returns the seconds of each."""
+
+        def stop(taken: int) -> None:
+            if taken == steps:
+                raise _Enough
+
+        clock = _Clock(stop)
+        budget = Budget(steps=BUDGET)
+        with contextlib.suppress(_Enough):
+            optimize(self._fit, budget, clock, start=self._taken, watchers=self._watchers)
+        self._taken += steps
+        return clock.seconds
+
+
+def run_plain(
+    training: TrainingCapture,
+    settings: Mapping[str, Any],
+    blocks: int,
+    after_block: Callable[[int, list[Spent]], None],
+) -> None:
+    """Run the loop of the plain baseline.
+
+    Args:
+        training: what it may see.
+        settings: of the method.
+        blocks: how many blocks of steps to take.
+        after_block: called after each block with its number and the seconds of its steps.
+    """
+    sys.path.insert(0, str(find_method("plain")))
+    from plain_fit.method import PlainMethod
+
+    clock: _Clock
+
+    def after_step(taken: int) -> None:
+        if taken % BLOCK == 0:
+            after_block(taken // BLOCK - 1, clock.seconds[-BLOCK:])
+            if taken == blocks * BLOCK:
+                raise _Enough
+
+    clock = _Clock(after_step)
+    with contextlib.suppress(_Enough):
+        PlainMethod({"device": "cpu", **settings}).fit(training, Budget(steps=BUDGET), clock)
+
+
+def race(
+    training: TrainingCapture,
+    plain: Mapping[str, Any],
+    others: Mapping[str, WildGHandLoop],
+    threads: tuple[int, ...],
+    rounds: int,
+) -> dict[tuple[str, int], list[Spent]]:
+    """Let fits take turns, on every number of threads.
+
+    Args:
+        training: what they may see.
+        plain: settings of the plain baseline.
+        others: fits by name.
+        threads: numbers of threads.
+        rounds: turns of each fit that count; one more goes before.
+
+    Returns:
+        Seconds of steps by name (the baseline is `plain`) and number of threads.
+    """
+    names = ("plain", *others)
+    found: dict[tuple[str, int], list[Spent]] = {(name, n): [] for name in names for n in threads}
+    torch.set_num_threads(threads[0])
+
+    def after_block(number: int, seconds: list[Spent]) -> None:
+        turn, place = divmod(number, len(threads))
+        taken = {"plain": seconds}
+        taken |= {name: loop.block() for name, loop in others.items()}
+        if turn > 0:
+            for name, values in taken.items():
+                found[name, threads[place]] += values[1:]
+        torch.set_num_threads(threads[(place + 1) % len(threads)])
+
+    run_plain(training, plain, (rounds + 1) * len(threads), after_block)
+    return found

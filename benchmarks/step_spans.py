@@ -1,0 +1,110 @@
+"""Which component of a step each piece of its code belongs to, told to torch's profiler.
+
+While `marked` holds, the functions listed here open a span of the profiler. A name that is not
+there (any more) is left out; what it did is counted for the span around it.
+"""
+
+from __future__ import annotations
+
+import functools
+import importlib
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch.profiler import record_function
+
+#: What spans of components and of passes begin with.
+COMPONENT, PASS = "component: ", "pass: "
+#: Code that no other component claims.
+OTHER = "other"
+
+#: Functions by component, as `module:name`.
+FUNCTIONS: dict[str, tuple[str, ...]] = {
+    "network: texture": ("wildghand.network.network:PredictionNetwork.texture",),
+    "network: coder": ("wildghand.network.compact:PlaneCoder.forward",),
+    "network: geometry": ("wildghand.network.network:PredictionNetwork.geometry",),
+    "network: heads": ("wildghand.network.network:PredictionNetwork.forward",),
+    "hand poses": (
+        "wildghand.gaussians.training:TrainingClip.hand",
+        "wildghand.gaussians.training:TrainingClip.poses",
+        "wildghand.gaussians.rig:HandRig.follow",
+        "wildghand.gaussians.rig:HandRig.pose",
+    ),
+    "DPD": (
+        "wildghand.dpd.dpd:DynamicPerturbation.temporal",
+        "wildghand.dpd.dpd:DynamicPerturbation.biases",
+        "wildghand.model.model:scale_gradients",
+    ),
+    "placing": (
+        "wildghand.model.model:WildGHandModel._dress",
+        "wildghand.gaussians.anchored:AnchoredGaussians.place",
+    ),
+    "shading": ("plain_fit.model:sh_basis",),
+    "rasterizer": (
+        "wildghand.model.model:_rasterize",
+        "wildghand.model.model:rasterize",
+        "plain_fit.model:rasterize",
+    ),
+    "photometric loss": (
+        "wildghand.model.terms:reconstruction",
+        "plain_fit.optimize:photometric_loss",
+    ),
+    "regularisers": ("wildghand.fitting.objective:Objective.__call__",),
+    "targets and weights": (
+        "wildghand.fitting.weighting:Weighting.__call__",
+        "wildghand.gaussians.training:TrainingFrames.targets",
+    ),
+    "optimizer": (
+        "torch.optim.optimizer:Optimizer.zero_grad",
+        "torch.nn.utils:clip_grad_norm_",
+        "wildghand.fitting.fit:set_rates",
+    ),
+}
+
+
+@contextmanager
+def marked() -> Iterator[None]:
+    """Mark components and passes while this holds."""
+    undo: list[Callable[[], None]] = []
+    try:
+        for component, places in FUNCTIONS.items():
+            for place in places:
+                _mark(place, COMPONENT + component, undo)
+        _mark("torch:Tensor.backward", PASS + "backward", undo)
+        yield
+    finally:
+        for restore in reversed(undo):
+            restore()
+
+
+def _mark(place: str, span: str, undo: list[Callable[[], None]]) -> None:
+    module, _, path = place.partition(":")
+    *owners, name = path.split(".")
+    try:
+        owner = functools.reduce(getattr, owners, importlib.import_module(module))
+        original = getattr(owner, name)
+    except (ImportError, AttributeError):
+        return
+
+    @functools.wraps(original)
+    def inside(*args: Any, **kwargs: Any) -> Any:
+        with record_function(span):
+            return original(*args, **kwargs)
+
+    setattr(owner, name, inside)
+    undo.append(lambda: setattr(owner, name, original))
+
+
+def component_of(event: str) -> str | None:
+    """The component that an event of the profiler opens; None for one that opens none."""
+    if event.startswith(COMPONENT):
+        return event.removeprefix(COMPONENT)
+    # Torch opens this span itself, in whatever optimizer.
+    return "optimizer" if event.startswith("Optimizer.step#") else None
+
+
+def profiled() -> Any:
+    """A profiler of this process's threads (CPU)."""
+    return torch.profiler.profile(activities=[torch.profiler.ProfilerActivity.CPU])
