@@ -17,6 +17,7 @@ from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
 from wildghand.fitting.weighting import Weighting, assess_frames
+from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import repeatable
 from wildghand.gaussians.training import TrainingClip, load_frames
 from wildghand.model.assemble import make_model
@@ -25,10 +26,6 @@ from wildghand.model.settings import WildGHandSettings
 from wildghand.network import parameter_groups
 from wildghand.pao.pao import PerturbationAwareWeights
 from wildghand.prior.files import choose_prior
-
-# Gradients of a mean over all pixels are small next to Adam's usual 1e-8.
-_EPSILON = 1e-15
-_BETAS = (0.9, 0.99)
 
 
 class Fit:
@@ -99,16 +96,13 @@ class Fit:
         value = float(world.average_(loss.detach().clone()))
         if not math.isfinite(value):
             return value
-        self.optimizer.zero_grad(set_to_none=True)
+        self.optimizer.clear()
         with repeatable(self.device):
             loss.backward()
         average_gradients(
             (tensor for group in self.optimizer.param_groups for tensor in group["params"]), world
         )
-        limit = settings.schedule.clip_gradient
-        if limit > 0.0:
-            torch.nn.utils.clip_grad_norm_(self.model.parameters(), limit)
-        self.optimizer.step()
+        self.optimizer.take_step(loss)
         return value
 
     def require_same(self, step: int) -> None:
@@ -272,7 +266,7 @@ def begin_temporal_weights(
 
 def make_optimizer(
     model: WildGHandModel, weights: PerturbationAwareWeights, settings: WildGHandSettings
-) -> torch.optim.Adam:
+) -> ClippedAdam:
     """Adam over everything that is fitted; each group keeps its first rate as `start`."""
     rates = settings.schedule.rates
     groups = {name: list(group) for name, group in parameter_groups(model.network).items()}
@@ -281,19 +275,22 @@ def make_optimizer(
     groups["gains"] = [model.log_gains]
     groups["pose"] = [model.pose_steps]
     groups["transl"] = [model.transl_steps]
-    return torch.optim.Adam(
+    return ClippedAdam(
         [
-            {"params": group, "lr": getattr(rates, name), "start": getattr(rates, name)}
+            {
+                "params": group,
+                "lr": getattr(rates, name),
+                "start": getattr(rates, name),
+                "clipped": name != "thresholds",
+            }
             for name, group in groups.items()
             if group
         ],
-        eps=_EPSILON,
-        betas=_BETAS,
-        fused=True,
+        settings.schedule.clip_gradient,
     )
 
 
-def set_rates(optimizer: torch.optim.Adam, settings: WildGHandSettings, fraction: float) -> None:
+def set_rates(optimizer: ClippedAdam, settings: WildGHandSettings, fraction: float) -> None:
     """Set the steps for a share of the budget that is used up."""
     schedule = settings.schedule
     if schedule.decay == "halving":

@@ -13,6 +13,7 @@ import torch
 
 from hwp_bench.base.errors import DidNotConverge, MissingDependency
 from hwp_bench.methods.contract import Budget, Report
+from wildghand.gaussians.adam import warm_up as warm_up_optimizer
 from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
 from wildghand.splat.warmup import warm_up
 
@@ -59,6 +60,7 @@ def ready_device(name: str) -> torch.device:
     if device.type == "cpu":
         warm_up()
         warm_up_loss()
+        warm_up_optimizer()
     return device
 
 

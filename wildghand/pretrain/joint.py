@@ -12,6 +12,7 @@ from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit, make_optimizer
 from wildghand.fitting.optimize import Watchers
+from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import batches
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import PredictionNetwork
@@ -148,7 +149,7 @@ def _share(source: PredictionNetwork, network: PredictionNetwork) -> None:
             setattr(network, name, child)
 
 
-def _joint_optimizer(fits: Sequence[Fit]) -> torch.optim.Adam:
+def _joint_optimizer(fits: Sequence[Fit]) -> ClippedAdam:
     """Adam over the parameters of all fits, each of them once; rates by group as in a fit."""
     joint, *others = [make_optimizer(fit.model, fit.weighting.pao, fit.settings) for fit in fits]
     for other in others:

@@ -1,0 +1,184 @@
+"""Adam with the norm of the gradient clipped: two passes over everything that is fitted.
+
+On the CPU a step of torch's optimizer and of its clipping starts some two hundred operations on
+tensors that are mostly tiny. Here all tensors are cut into pieces that compiled code goes through,
+on several threads. On other devices torch's own fused step does the work, and nothing is read back.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from wildghand.gaussians.adam_kernels import PIECE, Pieces, add_squares, advance, update
+from wildghand.splat.threads import even_jobs, run, thread_count
+
+# Gradients of a mean over all pixels are small next to Adam's usual 1e-8.
+_EPSILON = 1e-15
+_BETAS = (0.9, 0.99)
+# Added to the norm that the limit is divided by, as in torch.
+_LEAST_NORM = 1e-6
+# Numbers that are worth a thread: half a millisecond's work.
+_WORTH_A_THREAD = 4 * PIECE
+
+
+class ClippedAdam(torch.optim.Adam):
+    """`torch.optim.Adam`, which clips the norm of the gradient; saved states are the same.
+
+    On the CPU numbers are rounded as in torch's fused step on processors with fused multiply-add.
+    The norm is summed in float64 and in an order that does not depend on the number of threads.
+
+    Args:
+        groups: as torch takes them; each may have `clipped`, whether its gradients count in the
+            norm and are scaled (true where it is left out). Parameters are float32.
+        limit: largest norm; 0 leaves gradients as they are.
+
+    Source: Kingma and Ba, "Adam: a method for stochastic optimization"; betas 0.9 and 0.99,
+    epsilon 1e-15.
+    """
+
+    def __init__(self, groups: Iterable[dict[str, Any]], limit: float) -> None:
+        super().__init__(list(groups), eps=_EPSILON, betas=_BETAS, fused=True)
+        self.limit = limit
+        self._tables: _Tables | None = None
+
+    def clear(self) -> None:
+        """Drop all gradients."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                parameter.grad = None
+
+    def take_step(self, loss: Tensor) -> None:
+        """Move everything that has a gradient.
+
+        Args:
+            loss: the scalar that the gradients are of. Not on the CPU, nothing changes where it is
+                not finite, and nobody waits to learn whether it is; on the CPU the caller knows.
+        """
+        if loss.device.type == "cpu":
+            self._step_compiled()
+        else:
+            self._step_on_device(loss)
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Go on from a saved state, also one of `torch.optim.Adam` over the same groups."""
+        clipped = [group.get("clipped", True) for group in self.param_groups]
+        super().load_state_dict(state_dict)
+        for group, held in zip(self.param_groups, clipped, strict=True):
+            group["clipped"] = held
+        self._tables = None
+
+    def _step_on_device(self, loss: Tensor) -> None:
+        if self.limit > 0.0:
+            clipped = [p for group, p in self._parameters() if group.get("clipped", True)]
+            torch.nn.utils.clip_grad_norm_(clipped, self.limit)
+        # Torch's fused kernels read it where it lies, as for a `GradScaler`, and skip the step.
+        self.found_inf = (~loss.detach().isfinite()).float()
+        self.step()
+
+    def _parameters(self) -> Iterator[tuple[dict[str, Any], Tensor]]:
+        """The parameters that have a gradient, each with its group."""
+        for group in self.param_groups:
+            for parameter in group["params"]:
+                if parameter.grad is not None:
+                    yield group, parameter
+
+    @torch.no_grad()
+    def _step_compiled(self) -> None:
+        chosen = list(self._parameters())
+        if not chosen:
+            return
+        gradients = [_laid_out_alike(parameter) for _, parameter in chosen]
+        tables = self._tables
+        if tables is None or not tables.are_of(chosen):
+            tables = self._tables = _Tables([(p, self._moments(p)) for _, p in chosen])
+        clipped = np.array([group.get("clipped", True) for group, _ in chosen])
+        rates = np.array([float(group["lr"]) for group, _ in chosen])
+        tables.step(gradients, rates, clipped, self.limit)
+
+    def _moments(self, parameter: Tensor) -> dict[str, Tensor]:
+        """Count of steps and moments, as torch names and makes them."""
+        state = self.state[parameter]
+        if not state:
+            state["step"] = torch.zeros((), dtype=torch.float32)
+            state["exp_avg"] = torch.zeros_like(parameter)
+            state["exp_avg_sq"] = torch.zeros_like(parameter)
+        return state
+
+
+def _laid_out_alike(parameter: Tensor) -> Tensor:
+    """The gradient of a parameter, with its numbers in the parameter's order in memory."""
+    gradient = parameter.grad
+    assert gradient is not None
+    if gradient.is_contiguous() and parameter.is_contiguous():
+        return gradient
+    if gradient.stride() == parameter.stride():
+        return gradient
+    return torch.empty_like(parameter).copy_(gradient)
+
+
+class _Tables:
+    """Where tensors lie in memory, and how they are cut into pieces.
+
+    Args:
+        tensors: parameters, each with its count of steps and its moments.
+    """
+
+    def __init__(self, tensors: Sequence[tuple[Tensor, dict[str, Tensor]]]) -> None:
+        self._held = tensors
+        names = ("exp_avg", "exp_avg_sq", "step")
+        rest = [[state[name].data_ptr() for _, state in tensors] for name in names]
+        self._addresses = np.zeros((5, len(tensors)), np.int64)
+        self._addresses[2:] = rest
+        cuts = [
+            (owner, first, min(first + PIECE, parameter.numel()))
+            for owner, (parameter, _) in enumerate(tensors)
+            for first in range(0, parameter.numel(), PIECE)
+        ]
+        self._pieces = Pieces(*np.array(cuts, np.int64).T.copy())
+        self._numbers = sum(parameter.numel() for parameter, _ in tensors)
+        self._factors = np.empty((len(tensors), 2), np.float32)
+        self._sums = np.empty(len(cuts))
+
+    def are_of(self, chosen: Sequence[tuple[dict[str, Any], Tensor]]) -> bool:
+        """Whether these are the parameters."""
+        return len(chosen) == len(self._held) and all(
+            mine is theirs for (mine, _), (_, theirs) in zip(self._held, chosen, strict=True)
+        )
+
+    def step(
+        self, gradients: Sequence[Tensor], rates: np.ndarray, clipped: np.ndarray, limit: float
+    ) -> None:
+        """Take a step.
+
+        Args:
+            gradients: of the T parameters, contiguous.
+            rates: (T,) learning rates.
+            clipped: (T,) bool, which count in the norm and are scaled.
+            limit: largest norm; 0: none.
+        """
+        addresses, pieces = self._addresses, self._pieces
+        addresses[0] = [parameter.data_ptr() for parameter, _ in self._held]
+        addresses[1] = [gradient.data_ptr() for gradient in gradients]
+        worth = max(1, self._numbers // _WORTH_A_THREAD)
+        jobs = even_jobs(len(pieces.owner), min(worth, thread_count(len(pieces.owner))))
+        scales = np.ones(len(rates), np.float32)
+        if limit > 0.0:
+            run(add_squares, jobs, addresses, pieces, self._sums)
+            norm = math.sqrt(self._sums[clipped[pieces.owner]].sum())
+            # A norm that is not finite makes everything NaN, as in torch; the guard will see it.
+            scales[clipped] = np.minimum(np.float32(1.0), limit / np.float32(norm + _LEAST_NORM))
+        advance(addresses, rates, _BETAS, self._factors)
+        run(update, jobs, addresses, pieces, self._factors, scales, _BETAS, _EPSILON)
+
+
+def warm_up() -> None:
+    """Make the kernels ready: compiled once on a machine, loaded later."""
+    values = torch.zeros(1, requires_grad=True)
+    values.grad = torch.zeros(1)
+    ClippedAdam([{"params": [values], "lr": 0.0}], 1.0).take_step(torch.zeros(()))
