@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import hashlib
+import importlib
 import os
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any
@@ -198,8 +199,8 @@ def run_in_world(choose: Callable[[], torch.device], work: Callable[[World], int
             raise
         stopped = 130 if isinstance(error, KeyboardInterrupt) else 1
         return error.exit_status if isinstance(error, HwpError) else stopped
-    if world.size > 1:
-        torch.distributed.destroy_process_group()
+    finally:
+        _leave()
     return status
 
 
@@ -226,6 +227,9 @@ def join(device: torch.device) -> World:
         )
     if device.type == "cuda":
         _own_gpu(_number("LOCAL_RANK", 0), _number("LOCAL_WORLD_SIZE", size))
+    # Its functions have the group that exists when it is first imported as a default value, and
+    # optimizers import it. A group that anything still holds outlives `_leave`.
+    importlib.import_module("torch.distributed.nn")
     try:
         store, rank, size = next(iter(torch.distributed.rendezvous("env://")))
         torch.distributed.init_process_group(
@@ -241,6 +245,16 @@ def join(device: torch.device) -> World:
             remedy="Start them with torchrun; docs/wildghand.md has the command.",
         ) from error
     return World(rank, size, device, store)
+
+
+def _leave() -> None:
+    """Leave the other processes, and end the threads that talked to them.
+
+    Such a thread returns tensors to Python. If it still runs when the interpreter ends, the
+    process is aborted although its work is done.
+    """
+    if torch.distributed.is_available() and torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 def _own_gpu(place: int, processes: int) -> None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import multiprocessing
 import os
 import socket
 import subprocess
 import sys
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -93,15 +95,29 @@ def check_spoiled(request: Path, world: World) -> None:
     assert all(torch.equal(before[name], v) for name, v in fit.model.snapshot().items())
 
 
-def process(rank: int, port: int, folder: Path) -> None:
-    """The work of each of two processes; both leave what they found in `folder`."""
-    torch.set_num_threads(1)
+def meet(rank: int, port: int, work: Callable[[World], int]) -> int:
+    """Work as one of two processes; checks that nothing of their meeting remains afterwards."""
     os.environ |= {
         "RANK": str(rank),
         "WORLD_SIZE": "2",
         "MASTER_ADDR": "127.0.0.1",
         "MASTER_PORT": str(port),
     }
+    groups: list[weakref.ref[Any]] = []
+
+    def watched(world: World) -> int:
+        groups.append(weakref.ref(torch.distributed.group.WORLD))
+        return work(world)
+
+    try:
+        return run_in_world(lambda: CPU, watched)
+    finally:
+        assert groups[0]() is None, "something holds the group, so that its threads still run"
+
+
+def process(rank: int, ports: tuple[int, int], folder: Path) -> None:
+    """The work of each of two processes; both leave what they found in `folder`."""
+    torch.set_num_threads(1)
 
     def work(world: World) -> int:
         request = folder / "request"
@@ -114,7 +130,22 @@ def process(rank: int, port: int, folder: Path) -> None:
         torch.save(found, folder / f"found-{rank}")
         return 0
 
-    sys.exit(run_in_world(lambda: CPU, work))
+    def fail(world: World) -> int:
+        world.wait_for_main()
+        raise UsageError("as asked")
+
+    assert meet(rank, ports[0], work) == 0
+    # A thread that hands a tensor back to Python waits until the code here is at its end. If one
+    # were alive then, the end of the interpreter would abort this process.
+    sys.setswitchinterval(60.0)
+    with contextlib.suppress(UsageError):  # of the first to fail
+        assert meet(rank, ports[1], fail) == UsageError.exit_status
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return probe.getsockname()[1]
 
 
 @pytest.fixture(scope="module")
@@ -124,11 +155,9 @@ def folder(make_painted: Callable[..., Capture], tmp_path_factory: pytest.TempPa
     capture = make_painted()
     split = contiguous_split(capture.info.id, FRAMES)
     write_request(folder / "request", capture, split, RunSettings({}, 0, Budget()))
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        port = probe.getsockname()[1]
     context = multiprocessing.get_context("spawn")
-    processes = [context.Process(target=process, args=(rank, port, folder)) for rank in (0, 1)]
+    ports = (free_port(), free_port())
+    processes = [context.Process(target=process, args=(rank, ports, folder)) for rank in (0, 1)]
     for each in processes:
         each.start()
     for each in processes:
