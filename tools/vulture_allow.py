@@ -10,6 +10,9 @@ modified  # part of the cache's key: a changed file is read again
 _.maxlong  # reprlib reads it
 _.maxother  # reprlib reads it
 _.maxstring  # reprlib reads it
+_.cache_path  # numba's dispatcher reads it
+_.load_overload  # numba's dispatcher calls it
+_.save_overload  # numba's dispatcher calls it
 _.find_class  # pickle.Unpickler calls it
 _.persistent_load  # pickle.Unpickler calls it
 align  # pickles of numpy pass it

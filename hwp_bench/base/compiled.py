@@ -7,21 +7,36 @@ from typing import Any
 
 import numba
 
+from hwp_bench.base.machine_code import MachineCode
+
+#: Untyped: the types that numba declares differ between its versions.
+_njit: Any = numba.njit
+
 
 def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator: compile a function on first use; the machine code is kept on disk where possible.
+    """Decorator: compile a function on first use; the machine code is kept on disk.
 
-    Bounds are not checked, and a division by zero gives what NumPy gives.
+    It lies in the folder `kernels` of `HWP_CACHE` and is found by what it was made from
+    (`machine_code`). Functions of other packages, and those that read variables of a function
+    around them, are compiled in every process. Bounds are not checked, and a division by zero gives
+    what NumPy gives.
 
     Args:
         options: further options of `numba.njit`, such as `nogil=True`.
     """
-    settings = {"boundscheck": False, "error_model": "numpy", **options}
+    # Nothing calls a kernel from C.
+    settings = {"boundscheck": False, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
 
     def compile_function(function: Callable[..., Any]) -> Any:
-        try:
-            return numba.njit(cache=True, **settings)(function)
-        except RuntimeError:  # numba found no folder to write to
-            return numba.njit(**settings)(function)
+        dispatcher: Any = _njit(**settings)(function)
+        if hasattr(dispatcher, "signatures"):  # not if NUMBA_DISABLE_JIT is set
+            dispatcher._cache = MachineCode(function, settings)
+        return dispatcher
 
     return compile_function
+
+
+def on_disk(dispatcher: Any) -> bool:
+    """Return whether the disk holds machine code of a compiled function, as far as can be told."""
+    cache = getattr(dispatcher, "_cache", None)
+    return isinstance(cache, MachineCode) and cache.on_disk()

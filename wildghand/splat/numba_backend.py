@@ -9,6 +9,7 @@ import torch
 from wildghand.splat.autograd import Blend, Call, Project
 from wildghand.splat.scene import (
     FlatScene,
+    channel_count,
     channels_with_depth,
     expected_depth,
     per_image,
@@ -25,7 +26,7 @@ def rasterize_numba(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[
         channels (I, H, W, X), alphas (I, H, W, 1) and the backend's part of `info`.
     """
     options = scene.options
-    warm_up()
+    warm_up(channel_count(scene))
     call = Call(
         options,
         camera_rows(

@@ -75,6 +75,12 @@ def per_image(tensor: torch.Tensor, images: int) -> torch.Tensor:
     return tensor.unsqueeze(1).expand(share, repeat, *tensor.shape[1:]).flatten(0, 1)
 
 
+def channel_count(scene: FlatScene) -> int:
+    """How many channels are blended in the scene's render mode."""
+    mode = scene.options.render_mode
+    return scene.colors.shape[-1] * ("RGB" in mode) + (mode != "RGB")
+
+
 def channels_with_depth(
     colors: torch.Tensor, depths: torch.Tensor, scene: FlatScene
 ) -> tuple[torch.Tensor, torch.Tensor | None]:

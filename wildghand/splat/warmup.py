@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import logging
-import pickle
 import threading
 import time
 
@@ -21,36 +20,32 @@ from wildghand.splat.scene import Options
 _log = logging.getLogger("wildghand.splat")
 _lock = threading.Lock()
 
-#: Errors that a damaged or full cache may raise.
-_CACHE_ERRORS = (OSError, EOFError, pickle.PickleError, ImportError, AttributeError, IndexError)
 
-
-def warm_up() -> None:
+def warm_up(channels: int = stages.UNROLLED[0]) -> None:
     """Makes the kernels ready; costs nothing from the second call on.
 
     Compiling takes some ten seconds, once on a machine. A person who waits is told on the log
     (level WARNING, which goes to standard error unless logging is set up otherwise).
+
+    Args:
+        channels: how many are to be blended. Numbers that are not unrolled share one version,
+            which few programs need.
     """
     with _lock:
-        _warm_up()
+        _warm_up(channels if channels in stages.UNROLLED else None)
 
 
 @functools.cache
-def _warm_up() -> None:
+def _warm_up(unrolled: int | None) -> None:
     kernels = all_kernels()
+    before = sum(kernel.compiled_here() for kernel in kernels)
     if not all(kernel.on_disk() for kernel in kernels):
         _log.warning(
             "compiling the CPU rasterizer, once on this machine; it takes some ten seconds"
         )
     start = time.perf_counter()
-    try:
-        _run_all()
-    except _CACHE_ERRORS as error:
-        _log.warning("the compile cache cannot be used (%s); compiling without it", error)
-        for kernel in kernels:
-            kernel.forget_cache()
-        _run_all()
-    if any(kernel.compiled_here() for kernel in kernels):
+    _draw_nothing(max(stages.UNROLLED) + 1 if unrolled is None else unrolled)
+    if sum(kernel.compiled_here() for kernel in kernels) > before:
         _log.warning("compiled the CPU rasterizer in %.1f s", time.perf_counter() - start)
 
 
@@ -60,12 +55,6 @@ def all_kernels() -> list[Kernel]:
     return [
         value for module in modules for value in vars(module).values() if isinstance(value, Kernel)
     ]
-
-
-def _run_all() -> None:
-    """Every kernel in every version: unrolled and for any number of channels."""
-    for channels in (*stages.UNROLLED, max(stages.UNROLLED) + 1):
-        _draw_nothing(channels)
 
 
 def _draw_nothing(channels: int) -> None:

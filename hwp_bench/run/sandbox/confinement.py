@@ -113,7 +113,8 @@ def sandbox_environment(
     """Return the environment of a method in a sandbox, and what it sees of the file system.
 
     It may write to its output folder, and to a cache that it shares only with other runs of the
-    same method: compiled code must survive a run, and must never reach another program.
+    same method: compiled code must survive a run, and must never reach another program. It may
+    read the machine code that the toolkit itself has compiled.
 
     Args:
         method: its directory.
@@ -125,18 +126,20 @@ def sandbox_environment(
     home = output / "home"
     home.mkdir()
     cache = _own_cache(method, output)
+    kernels = cache_root().absolute() / "kernels"
     environment = {
         **_taken(INHERITED),
         "HOME": str(home.resolve()),
         "HWP_CACHE": str(cache),
         "NUMBA_CACHE_DIR": str(cache / "numba"),
+        "HWP_KERNELS": str(kernels),
     }
     weights = _torch_home()
     if weights.is_dir():
         environment["TORCH_HOME"] = str(weights)
     libraries = [Path(entry) for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep)]
     places = visible_places(
-        read=[method, request, weights, *_absolute(libraries), *confinement.exposed],
+        read=[method, request, weights, kernels, *_absolute(libraries), *confinement.exposed],
         write=[output, cache],
         hidden=confinement.hidden,
         program=command[0],

@@ -13,6 +13,7 @@ from typing import Protocol
 import numpy as np
 
 from hwp_bench.base.arrays import read_npz, take, write_npz
+from hwp_bench.base.caches import trim
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.files import cache_root, sha256_json
 from hwp_bench.base.images import pixel_digest
@@ -130,21 +131,7 @@ class RegionCache:
 
     def prune(self) -> None:
         """Remove the files that were used longest ago until the rest fits."""
-        entries = []
-        with contextlib.suppress(OSError):
-            for entry in os.scandir(self.folder):
-                # Another process may remove what this one has just listed.
-                with contextlib.suppress(OSError):
-                    if entry.name.endswith(".npz"):
-                        status = entry.stat(follow_symlinks=False)
-                        entries.append((status.st_mtime_ns, status.st_size, entry.path))
-        total = sum(size for _, size, _ in entries)
-        for _, size, path in sorted(entries):
-            if total <= self.max_bytes:
-                return
-            with contextlib.suppress(OSError):
-                os.unlink(path)
-            total -= size
+        trim(self.folder, ".npz", self.max_bytes)
 
 
 def _load(path: Path, shape: tuple[int, int]) -> FrameRegions | None:
