@@ -80,7 +80,7 @@ def render_instant(
     tracers: list[Tracer] = [layer.tracer for _, layer in layers]
     for name, layer in layers:
         with cost.time(name):
-            hits = layer.tracer.first_hits(np.broadcast_to(origin, rays.shape), rays, name)
+            hits = layer.tracer.first_hits(origin[None], rays, name)
             hits = _nearer(hits, depth)
             samples = gather(layer.surface, hits, rays)
         with cost.time("shadow"):

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.raycast import LIFT, Tracer
+from hwp_bench.sim.render.radiance import radiance
 from hwp_bench.sim.render.samples import Samples
 from hwp_bench.sim.scene.optics import Lights
 
@@ -32,37 +32,13 @@ def shade(samples: Samples, lights: Lights, lit: np.ndarray) -> np.ndarray:
     """
     if lights.cast is not None:
         lit = lit * lights.cast.passed(samples.points)
-    cosine = samples.normals @ lights.direction
-    wrap = samples.wrap
-    diffuse = np.clip((cosine[:, None] + wrap) / (1.0 + wrap) ** 2, 0.0, None)
-    # Light that wraps past the terminator has gone through the skin: shadow softens it only.
-    beam = diffuse * lit[:, None]
-    up = 0.5 - 0.5 * samples.normals[:, 1:2]
-    # Bounces between skin and skin brighten the occluded parts, in the skin's own colour.
-    open_ = samples.openness[:, None]
-    bounced = open_ / (1.0 - samples.albedo * (1.0 - open_) * 0.8)
-    around = (up * lights.sky + (1.0 - up) * lights.ground) * bounced
-    color = samples.albedo * (beam * lights.key + around)
-    color += _gloss(samples, lights, cosine, lit)
-    color += samples.glow[:, None] * samples.albedo
-    return color * lights.exposure
-
-
-def _gloss(samples: Samples, lights: Lights, cosine: np.ndarray, lit: np.ndarray) -> np.ndarray:
-    half = unit(samples.view + lights.direction)
-    nh = np.clip(np.einsum("ni,ni->n", samples.normals, half), 0.0, 1.0)
-    nv = np.clip(np.einsum("ni,ni->n", samples.normals, samples.view), 0.05, 1.0)
-    nl = np.clip(cosine, 0.0, 1.0)
-    vh = np.clip(np.einsum("ni,ni->n", samples.view, half), 0.0, 1.0)
-    alpha = np.clip(samples.roughness, 0.05, 1.0) ** 2
-    lobe = alpha**2 / np.maximum(np.pi * (nh**2 * (alpha**2 - 1.0) + 1.0) ** 2, 1e-9)
-    k = alpha / 2.0
-    shape = 0.25 / ((nl * (1 - k) + k) * (nv * (1 - k) + k))
-    fresnel = samples.specular + (1.0 - samples.specular) * (1.0 - vh) ** 5
-    beam = lobe * shape * fresnel * nl * lit * np.pi
-    edge = samples.specular + (1.0 - samples.specular) * (1.0 - nv) ** 5
-    sky = 0.5 * edge * (1.0 - 0.8 * samples.roughness) * samples.openness
-    return beam[:, None] * lights.key + sky[:, None] * lights.sky
+    return radiance(
+        (samples.normals, samples.view),
+        (samples.albedo, samples.wrap, samples.roughness, samples.specular, samples.glow),
+        (lit, samples.openness),
+        np.stack([lights.direction, lights.key, lights.sky, lights.ground]),
+        lights.exposure,
+    )
 
 
 def openness(tracer: Tracer, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:

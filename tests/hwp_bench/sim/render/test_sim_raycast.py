@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections import Counter
 
 import numpy as np
+import pytest
 import trimesh
 
-from hwp_bench.sim.geometry.raycast import Tracer
+from hwp_bench.sim.geometry.embree import EmbreeMesh, library
+from hwp_bench.sim.geometry.raycast import EmbreexMesh, Tracer
 from hwp_bench.sim.render.shading import openness
 
 
@@ -45,3 +47,31 @@ def test_openness_of_a_floor_and_of_a_corner() -> None:
     near, far = openness(tracer, points, up)
     assert far == 1.0
     assert 0.45 < near < 0.62
+
+
+def test_hits_equal_those_of_embreex_bit_for_bit() -> None:
+    # Oracle: the package embreex itself, on a bumpy ball from one place and from many.
+    ball = trimesh.creation.icosphere(subdivisions=5, radius=0.1)
+    rng = np.random.default_rng(1)
+    vertices = ball.vertices * rng.uniform(0.9, 1.1, (len(ball.vertices), 1))
+    loaded = library()
+    assert loaded is not None
+    ours, plain = EmbreeMesh(loaded, vertices, ball.faces), EmbreexMesh(vertices, ball.faces)
+    directions = np.array([0.0, 0.0, 1.0]) + rng.normal(0.0, 0.15, (20_000, 3))
+    many = rng.normal(0.0, 0.2, (20_000, 3)) - [0.0, 0.0, 0.5]
+    for origins in (np.array([[0.0, 0.0, -0.5]]), many):
+        met = plain.first_hits(origins, directions)
+        assert 1000 < len(met[0]) < 20_000
+        for value, oracle in zip(ours.first_hits(origins, directions), met, strict=True):
+            np.testing.assert_array_equal(value, oracle)
+        expected = plain.blocked(origins, directions)
+        np.testing.assert_array_equal(ours.blocked(origins, directions), expected)
+    nothing = np.zeros((0, 3))
+    assert not len(ours.blocked(nothing, nothing))
+    assert not len(plain.blocked(nothing, nothing))
+    assert not len(ours.first_hits(nothing, nothing)[0])
+
+
+def test_a_tracer_works_through_embreex_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("hwp_bench.sim.geometry.embree.library", lambda: None)
+    test_hits_lie_on_the_sphere()

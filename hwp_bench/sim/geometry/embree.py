@@ -1,0 +1,218 @@
+"""Embree through its C interface: meshes from arrays, rays in a compiled loop.
+
+The package embreex builds a mesh from Python numbers, one coordinate at a time, which takes
+longer than Embree's own work on it. Here Embree reads the arrays themselves. Hits are those of
+embreex, bit for bit; the tests compare them.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import weakref
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+from numba import types
+from numba.experimental import function_type  # noqa: F401  (lets addresses pass as arguments)
+
+from hwp_bench.base.compiled import compiled
+from hwp_bench.base.errors import HwpError
+
+# From the headers of Embree 4: rtcore_common.h, rtcore_buffer.h, rtcore_scene.h, rtcore_device.h.
+_TRIANGLES, _INDEX_BUFFER, _VERTEX_BUFFER, _VERSION = 0, 0, 1, 0
+_UINT3, _FLOAT3 = 0x5003, 0x9003
+_ROBUST = 4
+# Versions whose ray, in the order of its fields, is the one that `_cast` writes.
+_VERSIONS = range(40000, 50000)
+#: (ray, face, u, v, distance) of the rays that met something, each (H,).
+Met = tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]
+
+
+class _Address(types.WrapperAddressProtocol):
+    """A C function of three pointers, as compiled code is handed it."""
+
+    def __init__(self, address: int) -> None:
+        self._address = address
+
+    def __wrapper_address__(self) -> int:
+        return self._address
+
+    def signature(self) -> Any:
+        return types.void(types.int64, types.int64, types.int64)
+
+
+@dataclass(frozen=True, eq=False)
+class Library:
+    """Embree as this process has loaded it."""
+
+    #: Calls a function of the C interface by its name, such as `rtcNewScene`.
+    call: Callable[..., Any]
+    #: The device, which builds on the thread that asks: processes share the cores already.
+    device: int
+    #: `rtcIntersect1` and `rtcOccluded1`.
+    intersect: _Address
+    occluded: _Address
+
+
+@lru_cache(maxsize=1)
+def library() -> Library | None:
+    """Embree, loaded once, or None where its C interface is not the one that is known here."""
+    from embreex import rtcore_scene
+
+    pointer, number, size = ctypes.c_void_p, ctypes.c_uint, ctypes.c_size_t
+    kinds: dict[str, tuple[Any, tuple[Any, ...]]] = {
+        "rtcNewDevice": (pointer, (ctypes.c_char_p,)),
+        "rtcGetDeviceProperty": (ctypes.c_ssize_t, (pointer, ctypes.c_int)),
+        "rtcGetDeviceError": (ctypes.c_int, (pointer,)),
+        "rtcNewScene": (pointer, (pointer,)),
+        "rtcSetSceneFlags": (None, (pointer, ctypes.c_int)),
+        "rtcCommitScene": (None, (pointer,)),
+        "rtcReleaseScene": (None, (pointer,)),
+        "rtcNewGeometry": (pointer, (pointer, ctypes.c_int)),
+        "rtcSetSharedGeometryBuffer": (
+            None,
+            (pointer, ctypes.c_int, number, ctypes.c_int, pointer, size, size, size),
+        ),
+        "rtcCommitGeometry": (None, (pointer,)),
+        "rtcAttachGeometry": (number, (pointer, pointer)),
+        "rtcReleaseGeometry": (None, (pointer,)),
+    }
+    functions = {}
+    try:
+        # The extension is linked against Embree, so its handle finds Embree's symbols too.
+        loaded = ctypes.CDLL(rtcore_scene.__file__)
+        for name, (result, arguments) in kinds.items():
+            functions[name] = getattr(loaded, name)
+            functions[name].restype, functions[name].argtypes = result, arguments
+        rays = [
+            _Address(ctypes.cast(getattr(loaded, name), pointer).value or 0)
+            for name in ("rtcIntersect1", "rtcOccluded1")
+        ]
+    except (OSError, AttributeError):
+        return None
+
+    def call(name: str, *arguments: Any) -> Any:
+        return functions[name](*arguments)
+
+    device = call("rtcNewDevice", b"threads=1")
+    if not device or call("rtcGetDeviceProperty", device, _VERSION) not in _VERSIONS:
+        return None
+    return Library(call, device, *rays)
+
+
+class EmbreeMesh:
+    """One mesh, built where it is.
+
+    Args:
+        loaded: what `library` returned.
+        vertices: (V, 3) m.
+        faces: (F, 3) vertex indices.
+
+    Raises:
+        HwpError: Embree refuses the mesh.
+    """
+
+    def __init__(self, loaded: Library, vertices: np.ndarray, faces: np.ndarray) -> None:
+        self._library, call = loaded, loaded.call
+        # Embree reads 16 bytes at each vertex, so there is one more.
+        self._vertices = np.zeros((len(vertices) + 1, 3), np.float32)
+        self._vertices[:-1] = vertices
+        self._faces = np.ascontiguousarray(faces, np.uint32)
+        self._scene = call("rtcNewScene", loaded.device)
+        weakref.finalize(self, call, "rtcReleaseScene", self._scene)
+        # Rays that pass exactly between two faces must not fall through.
+        call("rtcSetSceneFlags", self._scene, _ROBUST)
+        self._geometry = call("rtcNewGeometry", loaded.device, _TRIANGLES)
+        weakref.finalize(self, call, "rtcReleaseGeometry", self._geometry)
+        for kind, layout, array, count in (
+            (_VERTEX_BUFFER, _FLOAT3, self._vertices, len(vertices)),
+            (_INDEX_BUFFER, _UINT3, self._faces, len(faces)),
+        ):
+            address = array.ctypes.data
+            call(
+                "rtcSetSharedGeometryBuffer", self._geometry, kind, 0, layout, address, 0, 12, count
+            )
+        call("rtcCommitGeometry", self._geometry)
+        call("rtcAttachGeometry", self._scene, self._geometry)
+        self._commit()
+
+    def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> Met:
+        """The first face on each ray.
+
+        Args:
+            origins: (N, 3) m, or (1, 3) for all.
+            directions: (N, 3), any length.
+        """
+        rays = _rays(origins, directions)
+        return _cast(self._library.intersect, self._scene, *rays)
+
+    def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Whether anything is in each ray's way: (N,) bool; arguments as of `first_hits`."""
+        rays = _rays(origins, directions)
+        return _ask(self._library.occluded, self._scene, *rays)
+
+    def _commit(self) -> None:
+        self._library.call("rtcCommitScene", self._scene)
+        error = self._library.call("rtcGetDeviceError", self._library.device)
+        if error:
+            raise HwpError(f"Embree cannot build a mesh of {len(self._faces)} faces ({error})")
+
+
+def _rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    return np.ascontiguousarray(origins, np.float64), np.ascontiguousarray(directions, np.float64)
+
+
+@compiled(nogil=True)
+def _new_ray() -> np.ndarray:
+    """A ray with room for its hit (RTCRayHit, 96 bytes), at a multiple of 64 bytes."""
+    room = np.zeros(48, np.float32)
+    start = (16 - (room.ctypes.data // 4) % 16) % 16
+    return room[start : start + 32]
+
+
+@compiled(nogil=True)
+def _aim(ray: np.ndarray, numbers: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> None:
+    """Write a ray: origin, near end, direction, time, far end, mask, id, flags; no hit yet."""
+    ray[0], ray[1], ray[2], ray[3] = origin[0], origin[1], origin[2], 0.0
+    ray[4], ray[5], ray[6], ray[7] = direction[0], direction[1], direction[2], 0.0
+    ray[8] = 1e37
+    numbers[9], numbers[10], numbers[11] = -1, 0, 0
+    numbers[17], numbers[18], numbers[19], numbers[20] = -1, -1, -1, -1
+
+
+@compiled(nogil=True)
+def _cast(call: Any, scene: int, origins: np.ndarray, directions: np.ndarray) -> Met:
+    ray = _new_ray()
+    numbers = ray.view(np.int32)
+    place = np.int64(ray.ctypes.data)
+    count = len(directions)
+    index, face = np.empty(count, np.int64), np.empty(count, np.int64)
+    u, v = np.empty(count, np.float32), np.empty(count, np.float32)
+    distance = np.empty(count, np.float32)
+    several = len(origins) > 1
+    hits = 0
+    for i in range(count):
+        _aim(ray, numbers, origins[i if several else 0], directions[i])
+        call(scene, place, 0)
+        if numbers[17] >= 0:
+            index[hits], face[hits] = i, numbers[17]
+            u[hits], v[hits], distance[hits] = ray[15], ray[16], ray[8]
+            hits += 1
+    return index[:hits], face[:hits], u[:hits], v[:hits], distance[:hits]
+
+
+@compiled(nogil=True)
+def _ask(call: Any, scene: int, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+    ray = _new_ray()
+    numbers = ray.view(np.int32)
+    place = np.int64(ray.ctypes.data)
+    met = np.empty(len(directions), np.bool_)
+    several = len(origins) > 1
+    for i in range(len(directions)):
+        _aim(ray, numbers, origins[i if several else 0], directions[i])
+        call(scene, place, 0)
+        met[i] = ray[8] < 0.0
+    return met
