@@ -168,7 +168,9 @@ def oriented_energies(plane: np.ndarray) -> np.ndarray:
     even = cv2.transform(even_basis, bank.even_steering)
     odd = cv2.transform(odd_basis, bank.odd_steering)
     # Not cv2.magnitude: its last bit depends on where in memory the arrays happen to lie.
-    return np.sqrt(np.square(even) + np.square(odd))
+    np.square(even, out=even)
+    even += np.square(odd, out=odd)
+    return np.sqrt(even, out=even)
 
 
 def local_mean(image: np.ndarray) -> np.ndarray:

@@ -11,6 +11,9 @@ from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.metrics.pixels import bounding_box, check_same_shape, composite, crop
 from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PSNR_CAP, SsimSettings
 
+# Rows that are scored together: the arithmetic between the window means then stays in the cache.
+_STRIP = 32
+
 
 def decibels(mse: float, cap: float = PSNR_CAP) -> float:
     """-10 log10(mse) for data range 1, at most `cap`; `cap` for mse = 0."""
@@ -44,23 +47,52 @@ def ssim_map(x: np.ndarray, y: np.ndarray, settings: SsimSettings = HWP_V1.ssim)
     check_same_shape(x, y)
     if min(x.shape[:2]) < settings.size:
         raise ShapeMismatch(f"an image of {x.shape[:2]} is smaller than the window")
-    mean_x, mean_y = _window_mean(x, settings), _window_mean(y, settings)
-    mean_xx, mean_yy, mean_xy = mean_x * mean_x, mean_y * mean_y, mean_x * mean_y
-    variance_x = np.maximum(_window_mean(x * x, settings) - mean_xx, 0.0)
-    variance_y = np.maximum(_window_mean(y * y, settings) - mean_yy, 0.0)
-    bound = np.sqrt(variance_x * variance_y)
-    covariance = _window_mean(x * y, settings) - mean_xy
-    covariance = cv2.max(cv2.min(covariance, bound), -bound)
+    means = tuple(_window_mean(image, settings) for image in (x, y, x * x, y * y, x * y))
+    similarity = np.empty(x.shape[:2])
+    for top in range(0, len(x), _STRIP):
+        rows = slice(top, top + _STRIP)
+        similarity[rows] = _similarity(*(mean[rows] for mean in means), settings)
+    r = settings.radius
+    return similarity[r : similarity.shape[0] - r, r : similarity.shape[1] - r]
 
+
+def _similarity(
+    mean_x: np.ndarray,
+    mean_y: np.ndarray,
+    square_x: np.ndarray,
+    square_y: np.ndarray,
+    product: np.ndarray,
+    settings: SsimSettings,
+) -> np.ndarray:
+    """SSIM (H, W) from the window means (H, W, 3) of x, y, x * x, y * y and x * y."""
     pixels = settings.size**2
     correction = pixels / (pixels - 1) if settings.sample_covariance else 1.0
     c1 = (settings.k1 * settings.data_range) ** 2
     c2 = (settings.k2 * settings.data_range) ** 2
-    numerator = (2.0 * mean_xy + c1) * (2.0 * correction * covariance + c2)
-    denominator = (mean_xx + mean_yy + c1) * (correction * (variance_x + variance_y) + c2)
-    similarity = cv2.transform(numerator / denominator, np.full((1, 3), 1.0 / 3.0))
-    r = settings.radius
-    return similarity[r : similarity.shape[0] - r, r : similarity.shape[1] - r]
+    mean_xx, mean_yy, numerator = mean_x * mean_x, mean_y * mean_y, mean_x * mean_y
+    variance_x, variance_y = square_x - mean_xx, square_y - mean_yy
+    np.maximum(variance_x, 0.0, out=variance_x)
+    np.maximum(variance_y, 0.0, out=variance_y)
+    bound = variance_x * variance_y
+    np.sqrt(bound, out=bound)
+    covariance = product - numerator
+    np.minimum(covariance, bound, out=covariance)
+    np.maximum(covariance, np.negative(bound, out=bound), out=covariance)
+
+    numerator *= 2.0
+    numerator += c1
+    covariance *= 2.0 * correction
+    covariance += c2
+    numerator *= covariance
+    denominator, variances = mean_xx, variance_x
+    denominator += mean_yy
+    denominator += c1
+    variances += variance_y
+    variances *= correction
+    variances += c2
+    denominator *= variances
+    numerator /= denominator
+    return cv2.transform(numerator, np.full((1, 3), 1.0 / 3.0))
 
 
 def ssim_box(
