@@ -47,24 +47,18 @@ def ssim_map(x: np.ndarray, y: np.ndarray, settings: SsimSettings = HWP_V1.ssim)
     check_same_shape(x, y)
     if min(x.shape[:2]) < settings.size:
         raise ShapeMismatch(f"an image of {x.shape[:2]} is smaller than the window")
-    means = tuple(_window_mean(image, settings) for image in (x, y, x * x, y * y, x * y))
-    similarity = np.empty(x.shape[:2])
+    means = [_window_mean(image, settings) for image in (x, y, x * x, y * y, x * y)]
+    similarity: np.ndarray = np.empty(x.shape[:2])
     for top in range(0, len(x), _STRIP):
         rows = slice(top, top + _STRIP)
-        similarity[rows] = _similarity(*(mean[rows] for mean in means), settings)
+        similarity[rows] = _similarity([mean[rows] for mean in means], settings)
     r = settings.radius
     return similarity[r : similarity.shape[0] - r, r : similarity.shape[1] - r]
 
 
-def _similarity(
-    mean_x: np.ndarray,
-    mean_y: np.ndarray,
-    square_x: np.ndarray,
-    square_y: np.ndarray,
-    product: np.ndarray,
-    settings: SsimSettings,
-) -> np.ndarray:
+def _similarity(means: list[np.ndarray], settings: SsimSettings) -> np.ndarray:
     """SSIM (H, W) from the window means (H, W, 3) of x, y, x * x, y * y and x * y."""
+    mean_x, mean_y, square_x, square_y, product = means
     pixels = settings.size**2
     correction = pixels / (pixels - 1) if settings.sample_covariance else 1.0
     c1 = (settings.k1 * settings.data_range) ** 2
