@@ -15,7 +15,7 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -98,6 +98,31 @@ def time_network(size: str, count: int, rounds: int) -> Table:
     row = (*cells, float(np.median(whole)), float(whole.min()), 1e3 * min(processor[2:]))
     caption = f"{size}, {count:,} Gaussians, {torch.get_num_threads()} threads: ms"
     return Table(caption, columns, (row,), ranked=False)
+
+
+def measure(size: str = "compact", count: int = 5_000, rounds: int = 12) -> Mapping[str, float]:
+    """Ratios of processor seconds by name, lower is better, on one thread.
+
+    The reference is the rasterizer: as many Gaussians on a hand that fills 176 px, both passes.
+
+    Args:
+        size: of the network.
+        count: Gaussians.
+        rounds: turns of each.
+    """
+    from benchmarks.splat import Contender as Drawing
+    from benchmarks.splat import ours, race
+    from benchmarks.splat_workloads import make
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        network = float(time_network(size, count, rounds).rows[0][-1])
+        drawn = race([Drawing("one", ours("numba"))], make(count, 176), rounds)["one"]
+        fastest = 1e3 * min(processor for *_, processor in drawn.rows)
+        return {"network / rasterizer": network / fastest}
+    finally:
+        torch.set_num_threads(before)
 
 
 def plain(training: TrainingCapture, frames: TrainingFrames, count: int) -> Contender:

@@ -1,7 +1,8 @@
-"""A small simulated capture for benchmarks: one of `mini`, rendered once into the cache."""
+"""A small simulated capture for benchmarks, rendered once into the cache."""
 
 from __future__ import annotations
 
+import dataclasses
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -14,10 +15,15 @@ from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.sim.produce.suites import ensure_captures, suite
 
+#: Frames of the small capture; a benchmark repeats them.
+FRAMES = 24
+
 
 def small_capture(path: str | Path | None = None) -> Capture:
-    """Open a capture; without a path the first of `mini` (176 px), rendered if need be."""
-    return open_capture(path if path else ensure_captures(suite("mini")[:1])[0])
+    """Open a capture; without a path the first of `mini` (176 px), shorter, rendered if need be."""
+    if path is None:
+        (path,) = ensure_captures([dataclasses.replace(suite("mini")[0], frame_count=FRAMES)])
+    return open_capture(path)
 
 
 @contextmanager

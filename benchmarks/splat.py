@@ -17,7 +17,7 @@ import json
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -235,6 +235,31 @@ def table_of(args: argparse.Namespace) -> Table:
         "4 views are drawn in one call."
     )
     return Table("Rasterizer, forward and backward", columns, tuple(rows), (note,))
+
+
+def measure(name: str = "W3", rounds: int = 20) -> Mapping[str, float]:
+    """Ratios of processor seconds by name, lower is better, on one thread.
+
+    Args:
+        name: of the workload.
+        rounds: turns of each contender.
+    """
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        workload = make(*SIZES[name])
+        found = [Contender("one", ours("numba")), Contender("four", ours("numba"), 4)]
+        times = {key: taken.median_ms()[-1] for key, taken in race(found, workload, rounds).items()}
+        speed = operations_per_second(1)
+        size = workload.size
+        *_, info = rasterize(**workload.arguments, width=size, height=size, count_pairs=True)
+        floor = 1e3 * float(info["pairs"].sum()) * OPERATIONS_PER_PAIR / speed
+        return {
+            "one view / floor": times["one"] / floor,
+            "four views / one": times["four"] / times["one"],
+        }
+    finally:
+        torch.set_num_threads(before)
 
 
 def scaling(args: argparse.Namespace) -> dict[str, list[dict[str, float]]]:

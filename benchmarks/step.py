@@ -1,13 +1,12 @@
 """What one step of a fit costs, component by component, next to one of the plain baseline.
 
 Run from the repository: `python -m benchmarks.step [CAPTURE] [--gaussians 5000] [--threads 1 2]
-[--batch 1 4] [--set NAME=VALUE] [--flame FILE.svg] [--json]`. Without a capture the first one of
-the suite `mini` is rendered (176 px). Both methods have as many Gaussians and draw the same frames
-of the same capture; their loops take turns in one process, and medians of whole steps are compared:
-processor seconds on one thread, which other work on the machine hardly changes, and the clock on
-the wall on several.
-The components are the profiler's shares of those medians, on the first number of threads and with
-the first size of batch.
+[--batch 1 4] [--set NAME=VALUE] [--flame FILE.svg] [--json]`. Without a capture a small one of 176
+px is rendered. Both methods have as many Gaussians and draw the same frames of one capture; their
+loops take turns in one process, and medians of whole steps are compared: processor seconds on one
+thread, which other work on the machine hardly changes, and the clock on the wall on several. The
+components are the profiler's shares of those medians, on the first number of threads and with the
+first size of batch.
 """
 
 from __future__ import annotations
@@ -198,7 +197,7 @@ def measure(
     step, to one thread.
 
     Args:
-        capture: its folder; None: one of `mini`.
+        capture: its folder; None: a small one of 176 px.
         gaussians: of both methods.
         batches: sizes of the batch.
         threads: numbers of threads.
@@ -216,7 +215,7 @@ def measure(
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
-    parser.add_argument("capture", nargs="?", help="capture folder (one of the suite mini)")
+    parser.add_argument("capture", nargs="?", help="capture folder (a small one of 176 px)")
     parser.add_argument("--gaussians", type=int, default=GAUSSIANS, help="on each hand")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2], help="to compare (1 2)")
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 4], help="to compare (1 4)")

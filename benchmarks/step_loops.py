@@ -21,6 +21,7 @@ from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.model.settings import read_settings
+from wildghand.splat.threads import denormals_flushed
 
 #: Steps of a block. The first is not counted: it finds the caches as the other fit left them.
 BLOCK = 6
@@ -73,8 +74,13 @@ class WildGHandLoop:
         self._watchers = Watchers(0)
         self._taken = 0
 
-    def block(self, steps: int = BLOCK) -> list[Spent]:
-        """Take steps; returns the seconds of each."""
+    def block(self, steps: int = BLOCK, *, flush: bool = True) -> list[Spent]:
+        """Take steps; returns the seconds of each.
+
+        Args:
+            steps: how many.
+            flush: treat denormals as a fit does, or compute with them.
+        """
 
         def stop(taken: int) -> None:
             if taken == steps:
@@ -82,7 +88,8 @@ class WildGHandLoop:
 
         clock = _Clock(stop)
         budget = Budget(steps=BUDGET)
-        with contextlib.suppress(_Enough):
+        denormals = denormals_flushed() if flush else contextlib.nullcontext()
+        with denormals, contextlib.suppress(_Enough):
             optimize(self._fit, budget, clock, start=self._taken, watchers=self._watchers)
         self._taken += steps
         return clock.seconds

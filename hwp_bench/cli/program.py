@@ -12,6 +12,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+from hwp_bench.base.denormals import flushed_process
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.version import __version__
 
@@ -28,6 +29,7 @@ class Command:
     commands: dict[str, Command] = field(default_factory=dict)
 
 
+@flushed_process()
 def run_program(program: str, tree: Command, arguments: Sequence[str] | None = None) -> int:
     """Run one command of a program.
 

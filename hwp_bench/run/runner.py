@@ -171,7 +171,7 @@ def _run(
 
 def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]:
     if manifest.kind == "python":
-        worker = [sys.executable, "-m", "hwp_bench.run.worker"]
+        worker = [sys.executable, "-m", "hwp_bench.run.start", "hwp_bench.run.worker"]
         method = ["--method", str(manifest.root.resolve()), "--entry", str(manifest.entry)]
         return [*worker, str(request.resolve()), str(output.resolve()), *method]
     places = {

@@ -1,4 +1,4 @@
-"""The process that a Python method runs in: `python -m hwp_bench.run.worker`.
+"""The process that a Python method runs in, started by `hwp_bench.run.start`.
 
 It is given a request folder and an output folder, and does not know where the capture is.
 """
@@ -233,7 +233,3 @@ def peak_memory() -> int:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # Linux counts in KiB, macOS in bytes.
     return peak if sys.platform == "darwin" else peak * 1024
-
-
-if __name__ == "__main__":
-    sys.exit(main())

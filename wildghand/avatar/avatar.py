@@ -18,6 +18,7 @@ from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
+from wildghand.splat.threads import denormals_flushed
 
 
 @dataclass(frozen=True)
@@ -121,6 +122,7 @@ class WildGHandAvatar:
         """The hands that it has."""
         return tuple(self.model.rigs)
 
+    @denormals_flushed()
     @torch.no_grad()
     def render(self, hands: Mapping[str, HandPose], camera: Camera) -> np.ndarray:
         """Draw the hands that are given, without what perturbed the training frames.
@@ -160,6 +162,7 @@ class WildGHandAvatar:
             hands[side] = HandPose(side, np.zeros((16, 3)), self.betas[side], shift)
         return hands
 
+    @denormals_flushed()
     @torch.no_grad()
     def pose(self, hands: Mapping[str, HandPose]) -> PosedGaussians:
         """Pose the Gaussians of the given hands, one hand after the other.

@@ -11,6 +11,7 @@ from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import optimize
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.model.settings import read_settings
+from wildghand.splat.threads import denormals_flushed
 
 
 class WildGHandMethod:
@@ -31,6 +32,7 @@ class WildGHandMethod:
         self.seed = seed
         self.device = ready_device(self.settings.device)
 
+    @denormals_flushed()
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> WildGHandAvatar:
         """Fit an avatar to the training frames (the validation frames are not used).
 

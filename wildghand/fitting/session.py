@@ -27,6 +27,7 @@ from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.model.settings import WildGHandSettings, read_settings
+from wildghand.splat.threads import denormals_flushed
 
 #: Seconds between two saved states.
 SAVE_EVERY = 20.0
@@ -59,6 +60,7 @@ class _Clock:
         return time.perf_counter() - self._start
 
 
+@denormals_flushed()
 def fit_capture(
     source: str | os.PathLike[str],
     out: str | os.PathLike[str] | None = None,

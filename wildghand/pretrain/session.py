@@ -23,8 +23,10 @@ from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.pretrain.joint import JointFit, take_steps
 from wildghand.prior.files import save_prior
 from wildghand.prior.prior import Prior
+from wildghand.splat.threads import denormals_flushed
 
 
+@denormals_flushed()
 def pretrain(
     sources: Sequence[Path],
     out: Path,

@@ -7,7 +7,8 @@ them for the cores. Where torch has no OpenMP, in a forked child, whose OpenMP i
 machine that is busy otherwise, plain threads take their place. Numba's own layers cannot be used:
 they forbid two callers at once or end the process on a fork.
 
-How many threads: `torch.get_num_threads()`. Results do not depend on it.
+How many threads: `torch.get_num_threads()`. Results do not depend on it. All of them treat
+denormal numbers as the calling thread does.
 """
 
 from __future__ import annotations
@@ -17,14 +18,16 @@ import functools
 import multiprocessing
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+from hwp_bench.base.denormals import flushes, set_flush
 from wildghand.splat.kernels.jobs import SPACING
 
 #: Work, in Gaussians or (Gaussian, tile) pairs, that outweighs waking a thread (some 0.1 ms).
@@ -79,9 +82,11 @@ def run(kernel: Callable[..., Any], ends: np.ndarray, *args: Any) -> None:
         kernel(0, counters, ends, *args)
         return
     failures: list[BaseException] = []
+    flush = flushes()
 
     def work(worker: int) -> None:
         try:
+            set_flush(flush)
             kernel(worker, counters, ends, *args)
         except BaseException as error:  # it must not unwind into the threads' own code
             failures.append(error)
@@ -93,6 +98,38 @@ def run(kernel: Callable[..., Any], ends: np.ndarray, *args: Any) -> None:
         _plain_threads(work, threads)
     if failures:
         raise failures[0]
+
+
+@contextmanager
+def denormals_flushed() -> Iterator[None]:
+    """Flush denormals in the calling thread and in the threads of torch's team while this holds.
+
+    For the entrances of a library: whoever imports it finds every thread as before.
+    """
+    before: dict[int, bool] = {}
+
+    def enter(worker: int) -> None:
+        before[worker] = set_flush(True)
+
+    def leave(worker: int) -> None:
+        # A thread that has joined the team meanwhile took over the switch of its starter.
+        set_flush(before.get(worker, before[0]))
+
+    _on_torch_threads(enter, 1)
+    try:
+        yield
+    finally:
+        _on_torch_threads(leave, len(before))
+
+
+def _on_torch_threads(work: Callable[[int], None], least: int) -> None:
+    """Call a function once on every thread that torch's operators use, with the thread's number."""
+    threads = max(torch.get_num_threads(), least)
+    team = _openmp() if threads > 1 and _may_use_openmp() else None
+    if team is None:
+        work(0)
+    else:
+        team(work, threads)
 
 
 def _may_use_openmp() -> bool:

@@ -16,6 +16,7 @@ from plain_fit.optimize import fit_model
 from plain_fit.settings import read_settings
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.gaussians.training import load_frames
+from wildghand.splat.threads import denormals_flushed
 
 
 class PlainMethod:
@@ -36,6 +37,7 @@ class PlainMethod:
         self.seed = seed
         self.device = ready_device(self.settings.device)
 
+    @denormals_flushed()
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> PlainAvatar:
         """Fit an avatar to the training frames (the validation frames are left alone).
 

@@ -17,6 +17,7 @@ from wildghand.gaussians.rig import AnchorPoses, HandRig, make_rig
 from wildghand.gaussians.shading import sh_basis, sh_count
 from wildghand.gaussians.training import join_hands
 from wildghand.splat import rasterize
+from wildghand.splat.threads import denormals_flushed
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,6 +148,7 @@ class PlainAvatar:
         """Where it is drawn."""
         return str(self.model.light.device)
 
+    @denormals_flushed()
     @torch.no_grad()
     def render(self, hands: Mapping[str, HandPose], camera: Camera) -> np.ndarray:
         """Draw the hands that are given.

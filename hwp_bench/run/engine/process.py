@@ -42,7 +42,8 @@ LOOK_SECONDS = 0.5
 GRACE_SECONDS = 20.0
 
 _POLL_SECONDS = 0.1
-_MAIN = "import sys; from hwp_bench.run.engine.process import main; sys.exit(main())"
+#: The module that is started, and the one whose `main` it runs.
+_START = ("-m", "hwp_bench.run.start", "hwp_bench.run.engine.process")
 
 
 class WorkerLost(Exception):
@@ -116,7 +117,7 @@ def _start(job: LocalJob, messages: Path, log: int) -> subprocess.Popen[bytes]:
         "PYTHONPATH": root if not known else os.pathsep.join([root, known]),
     }
     process = subprocess.Popen(
-        [sys.executable, "-c", _MAIN],
+        [sys.executable, *_START],
         stdin=subprocess.PIPE,
         stdout=log,
         stderr=log,

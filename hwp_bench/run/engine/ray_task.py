@@ -11,6 +11,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.base.denormals import flushed
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import cache_root, files_digest
 from hwp_bench.base.packages import PACKAGES
@@ -81,6 +82,7 @@ def toolkit_digest() -> str:
     )
 
 
+@flushed()
 def run_order(order: Order, sent: Mapping[str, list[Any]], board: Any) -> Reply:
     """Do a job on this node.
 

@@ -1,0 +1,115 @@
+"""What denormal gradients cost a fit, with and without flushing them to zero.
+
+Run from the repository: `python -m benchmarks.denormals [CAPTURE] [--threads 1] [--rounds 8]`. Two
+fits take turns: an ordinary one, and one whose loss is so small that nearly every gradient is a
+denormal. Each takes blocks of steps with denormals flushed, as fits do, and without. Numbers are
+medians of processor seconds, which other work on the machine hardly changes. What a denormal costs
+depends on the processor: next to nothing on AMD's, a hundred cycles and more on many of Intel's.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from benchmarks.small_capture import opened_request, small_capture
+from benchmarks.step_loops import WildGHandLoop
+from hwp_bench.base.tables import Column, Table, print_table
+from wildghand.model.terms import TermWeights
+
+#: What the loss is multiplied with, so that gradients of pixels are about 1e-40.
+FADED = 1e-35
+#: Terms of the loss by the setting of their weight, and that weight.
+TERMS = {
+    **{
+        f"terms.{name}": getattr(TermWeights(), name)
+        for name in TermWeights.__dataclass_fields__
+        if name not in ("dssim_weight", "outside_weight")
+    },
+    "dpd.gain_weight": 0.1,
+    "dpd.omega_weight": 1.0,
+}
+
+
+def processor_ms(
+    capture: str | Path | None, gaussians: int, threads: int, rounds: int
+) -> dict[tuple[str, bool], float]:
+    """Median processor milliseconds of a step by fit (ordinary, faded) and flushing."""
+    torch.set_num_threads(threads)
+    settings = {
+        "ordinary": {"gaussians": gaussians},
+        "faded": {"gaussians": gaussians} | {name: FADED * w for name, w in TERMS.items()},
+    }
+    spent: dict[tuple[str, bool], list[float]] = {}
+    with opened_request(small_capture(capture)) as training:
+        loops = {name: WildGHandLoop(training, values) for name, values in settings.items()}
+        for turn in range(rounds + 1):
+            for name, loop in loops.items():
+                for flush in (True, False):
+                    block = [processor for _, processor in loop.block(flush=flush)]
+                    if turn > 0:
+                        spent.setdefault((name, flush), []).extend(block[1:])
+    return {key: 1e3 * float(np.median(values)) for key, values in spent.items()}
+
+
+def ratios(spent: Mapping[tuple[str, bool], float]) -> dict[str, float]:
+    """What denormal gradients cost: the step of the faded fit over that of the ordinary one."""
+    return {
+        "denormal / ordinary gradients, flushed": spent["faded", True] / spent["ordinary", True],
+        "denormal / ordinary gradients, not flushed": spent["faded", False]
+        / spent["ordinary", False],
+    }
+
+
+def measure(
+    capture: str | Path | None = None,
+    *,
+    gaussians: int = 2_000,
+    threads: int = 1,
+    rounds: int = 6,
+) -> Mapping[str, float]:
+    """Ratios by name, lower is better: what denormal gradients cost.
+
+    Args:
+        capture: its folder; None: a small one of 176 px.
+        gaussians: of the fit.
+        threads: of torch.
+        rounds: turns of each fit.
+    """
+    before = torch.get_num_threads()
+    try:
+        return ratios(processor_ms(capture, gaussians, threads, rounds))
+    finally:
+        torch.set_num_threads(before)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
+    parser.add_argument("capture", nargs="?", help="capture folder (a small one of 176 px)")
+    parser.add_argument("--gaussians", type=int, default=5_000)
+    parser.add_argument("--threads", type=int, default=1)
+    parser.add_argument("--rounds", type=int, default=8, help="turns of each fit")
+    parser.add_argument("--json", action="store_true", help="print numbers for programs")
+    args = parser.parse_args()
+    spent = processor_ms(args.capture, args.gaussians, args.threads, args.rounds)
+    found = ratios(spent)
+    if args.json:
+        print(json.dumps(found, indent=1))
+        return
+    names = ("ordinary", "faded")
+    rows = [
+        ("flushed" if flush else "not flushed", *(spent[name, flush] for name in names), ratio)
+        for flush, ratio in zip((True, False), found.values(), strict=True)
+    ]
+    titles = ("denormals", "ordinary gradients, ms", "denormal gradients, ms", "ratio")
+    columns = tuple(Column(title, 2) for title in titles)
+    print_table(Table("Processor time of a step", columns, tuple(rows), ranked=False))
+
+
+if __name__ == "__main__":
+    main()
