@@ -19,6 +19,8 @@ _STRIP = 400
 _SAME_COLOUR = 2.0
 # Colours of a mixture that have less weight than this are noise.
 _LEAST_WEIGHT = 0.01
+# Bits of a channel whose evidence is computed: neighbours share it.
+_BITS = 7
 # Where the nine covariance entries of each of the five colours lie in a mixture.
 _COVARIANCES = slice(20, 65)
 
@@ -44,13 +46,13 @@ class ColourModel:
 
 
 def learn_colours(
-    samples: Iterable[tuple[np.ndarray, np.ndarray, np.ndarray]], seed: int = 0
+    samples: Iterable[tuple[np.ndarray, np.ndarray]], seed: int = 0
 ) -> ColourModel | None:
     """Learn the mixtures from labelled pixels of all frames.
 
     Args:
-        samples: for each frame its image (S, S, 3) uint8 and two (S, S) bool arrays: pixels
-            that are hand, and pixels that are not.
+        samples: for each frame the colours (N, 3) uint8 of pixels that are hand, and of pixels
+            that are not.
         seed: of the choice of pixels and of the clustering.
 
     Returns:
@@ -60,9 +62,8 @@ def learn_colours(
 
     random = np.random.default_rng(seed)
     kinds: tuple[list[np.ndarray], list[np.ndarray]] = ([], [])
-    for image, hand, other in samples:
-        for pixels, where in zip(kinds, (hand, other), strict=True):
-            found = image[where]
+    for sample in samples:
+        for pixels, found in zip(kinds, sample, strict=True):
             # A thousand of each frame, so that every frame counts and memory is bounded.
             pixels.append(found[random.integers(0, len(found), 1000)] if len(found) else found)
     hand, other = (np.concatenate([np.zeros((0, 3), np.uint8), *pixels]) for pixels in kinds)
@@ -102,16 +103,23 @@ def evidence(image: np.ndarray, model: ColourModel) -> np.ndarray:
     Returns:
         (S, S) float32.
     """
-    colours, place = np.unique(_packed(image), return_inverse=True)
-    table = np.stack([colours >> 16, (colours >> 8) & 255, colours & 255], axis=1).astype(float)
+    packed = _packed(image)
+    seen = np.zeros(1 << 3 * _BITS, dtype=bool)
+    seen[packed] = True
+    colours = np.flatnonzero(seen)
+    # The middle of each cell, as it is when the lowest bit is set.
+    channels = [(colours >> shift) & ((1 << _BITS) - 1) for shift in (2 * _BITS, _BITS, 0)]
+    table = (2.0 * np.stack(channels, axis=1) + 1.0).astype(float)
     value = _log_density(table, model.foreground) - _log_density(table, model.background)
-    return value.astype(np.float32)[place].reshape(image.shape[:2])
+    by_colour = np.empty(len(seen), dtype=np.float32)
+    by_colour[colours] = value
+    return by_colour[packed]
 
 
 def _packed(image: np.ndarray) -> np.ndarray:
-    """Colours as one number each, at half the resolution of each channel."""
-    coarse = image.astype(np.uint32) | 1
-    return (coarse[..., 0] << 16) | (coarse[..., 1] << 8) | coarse[..., 2]
+    """Colours (S, S) as one number each, at half the resolution of each channel."""
+    coarse = image.astype(np.int32) >> 1
+    return (coarse[..., 0] << 2 * _BITS) | (coarse[..., 1] << _BITS) | coarse[..., 2]
 
 
 def _least_distance(colours: np.ndarray, mixture: np.ndarray) -> np.ndarray:

@@ -11,6 +11,7 @@ import torch
 from hwp_bench.hands.raster import draw_silhouette
 from hwp_bench.hands.rotations import axis_angle_to_matrix
 from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.importers.shared.frames_parallel import each_frame
 from hwp_bench.importers.shared.windows import CropWindows
 from hwp_bench.importers.video.clip_model import ClipModel, PosedClip, posed_vertices
 from hwp_bench.importers.video.fit_terms import geman_mcclure
@@ -66,15 +67,17 @@ class ContourEnergy:
         with torch.no_grad():
             vertices = torch.as_tensor(posed_vertices(model))
             pixels = self._in_field(model.pixels(vertices)).numpy()
+
+        def match(frame: int) -> Outline:
+            if not self.usable[frame]:
+                return Outline.nothing()
+            return match_outline(pixels[frame], faces, candidates, self.fields[frame], self.reach)
+
         matches = []
-        for frame, usable in enumerate(self.usable):
-            matches.append(
-                match_outline(pixels[frame], faces, candidates, self.fields[frame], self.reach)
-                if usable
-                else Outline.nothing()
-            )
+        for found in each_frame(match, range(len(self.usable))):
+            matches.append(found)
             if update is not None:
-                update(frame + 1)
+                update(len(matches))
         self.index = torch.as_tensor(np.stack([match.index for match in matches]))
         self.normal = torch.as_tensor(np.stack([match.normal for match in matches]))
         self.target = torch.as_tensor(np.stack([match.target for match in matches]))

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
 
+from hwp_bench.importers.shared.frames_parallel import each_frame
 from hwp_bench.importers.video.colour_model import ColourModel, evidence, learn_colours
 
 #: Frames that the colour model is learnt from.
@@ -95,22 +94,24 @@ def segment_clip(
         The prompt and the masks of each frame, in order.
     """
 
-    def samples() -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
-        for frame in np.unique(np.linspace(0, count - 1, min(count, _COLOUR_FRAMES)).astype(int)):
-            drawn = prompt(int(frame))
-            if drawn.detected:
-                yield to_lab(image(int(frame))), *_sure(drawn, hand_size, settings)
+    chosen = np.unique(np.linspace(0, count - 1, min(count, _COLOUR_FRAMES)).astype(int))
 
-    model = learn_colours(samples())
+    def sample(frame: int) -> tuple[np.ndarray, np.ndarray] | None:
+        drawn = prompt(frame)
+        if not drawn.detected:
+            return None
+        lab = to_lab(image(frame))
+        hand, other = _sure(drawn, hand_size, settings)
+        return lab[hand], lab[other]
+
+    samples = each_frame(sample, chosen.tolist())
+    model = learn_colours(found for found in samples if found is not None)
 
     def work(frame: int) -> tuple[Prompt, Segmentation]:
         drawn = prompt(frame)
         return drawn, segment(image(frame), drawn, model, hand_size, settings)
 
-    workers = min(4, os.cpu_count() or 1)
-    with ThreadPoolExecutor(workers) as pool:
-        for first in range(0, count, 8 * workers):
-            yield from pool.map(work, range(first, min(first + 8 * workers, count)))
+    yield from each_frame(work, range(count))
 
 
 def segment(

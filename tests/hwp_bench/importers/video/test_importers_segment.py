@@ -116,9 +116,9 @@ def test_masks_repeat_exactly() -> None:
 def test_evidence_has_the_sign_of_the_colour() -> None:
     picture = to_lab(pictures()[0])
     hand = square(clip().silhouette(0)) > 0
-    model = learn_colours([(picture, hand, ~hand & ~prompt(0).beyond)])
+    model = learn_colours([(picture[hand], picture[~hand & ~prompt(0).beyond])])
     assert model is not None
     value = evidence(picture, model)
     assert (value[hand] > 0).mean() > 0.99
     assert (value[~hand & ~prompt(0).beyond] < 0).mean() > 0.97
-    assert learn_colours([(picture, hand & False, ~hand)]) is None
+    assert learn_colours([(picture[hand & False], picture[~hand])]) is None
