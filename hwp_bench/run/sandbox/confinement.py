@@ -13,7 +13,7 @@ from pathlib import Path
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
-from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.packages import PACKAGES, data_folder
 from hwp_bench.run.sandbox.root import Place
 
 #: `auto` takes namespaces where the system allows them and says so where it does not; `required`
@@ -179,7 +179,7 @@ def _torch_home() -> Path:
 
 
 def _own_cache(method: Path, output: Path) -> Path:
-    name = hashlib.sha256(os.fsencode(method.resolve())).hexdigest()[:16]
+    name = hashlib.sha256(os.fsencode(_identity(method.resolve()))).hexdigest()[:16]
     cache = cache_root().absolute() / "methods" / name
     try:
         cache.mkdir(parents=True, exist_ok=True)
@@ -187,6 +187,17 @@ def _own_cache(method: Path, output: Path) -> Path:
         cache = output.resolve() / "cache"
         cache.mkdir()
     return cache.resolve()
+
+
+def _identity(method: Path) -> str:
+    """Return what makes a method the same program as another time: its place, as a rule.
+
+    A method that ships has its name: its machine code is then found after another installation.
+    """
+    for folder in (data_folder("baselines"), PACKAGES / "wildghand"):
+        if method.is_relative_to(folder):
+            return f"{folder.name}/{method.relative_to(folder)}"
+    return os.fspath(method)
 
 
 def visible_places(

@@ -6,12 +6,13 @@ import functools
 
 import cv2
 import numpy as np
+from scipy.stats import multivariate_normal
 from synthetic_clip import CUP, HEIGHT, WIDTH, SyntheticClip, make_clip
 
 from hwp_bench.hands.raster import draw_silhouette, overlap
 from hwp_bench.hands.topology import boundary_vertices
 from hwp_bench.importers.video.clip_masks import beyond_wrist
-from hwp_bench.importers.video.colour_model import evidence, learn_colours
+from hwp_bench.importers.video.colour_model import ColourModel, evidence, learn_colours
 from hwp_bench.importers.video.segmentation import WIDE, Prompt, Segmentation, segment_clip, to_lab
 
 HAND = 150.0
@@ -122,3 +123,26 @@ def test_evidence_has_the_sign_of_the_colour() -> None:
     assert (value[hand] > 0).mean() > 0.99
     assert (value[~hand & ~prompt(0).beyond] < 0).mean() > 0.97
     assert learn_colours([(picture[hand & False], picture[~hand])]) is None
+
+
+def test_evidence_is_that_of_the_middle_of_a_colour_s_cell() -> None:
+    """Oracle: SciPy's densities, pixel by pixel."""
+    random = np.random.default_rng(0)
+    mixtures = []
+    for _ in range(2):
+        covariances = [np.diag(random.uniform(200, 900, 3)) for _ in range(5)]
+        parts = [np.full(5, 0.2), random.uniform(60, 200, 15), np.ravel(covariances)]
+        mixtures.append(np.concatenate(parts)[None])
+    image = random.integers(0, 256, (20, 30, 3)).astype(np.uint8)
+
+    def density(mixture: np.ndarray) -> np.ndarray:
+        means, covariances = mixture[0, 5:20].reshape(5, 3), mixture[0, 20:].reshape(5, 3, 3)
+        parts = [
+            multivariate_normal(mean, covariance).pdf(image | 1)
+            for mean, covariance in zip(means, covariances, strict=True)
+        ]
+        return 0.2 * (2 * np.pi) ** 1.5 * np.sum(parts, axis=0) + 1e-30
+
+    expected = np.log(density(mixtures[1])) - np.log(density(mixtures[0]))
+    found = evidence(image, ColourModel(*mixtures))
+    np.testing.assert_allclose(found, expected, rtol=1e-5, atol=1e-5)

@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.run.sandbox import confinement
 from hwp_bench.run.sandbox.confinement import Confinement, visible_places
 
 
@@ -62,3 +63,23 @@ def test_a_command_shows_its_python_environment_and_nothing_else_that_it_names(
 def test_wrong_settings_are_named(wrong: dict) -> None:
     with pytest.raises(UsageError):
         Confinement(**wrong)
+
+
+def test_a_method_that_ships_has_one_cache_in_every_installation(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its machine code is found after an update; methods elsewhere have one for each place."""
+    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "cache"))
+    found = []
+    for name in ("one", "two"):
+        root = tmp_path / name
+        for method in ("baselines/plain", "baselines/other", "wildghand", "mine"):
+            (root / method).mkdir(parents=True)
+        monkeypatch.setattr(confinement, "PACKAGES", root)
+        monkeypatch.setattr(confinement, "data_folder", root.joinpath)
+        places = ("baselines/plain", "baselines/other", "wildghand", "mine")
+        found.append([confinement._own_cache(root / place, root) for place in places])
+    one, two = found
+    assert one[:3] == two[:3]
+    assert one[3] != two[3]
+    assert len({*one, *two}) == 5
