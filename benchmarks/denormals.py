@@ -18,7 +18,7 @@ import numpy as np
 import torch
 
 from benchmarks.small_capture import opened_request, small_capture
-from benchmarks.step_loops import WildGHandLoop
+from benchmarks.step_loops import WildGHandLoop, mean_of
 from hwp_bench.base.tables import Column, Table, print_table
 from wildghand.model.terms import TermWeights
 
@@ -51,9 +51,9 @@ def processor_ms(
         for turn in range(rounds + 1):
             for name, loop in loops.items():
                 for flush in (True, False):
-                    block = [processor for _, processor in loop.block(flush=flush)]
+                    _, processor = mean_of(loop.block(flush=flush))
                     if turn > 0:
-                        spent.setdefault((name, flush), []).extend(block[1:])
+                        spent.setdefault((name, flush), []).append(processor)
     return {key: 1e3 * float(np.median(values)) for key, values in spent.items()}
 
 

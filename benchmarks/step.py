@@ -3,10 +3,10 @@
 Run from the repository: `python -m benchmarks.step [CAPTURE] [--gaussians 5000] [--threads 1 2]
 [--batch 1 4] [--set NAME=VALUE] [--flame FILE.svg] [--json]`. Without a capture a small one of 176
 px is rendered. Both methods have as many Gaussians and draw the same frames of one capture; their
-loops take turns in one process, and medians of whole steps are compared: processor seconds on one
-thread, which other work on the machine hardly changes, and the clock on the wall on several. The
-components are the profiler's shares of those medians, on the first number of threads and with the
-first size of batch.
+loops take turns in one process, and whole steps (means of blocks) are compared: on one thread the
+median of the processor's seconds, which other work on the machine hardly changes; on several the
+clock on the wall, in the fastest block. The components are the profiler's shares of those times, on
+the first number of threads and with the first size of batch.
 """
 
 from __future__ import annotations
@@ -19,11 +19,10 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import torch
 
 from benchmarks.small_capture import opened_request, small_capture
-from benchmarks.step_loops import BLOCK, Spent, WildGHandLoop, race, run_plain
+from benchmarks.step_loops import Spent, WildGHandLoop, race, run_plain
 from benchmarks.step_picture import draw_flames
 from benchmarks.step_shares import Shares, by_component, shares_of
 from benchmarks.step_spans import marked, profiled
@@ -34,7 +33,7 @@ from hwp_bench.methods.contract import TrainingCapture
 
 #: Gaussians of a step that is measured.
 GAUSSIANS = 5_000
-#: Turns of each fit that count, of `BLOCK` steps.
+#: Blocks of steps of each fit that count.
 ROUNDS = 8
 #: Blocks that a loop has behind it when it is profiled.
 WARM = 3
@@ -61,7 +60,7 @@ class Workload:
 
 @dataclass(frozen=True)
 class Times:
-    """Median milliseconds of a step on a number of threads."""
+    """Milliseconds of a step on a number of threads."""
 
     wall: float
     processor: float
@@ -94,7 +93,7 @@ def whole_steps(
             loops["single"] = workload.loop(first)
         found = race(workload.training, workload.plain(batch), loops, tuple(threads), rounds)
         medians = {
-            key: Times(*(1e3 * np.median(values, axis=0)).tolist()) for key, values in found.items()
+            key: Times(1e3 * wall, 1e3 * processor) for key, (wall, processor) in found.items()
         }
         for count in threads:
             where = f"{_count(batch, 'frame')}, {_count(count, 'thread')}"
@@ -123,7 +122,7 @@ def profile(workload: Workload, batch: int, threads: int, blocks: int = 3) -> di
     for _ in range(WARM):
         loop.block()
     with marked(), profiled() as profiler:
-        seconds = sum(wall for wall, _ in loop.block(blocks * BLOCK))
+        seconds = sum(wall for wall, _ in loop.block(blocks))
     found = {"wildghand": shares_of(profiler, seconds)}
     marks, profiler, spent = marked(), profiled(), [0.0]
 
@@ -181,7 +180,7 @@ def steps_table(steps: Steps) -> Table:
             plain = steps["plain", batch, count]
             cells = step.wall, step.processor, plain.wall, plain.processor
             rows.append((batch, count, *cells, step.over(plain, count)))
-    return Table("Median of whole steps", tuple(columns), tuple(rows), ranked=False)
+    return Table("Whole steps", tuple(columns), tuple(rows), ranked=False)
 
 
 def measure(

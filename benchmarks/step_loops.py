@@ -10,9 +10,10 @@ from __future__ import annotations
 import contextlib
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 
 from hwp_bench.methods.contract import Budget, TrainingCapture
@@ -23,8 +24,8 @@ from wildghand.gaussians.fit_loop import ready_device
 from wildghand.model.settings import read_settings
 from wildghand.splat.threads import denormals_flushed
 
-#: Steps of a block. The first is not counted: it finds the caches as the other fit left them.
-BLOCK = 6
+#: Least number of steps of a block.
+BLOCK = 8
 #: Wall-clock and processor seconds of a step; the processor's of all threads.
 Spent = tuple[float, float]
 #: Steps that the budget of a fit is made of; its loop is left long before.
@@ -73,14 +74,18 @@ class WildGHandLoop:
         self._fit = Fit(training, chosen, 0, ready_device("cpu"))
         self._watchers = Watchers(0)
         self._taken = 0
+        # Steps may share work, which one of them does: a block has each of them equally often.
+        shared: int = getattr(chosen.schedule, "texture_every", 1)
+        self._block = -(-BLOCK // shared) * shared
 
-    def block(self, steps: int = BLOCK, *, flush: bool = True) -> list[Spent]:
-        """Take steps; returns the seconds of each.
+    def block(self, blocks: int = 1, *, flush: bool = True) -> list[Spent]:
+        """Take blocks of steps; returns the seconds of each step.
 
         Args:
-            steps: how many.
+            blocks: how many.
             flush: treat denormals as a fit does, or compute with them.
         """
+        steps = blocks * self._block
 
         def stop(taken: int) -> None:
             if taken == steps:
@@ -131,7 +136,7 @@ def race(
     others: Mapping[str, WildGHandLoop],
     threads: tuple[int, ...],
     rounds: int,
-) -> dict[tuple[str, int], list[Spent]]:
+) -> dict[tuple[str, int], Spent]:
     """Let fits take turns, on every number of threads.
 
     Args:
@@ -142,7 +147,8 @@ def race(
         rounds: turns of each fit that count; one more goes before.
 
     Returns:
-        Seconds of steps by name (the baseline is `plain`) and number of threads.
+        Mean seconds of a step in a block, of the `typical` block, by name (the baseline is
+        `plain`) and number of threads.
     """
     names = ("plain", *others)
     found: dict[tuple[str, int], list[Spent]] = {(name, n): [] for name in names for n in threads}
@@ -154,8 +160,21 @@ def race(
         taken |= {name: loop.block() for name, loop in others.items()}
         if turn > 0:
             for name, values in taken.items():
-                found[name, threads[place]] += values[1:]
+                found[name, threads[place]].append(mean_of(values))
         torch.set_num_threads(threads[(place + 1) % len(threads)])
 
     run_plain(training, plain, (rounds + 1) * len(threads), after_block)
-    return found
+    return {key: typical(blocks) for key, blocks in found.items()}
+
+
+def mean_of(steps: Sequence[Spent]) -> Spent:
+    """The mean step of a block."""
+    wall, processor = np.mean(steps, axis=0).tolist()
+    return wall, processor
+
+
+def typical(blocks: Sequence[Spent]) -> Spent:
+    """The wall-clock seconds of the fastest block, which other work has slowed least, and the
+    median of the processor seconds."""
+    walls, processors = zip(*blocks, strict=True)
+    return min(walls), float(np.median(processors))

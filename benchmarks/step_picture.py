@@ -45,7 +45,7 @@ def draw_flames(shares: Mapping[str, Shares], steps: Mapping[str, float], title:
         figure.suptitle(title, fontsize=11)
         for axes, (method, found) in zip(plots, shares.items(), strict=True):
             _draw(axes, method, found, steps[method], longest, order)
-        plots[-1].set_xlabel("ms of a step (shares of the profiler, median of steps without it)")
+        plots[-1].set_xlabel("ms of a step (shares of the profiler, time of steps without it)")
     return figure
 
 

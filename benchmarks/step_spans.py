@@ -25,7 +25,10 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "network: texture": ("wildghand.network.network:PredictionNetwork.texture",),
     "network: coder": ("wildghand.network.compact:PlaneCoder.forward",),
     "network: geometry": ("wildghand.network.network:PredictionNetwork.geometry",),
-    "network: heads": ("wildghand.network.network:PredictionNetwork.forward",),
+    "network: heads": (
+        "wildghand.network.network:PredictionNetwork.forward",
+        "wildghand.network.network:PredictionNetwork.features",
+    ),
     "hand poses": (
         "wildghand.gaussians.training:TrainingClip.hand",
         "wildghand.gaussians.training:TrainingClip.poses",
@@ -39,6 +42,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     ),
     "placing": (
         "wildghand.model.model:WildGHandModel._dress",
+        "wildghand.model.model:dress",
         "wildghand.gaussians.anchored:AnchoredGaussians.place",
     ),
     "shading": ("plain_fit.model:sh_basis",),
@@ -58,7 +62,8 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     ),
     "optimizer": (
         "torch.optim.optimizer:Optimizer.zero_grad",
-        "torch.nn.utils:clip_grad_norm_",
+        "wildghand.gaussians.adam:ClippedAdam.clear",
+        "wildghand.gaussians.adam:ClippedAdam.take_step",
         "wildghand.fitting.fit:set_rates",
     ),
 }
@@ -72,7 +77,7 @@ def marked() -> Iterator[None]:
         for component, places in FUNCTIONS.items():
             for place in places:
                 _mark(place, COMPONENT + component, undo)
-        _mark("torch:Tensor.backward", PASS + "backward", undo)
+        _mark("torch.autograd:backward", PASS + "backward", undo)
         yield
     finally:
         for restore in reversed(undo):
