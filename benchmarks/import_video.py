@@ -85,7 +85,7 @@ def race(video: Path | None, landmarks: Path | None) -> dict[str, float]:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         if video is None or landmarks is None:
-            video, landmarks = make_video(folder, small_capture())
+            video, landmarks = make_video(folder, small_capture(frames=FRAMES))
         out = folder / "imported"
         ours = spent(lambda: import_video(video, landmarks, out, VideoImport()))
         capture = open_capture(out)

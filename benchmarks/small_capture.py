@@ -19,10 +19,15 @@ from hwp_bench.sim.produce.suites import ensure_captures, suite
 FRAMES = 24
 
 
-def small_capture(path: str | Path | None = None) -> Capture:
-    """Open a capture; without a path the first of `mini` (176 px), shorter, rendered if need be."""
+def small_capture(path: str | Path | None = None, frames: int = FRAMES) -> Capture:
+    """Open a capture; without a path the first of `mini` (176 px), rendered if need be.
+
+    Args:
+        path: the capture.
+        frames: of the one that is rendered; `mini` has 60.
+    """
     if path is None:
-        (path,) = ensure_captures([dataclasses.replace(suite("mini")[0], frame_count=FRAMES)])
+        (path,) = ensure_captures([dataclasses.replace(suite("mini")[0], frame_count=frames)])
     return open_capture(path)
 
 
