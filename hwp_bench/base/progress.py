@@ -216,7 +216,7 @@ class JobsView:
 class _Running:
     """A job that runs."""
 
-    began: float = field(default_factory=time.perf_counter)
+    began: float = field(default_factory=lambda: time.perf_counter())
     task: TaskID | None = None
 
 

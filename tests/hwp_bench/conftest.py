@@ -12,7 +12,7 @@ from hwp_bench.hands.template import make_template
 
 @pytest.fixture(scope="session")
 def free_right() -> HandTemplate:
-    """The free right hand; the first test session on a machine extracts it (about a minute)."""
+    """The free right hand."""
     return load_template()
 
 

@@ -3,14 +3,30 @@
 from __future__ import annotations
 
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 from hwp_bench.base.progress import JobsView, track
 
 
+class Clock:
+    """A clock that stands still unless it is told to go on, seconds."""
+
+    now = 100.0
+
+
+@pytest.fixture
+def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
+    """The clock that progress looks at."""
+    made = Clock()
+    stopped = SimpleNamespace(perf_counter=lambda: made.now)
+    monkeypatch.setattr("hwp_bench.base.progress.time", stopped)
+    return made
+
+
 @pytest.mark.parametrize("terminal", [False, True])
-def test_jobs_are_told_of_once_each(terminal: bool, capsys, monkeypatch) -> None:
+def test_jobs_are_told_of_once_each(terminal: bool, clock: Clock, capsys, monkeypatch) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     with JobsView() as view:
         view.begin(3)
@@ -19,6 +35,7 @@ def test_jobs_are_told_of_once_each(terminal: bool, capsys, monkeypatch) -> None
         view.steps(0, 3, 4)
         view.steps(2, 1, 4)
         view.start(1, "two", "c")
+        clock.now += 65.0
         view.end(0, "one [bold]")
         view.end(1, "two", "no luck")
         view.end(2, "three")
@@ -30,16 +47,20 @@ def test_jobs_are_told_of_once_each(terminal: bool, capsys, monkeypatch) -> None
         assert "3/3" in captured.err
     else:
         assert captured.err.splitlines()[:2] == ["[1/3] one [bold], on a", "[2/3] two, on b"]
-        assert "[3 of 3 ended, 0:00 elapsed] three" in captured.err
+        assert "[1 of 3 ended, 1:05 elapsed] one [bold] in 1:05" in captured.err
+        assert "[3 of 3 ended, 1:05 elapsed] three" in captured.err
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_jobs_in_turn_are_told_of_once_each(terminal: bool, capsys, monkeypatch) -> None:
+def test_jobs_in_turn_are_told_of_once_each(
+    terminal: bool, clock: Clock, capsys, monkeypatch
+) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     with JobsView() as view:
         for index, name in enumerate(("one [bold]", "two", "three")):
             step = view.turn(index, 3, name)
             step(1, 2)
+            clock.now += 30.0
             step(2, 2)
     captured = capsys.readouterr()
     assert captured.out == ""
@@ -49,8 +70,8 @@ def test_jobs_in_turn_are_told_of_once_each(terminal: bool, capsys, monkeypatch)
     else:
         assert captured.err.splitlines() == [
             "[1/3] one [bold] (0:00 elapsed)",
-            "[2/3] two (0:00 elapsed, about 0:00 left)",
-            "[3/3] three (0:00 elapsed, about 0:00 left)",
+            "[2/3] two (0:30 elapsed, about 1:00 left)",
+            "[3/3] three (1:00 elapsed, about 0:30 left)",
         ]
 
 
@@ -62,7 +83,9 @@ def test_a_quiet_view_shows_nothing(capsys) -> None:
 
 
 @pytest.mark.parametrize("terminal", [False, True])
-def test_one_piece_of_work_is_a_bar_or_a_line(terminal: bool, capsys, monkeypatch) -> None:
+def test_one_piece_of_work_is_a_bar_or_a_line(
+    terminal: bool, clock: Clock, capsys, monkeypatch
+) -> None:
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal)
     assert list(track("abc", "reading [bold]")) == ["a", "b", "c"]
     shown = capsys.readouterr().err

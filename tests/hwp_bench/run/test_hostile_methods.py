@@ -158,7 +158,7 @@ def test_there_is_no_network_but_itself(attack) -> None:
 import socket
 def reaches(address):
     try:
-        socket.create_connection(address, timeout=2).close()
+        socket.create_connection(address, timeout=30).close()
     except OSError:
         return False
     return True
@@ -200,12 +200,14 @@ print(json.dumps({"first": first, "second": second, "status": "".join(caps).spli
 
 GRANDCHILD = """
 child = "import os, time, pathlib; os.setsid(); time.sleep(600)"
+here, there = os.pipe()  # the grandchild's end closes when its new program begins
 if os.fork() == 0:
     os.setsid()
     if os.fork() == 0:
         os.execv(sys.executable, [sys.executable, "-c", child, "TAG"])
     os._exit(0)
-time.sleep(0.5)
+os.close(there)
+os.read(here, 1)
 """
 
 
@@ -241,10 +243,9 @@ run_method(read_manifest({str(method)!r}), "tiny", Path({str(_folder(tmp_path / 
            Path({str(tmp_path / "output")!r}), confinement=Confinement({mode!r}))
 """
     toolkit = subprocess.Popen([sys.executable, "-c", program], cwd=Path(__file__).parents[3])
-    deadline = time.monotonic() + 30
-    while not _tagged(tag) and time.monotonic() < deadline:
+    while not _tagged(tag):
+        assert toolkit.poll() is None
         time.sleep(0.05)
-    assert _tagged(tag)
     toolkit.send_signal(signal.SIGKILL)
     toolkit.wait()
     _assert_gone(tag)
@@ -262,10 +263,9 @@ def _tagged(tag: str) -> list[str]:
 
 
 def _assert_gone(tag: str) -> None:
-    deadline = time.monotonic() + 10
-    while _tagged(tag) and time.monotonic() < deadline:
+    # The suite's own time limit ends a wait that never comes true.
+    while _tagged(tag):
         time.sleep(0.05)
-    assert _tagged(tag) == []
 
 
 @pytest.mark.parametrize("mode", MODES)

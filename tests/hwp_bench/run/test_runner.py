@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -162,17 +162,24 @@ def test_the_schedule_is_dense_at_the_start_then_every_tenth() -> None:
     assert schedule(Budget(seconds=0.5)) == pytest.approx([0.05 * k for k in range(1, 10)])
 
 
-def test_the_clock_stands_still_while_a_checkpoint_is_taken(tmp_path: Path) -> None:
-    taken = []
-    clock = ReportClock(
-        Budget(), lambda index, avatar: (time.sleep(0.3), taken.append(index)), tmp_path / "p.json"
-    )
-    before = clock.elapsed
+def test_the_clock_stands_still_while_a_checkpoint_is_taken(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now, taken = [100.0], []
+    monkeypatch.setattr("hwp_bench.run.worker.time", SimpleNamespace(perf_counter=lambda: now[0]))
+
+    def record(index: int, avatar: object) -> None:
+        now[0] += 0.25
+        taken.append(index)
+
+    clock = ReportClock(Budget(), record, tmp_path / "p.json")
+    now[0] += 0.5
     clock.take(5, None)  # type: ignore[arg-type]
-    assert clock.elapsed - before < 0.2
-    assert clock.paused >= 0.3
+    assert clock.elapsed == 0.5
+    assert clock.paused == 0.25
     assert taken == [0]
     assert clock.checkpoints[0].step == 5
+    assert clock.checkpoints[0].seconds == 0.5
     clock(6, None)  # type: ignore[arg-type]
     assert taken == [0]
 

@@ -83,12 +83,10 @@ def fits() -> list[int]:
     ]
 
 
-def left_over() -> list[int]:
-    """Processes of the method, after a while in which they may end."""
-    deadline = time.monotonic() + 40.0
-    while fits() and time.monotonic() < deadline:
+def wait_until_none_is_left() -> None:
+    """Wait for the method's processes to end; the suite's own time limit ends this otherwise."""
+    while fits():
         time.sleep(0.2)
-    return fits()
 
 
 def test_a_node_is_killed_in_the_middle_and_the_results_are_those_without_ray(
@@ -125,7 +123,7 @@ def test_a_node_is_killed_in_the_middle_and_the_results_are_those_without_ray(
     assert len(set(nodes.cached())) == 3
     run_ablation(manifest, design, captures, tmp_path / "turn", settings, [0], engine=LocalEngine())
     assert contents(tmp_path / "ray") == contents(tmp_path / "turn")
-    assert left_over() == []
+    wait_until_none_is_left()
 
 
 def test_a_capture_is_rendered_to_the_same_digest(nodes: Nodes, tmp_path: Path) -> None:
@@ -157,11 +155,11 @@ def test_a_stop_ends_the_jobs_on_the_nodes_and_leaves_no_half_result(
             assert process.poll() is None
             time.sleep(0.2)
         process.send_signal(signal.SIGTERM)
-        shown, errors = process.communicate(timeout=90)
+        shown, errors = process.communicate()
     assert process.returncode == 130, errors
     assert shown == ""
     assert "Traceback" not in errors
-    assert left_over() == []
+    wait_until_none_is_left()
     # The lock that keeps a second run away stays, and holds nothing.
     written = [path for path in out.rglob("*") if path.is_file() and path.stat().st_size]
     assert written == []
