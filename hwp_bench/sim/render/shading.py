@@ -75,7 +75,7 @@ def lit(samples: Samples, lights: Lights, tracers: list[Tracer], turn: np.ndarra
     Args:
         samples: the points.
         lights: the light.
-        tracers: what may throw a shadow.
+        tracers: what may throw a shadow, at least one.
         turn: (H,) 0-3, which part of the lamp each sample aims at; the samples of a pixel aim
             at different parts, which softens the shadow's rim.
 
@@ -93,8 +93,8 @@ def lit(samples: Samples, lights: Lights, tracers: list[Tracer], turn: np.ndarra
     aim = lights.direction + _LIGHT_RADIUS * (_DISC @ np.stack([first, second]))
     directions = aim[turn[facing]]
     origins = samples.points[facing] + LIFT * samples.flat[facing]
-    dark = np.zeros(len(facing), dtype=bool)
-    for tracer in tracers:
+    dark = tracers[0].blocked(origins, directions, "shadow")
+    for tracer in tracers[1:]:
         open_ = np.flatnonzero(~dark)
         dark[open_] = tracer.blocked(origins[open_], directions[open_], "shadow")
     reached[facing[dark]] = 0.0
