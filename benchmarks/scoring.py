@@ -130,7 +130,7 @@ def measure(size: int = 256, count: int = 40, rounds: int = 3) -> dict[str, floa
         for _ in range(rounds):
             ours += timed(partial(run_ours, frames, count, 1))[1] / count
             plain += timed(partial(run_scikit_image, frames, count // 4))[1] / (count // 4)
-        ratios[f"scoring / scikit-image, hand fills {share:.0%}"] = ours / plain
+        ratios[f"scoring / scikit-image, hand fills {share:.0%}"] = float(ours / plain)
     return ratios
 
 

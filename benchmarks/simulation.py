@@ -2,7 +2,6 @@
 
 Run from the repository: `python -m benchmarks.simulation` prints seconds a frame by kind of frame
 and the largest memory of `hwp-bench sim render` for a short and a long capture;
-`python -m benchmarks.simulation --blur` prints what a frame with motion blur costs in clean frames;
 `python -m benchmarks.simulation --penetration 24` prints, for every gesture and for that many
 frames spread over every scene, the deepest place of a hand inside itself or the other.
 
@@ -23,22 +22,16 @@ import tempfile
 import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from multiprocessing import get_context
 from pathlib import Path
 
 import numpy as np
 import psutil
 
-from hwp_bench.sim.effects.plan import hands_at, plan
-from hwp_bench.sim.geometry.embree import EmbreeMesh, library
-from hwp_bench.sim.geometry.raycast import EmbreexMesh, RenderCost
+from hwp_bench.sim.effects.plan import plan
 from hwp_bench.sim.render.frame import render_frame
-from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.optics import intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.scene.reader import load_scene, scene_names
 from hwp_bench.sim.scene.schema import Scene
-from hwp_bench.sim.subject.hand import MOVING
 
 #: Frames over which a scene is spread where frames of a kind are looked for.
 SPREAD = 240
@@ -66,14 +59,6 @@ KINDS = (
     Kind("two hands, object and shadow", "capture10", ("hand_object_interaction",), 0.6),
     Kind("two hands, motion blur", "capture10", ("motion_blur",), None),
 )
-
-
-#: Scenes whose frames with motion blur are compared with their clean frames, by what they show.
-BLURRED = {"one hand": "capture3", "two hands": "capture10"}
-#: Clean frames that a frame with motion blur may cost, its own clean version included.
-BLUR_BUDGET = 4.0
-#: Share of embreex's time that a mesh and one ray a pixel may take.
-RAY_BUDGET = 0.7
 
 
 def frames_of(kind: Kind, scene: Scene, size: int, count: int) -> list[int]:
@@ -125,57 +110,6 @@ def speed_table(size: int, count: int, workers: int) -> str:
                 f"| {np.mean(processors):.2f} | {wall:.2f} | {goal} |"
             )
     return "\n".join(lines)
-
-
-def measure(size: int = 256, count: int = 4) -> dict[str, float]:
-    """Ratios of processor time; lower is better.
-
-    The first two are what a frame with motion blur costs in clean frames of the same scene, the
-    third what a mesh and its rays cost next to the package embreex alone. What is compared takes
-    turns in this process, so that other work on the machine slows both sides.
-
-    Args:
-        size: edge of the image, px.
-        count: frames of each kind and scene, spread over the scene.
-
-    Returns:
-        Name of a ratio -> ratio; `BLUR_BUDGET` and `RAY_BUDGET` are what they may be.
-    """
-    ratios = {}
-    for title, name in BLURRED.items():
-        scene = load_scene(name)
-        kinds = [Kind(title, name, acting, None) for acting in ((), ("motion_blur",))]
-        turns = zip(*(frames_of(kind, scene, size, count) for kind in kinds), strict=True)
-        seconds = np.zeros(2)
-        render_frame(scene, 0, SPREAD, size)
-        for turn in turns:
-            for kind, frame in enumerate(turn):
-                start = time.process_time()
-                render_frame(scene, frame, SPREAD, size)
-                seconds[kind] += time.process_time() - start
-        ratios[f"blurred frame / clean frame, {title}"] = float(seconds[1] / seconds[0])
-    return ratios | {"mesh and rays / embreex alone": _rays_ratio(size)}
-
-
-def _rays_ratio(size: int) -> float:
-    """Processor time of a hand's mesh and one ray a pixel, over that of embreex; best of five."""
-    scene = load_scene("capture3")
-    surface = Stage(scene, RenderCost()).surface(hands_at(scene, 0.0), MOVING)
-    origin, directions = pixel_rays(
-        intrinsics(scene, size), viewmat(scene, 0.0), (0, size, 0, size), 1
-    )
-    loaded = library()
-    if loaded is None:
-        return 1.0
-    best = [np.inf, np.inf]
-    for _ in range(5):
-        for way, mesh in enumerate((partial(EmbreeMesh, loaded), EmbreexMesh)):
-            start = time.process_time()
-            mesh(surface.vertices, surface.faces).first_hits(
-                origin[None], directions.reshape(-1, 3)
-            )
-            best[way] = min(best[way], time.process_time() - start)
-    return best[0] / best[1]
 
 
 def peak_memory(scene: str, frames: int, size: int, workers: int) -> float:
@@ -260,13 +194,7 @@ def main() -> None:
     parser.add_argument("--frames", type=int, default=4, help="frames of a kind and process")
     parser.add_argument("--workers", type=int, default=2, help="processes (default 2)")
     parser.add_argument("--penetration", type=int, metavar="FRAMES", help="depths instead")
-    parser.add_argument("--blur", action="store_true", help="ratios of blurred to clean instead")
     args = parser.parse_args()
-    if args.blur:
-        for name, ratio in measure(args.size, args.frames).items():
-            budget = BLUR_BUDGET if name.startswith("blurred") else RAY_BUDGET
-            print(f"{name}: {ratio:.2f} (budget {budget:.1f})")
-        return
     if args.penetration is not None:
         print(penetration_table(args.penetration))
         return
