@@ -71,10 +71,11 @@ def photometric_loss(
             field="weights",
         )
     images = (prediction, target, weights)
-    if dssim_weight > 0.0 and all(_is_float32_cpu(tensor) for tensor in images):
-        from wildghand.gaussians.photometric_cpu import PhotometricCpu
+    if dssim_weight > 0.0 and prediction.device.type == "cpu":
+        from wildghand.gaussians.photometric_cpu import PhotometricCpu, takes
 
-        return PhotometricCpu.apply(*images, dssim_weight, _window(), (C1, C2))
+        if takes(*images):
+            return PhotometricCpu.apply(*images, dssim_weight, _window(), (C1, C2))
     error = (prediction - target).abs()
     if dssim_weight > 0.0:
         dissimilarity = 1.0 - ssim_map(prediction, target)
@@ -114,10 +115,6 @@ class _SsimMap(torch.autograd.Function):
         # The window is symmetric and the border zero: blurring is its own adjoint.
         from_mu, from_xx, from_xy = _blur(stack).split(channels, dim=-1)
         return from_mu + 2.0 * x * from_xx + y * from_xy, None
-
-
-def _is_float32_cpu(tensor: torch.Tensor) -> bool:
-    return tensor.dtype == torch.float32 and tensor.device.type == "cpu"
 
 
 def _blur(images: torch.Tensor) -> torch.Tensor:

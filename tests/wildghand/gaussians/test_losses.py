@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -57,11 +59,28 @@ def test_both_ways_to_blur_agree() -> None:
     np.testing.assert_allclose(losses._blur(x), losses._convolve(x), atol=1e-14)
 
 
-@pytest.mark.parametrize("dssim_weight", [0.2, 1.0])
-def test_the_compiled_loss_agrees_with_torch_in_float64(dssim_weight: float) -> None:
-    """Value to 1e-6; gradients to 1e-5 of the largest entry."""
-    x, y, w = images(9), images(10), images(11, (2, 24, 30))
+def pair(content: str) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """Two images and weights; what is not content is black in both."""
+    if content == "narrow":
+        return images(9, (1, 9, 6, 3)), images(10, (1, 9, 6, 3)), images(11, (1, 9, 6))
+    x, y, w = images(9, (2, 40, 50, 3)), images(10, (2, 40, 50, 3)), images(11, (2, 40, 50))
     y[:, 5:9] = x[:, 5:9]
+    inside = torch.zeros(2, 40, 50, 1, dtype=x.dtype)
+    if content == "all":
+        inside[:] = 1.0
+    elif content == "middle":
+        inside[0, 20:24, 17:21] = 1.0
+    elif content == "corners":
+        inside[0, :3, 45:] = 1.0
+        inside[1, 39:, :1] = 1.0
+    return x * inside, y * inside, w
+
+
+@pytest.mark.parametrize("content", ["all", "middle", "corners", "nothing", "narrow"])
+@pytest.mark.parametrize("dssim_weight", [0.2, 1.0])
+def test_the_compiled_loss_agrees_with_torch_in_float64(dssim_weight: float, content: str) -> None:
+    """Value to 1e-6; gradients to 1e-5 of the largest entry."""
+    x, y, w = pair(content)
     values, gradients = [], []
     for dtype in (torch.float32, torch.float64):
         leaves = [x.to(dtype).requires_grad_(), w.to(dtype).requires_grad_()]
@@ -71,7 +90,29 @@ def test_the_compiled_loss_agrees_with_torch_in_float64(dssim_weight: float) -> 
         gradients.append([leaf.grad.double() for leaf in leaves])
     assert values[0] == pytest.approx(values[1], abs=1e-6)
     for fast, exact in zip(*gradients, strict=True):
-        np.testing.assert_allclose(fast, exact, atol=1e-5 * float(exact.abs().max()))
+        np.testing.assert_allclose(fast, exact, atol=1e-5 * float(exact.abs().max()) + 1e-12)
+
+
+def test_the_number_of_threads_changes_no_bit_of_the_compiled_loss() -> None:
+    x, y, w = (tensor.float() for tensor in pair("all"))
+    made = []
+    threads = torch.get_num_threads()
+    try:
+        for count in (1, 3):
+            torch.set_num_threads(count)
+            leaf = x.repeat(1, 5, 5, 1).requires_grad_()
+            loss = photometric_loss(leaf, y.repeat(1, 5, 5, 1), w.repeat(1, 5, 5), 0.2)
+            loss.backward()
+            made.append((loss.detach(), leaf.grad))
+    finally:
+        torch.set_num_threads(threads)
+    assert all(torch.equal(a, b) for a, b in zip(*made, strict=True))
+
+
+def test_a_pixel_that_is_no_number_makes_the_loss_none() -> None:
+    x, y, w = (tensor.float() for tensor in pair("nothing"))
+    x[1, 30, 7, 2] = math.nan
+    assert photometric_loss(x, y, w, 0.2).isnan()
 
 
 def test_weighted_l1_by_hand() -> None:
