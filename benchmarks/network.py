@@ -30,6 +30,7 @@ from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from hwp_bench.methods.manifest import find_method
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.gaussians.fit_loop import batches
+from wildghand.gaussians.frame_table import soft_weights
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.quaternions import quat_multiply, quat_rotate, quat_third_axis
 from wildghand.gaussians.rig import make_rig
@@ -196,15 +197,16 @@ def fit(contender: Contender, clip: TrainingClip, frames: TrainingFrames, steps:
     optimizer = torch.optim.Adam(contender.groups, eps=1e-15, betas=(0.9, 0.99), fused=True)
     starts = [group["lr"] for group in optimizer.param_groups]
     order = batches(len(frames), 1, seed=0)
+    images, masks = (table(torch.device("cpu")) for table in (frames.images_on, frames.masks_on))
     began = time.perf_counter()
     for step in range(steps):
         for group, start in zip(optimizer.param_groups, starts, strict=True):
             group["lr"] = start * FINAL ** (step / steps)
         rows = next(order)
         image = contender.render(clip, rows)
-        target, weights = frames.targets(rows, 0.03, torch.device("cpu"))
         optimizer.zero_grad()
-        photometric_loss(image, target, weights, 0.2).backward()
+        weights = soft_weights(masks(rows), 0.03)
+        photometric_loss(image, images(rows), weights, 0.2).backward()
         optimizer.step()
     return 1e3 * (time.perf_counter() - began) / steps
 

@@ -58,7 +58,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "regularisers": ("wildghand.fitting.objective:Objective.__call__",),
     "targets and weights": (
         "wildghand.fitting.weighting:Weighting.__call__",
-        "wildghand.gaussians.training:TrainingFrames.targets",
+        "wildghand.gaussians.frame_table:FrameTable.__call__",
     ),
     "optimizer": (
         "torch.optim.optimizer:Optimizer.zero_grad",

@@ -97,7 +97,9 @@ class DynamicPerturbation(nn.Module):
         Raises:
             UsageError: a frame that is not in the clip.
         """
-        if frames.numel() and not 0 <= int(frames.min()) <= int(frames.max()) < self.frame_count:
+        # Off the CPU the check would wait for the device.
+        known = frames.device.type != "cpu" or not frames.numel()
+        if not known and not 0 <= int(frames.min()) <= int(frames.max()) < self.frame_count:
             raise UsageError(
                 f"are {int(frames.min())} to {int(frames.max())}",
                 field="frames",
@@ -185,6 +187,19 @@ def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator)
         raise ShapeMismatch(
             f"has shape {tuple(chance.shape)}, omega {tuple(omega.shape)}", field="probability"
         )
-    drawn = torch.rand(omega.shape, generator=generator, device=generator.device)
-    kept = drawn >= chance.to(drawn.device)
+    kept = draw_kept(chance.expand(omega.shape), generator)
     return torch.where(kept.to(omega.device), omega, torch.zeros_like(omega))
+
+
+def draw_kept(probability: Tensor, generator: torch.Generator) -> Tensor:
+    """Which of B frames keep their temporal weights in a step; see `drop`.
+
+    Args:
+        probability: (B,) in [0, 1] that a frame does not, on the CPU.
+        generator: draws B numbers.
+
+    Returns:
+        (B,) bool, where the generator is.
+    """
+    drawn = torch.rand(probability.shape, generator=generator, device=generator.device)
+    return drawn >= probability.to(drawn.device)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -12,13 +13,14 @@ import torch
 from hwp_bench.capture.schema import HandModelId
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
-from wildghand.dpd.dpd import drop
+from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
 from wildghand.fitting.weighting import Weighting, assess_frames
 from wildghand.gaussians.adam import ClippedAdam
-from wildghand.gaussians.fit_loop import repeatable
+from wildghand.gaussians.fit_loop import Loss, repeatable
+from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.training import TrainingClip, load_frames
 from wildghand.model.assemble import make_model
 from wildghand.model.model import RenderedFrames, WildGHandModel
@@ -70,12 +72,20 @@ class Fit:
         self.objective = Objective(settings, self.model.rigs, temporal)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
         self.generator = torch.Generator().manual_seed(seed)
+        self._record = FitRecord(
+            frames=self.frames.indices.tolist(),
+            clean=self.weighting.clean.tolist(),
+            frame_weights=self.weighting.frame_weights.tolist(),
+            source=dict(self.source),
+        )
 
-    def step(self, rows: torch.Tensor, fraction: float) -> float:
+    def step(self, rows: torch.Tensor, fraction: float) -> Loss:
         """Take one step on a batch, of which each process draws its part.
 
+        Off the CPU nobody waits for the device: the step is queued.
+
         Args:
-            rows: (B,) int64, which of the training frames; the same in every process.
+            rows: (B,) int64, which of the training frames; the same in every process. On the CPU.
             fraction: share of the budget that is used up.
 
         Returns:
@@ -85,25 +95,30 @@ class Fit:
             UsageError: the processes cannot share the batch evenly.
             PeerLost: another process has ended.
         """
-        settings, weighting, world = self.settings, self.weighting, self.world
-        set_rates(self.optimizer, settings, fraction)
-        part = world.shard(len(rows))
-        mine = rows[part]
-        kept = {side: keep[part] for side, keep in self._keep(rows).items()}
-        drawing = self.draw(mine, kept, move=weighting.moves(rows))
-        target = weighting(rows, drawing, fraction, world)
-        loss = self.objective(self.model, drawing, target, mine, weighting.clean[mine])
-        value = float(world.average_(loss.detach().clone()))
-        if not math.isfinite(value):
-            return value
+        set_rates(self.optimizer, self.settings, fraction)
+        loss = self._loss(rows, fraction)
+        mean = self.world.average_(loss.detach().clone())
+        known: Loss = float(mean) if self.device.type == "cpu" else mean
+        if isinstance(known, float) and not math.isfinite(known):
+            return known
         self.optimizer.clear()
         with repeatable(self.device):
             loss.backward()
         average_gradients(
-            (tensor for group in self.optimizer.param_groups for tensor in group["params"]), world
+            (tensor for group in self.optimizer.param_groups for tensor in group["params"]),
+            self.world,
         )
-        self.optimizer.take_step(loss)
-        return value
+        self.optimizer.take_step(mean)
+        return known
+
+    def _loss(self, rows: torch.Tensor, fraction: float) -> torch.Tensor:
+        """The loss of this process's part of a batch."""
+        weighting, part = self.weighting, self.world.shard(len(rows))
+        mine = rows[part]
+        kept = {side: keep[part] for side, keep in self._keep(rows).items()}
+        drawing = self.draw(mine, kept, move=weighting.moves(rows))
+        target = weighting(rows, drawing, fraction, self.world)
+        return self.objective(self.model, drawing, target, mine, weighting.clean[mine])
 
     def require_same(self, step: int) -> None:
         """Check that all processes start from the same state.
@@ -127,7 +142,7 @@ class Fit:
         return {
             "model": self.model.state_dict(),
             "thresholds": self.weighting.pao.state_dict(),
-            "median": self.weighting.median,
+            "median": self.weighting.saved_median,
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
         }
@@ -142,8 +157,11 @@ class Fit:
 
     def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """(B,) bool by side: which frames of a batch keep their biases in this step."""
-        ones, chances = torch.ones(len(rows)), self.weighting.drop_probability[rows]
-        return {side: drop(ones, chances, self.generator) > 0.0 for side in self.model.perturbation}
+        chances = self.weighting.drop_probability[rows]
+        return {
+            side: upload(draw_kept(chances, self.generator), self.device)
+            for side in self.model.perturbation
+        }
 
     def draw(
         self,
@@ -155,14 +173,14 @@ class Fit:
         """Draw training frames with everything that is particular to them.
 
         Args:
-            rows: (B,) int64, which of the training frames.
+            rows: (B,) int64, which of the training frames; on the CPU.
             kept: (B,) bool by side, whether a frame keeps its biases; None: every one does.
             move: refine the poses of the frames; None: if any of them needs it.
         """
         with self._precision():
             return self.model.draw_frames(
                 self.clip,
-                rows,
+                upload(rows, self.device),
                 self.training.width,
                 self.training.height,
                 kept=kept,
@@ -187,14 +205,11 @@ class Fit:
             {side: hands[side].betas for side in self.model.rigs},
             self.mean_color,
             self.seed,
-            FitRecord(
-                frames=self.frames.indices.tolist(),
+            dataclasses.replace(
+                self._record,
                 temporal=self._temporal() if final else {},
-                clean=self.weighting.clean.tolist(),
-                frame_weights=self.weighting.frame_weights.tolist(),
                 steps=steps,
                 seconds=seconds,
-                source=dict(self.source),
             ),
             self._weight_masks() if final else None,
         )

@@ -9,6 +9,7 @@ from torch import Tensor
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fitting.weighting import FrameTarget
 from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.laplacian import surface_laplacian
 from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.gaussians.rig import HandRig
@@ -59,8 +60,8 @@ class Objective:
             model: what is fitted.
             drawing: of B frames.
             target: what they are compared with.
-            rows: (B,) which of the training frames they are.
-            clean: (B,) probability that a frame is clean.
+            rows: (B,) which of the training frames they are, on the CPU.
+            clean: (B,) probability that a frame is clean, on the CPU.
         """
         weights, settings = self.weights, self.settings
         image = drawing.image
@@ -92,8 +93,9 @@ class Objective:
             total = total + settings.dpd.omega_weight * held
         if settings.dpd.gains:
             # Clean frames have no gain: without this prior gain and colours could trade places.
-            size = model.log_gains[rows].square().mean(dim=-1)
-            total = total + settings.dpd.gain_weight * (clean.to(size) * size).mean()
+            device = model.log_gains.device
+            size = model.log_gains[upload(rows, device)].square().mean(dim=-1)
+            total = total + settings.dpd.gain_weight * (upload(clean, device) * size).mean()
         return total
 
     def _roughness(self, side: str, raw: RawAttributes, offsets: Tensor) -> Tensor:

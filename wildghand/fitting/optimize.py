@@ -13,7 +13,7 @@ from hwp_bench.methods.contract import Budget, Report
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.parallel import World
-from wildghand.gaussians.fit_loop import Guard, batches, spent
+from wildghand.gaussians.fit_loop import Guard, Loss, batches, read_losses, repeatable, spent
 
 #: Fall of the mean loss from window to window, as a share, that still counts as progress.
 PROGRESS = 1e-3
@@ -74,28 +74,36 @@ def optimize(
     watchers = watchers or Watchers(settings.schedule.plateau_steps)
     step = start
     report(step, fit.avatar(step))
-    while step < steps:
-        # All processes go by the clock of rank 0, or some would stop a step before the others.
-        fraction = world.broadcast(spent(step, steps, budget, report))
-        if fraction >= 1.0:
-            break
-        loss = fit.step(next(order), fraction)
-        if not watchers.guard.watch(step, loss, fit.model):
-            fit.model.load_state_dict(watchers.guard.best())
-            kept = watchers.guard.step
-            _tell(world, f"The fit diverged at step {step}; the state of step {kept} is kept.")
-            step = kept
-            break
-        step += 1
-        report.progress(step, steps)
-        report(step, fit.avatar(step))
-        if after_step is not None:
-            after_step(step, watchers)
-        if watchers.plateau.reached(loss):
-            window = settings.schedule.plateau_steps
-            _tell(world, f"The loss has stood still for {window} steps; finished early.")
-            break
+    with repeatable(fit.device):
+        while step < steps:
+            # All processes go by the clock of rank 0, or some would stop a step before the others.
+            fraction = world.broadcast(spent(step, steps, budget, report))
+            if fraction >= 1.0:
+                break
+            loss = fit.step(next(order), fraction)
+            if not watchers.guard.watch(step, loss, fit.model):
+                step = _go_back(fit, watchers, step)
+                break
+            step += 1
+            report.progress(step, steps)
+            report(step, fit.avatar(step))
+            if after_step is not None:
+                after_step(step, watchers)
+            if watchers.plateau.reached(loss):
+                window = settings.schedule.plateau_steps
+                _tell(world, f"The loss has stood still for {window} steps; finished early.")
+                break
+        if not watchers.guard.sound():
+            step = _go_back(fit, watchers, step)
     return fit.avatar(step, report.elapsed, final=world.is_main)
+
+
+def _go_back(fit: Fit, watchers: Watchers, step: int) -> int:
+    """Bring a fit that diverged back to its best state; returns the steps behind that."""
+    fit.model.load_state_dict(watchers.guard.best())
+    kept = watchers.guard.step
+    _tell(fit.world, f"The fit diverged at step {step}; the state of step {kept} is kept.")
+    return kept
 
 
 def _tell(world: World, text: str) -> None:
@@ -112,24 +120,24 @@ class Plateau:
 
     def __init__(self, window: int) -> None:
         self._window = window
-        self._losses: list[float] = []
+        self._losses: list[Loss] = []
         self._before = math.inf
 
-    def reached(self, loss: float) -> bool:
+    def reached(self, loss: Loss) -> bool:
         """Take note of a loss; True when the fit may stop."""
         if not self._window:
             return False
         self._losses.append(loss)
         if len(self._losses) < self._window:
             return False
-        mean = sum(self._losses) / self._window
+        mean = sum(read_losses(self._losses)) / self._window
         self._losses.clear()
         before, self._before = self._before, mean
         return mean > (1.0 - PROGRESS) * before
 
     def state_dict(self) -> dict[str, Any]:
         """The state for `load_state_dict`."""
-        return {"losses": list(self._losses), "before": self._before}
+        return {"losses": read_losses(self._losses), "before": self._before}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""

@@ -10,11 +10,12 @@ from torch import Tensor
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
+from wildghand.gaussians.frame_table import FrameTable, soft_weights, upload
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.model import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.pao.pao import PerturbationAwareWeights, binary_weights
-from wildghand.pao.regions import FrameRegions, Regions, stack_regions
+from wildghand.pao.regions import ClipRegions, Regions
 from wildghand.pao.regions.superpixels import RegionCache, Superpixels
 from wildghand.pao.robust import blended_residual, residual_weights, running_median
 from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
@@ -89,15 +90,24 @@ class Weighting:
         self.drop_probability = torch.full((count,), settings.dpd.omega_dropout)
         self.frame_weights = torch.ones(count, device=device)
         self.pao = PerturbationAwareWeights(pao, hands).to(device)
-        self.median: float | None = None
+        self.median: float | Tensor | None = None
         self._refine_pose = torch.zeros(count, dtype=torch.bool)
         self._weighs_frames = False
         self._pixel_weights: Tensor | None = None
-        self._regions: list[FrameRegions] | None = None
+        self._regions: ClipRegions | None = None
         if assessment is not None:
             self._follow(assessment)
         if pao.robust or (pao.enabled and pao.variant == "paper"):
-            self._regions = RegionCache().clip(frames.images.numpy(), Superpixels())
+            regions = RegionCache().clip(frames.images.numpy(), Superpixels())
+            self._regions = ClipRegions(regions, device)
+        self._images, self._hands = frames.images_on(device), frames.masks_on(device)
+        size = 4 * frames.masks[0].numel()
+        self._fixed = FrameTable(self._fixed_weights, count, size, device)
+
+    @property
+    def saved_median(self) -> float | None:
+        """`median` as a number; it may wait for the device."""
+        return None if self.median is None else float(self.median)
 
     def moves(self, rows: Tensor) -> bool:
         """Whether the pose of any frame of a batch is refined."""
@@ -105,7 +115,9 @@ class Weighting:
 
     def shares(self, rows: Tensor) -> Tensor | None:
         """How much the canonical hand learns from each frame of a batch, (B,); None: all."""
-        return self.frame_weights[rows] if self._weighs_frames else None
+        if not self._weighs_frames:
+            return None
+        return self.frame_weights[upload(rows, self.device)]
 
     def __call__(
         self, rows: Tensor, drawing: RenderedFrames, fraction: float, world: World = SINGLE_PROCESS
@@ -121,23 +133,27 @@ class Weighting:
             world: the processes.
         """
         mine = rows[world.shard(len(rows))]
-        hand = self._coverage(mine)
-        image = self.frames.images[mine].to(self.device).float() / 255.0 * hand[..., None]
-        pao, outside = self.settings.pao, self.settings.terms.outside_weight
-        soft = outside + (1.0 - outside) * hand
-        if not pao.enabled:
-            weights = soft
-        elif pao.variant == "binary":
-            weights = binary_weights(hand, pao.binary_outside)
-        elif pao.variant == "paper":
+        hand, image = self._hands(mine), self._images(mine)
+        pao = self.settings.pao
+        if pao.enabled and pao.variant == "paper":
             weights = self._paper_weights(rows, image, drawing, world)
         elif pao.robust and fraction >= pao.robust_start:
-            weights = soft * self._robust_weights(rows, image, drawing, world)
-        elif self._pixel_weights is not None:
-            weights = soft * self._pixel_weights[mine].to(self.device).float() / 255.0
+            weights = self._soft(hand) * self._robust_weights(rows, image, drawing, world)
         else:
-            weights = soft
+            weights = self._fixed(mine)
         return FrameTarget(image, hand, weights)
+
+    def _soft(self, hand: Tensor) -> Tensor:
+        return soft_weights(hand, self.settings.terms.outside_weight)
+
+    def _fixed_weights(self, rows: Tensor) -> Tensor:
+        """(B, H, W) weights that do not follow from the drawing."""
+        hand, pao = self._hands(rows), self.settings.pao
+        if pao.enabled and pao.variant == "binary":
+            return binary_weights(hand, pao.binary_outside)
+        if self._pixel_weights is None:
+            return self._soft(hand)
+        return self._soft(hand) * upload(self._pixel_weights[rows], self.device).float() / 255.0
 
     def _follow(self, assessment: FrameAssessment) -> None:
         """Take from the pre-pass what the components use."""
@@ -150,25 +166,19 @@ class Weighting:
             self.frame_weights = weights.to(self.device)
             self._pixel_weights = torch.from_numpy(assessment.pixel_weights)
 
-    def _coverage(self, rows: Tensor) -> Tensor:
-        """(B, H, W) estimated coverage of the visible hand, 0-1."""
-        return self.frames.masks[rows].to(self.device).float() / 255.0
-
     def _paper_weights(
         self, rows: Tensor, image: Tensor, drawing: RenderedFrames, world: World
     ) -> Tensor:
         """The paper's equations on all frames of the batch; this process's part of the weights."""
         error, omega = _error(image, drawing), world.gather(drawing.omega)
-        found = self.pao(
-            world.gather(error), self._batch_regions(rows), self._coverage(rows), omega
-        )
+        found = self.pao(world.gather(error), self._batch_regions(rows), self._hands(rows), omega)
         return found.weights[world.shard(len(rows))]
 
     def _robust_weights(
         self, rows: Tensor, image: Tensor, drawing: RenderedFrames, world: World
     ) -> Tensor:
         """Weights from the residuals of all frames of the batch; this process's part of them."""
-        hands = self._coverage(rows)
+        hands = self._hands(rows)
         error = world.gather(_error(image, drawing))
         residual = blended_residual(error, self._batch_regions(rows), hands)
         self.median = running_median(self.median, residual, hands)
@@ -176,7 +186,7 @@ class Weighting:
 
     def _batch_regions(self, rows: Tensor) -> Regions:
         assert self._regions is not None
-        return stack_regions([self._regions[row] for row in rows.tolist()], self.device)
+        return self._regions(rows)
 
 
 def _error(image: Tensor, drawing: RenderedFrames) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
@@ -22,6 +22,8 @@ WINDOW = 50
 #: A mean loss of a window beyond this multiple of the best one means divergence.
 MAX_RISE = 3.0
 
+#: The loss of a step: a number, or a scalar on a device, which nobody has waited for yet.
+Loss = float | torch.Tensor
 Snapshot = TypeVar("Snapshot", covariant=True)
 Kept = TypeVar("Kept")
 
@@ -69,13 +71,14 @@ def repeatable(device: torch.device) -> Iterator[None]:
     """Make gradients on the CPU the same bit for bit every time, on several threads too.
 
     Where a tensor is read through an index, PyTorch adds up the gradient of large tensors with
-    atomic additions, in whatever order its threads come. On CUDA this does nothing.
+    atomic additions, in whatever order its threads come. On CUDA this does nothing, and nothing
+    where it holds already: setting it costs as much as some ten operations.
     """
-    if device.type != "cpu":
-        yield
-        return
     filling: Any = torch.utils.deterministic
     before = torch.are_deterministic_algorithms_enabled(), filling.fill_uninitialized_memory
+    if device.type != "cpu" or before == (True, False):
+        yield
+        return
     warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
     torch.use_deterministic_algorithms(True)
     # Filling new memory with NaN costs time and changes no result.
@@ -116,6 +119,13 @@ def batches(count: int, batch: int, seed: int) -> Iterator[torch.Tensor]:
         queue = queue[batch:]
 
 
+def read_losses(losses: Sequence[Loss]) -> list[float]:
+    """The losses of some steps as numbers; waits once for those that are on a device."""
+    held = [loss for loss in losses if isinstance(loss, torch.Tensor)]
+    numbers = iter(torch.stack(held).tolist() if held else ())
+    return [next(numbers) if isinstance(loss, torch.Tensor) else loss for loss in losses]
+
+
 class Fitted(Protocol[Snapshot]):
     """A model that is being fitted."""
 
@@ -139,22 +149,31 @@ class Guard(Generic[Kept]):
         self.step = 0
         self._best_loss = math.inf
         self._best: Kept | None = None
-        self._losses: list[float] = []
+        self._losses: list[Loss] = []
 
-    def watch(self, step: int, loss: float, model: Fitted[Kept]) -> bool:
-        """Take note of the loss of `model` after `step` steps; False means divergence."""
-        if not math.isfinite(loss):
+    def watch(self, step: int, loss: Loss, model: Fitted[Kept]) -> bool:
+        """Take note of the loss of `model` after `step` steps; False means divergence.
+
+        A loss that is on a device is looked at when its window ends. The steps until then are not
+        kept if it turns out not to be finite.
+        """
+        if not isinstance(loss, torch.Tensor) and not math.isfinite(loss):
             return False
         self._losses.append(loss)
         if len(self._losses) < WINDOW:
             return True
-        mean = sum(self._losses) / len(self._losses)
+        losses = read_losses(self._losses)
+        mean = sum(losses) / len(losses)
         self._losses.clear()
-        if not model.finite():
+        if not math.isfinite(mean) or not model.finite():
             return False
         if mean < self._best_loss:
             self._best_loss, self._best, self.step = mean, model.snapshot(), step
         return mean <= MAX_RISE * self._best_loss
+
+    def sound(self) -> bool:
+        """Whether the losses since the last window are finite; to be asked when a fit ends."""
+        return all(math.isfinite(loss) for loss in read_losses(self._losses))
 
     def best(self) -> Kept:
         """The state with the lowest loss.
@@ -175,7 +194,7 @@ class Guard(Generic[Kept]):
             "step": self.step,
             "best_loss": self._best_loss,
             "best": self._best,
-            "losses": list(self._losses),
+            "losses": read_losses(self._losses),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:

@@ -133,7 +133,7 @@ def _blur(images: torch.Tensor) -> torch.Tensor:
 
 
 def _convolve(images: torch.Tensor) -> torch.Tensor:
-    window = torch.as_tensor(_window(), dtype=images.dtype, device=images.device)
+    window = _window_on(images.device, images.dtype)
     channels = images.shape[-1]
     half = WINDOW // 2
     planes = images.permute(0, 3, 1, 2)
@@ -148,6 +148,11 @@ def _window() -> np.ndarray:
     places = np.arange(WINDOW) - WINDOW // 2
     window = np.exp(-0.5 * (places / SIGMA) ** 2)
     return window / window.sum()
+
+
+@functools.cache
+def _window_on(device: torch.device, dtype: torch.dtype) -> torch.Tensor:
+    return torch.as_tensor(_window(), dtype=dtype, device=device)
 
 
 def _same_shape(prediction: torch.Tensor, other: torch.Tensor, field: str) -> None:

@@ -44,7 +44,7 @@ class Images(NamedTuple):
 
 
 class Constants(NamedTuple):
-    """What the loss is made of."""
+    """Constants of the loss."""
 
     window: np.ndarray  # (11,) float32, symmetric
     dssim_weight: np.float32  # lambda
@@ -54,7 +54,7 @@ class Constants(NamedTuple):
 
 
 class Made(NamedTuple):
-    """What the first pass makes."""
+    """Results of the first pass."""
 
     errors: np.ndarray  # (B, H, W) float32, summed over channels
     sums: np.ndarray  # (B, H) float64, weighted errors of each row

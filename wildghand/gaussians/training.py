@@ -10,6 +10,7 @@ import torch
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.methods.contract import TrainingCapture
+from wildghand.gaussians.frame_table import FrameTable, shares_of_255, upload
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 
 #: Most memory that posed anchors are kept in, bytes; longer clips are posed step by step.
@@ -33,22 +34,32 @@ class TrainingFrames:
     def __len__(self) -> int:
         return len(self.indices)
 
-    def targets(
-        self, rows: torch.Tensor, outside_weight: float, device: torch.device
-    ) -> tuple[torch.Tensor, torch.Tensor]:
-        """The images and weights that the renderings of a batch are compared with.
+    def images_on(self, device: torch.device) -> FrameTable:
+        """What renderings are compared with: float32 images, black outside the mask.
 
         Args:
-            rows: (B,) int64.
-            outside_weight: weight of a pixel that the mask leaves out.
-            device: where the result lives.
+            device: where the table gives them out.
 
         Returns:
-            (B, H, W, 3) float32 image over black outside the mask, and (B, H, W) pixel weights.
+            a table of (H, W, 3).
         """
-        masks = self.masks[rows].to(device).float() / 255.0
-        images = self.images[rows].to(device).float() / 255.0
-        return images * masks[..., None], outside_weight + (1.0 - outside_weight) * masks
+
+        def make(rows: torch.Tensor) -> torch.Tensor:
+            images = upload(self.images[rows], device).float() / 255.0
+            return images * shares_of_255(self.masks[rows], device)[..., None]
+
+        return FrameTable(make, len(self), 4 * self.images[0].numel(), device)
+
+    def masks_on(self, device: torch.device) -> FrameTable:
+        """Estimated coverage of the visible hand: a table of (H, W) float32 in [0, 1].
+
+        Args:
+            device: where the table gives it out.
+        """
+        each = 4 * self.masks[0].numel()
+        return FrameTable(
+            lambda rows: shares_of_255(self.masks[rows], device), len(self), each, device
+        )
 
     def mean_color(self) -> torch.Tensor:
         """(3,) mean sRGB colour of the visible hand, in [0, 1]."""

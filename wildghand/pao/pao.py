@@ -180,9 +180,9 @@ def binary_weights(hand: Tensor, outside: float = 0.0) -> Tensor:
 
 def _stretch(errors: Tensor, present: Tensor) -> Tensor:
     """Errors of the regions that are present, from their smallest to their largest, on [0, 1]."""
-    if not bool(present.any()):
-        return errors
-    low, high = errors[present].aminmax()
+    # Without a region that is present the span is minus infinity, and all is 0.
+    low = torch.where(present, errors, math.inf).amin()
+    high = torch.where(present, errors, -math.inf).amax()
     span = high - low
     stretched = (errors - low) / torch.where(span > 0.0, span, torch.ones_like(span))
     return torch.where(present & (span > _EQUAL * high), stretched, torch.zeros_like(errors))

@@ -80,11 +80,11 @@ def blended_residual(
 
 @torch.no_grad()
 def running_median(
-    previous: float | None,
+    previous: float | Tensor | None,
     residual: Tensor,
     hand: Tensor,
     settings: RobustSettings = RobustSettings(),
-) -> float:
+) -> float | Tensor:
     """Follow the median residual of hand pixels over the steps of a fit.
 
     Args:
@@ -94,22 +94,41 @@ def running_median(
         settings: the rate.
 
     Returns:
-        The new median, at least `least_scale`; `previous` where no hand pixel is finite.
+        The new median, at least `least_scale`; `previous` where no hand pixel is finite. A number
+        on the CPU, elsewhere a scalar on the device, float64, which nobody waits for.
     """
     on_hand = hand if hand.dtype == torch.bool else hand > 0.5
+    if residual.device.type != "cpu":
+        return _running_median_on_device(previous, residual, on_hand, settings)
     values = residual[on_hand]
     values = values[values.isfinite()]
     if not len(values):
         return settings.least_scale if previous is None else previous
     newest = float(values.median())
     if previous is not None:
-        newest = previous + settings.rate * (newest - previous)
+        newest = float(previous) + settings.rate * (newest - float(previous))
     return max(newest, settings.least_scale)
+
+
+def _running_median_on_device(
+    previous: float | Tensor | None, residual: Tensor, on_hand: Tensor, settings: RobustSettings
+) -> Tensor:
+    """As above, without a shape that follows from the values."""
+    counted = (on_hand & residual.isfinite()).flatten()
+    ordered = torch.where(counted, residual.flatten(), math.inf).sort().values
+    middle = (counted.sum() - 1).clamp(min=0) // 2
+    found = ordered.gather(0, middle[None])[0].double()
+    if previous is None:
+        newest = torch.where(counted.any(), found, settings.least_scale)
+    else:
+        moved = previous + settings.rate * (found - previous)
+        newest = torch.where(counted.any(), moved, previous)
+    return newest.clamp(min=settings.least_scale)
 
 
 @torch.no_grad()
 def residual_weights(
-    residual: Tensor, median: float, settings: RobustSettings = RobustSettings()
+    residual: Tensor, median: float | Tensor, settings: RobustSettings = RobustSettings()
 ) -> Tensor:
     """1 / (1 + (r / (2.5 median))^4).
 
@@ -125,7 +144,10 @@ def residual_weights(
     Source: an experiment on simulated captures; the form is that of a Cauchy weight with a
     fourth power, which leaves pixels below the median almost whole.
     """
-    scale = settings.cutoff * max(median, settings.least_scale)
+    if isinstance(median, Tensor):
+        scale: float | Tensor = settings.cutoff * median.clamp(min=settings.least_scale)
+    else:
+        scale = settings.cutoff * max(median, settings.least_scale)
     weights = 1.0 / (1.0 + (residual / scale).pow(settings.power))
     return torch.nan_to_num(weights, nan=0.0)
 

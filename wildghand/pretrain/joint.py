@@ -13,7 +13,7 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit, make_optimizer
 from wildghand.fitting.optimize import Watchers
 from wildghand.gaussians.adam import ClippedAdam
-from wildghand.gaussians.fit_loop import batches
+from wildghand.gaussians.fit_loop import Loss, batches
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import PredictionNetwork
 from wildghand.prior.prior import MAPS, mean_weights
@@ -63,7 +63,7 @@ class JointFit:
             for index, fit in enumerate(self.fits)
         ]
 
-    def step(self, fraction: float) -> float:
+    def step(self, fraction: float) -> Loss:
         """Take one step on a batch of the next capture.
 
         Args:
@@ -110,7 +110,7 @@ class JointFit:
         return {
             "models": self._tensors(),
             "thresholds": [fit.weighting.pao.state_dict() for fit in self.fits],
-            "medians": [fit.weighting.median for fit in self.fits],
+            "medians": [fit.weighting.saved_median for fit in self.fits],
             "generators": [fit.generator.get_state() for fit in self.fits],
             "optimizer": self.optimizer.state_dict(),
         }

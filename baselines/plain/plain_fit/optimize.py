@@ -11,6 +11,7 @@ from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from plain_fit.model import PlainAvatar, PlainModel
 from plain_fit.settings import PlainSettings
 from wildghand.gaussians.fit_loop import Guard, batches, repeatable, spent
+from wildghand.gaussians.frame_table import soft_weights
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
 
@@ -60,30 +61,35 @@ def fit_model(
         fused=True,
     )
     order = batches(len(frames), settings.batch, seed)
+    images, masks = frames.images_on(device), frames.masks_on(device)
     guard: Guard[PlainModel] = Guard()
     step = 0
     report(step, PlainAvatar(model, step))
-    while step < steps and (fraction := spent(step, steps, budget, report)) < 1.0:
-        for group, name in zip(optimizer.param_groups, parameters, strict=True):
-            group["lr"] = rates[name] * settings.final_rate**fraction
-        rows = next(order)
-        image, _ = model.render(
-            clip.poses(rows), clip.viewmats[rows], clip.Ks[rows], training.width, training.height
-        )
-        target, weights = frames.targets(rows, settings.outside_weight, device)
-        loss = photometric_loss(image, target, weights, settings.dssim_weight)
-        if not guard.watch(step, float(loss.detach()), model):
-            model = guard.best()
-            notice(f"The fit diverged at step {step}; the state of step {guard.step} is kept.")
-            return PlainAvatar(model, guard.step)
-        optimizer.zero_grad()
-        with repeatable(device):
+    with repeatable(device):
+        while step < steps and (fraction := spent(step, steps, budget, report)) < 1.0:
+            for group, name in zip(optimizer.param_groups, parameters, strict=True):
+                group["lr"] = rates[name] * settings.final_rate**fraction
+            rows = next(order)
+            image, _ = model.render(
+                clip.poses(rows),
+                clip.viewmats[rows],
+                clip.Ks[rows],
+                training.width,
+                training.height,
+            )
+            weights = soft_weights(masks(rows), settings.outside_weight)
+            loss = photometric_loss(image, images(rows), weights, settings.dssim_weight)
+            if not guard.watch(step, float(loss.detach()), model):
+                model = guard.best()
+                notice(f"The fit diverged at step {step}; the state of step {guard.step} is kept.")
+                return PlainAvatar(model, guard.step)
+            optimizer.zero_grad()
             loss.backward()
-        optimizer.step()
-        _clamp(model)
-        step += 1
-        report.progress(step, steps)
-        report(step, PlainAvatar(model, step))
+            optimizer.step()
+            _clamp(model)
+            step += 1
+            report.progress(step, steps)
+            report(step, PlainAvatar(model, step))
     return PlainAvatar(model.snapshot(), step)
 
 

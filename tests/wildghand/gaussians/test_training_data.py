@@ -12,6 +12,7 @@ from painted import FRAMES, SIZE, TrainingMaker
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import write_image
 from hwp_bench.methods.contract import TrainingCapture
+from wildghand.gaussians.frame_table import FrameTable, soft_weights
 from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.training import TrainingClip, TrainingFrames, load_frames
 
@@ -58,9 +59,21 @@ def test_targets_are_black_and_light_outside_the_mask() -> None:
         images=torch.tensor([[[[255, 51, 0], [255, 255, 255], [102, 102, 102]]]]).byte(),
         masks=torch.tensor([[[255, 0, 51]]]).byte(),
     )
-    target, weights = frames.targets(torch.tensor([0]), 0.1, torch.device("cpu"))
+    rows, cpu = torch.tensor([0]), torch.device("cpu")
+    target, weights = frames.images_on(cpu)(rows), soft_weights(frames.masks_on(cpu)(rows), 0.1)
     np.testing.assert_allclose(target[0, 0], [[1.0, 0.2, 0.0], [0.0] * 3, [0.08] * 3], rtol=1e-6)
     np.testing.assert_allclose(weights[0, 0], [1.0, 0.1, 0.28], rtol=1e-6)
+
+
+def test_a_table_of_frames_is_the_same_with_and_without_memory() -> None:
+    def make(rows: torch.Tensor) -> torch.Tensor:
+        return 2.0 * rows[:, None].expand(-1, 3)
+
+    for memory in (0, 12 * 50):
+        table = FrameTable(make, 50, 12, torch.device("cpu"), memory)
+        for rows in ([3], [49, 0, 7]):
+            expected = 2.0 * np.repeat(rows, 3).reshape(-1, 3)
+            np.testing.assert_array_equal(table(torch.tensor(rows)), expected)
 
 
 def test_mean_color_is_over_the_mask_alone() -> None:

@@ -1,6 +1,7 @@
 """The hand y_h and the regions y_u of a frame."""
 
 from wildghand.pao.regions.frame_regions import (
+    ClipRegions,
     FrameRegions,
     Regions,
     overlapping,
@@ -12,6 +13,7 @@ from wildghand.pao.regions.sam import SegmentAnything, open_sam
 from wildghand.pao.regions.superpixels import RegionCache, Segmenter, Superpixels
 
 __all__ = [
+    "ClipRegions",
     "FrameRegions",
     "RegionCache",
     "Regions",

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
+from wildghand.gaussians.frame_table import TABLE_BYTES, upload
 
 #: Most labels of one image; they are stored as 16-bit numbers.
 MAX_LABELS = 65536
@@ -113,11 +114,13 @@ class Regions:
         Returns:
             (B, U); no gradient.
         """
-        total = torch.bincount(
-            self.index.flatten(),
-            values.detach().flatten(),
-            minlength=len(self.index) * self.atoms,
-        ).reshape(len(self.index), self.atoms)
+        index, numbers = self.index.flatten(), values.detach().flatten()
+        places = len(self.index) * self.atoms
+        if index.device.type == "cpu":
+            total = torch.bincount(index, numbers, minlength=places)
+        else:  # a count would wait for the device
+            total = numbers.new_zeros(places).index_add_(0, index, numbers)
+        total = total.reshape(len(self.index), self.atoms)
         if self.membership is None:
             return total
         return torch.einsum("ba,bau->bu", total, self.membership.to(total))
@@ -149,13 +152,50 @@ def stack_regions(frames: Sequence[FrameRegions], device: torch.device | str = "
     sizes = {frame.labels.shape for frame in frames}
     if len(sizes) != 1:
         raise ShapeMismatch(f"have the sizes {sorted(sizes)}", field="frames")
-    atoms = max(frame.atoms for frame in frames)
+    atoms, place = max(frame.atoms for frame in frames), torch.device(device)
     labels = torch.from_numpy(np.stack([frame.labels for frame in frames]).astype(np.int64))
     index = labels + atoms * torch.arange(len(frames))[:, None, None]
     if all(frame.membership is None for frame in frames):
-        return Regions(index.to(device), atoms)
+        return Regions(upload(index, place), atoms)
     membership = torch.zeros(len(frames), atoms, max(frame.count for frame in frames))
     for frame, made in zip(frames, membership, strict=True):
         member = np.eye(frame.atoms) if frame.membership is None else frame.membership
         made[: member.shape[0], : member.shape[1]] = torch.from_numpy(member.astype(np.float32))
-    return Regions(index.to(device), atoms, membership.to(device))
+    return Regions(upload(index, place), atoms, upload(membership, place))
+
+
+class ClipRegions:
+    """The regions of all R frames of a clip, where a fit runs; it takes those of a batch from them.
+
+    Args:
+        frames: all of one image size, at least one.
+        device: where the tensors live.
+        cache_bytes: most memory; the regions of a larger clip are put together batch by batch.
+    """
+
+    def __init__(
+        self,
+        frames: Sequence[FrameRegions],
+        device: torch.device,
+        cache_bytes: int = TABLE_BYTES,
+    ) -> None:
+        self._frames, self._device = frames, device
+        whole = None
+        if 8 * len(frames) * frames[0].labels.size <= cache_bytes:
+            whole = stack_regions(frames, device)
+        self._whole = whole
+
+    def __call__(self, rows: Tensor) -> Regions:
+        """The regions of B frames.
+
+        Args:
+            rows: (B,) int64 on the CPU, which of the frames.
+        """
+        whole = self._whole
+        if whole is None:
+            return stack_regions([self._frames[row] for row in rows.tolist()], self._device)
+        # Atoms are numbered through the clip; in the batch they are numbered through the batch.
+        moved = upload(whole.atoms * (torch.arange(len(rows)) - rows), self._device)
+        rows = upload(rows, self._device)
+        member = None if whole.membership is None else whole.membership[rows]
+        return Regions(whole.index[rows] + moved[:, None, None], whole.atoms, member)
