@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import math
 from collections.abc import Mapping
@@ -230,9 +231,10 @@ class Fit:
                 masks[frame] = (255.0 * weights / largest).byte().cpu().numpy()
         return masks
 
-    def _precision(self) -> torch.autocast:
-        enabled = self.settings.mixed_precision and self.device.type == "cuda"
-        return torch.autocast(self.device.type, dtype=torch.bfloat16, enabled=enabled)
+    def _precision(self) -> contextlib.AbstractContextManager[object]:
+        if self.settings.mixed_precision and self.device.type == "cuda":
+            return torch.autocast(self.device.type, dtype=torch.bfloat16)
+        return contextlib.nullcontext()
 
     @torch.no_grad()
     def _temporal(self) -> dict[str, list[float]]:

@@ -180,6 +180,8 @@ def binary_weights(hand: Tensor, outside: float = 0.0) -> Tensor:
 
 def _stretch(errors: Tensor, present: Tensor) -> Tensor:
     """Errors of the regions that are present, from their smallest to their largest, on [0, 1]."""
+    if not errors.numel():
+        return errors
     # Without a region that is present the span is minus infinity, and all is 0.
     low = torch.where(present, errors, math.inf).amin()
     high = torch.where(present, errors, -math.inf).amax()

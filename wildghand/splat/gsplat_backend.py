@@ -1,9 +1,10 @@
 """CUDA backend: gsplat's kernels, behind the same signature and with the same checks.
 
 gsplat computes in float32 throughout and does not look for values that are not finite: one NaN
-quaternion makes every gradient NaN. So one number is read back from the device before the call; if
-it tells of anything unusual, the offenders are replaced by Gaussians that draw nothing and get
-no gradient. Otherwise the tensors go to gsplat as they are.
+quaternion makes every gradient NaN. So offenders are replaced by Gaussians that draw nothing and
+get no gradient; all others go to gsplat as they are. This happens on the device: nobody waits to
+learn whether there are any, unless cameras share Gaussians but not their colours. gsplat itself
+reads one number back, how many tiles its splats cover.
 """
 
 from __future__ import annotations
@@ -104,15 +105,7 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
     tensors = {name: getattr(scene, name) for name in names}
     tensors = {name: tensor for name, tensor in tensors.items() if tensor is not None}
-    with torch.no_grad():
-        largest = torch.cat([tensor.reshape(-1) for tensor in tensors.values()]).abs().amax()
-        focals = scene.Ks.diagonal(dim1=-2, dim2=-1)[:, :2]
-        smallest = torch.minimum(scene.quats.norm(dim=-1).amin(), focals.amin())
-        usual = (smallest > 0) & (largest < _MAX_LENGTH)  # false for NaN
-    return tensors if bool(usual) else _sanitised(scene, tensors)
 
-
-def _sanitised(scene: FlatScene, tensors: dict[str, torch.Tensor]) -> dict[str, torch.Tensor]:
     def within(tensor: torch.Tensor, bound: float) -> torch.Tensor:
         return (tensor.detach().abs() <= bound).all(-1)
 
@@ -132,7 +125,7 @@ def _sanitised(scene: FlatScene, tensors: dict[str, torch.Tensor]) -> dict[str, 
     values = {
         "means": zero.expand(3),
         "scales": zero.expand(3),
-        "quats": scene.means.new_tensor([1.0, 0.0, 0.0, 0.0]),
+        "quats": torch.eye(4, dtype=zero.dtype, device=zero.device)[0],
         "colors": zero.expand(scene.colors.shape[-1]),
         "opacities": zero,
     }
@@ -140,7 +133,13 @@ def _sanitised(scene: FlatScene, tensors: dict[str, torch.Tensor]) -> dict[str, 
         result[name] = replaced(tensors[name], good[name], value)
     # An offender in any argument makes the Gaussian vanish: its opacity is zero.
     opacities = result["opacities"]
+    colors = good.pop("colors")
     finest = max(mask.shape[0] for mask in good.values())
+    # Where each camera has colours of its own, this would take the Gaussians apart that cameras
+    # share. Only then somebody looks whether it must be.
+    if colors.shape[0] <= finest or not bool(colors.all()):
+        good["colors"] = colors
+        finest = max(finest, colors.shape[0])
     visible = torch.ones(finest, scene.gaussians, dtype=torch.bool, device=opacities.device)
     for mask in good.values():
         visible = visible & _repeat(mask, finest)
@@ -196,7 +195,7 @@ def _draw(
         near_plane=max(options.near_plane, _LEAST_NEAR_PLANE),
         far_plane=options.far_plane,
         eps2d=options.eps2d,
-        packed=False,
+        packed=False,  # packing pays where cameras see little of a scene; they see whole hands
         render_mode=options.render_mode,
         rasterize_mode="antialiased" if options.antialiased else "classic",
     )
