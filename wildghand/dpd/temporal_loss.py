@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -77,6 +78,53 @@ class TemporalTarget:
         return torch.stack([self._distance(module, part) for module in modules]).sum()
 
     def _distance(self, module: DynamicPerturbation, part: slice) -> Tensor:
-        frames = torch.arange(len(self.omega), device=self.omega.device)[part]
-        distance = module.temporal(frames).omega - self.omega[part]
-        return (self.hold[part] * distance.square()).mean()
+        first, last = module.phi[0], module.phi[2]
+        return _HeldDistance.apply(
+            first.weight,
+            first.bias,
+            last.weight,
+            last.bias,
+            module.psi.weight,
+            module.psi.bias,
+            module.encoding[: len(self.omega)][part],
+            self.omega[part],
+            self.hold[part],
+        )
+
+
+class _HeldDistance(torch.autograd.Function):
+    """Mean of hold (omega - target)^2, with its gradient made along with it.
+
+    Between phi's SiLU and omega's sigmoid lie two linear layers, which are one here: a code of
+    each frame is not needed, and a step of the fit pays for a row instead of a matrix.
+    """
+
+    @staticmethod
+    def forward(ctx: Any, *given: Tensor) -> Tensor:
+        weight1, bias1, weight2, bias2, psi, psi_bias, codes, target, hold = given
+        before = torch.addmm(bias1, codes, weight1.T)
+        gate = before.sigmoid()
+        hidden = before * gate
+        row = psi @ weight2
+        omega = ((hidden @ row.T).squeeze(-1) + (psi @ bias2 + psi_bias)).mul_(0.5).tanh_()
+        distance = omega - target
+        held = hold * distance
+        # d omega / d (its argument) = (1 - omega^2) / 2.
+        slope = held * (1.0 - omega.square()) / len(target)
+        to_row = slope[None] @ hidden
+        to_shift = slope.sum()[None]
+        to_before = torch.outer(slope, row[0]) * (gate * (1.0 + before * (1.0 - gate)))
+        ctx.save_for_backward(
+            to_before.T @ codes,
+            to_before.sum(dim=0),
+            psi.T @ to_row,
+            to_shift * psi[0],
+            torch.addmm(to_shift * bias2, to_row, weight2.T),
+            to_shift,
+        )
+        return (held * distance).mean()
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
+        return (*(made * gradient for made in ctx.saved_tensors), None, None, None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, fields
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -103,8 +104,23 @@ def reconstruction(
 
 def bias_size(biases: RawAttributes) -> Tensor:
     """Mean over Gaussians and frames of |Delta g|_1, the sum over the 14 channels."""
-    sizes = [tensor.abs().sum(dim=-1).mean() for _, tensor in biases.items()]
-    return torch.stack(sizes).sum()
+    return _BiasSize.apply(*(tensor for _, tensor in biases.items()))
+
+
+class _BiasSize(torch.autograd.Function):
+    """Sum of |x| over all tensors, divided by the number of Gaussians and frames."""
+
+    @staticmethod
+    def forward(ctx: Any, *tensors: Tensor) -> Tensor:
+        ctx.save_for_backward(*tensors)
+        ctx.count = tensors[0][..., 0].numel()
+        return sum((tensor.abs().sum() for tensor in tensors), tensors[0].new_zeros(())) / ctx.count
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, ...]:
+        share = gradient / ctx.count
+        return tuple(tensor.sign().mul_(share) for tensor in ctx.saved_tensors)
 
 
 def distance_to_one(values: Tensor) -> Tensor:

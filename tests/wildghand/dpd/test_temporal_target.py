@@ -93,6 +93,22 @@ def test_distance_is_the_held_square_summed_over_hands() -> None:
     torch.testing.assert_close(target.temporal_loss([left, right], 3).detach(), expected)
 
 
+def test_gradient_of_the_distance_is_that_of_the_formula() -> None:
+    """Oracle: autograd on the formula as written; float64, to 1e-9."""
+    torch.manual_seed(3)
+    learnt = module(10).double()
+    torch.nn.init.normal_(learnt.psi.weight)
+    target = TemporalTarget(
+        torch.linspace(0.0, 0.5, 10).double(), torch.linspace(1.0, 0.0, 10).double()
+    )
+    weights = [*learnt.phi.parameters(), *learnt.psi.parameters()]
+    found = torch.autograd.grad(3.0 * target.temporal_loss([learnt], 3), weights)
+    omega = learnt.temporal(torch.arange(10)).omega
+    distance = (target.hold * (omega - target.omega) ** 2).mean()
+    expected = torch.autograd.grad(3.0 * distance, weights)
+    torch.testing.assert_close(found, expected, atol=1e-9, rtol=1e-9)
+
+
 def test_frames_that_are_not_held_pass_no_gradient() -> None:
     learnt = module(10)
     target = TemporalTarget(torch.full((10,), 0.3), torch.zeros(10))
