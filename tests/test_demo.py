@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from own_cache import make_own_cache
 
 
 def mean_psnr(results: Path) -> dict[str, float]:
@@ -25,7 +26,7 @@ def mean_psnr(results: Path) -> dict[str, float]:
 def test_the_demo_renders_fits_scores_and_draws(tmp_path: Path) -> None:
     out = tmp_path / "demo"
     command = [sys.executable, "-m", "hwp_bench.cli.main", "demo", "--out", str(out)]
-    environment = {**os.environ, "HWP_CACHE": str(tmp_path / "cache")}
+    environment = {**os.environ, "HWP_CACHE": str(make_own_cache(tmp_path / "cache"))}
     first = subprocess.run(
         command, env=environment, capture_output=True, text=True, check=False, cwd=tmp_path
     )

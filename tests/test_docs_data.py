@@ -13,6 +13,7 @@ from typing import Any
 import pytest
 from interhand_release import write_interhand
 from official_release import write_release
+from own_cache import make_own_cache
 from synthetic_mano import write_mirrored_mano
 
 from hwp_bench.base.images import write_image
@@ -76,7 +77,7 @@ def test_the_page_leads_to_a_scored_table(
     serve(monkeypatch, tmp_path / "hub")
     # The page names a folder of the download; the hub's own layout is not known.
     (tmp_path / "baselines").symlink_to(ROOT / "baselines")
-    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setenv("HWP_CACHE", str(make_own_cache(tmp_path / "cache")))
     monkeypatch.chdir(tmp_path)
     printed = {}
     for line in commands():

@@ -14,6 +14,7 @@ from typing import Any
 import psutil
 import pytest
 from engine_jobs import Told, write_gray_method
+from own_cache import make_own_cache
 from same_results import contents
 from small_captures import CaptureMaker
 
@@ -30,13 +31,17 @@ pytestmark = pytest.mark.slow
 class Nodes:
     """A head and a second node, one processor and one cache each."""
 
+    #: Of their caches' folders.
+    NAMES = ("head", "second")
+
     def __init__(self, folder: Path) -> None:
         from ray.cluster_utils import Cluster
 
         self._folder = folder
         self._cluster = Cluster()
-        self._add("head", include_dashboard=False)
-        self._second = self._add("second")
+        head, second = self.NAMES
+        self._add(head, include_dashboard=False)
+        self._second = self._add(second)
 
     def _add(self, name: str, **more: Any) -> Any:
         # A node hands its environment on to its workers.
@@ -67,10 +72,13 @@ class Nodes:
 def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
     tests = str(Path(__file__).resolve().parents[3])
     with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("HWP_CACHE", "")
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("PYTHONPATH", os.pathsep.join([tests, os.environ.get("PYTHONPATH", "")]))
-        started = Nodes(tmp_path_factory.mktemp("nodes"))
+        folder = tmp_path_factory.mktemp("nodes")
+        for name in Nodes.NAMES:
+            make_own_cache(folder / name)
+        patch.setenv("HWP_CACHE", "")
+        started = Nodes(folder)
     yield started
     started.stop()
 
