@@ -77,9 +77,9 @@ def time_network(size: str, count: int, rounds: int) -> Table:
     for _ in range(rounds + 2):
         spent = time.process_time()
         marks = [time.perf_counter()]
-        texture = network.texture("right")
+        features = network.features("right")
         marks.append(time.perf_counter())
-        prediction = network("right", normals, pose, texture)
+        prediction = network("right", normals, pose, features)
         marks.append(time.perf_counter())
         loss = prediction.raw.concatenate().square().mean() + prediction.shadow.mean()
         loss = loss + prediction.template_offsets.sum() + prediction.refinement.pose.sum()
@@ -92,7 +92,7 @@ def time_network(size: str, count: int, rounds: int) -> Table:
         processor.append(time.process_time() - spent)
     steps = 1e3 * np.array(rows[2:])
     cells = tuple(np.median(steps, axis=0).tolist())
-    names = ("texture", "geometry and heads", "backward", "Adam")
+    names = ("shared features", "of the frame", "backward", "Adam")
     totals = ("all", "fastest", "processor, fastest")
     columns = tuple(Column(name, 1) for name in (*names, *totals))
     whole = steps.sum(axis=1)

@@ -25,9 +25,12 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "network: texture": ("wildghand.network.network:PredictionNetwork.texture",),
     "network: coder": ("wildghand.network.compact:PlaneCoder.forward",),
     "network: geometry": ("wildghand.network.network:PredictionNetwork.geometry",),
+    "network: shared": (
+        "wildghand.network.network:PredictionNetwork.features",
+        "wildghand.fitting.shared_features:SharedFeatures._share_out",
+    ),
     "network: heads": (
         "wildghand.network.network:PredictionNetwork.forward",
-        "wildghand.network.network:PredictionNetwork.features",
     ),
     "hand poses": (
         "wildghand.gaussians.training:TrainingClip.hand",
@@ -37,11 +40,10 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     ),
     "DPD": (
         "wildghand.dpd.dpd:DynamicPerturbation.temporal",
-        "wildghand.dpd.dpd:DynamicPerturbation.biases",
-        "wildghand.model.model:scale_gradients",
+        "wildghand.dpd.dpd:DynamicPerturbation.layer",
+        "wildghand.model.model:scale_refinement",
     ),
     "placing": (
-        "wildghand.model.model:WildGHandModel._dress",
         "wildghand.model.model:dress",
         "wildghand.gaussians.anchored:AnchoredGaussians.place",
     ),

@@ -141,6 +141,42 @@ class DynamicPerturbation(nn.Module):
         return RawAttributes(**made)
 
 
+    def layer(self, z: Tensor) -> tuple[Tensor, Tensor]:
+        """varphi as one linear layer on g: Delta g = omega (A g + c) for every frame.
+
+        Args:
+            z: (B, width).
+
+        Returns:
+            A (14, 14), a block for each attribute; c (B, 14).
+        """
+        layers = [cast(nn.Linear, self.varphi[name]) for name in SIZES]
+        width = z.shape[-1]
+        of_g = torch.block_diag(*(layer.weight[:, width:] for layer in layers))
+        of_z = torch.cat([layer.weight[:, :width] for layer in layers])
+        bias = torch.cat([layer.bias for layer in layers])
+        return of_g, nn.functional.linear(z, of_z, bias)
+
+
+@dataclass(frozen=True, eq=False)
+class Perturbation:
+    """The perturbation of one hand in B frames, for `wildghand.model.dress`."""
+
+    #: Where the biases come from.
+    module: DynamicPerturbation
+    #: Embedding and weight of the frames.
+    temporal: Temporal
+    #: (B,) bool: frames that have biases in this step; None: all.
+    kept: Tensor | None = None
+
+    def biases(self, raw: RawAttributes) -> RawAttributes:
+        """(B, N, k) Delta g; 0 in frames that have none."""
+        omega = self.temporal.omega
+        if self.kept is not None:
+            omega = torch.where(self.kept.to(omega.device), omega, omega.new_zeros(()))
+        return self.module.biases(raw, self.temporal.z, omega)
+
+
 def encode_frames(frames: Tensor, frame_count: int) -> Tensor:
     """l / L and the sines and cosines of its octaves.
 

@@ -38,21 +38,33 @@ def scale_gradients(prediction: NetworkOutput, shares: Tensor) -> NetworkOutput:
         prediction: of B frames.
         shares: (B,) in [0, 1], without gradient.
     """
-    count = len(shares)
-
-    def by_frame(values: Tensor) -> Tensor:
-        factor = shares.reshape(count, *[1] * (values.ndim - 1)).to(values)
-        return _Share.apply(values, factor)
-
-    refinement = prediction.refinement
     return dataclasses.replace(
         prediction,
-        raw=RawAttributes(**{name: by_frame(values) for name, values in prediction.raw.items()}),
-        shadow=by_frame(prediction.shadow),
-        template_offsets=by_frame(prediction.template_offsets.expand(count, -1, -1)),
-        refinement=Refinement(
-            pose=by_frame(refinement.pose),
-            betas=by_frame(refinement.betas.expand(count, -1)),
-            transl=by_frame(refinement.transl),
+        raw=RawAttributes(
+            **{name: _by_frame(values, shares) for name, values in prediction.raw.items()}
         ),
+        shadow=_by_frame(prediction.shadow, shares),
+        template_offsets=_by_frame(
+            prediction.template_offsets.expand(len(shares), -1, -1), shares
+        ),
+        refinement=scale_refinement(prediction.refinement, shares),
     )
+
+
+def scale_refinement(refinement: Refinement, shares: Tensor) -> Refinement:
+    """The same corrections of the hand parameters, which learn from each of B frames by its share.
+
+    Args:
+        refinement: of B frames.
+        shares: (B,) in [0, 1], without gradient.
+    """
+    return Refinement(
+        pose=_by_frame(refinement.pose, shares),
+        betas=_by_frame(refinement.betas.expand(len(shares), -1), shares),
+        transl=_by_frame(refinement.transl, shares),
+    )
+
+
+def _by_frame(values: Tensor, shares: Tensor) -> Tensor:
+    factor = shares.reshape(len(shares), *[1] * (values.ndim - 1)).to(values)
+    return _Share.apply(values, factor)

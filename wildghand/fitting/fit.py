@@ -18,6 +18,7 @@ from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
+from wildghand.fitting.shared_features import SharedFeatures
 from wildghand.fitting.weighting import Weighting, assess_frames
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Loss, repeatable
@@ -26,7 +27,7 @@ from wildghand.gaussians.training import TrainingClip, load_frames
 from wildghand.model.assemble import make_model
 from wildghand.model.model import RenderedFrames, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
-from wildghand.network import parameter_groups
+from wildghand.network import HandFeatures, parameter_groups
 from wildghand.pao.pao import PerturbationAwareWeights
 from wildghand.prior.files import choose_prior
 
@@ -79,6 +80,9 @@ class Fit:
             frame_weights=self.weighting.frame_weights.tolist(),
             source=dict(self.source),
         )
+        self.shared = SharedFeatures(
+            self.model.network, settings.schedule.texture_every, self.objective.of_features
+        )
 
     def step(self, rows: torch.Tensor, fraction: float) -> Loss:
         """Take one step on a batch, of which each process draws its part.
@@ -98,26 +102,27 @@ class Fit:
         """
         set_rates(self.optimizer, self.settings, fraction)
         loss = self._loss(rows, fraction)
-        mean = self.world.average_(loss.detach().clone())
+        mean = self.world.average_(loss.detach() + self.shared.value)
         known: Loss = float(mean) if self.device.type == "cpu" else mean
         if isinstance(known, float) and not math.isfinite(known):
             return known
         self.optimizer.clear()
         with repeatable(self.device):
-            loss.backward()
+            waiting = self.shared.backward(loss, mean)
         average_gradients(
             (tensor for group in self.optimizer.param_groups for tensor in group["params"]),
             self.world,
         )
-        self.optimizer.take_step(mean)
+        self.optimizer.take_step(waiting)
         return known
 
     def _loss(self, rows: torch.Tensor, fraction: float) -> torch.Tensor:
-        """The loss of this process's part of a batch."""
+        """The loss of this process's part of a batch, without the terms that no frame enters."""
         weighting, part = self.weighting, self.world.shard(len(rows))
         mine = rows[part]
         kept = {side: keep[part] for side, keep in self._keep(rows).items()}
-        drawing = self.draw(mine, kept, move=weighting.moves(rows))
+        features = self.shared.features()
+        drawing = self.draw(mine, kept, move=weighting.moves(rows), features=features)
         target = weighting(rows, drawing, fraction, self.world)
         return self.objective(self.model, drawing, target, mine, weighting.clean[mine])
 
@@ -146,6 +151,7 @@ class Fit:
             "median": self.weighting.saved_median,
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
+            "shared": self.shared.state_dict(),
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -155,6 +161,7 @@ class Fit:
         self.weighting.median = None if state["median"] is None else float(state["median"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
+        self.shared.load_state_dict(state["shared"])
 
     def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """(B,) bool by side: which frames of a batch keep their biases in this step."""
@@ -170,6 +177,7 @@ class Fit:
         kept: Mapping[str, torch.Tensor] | None = None,
         *,
         move: bool | None = None,
+        features: Mapping[str, HandFeatures] | None = None,
     ) -> RenderedFrames:
         """Draw training frames with everything that is particular to them.
 
@@ -177,6 +185,7 @@ class Fit:
             rows: (B,) int64, which of the training frames; on the CPU.
             kept: (B,) bool by side, whether a frame keeps its biases; None: every one does.
             move: refine the poses of the frames; None: if any of them needs it.
+            features: of the network by side, where they are at hand already.
         """
         with self._precision():
             return self.model.draw_frames(
@@ -188,6 +197,7 @@ class Fit:
                 shares=self.weighting.shares(rows),
                 move=self.weighting.moves(rows) if move is None else move,
                 refine=self.settings.heads.refinement,
+                features=features,
             )
 
     def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 
+import torch
 from torch import Tensor
 
 from wildghand.dpd.temporal_loss import TemporalTarget
@@ -16,10 +18,11 @@ from wildghand.gaussians.rig import HandRig
 from wildghand.model import terms
 from wildghand.model.model import RenderedFrames, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
+from wildghand.network import HandFeatures
 
 
 class Objective:
-    """The loss of a batch; terms of weight 0 cost nothing.
+    """The loss of a batch, in two parts; terms of weight 0 cost nothing.
 
     Args:
         settings: weights of the terms.
@@ -54,7 +57,7 @@ class Objective:
         rows: Tensor,
         clean: Tensor,
     ) -> Tensor:
-        """The loss, a scalar.
+        """The terms that the frames enter, a scalar; `of_features` has the others.
 
         Args:
             model: what is fitted.
@@ -76,18 +79,14 @@ class Objective:
         if weights.weight_reward and target.weights.requires_grad:
             total = total + weights.weight_reward * terms.weight_reward(target.weights)
         for side, hand in drawing.hands.items():
-            if weights.bias and hand.biases is not None:
-                total = total + weights.bias * terms.bias_size(hand.biases)
+            if weights.bias and hand.bias_size is not None:
+                total = total + weights.bias * hand.bias_size
             if weights.shadow:
                 total = total + weights.shadow * terms.distance_to_one(hand.prediction.shadow)
             if weights.opacity:
                 total = total + weights.opacity * terms.distance_to_one(hand.opacities)
-            total = total + self._roughness(
-                side, hand.prediction.raw, hand.prediction.template_offsets
-            )
-        if weights.cross_hand and len(drawing.hands) == 2:
-            left, right = (drawing.hands[side].prediction.texture for side in ("left", "right"))
-            total = total + weights.cross_hand * terms.cross_hand(left, right)
+            rough = self._roughness(side, hand.prediction.raw)
+            total = total if rough is None else total + rough
         if self.temporal is not None and settings.dpd.omega_weight:
             held = self.temporal.temporal_loss(model.biases, int(rows[0]))
             total = total + settings.dpd.omega_weight * held
@@ -98,18 +97,27 @@ class Objective:
             total = total + settings.dpd.gain_weight * (upload(clean, device) * size).mean()
         return total
 
-    def _roughness(self, side: str, raw: RawAttributes, offsets: Tensor) -> Tensor:
-        weights = self.weights
-        total = offsets.new_zeros(())
-        if not self._laplacians:
-            return total
-        laplacian = self._laplacians[side]
+    def of_features(self, features: Mapping[str, HandFeatures]) -> Tensor | None:
+        """The terms that no frame enters, a scalar; None where there are none.
+
+        Args:
+            features: of the network, by side.
+        """
+        weights, found = self.weights, []
         if weights.laplacian_offsets and self.settings.heads.enabled:
-            total = total + weights.laplacian_offsets * laplacian.offsets(offsets)
+            for side, hand in features.items():
+                rough = self._laplacians[side].offsets(hand.template_offsets)
+                found.append(weights.laplacian_offsets * rough)
+        if weights.cross_hand and len(features) == 2:
+            left, right = (features[side].texture for side in ("left", "right"))
+            found.append(weights.cross_hand * terms.cross_hand(left, right))
+        return torch.stack(found).sum() if found else None
+
+    def _roughness(self, side: str, raw: RawAttributes) -> Tensor | None:
+        """Weighted roughness of log scales and colours: one product with the Laplacian."""
+        weights, parts = self.weights, []
         if weights.laplacian_scales:
-            total = total + weights.laplacian_scales * laplacian.roughness(raw.log_scales)
+            parts.append(raw.log_scales * math.sqrt(weights.laplacian_scales))
         if weights.laplacian_colors:
-            total = total + weights.laplacian_colors * laplacian.roughness(
-                raw.logit_colors.sigmoid()
-            )
-        return total
+            parts.append(raw.logit_colors.sigmoid() * math.sqrt(weights.laplacian_colors))
+        return self._laplacians[side].roughness(torch.cat(parts, dim=-1)) if parts else None

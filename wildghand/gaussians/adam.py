@@ -23,6 +23,8 @@ _EPSILON = 1e-15
 _BETAS = (0.9, 0.99)
 # Added to the norm that the limit is divided by, as in torch.
 _LEAST_NORM = 1e-6
+# Sets of parameters whose tables are kept.
+_TABLES = 4
 # Numbers that are worth a thread: half a millisecond's work.
 _WORTH_A_THREAD = 4 * PIECE
 
@@ -45,7 +47,8 @@ class ClippedAdam(torch.optim.Adam):
     def __init__(self, groups: Iterable[dict[str, Any]], limit: float) -> None:
         super().__init__(list(groups), eps=_EPSILON, betas=_BETAS, fused=True)
         self.limit = limit
-        self._tables: _Tables | None = None
+        #: By which parameters have a gradient: not all of them have one at every step.
+        self._tables: list[_Tables] = []
 
     def clear(self) -> None:
         """Drop all gradients."""
@@ -71,7 +74,7 @@ class ClippedAdam(torch.optim.Adam):
         super().load_state_dict(state_dict)
         for group, held in zip(self.param_groups, clipped, strict=True):
             group["clipped"] = held
-        self._tables = None
+        self._tables = []
 
     def _step_on_device(self, loss: Tensor) -> None:
         if self.limit > 0.0:
@@ -94,9 +97,10 @@ class ClippedAdam(torch.optim.Adam):
         if not chosen:
             return
         gradients = [_laid_out_alike(parameter) for _, parameter in chosen]
-        tables = self._tables
-        if tables is None or not tables.are_of(chosen):
-            tables = self._tables = _Tables([(p, self._moments(p)) for _, p in chosen])
+        tables = next((made for made in self._tables if made.are_of(chosen)), None)
+        if tables is None:
+            tables = _Tables([(p, self._moments(p)) for _, p in chosen])
+            self._tables = [tables, *self._tables[: _TABLES - 1]]
         clipped = np.array([group.get("clipped", True) for group, _ in chosen])
         rates = np.array([float(group["lr"]) for group, _ in chosen])
         tables.step(gradients, rates, clipped, self.limit)

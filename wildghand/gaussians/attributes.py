@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field
 from types import MappingProxyType
 
 import torch
@@ -39,6 +39,8 @@ class RawAttributes:
     logit_opacities: Tensor
     #: (..., N, 3) sRGB colour before the sigmoid.
     logit_colors: Tensor
+    # What `split` has made them of: `concatenate` need not make it again.
+    _joined: Tensor | None = field(default=None, repr=False)
 
     def __post_init__(self) -> None:
         for name, tensor in self.items():
@@ -53,7 +55,7 @@ class RawAttributes:
 
     def items(self) -> Iterator[tuple[str, Tensor]]:
         """Name and tensor of each attribute, in the order of `SIZES`."""
-        return ((item.name, getattr(self, item.name)) for item in fields(self))
+        return ((name, getattr(self, name)) for name in SIZES)
 
     def __add__(self, other: RawAttributes) -> RawAttributes:
         """Attribute by attribute, leading dimensions broadcast."""
@@ -70,6 +72,8 @@ class RawAttributes:
         Returns:
             (..., N, 14), in the order of `SIZES`.
         """
+        if self._joined is not None:
+            return self._joined
         return torch.cat([tensor for _, tensor in self.items()], dim=-1)
 
     @classmethod
@@ -87,7 +91,7 @@ class RawAttributes:
                 f"are {tuple(channels.shape)}, expected (..., N, {CHANNELS})", field="channels"
             )
         parts = channels.split(list(SIZES.values()), dim=-1)
-        return cls(**dict(zip(SIZES, parts, strict=True)))
+        return cls(*parts, _joined=channels)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,6 +12,7 @@ from torch import Tensor
 
 from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.hands.anchors import anchor_frames, anchor_positions
+from wildghand.gaussians.bags import sum_bags
 from wildghand.gaussians.rig import HandRig
 
 #: Neighbours of each anchor.
@@ -153,10 +154,18 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, matrix: Tensor, transposed: Tensor) -> Tensor:
         ctx.save_for_backward(transposed)
-        return matrix @ values
+        return _times(matrix, values)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (transposed,) = ctx.saved_tensors
-        return transposed @ gradient, None, None
+        return _times(transposed, gradient), None, None
+
+
+def _times(matrix: Tensor, rows: Tensor) -> Tensor:
+    """(N, N) sparse CSR times (N, C)."""
+    if rows.device.type == "cpu" and rows.dtype == torch.float32:
+        starts = matrix.crow_indices()[:-1]
+        return sum_bags(rows, matrix.col_indices(), matrix.values(), starts)
+    return matrix @ rows

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
 
@@ -14,6 +16,9 @@ from hwp_bench.hands.anchors import (
     sample_surface,
 )
 from wildghand.gaussians.quaternions import matrix_to_quat
+
+if TYPE_CHECKING:
+    from wildghand.gaussians.posing_cpu import PosingTables
 
 #: Frames that are posed at a time, so that memory does not grow with the clip.
 CHUNK = 32
@@ -72,11 +77,27 @@ class HandRig:
             betas: (10,) or (F, 10).
             transl: (F, 3) m.
         """
+        if _float32_on_the_cpu(self.template.vertices, pose, betas, transl):
+            from wildghand.gaussians.posing_cpu import FollowCpu
+
+            return AnchorPoses(*FollowCpu.apply(pose, betas, transl, self.tables))
         faces = self.template.faces
         vertices = pose_hand(self.template, pose, betas, transl).vertices
         with torch.no_grad():
             orientations = matrix_to_quat(anchor_frames(vertices, faces, self.anchors))
         return AnchorPoses(anchor_positions(vertices, faces, self.anchors), orientations)
+
+
+    @functools.cached_property
+    def tables(self) -> PosingTables:
+        """What posing on the CPU reads; made once."""
+        from wildghand.gaussians.posing_cpu import PosingTables
+
+        return PosingTables.of(self.template, self.anchors)
+
+
+def _float32_on_the_cpu(*tensors: torch.Tensor) -> bool:
+    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
 
 
 def make_rig(

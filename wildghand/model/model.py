@@ -8,30 +8,14 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
-from wildghand.dpd.dpd import DynamicPerturbation
-from wildghand.dpd.scale_gradients import scale_gradients
-from wildghand.gaussians.attributes import RawAttributes
-from wildghand.gaussians.quaternions import quat_multiply, quat_rotate, quat_third_axis
+from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
+from wildghand.dpd.scale_gradients import scale_refinement
+from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.gaussians.training import TrainingClip
-from wildghand.network import NetworkOutput, PredictionNetwork
+from wildghand.model.dress import Gaussians, dress
+from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
 from wildghand.splat import rasterize
-
-
-@dataclass(frozen=True, eq=False)
-class Gaussians:
-    """Gaussians in B frames, as `wildghand.splat.rasterize` takes them."""
-
-    #: (B, N, 3) m, world.
-    means: Tensor
-    #: (B, N, 4) of length 1, world.
-    quats: Tensor
-    #: (N, 3) or (B, N, 3) m.
-    scales: Tensor
-    #: (N,) or (B, N) in (0, 1).
-    opacities: Tensor
-    #: (B, N, 3) sRGB.
-    colors: Tensor
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +24,9 @@ class HandState:
 
     #: Output of the network.
     prediction: NetworkOutput
-    #: Biases of the attributes before activation; None while perturbations are not modelled.
-    biases: RawAttributes | None
+    #: Mean over Gaussians and frames of the sum of |bias| over the channels, a scalar; None while
+    #: perturbations are not modelled.
+    bias_size: Tensor | None
     #: (B,) temporal weight before dropout; zeros while perturbations are not modelled.
     omega: Tensor
     #: (B, N) opacities that were drawn.
@@ -132,6 +117,7 @@ class WildGHandModel(nn.Module):
         shares: Tensor | None = None,
         move: bool = False,
         refine: bool = False,
+        features: Mapping[str, HandFeatures] | None = None,
     ) -> RenderedFrames:
         """Draw training frames with everything that is particular to them.
 
@@ -143,6 +129,7 @@ class WildGHandModel(nn.Module):
             shares: (B,) how much the canonical hand learns from each frame, 0-1; None: all.
             move: add `pose_steps` and `transl_steps` to the given parameters.
             refine: apply the network's refinement of the parameters (head iv).
+            features: of the network by side, where they are at hand already.
         """
         states, parts = {}, []
         for index, (side, rig) in enumerate(self.rigs.items()):
@@ -152,27 +139,27 @@ class WildGHandModel(nn.Module):
             if move:
                 pose = pose + self.pose_steps[index, rows]
                 transl = transl + self.transl_steps[index, rows]
-            prediction = self._predict(side, anchors, pose.detach())
-            learning = prediction if shares is None else scale_gradients(prediction, shares)
+            prediction = self._predict(
+                side, anchors, pose.detach(), None if features is None else features[side]
+            )
             if refine:
-                step = learning.refinement
+                step = prediction.refinement
+                if shares is not None:
+                    step = scale_refinement(step, shares)
                 pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
             if move or refine:
                 anchors = rig.follow(pose, betas, transl)
-            raw, biases = learning.raw, None
-            omega = pose.new_zeros(len(rows))
+            perturbation, omega = None, pose.new_zeros(len(rows))
             if side in self.perturbation:
                 module = self.biases_of(side)
                 temporal = module.temporal(rows)
                 omega = temporal.omega
-                weight = omega
-                if kept is not None:
-                    weight = torch.where(kept[side].to(omega.device), omega, omega.new_zeros(()))
-                biases = module.biases(raw, temporal.z, weight)
-                raw = raw + biases
-            gaussians = self._dress(anchors, learning, raw)
+                perturbation = Perturbation(module, temporal, None if kept is None else kept[side])
+            gaussians, bias_size = dress(
+                anchors, prediction, self.network.activation, perturbation, shares
+            )
             parts.append(gaussians)
-            states[side] = HandState(prediction, biases, omega, gaussians.opacities)
+            states[side] = HandState(prediction, bias_size, omega, gaussians.opacities)
         image, coverage = _rasterize(parts, clip.viewmats[rows], clip.Ks[rows], width, height)
         # The image lies over black, so a gain on it is one on every Gaussian.
         image = image * self.log_gains[rows].exp()[:, None, None]
@@ -223,24 +210,12 @@ class WildGHandModel(nn.Module):
         if refine:
             step = prediction.refinement
             anchors = rig.follow(pose + step.pose, betas + step.betas, transl + step.transl)
-        return self._dress(anchors, prediction, prediction.raw)
+        return dress(anchors, prediction, self.network.activation)[0]
 
-    def _predict(self, side: str, anchors: AnchorPoses, pose: Tensor) -> NetworkOutput:
-        return self.network(side, quat_third_axis(anchors.orientations), pose)
-
-    def _dress(
-        self, anchors: AnchorPoses, prediction: NetworkOutput, raw: RawAttributes
-    ) -> Gaussians:
-        """p' = p_g + v': the predicted offset from the vertex that heads iii and iv moved."""
-        attributes = self.network.activation(raw)
-        offsets = attributes.offsets + prediction.template_offsets
-        return Gaussians(
-            means=anchors.positions + quat_rotate(anchors.orientations, offsets),
-            quats=quat_multiply(anchors.orientations, attributes.quats),
-            scales=attributes.scales,
-            opacities=attributes.opacities,
-            colors=attributes.colors * prediction.shadow,
-        )
+    def _predict(
+        self, side: str, anchors: AnchorPoses, pose: Tensor, features: HandFeatures | None = None
+    ) -> NetworkOutput:
+        return self.network(side, quat_third_axis(anchors.orientations), pose, features)
 
 
 def _rasterize(

@@ -73,6 +73,8 @@ class ScheduleSettings:
     steps: int = number(2_000, 1, 10_000_000)
     #: Frames in each step.
     batch: int = number(1, 1, 64)
+    #: Steps that share one evaluation of the texture branch, which moves at the last of them.
+    texture_every: int = number(8, 1, 64)
     #: Norm that the gradient is clipped to; 0 leaves it as it is.
     clip_gradient: float = number(1.0)
     #: `geometric`: rates fall smoothly to `final_rate`; `halving`: by half, `halvings` times.

@@ -58,21 +58,30 @@ class AttributeHead(nn.Module):
                 self.direct.weight.zero_()
                 self.direct.weight[:, :CHANNELS] = torch.diag(torch.tensor(DIRECT_GAINS))
 
-    def forward(self, x_t: Tensor, x_g: Tensor, initial: RawAttributes) -> RawAttributes:
+    def direct_weight(self) -> Tensor:
+        """(14, I) matrix of the direct path; (14, 0) without it."""
+        if self.direct is None:
+            return self.attributes.weight.new_zeros(CHANNELS, 0)
+        return self.direct.weight
+
+    def forward(
+        self, hidden: Tensor, x_g: Tensor, latent: Tensor, initial: Tensor
+    ) -> RawAttributes:
         """Predict.
 
         Args:
-            x_t: (N, Ft) texture features; with `direct`, the identity features come first.
+            hidden: (N, width) of `texture`, from the texture features.
             x_g: (B, N, Fg) geometry features.
-            initial: (N, k), what is predicted at the start.
+            latent: (N, I) identity features for the direct path; (N, 0) without it.
+            initial: (N, 14) raw attributes that are predicted at the start.
 
         Returns:
             (B, N, k).
         """
-        change = self.attributes(self.texture(x_t) + self.geometry(x_g))
-        canonical = initial.concatenate().to(change.dtype)
+        change = self.attributes(hidden + self.geometry(x_g))
+        canonical = initial.to(change.dtype)
         if self.direct is not None:
-            canonical = canonical + self.direct(x_t[:, : self.direct.in_features])
+            canonical = canonical + self.direct(latent)
         return RawAttributes.split(canonical + change)
 
 
@@ -91,7 +100,11 @@ class ShadowHead(nn.Module):
 
     def forward(self, x_g: Tensor) -> Tensor:
         """(B, N, Fg) to (B, N, 1) in (0, 1)."""
-        return torch.sigmoid(self.start + self.light(x_g) + self.detail(x_g))
+        return self.activate(self.light(x_g) + self.detail(x_g))
+
+    def activate(self, logit: Tensor) -> Tensor:
+        """From a logit of any shape, 0 at the start, to (0, 1)."""
+        return torch.sigmoid(self.start + logit)
 
 
 class TemplateHead(nn.Module):
@@ -122,24 +135,22 @@ class RefinementHead(nn.Module):
 
     def __init__(self, settings: NetworkSettings, texture: int, geometry: int) -> None:
         super().__init__()
-        self.bounds = (settings.max_pose, settings.max_betas, settings.max_transl)
+        self.max_pose = settings.max_pose
+        self.max_betas = settings.max_betas
+        self.max_transl = settings.max_transl
         width, layers = settings.head_width, settings.head_layers
         self.frame = mlp(texture + geometry, width, 48 + 3, layers)
         self.shape = mlp(texture, width, 10, layers)
 
-    def forward(self, x_t: Tensor, x_g: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """(N, Ft) and (B, N, Fg) to (B, 16, 3) rad, (10,), (B, 3) m."""
-        max_pose, max_betas, max_transl = self.bounds
-        hand = x_t.mean(dim=0)
-        frame = x_g.mean(dim=1)
+    def shape_change(self, hand: Tensor) -> Tensor:
+        """(Ft,) mean of the texture features to (10,) standard deviations."""
+        return self.max_betas * torch.tanh(self.shape(hand))
+
+    def forward(self, hand: Tensor, frame: Tensor) -> tuple[Tensor, Tensor]:
+        """Means of both features, (Ft,) and (B, Fg), to (B, 16, 3) rad and (B, 3) m."""
         seen = torch.cat((hand.expand(len(frame), -1), frame), dim=-1)
         values = torch.tanh(self.frame(seen))
-        betas = max_betas * torch.tanh(self.shape(hand))
-        return (
-            max_pose * values[:, :48].unflatten(1, (16, 3)),
-            betas,
-            max_transl * values[:, 48:],
-        )
+        return self.max_pose * values[:, :48].unflatten(1, (16, 3)), self.max_transl * values[:, 48:]
 
 
 def zeroed(layer: nn.Linear) -> nn.Linear:

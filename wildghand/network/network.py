@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from wildghand.gaussians.attributes import Activation, RawAttributes
 from wildghand.network.compact import CompactGeometry, CompactTexture
+from wildghand.network.compact_frames import frame_heads
 from wildghand.network.encoding import POSITION_CHANNELS
 from wildghand.network.heads import AttributeHead, RefinementHead, ShadowHead, TemplateHead
 from wildghand.network.identity import IdentityMap, initial_attributes
@@ -29,6 +30,30 @@ class Refinement:
     betas: Tensor
     #: (B, 3) m.
     transl: Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class HandFeatures:
+    """What the network knows of one hand before it sees a frame."""
+
+    #: (N, Ft) texture features x_t.
+    texture: Tensor
+    #: (Ft,) their mean.
+    mean: Tensor
+    #: (N, width) hidden layer of head (i) on them.
+    hidden: Tensor
+    #: (N, 3) m, displacement of the template in the anchors' frames, by head (iii).
+    template_offsets: Tensor
+    #: (10,) correction of the shape parameters, by head (iv).
+    betas: Tensor
+
+    def map(self, function: Callable[[Tensor], Tensor]) -> HandFeatures:
+        """Apply a function to each tensor."""
+        return HandFeatures(*(function(tensor) for tensor in self.tensors()))
+
+    def tensors(self) -> tuple[Tensor, ...]:
+        """Every tensor, in a fixed order."""
+        return (self.texture, self.mean, self.hidden, self.template_offsets, self.betas)
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,8 +116,7 @@ class PredictionNetwork(nn.Module):
         for side, surface in surfaces.items():
             self.charts[side] = Chart(settings, surface)
             start = initial_attributes(settings, surface, self.activation.log_scale_bias)
-            for name, tensor in start.items():
-                self.register_buffer(f"initial_{side}_{name}", tensor, persistent=False)
+            self.register_buffer(f"initial_{side}", start.concatenate(), persistent=False)
 
     def initial(self, side: str) -> RawAttributes:
         """The raw attributes, (N, k), that head (i) starts from.
@@ -100,14 +124,11 @@ class PredictionNetwork(nn.Module):
         Raises:
             UsageError: no such hand.
         """
+        return RawAttributes.split(self._initial(side))
+
+    def _initial(self, side: str) -> Tensor:
         self._chart(side)
-        return RawAttributes(
-            offsets=self.get_buffer(f"initial_{side}_offsets"),
-            log_scales=self.get_buffer(f"initial_{side}_log_scales"),
-            quats=self.get_buffer(f"initial_{side}_quats"),
-            logit_opacities=self.get_buffer(f"initial_{side}_logit_opacities"),
-            logit_colors=self.get_buffer(f"initial_{side}_logit_colors"),
-        )
+        return self.get_buffer(f"initial_{side}")
 
     def texture(self, side: str) -> Tensor:
         """Texture features x_t of a hand, the same in every frame.
@@ -135,6 +156,10 @@ class PredictionNetwork(nn.Module):
             UsageError: no such hand.
             ShapeMismatch: not N normals, or not as many poses as frames.
         """
+        return self.geometry_branch(self._checked(side, normals, pose), normals, pose)
+
+    def _checked(self, side: str, normals: Tensor, pose: Tensor) -> Chart:
+        """The chart of a hand, if normals and pose fit it."""
         chart = self._chart(side)
         if normals.ndim != 3 or normals.shape[1:] != (len(chart), 3):
             raise ShapeMismatch(
@@ -144,10 +169,27 @@ class PredictionNetwork(nn.Module):
             raise ShapeMismatch(
                 f"is {tuple(pose.shape)}, not ({len(normals)}, 16, 3)", field="pose"
             )
-        return self.geometry_branch(chart, normals, pose)
+        return chart
+
+    def features(self, side: str) -> HandFeatures:
+        """Everything that the frames of a hand share: what depends on texture features only.
+
+        Raises:
+            UsageError: no such hand.
+        """
+        x_t = self.texture(side)
+        mean = x_t.mean(dim=0)
+        position = self._chart(side).coordinates[:, -POSITION_CHANNELS:]
+        return HandFeatures(
+            texture=x_t,
+            mean=mean,
+            hidden=self.attribute_head.texture(x_t),
+            template_offsets=self.template_head(x_t, position.to(x_t.dtype)),
+            betas=self.refinement_head.shape_change(mean),
+        )
 
     def forward(
-        self, side: str, normals: Tensor, pose: Tensor, texture: Tensor | None = None
+        self, side: str, normals: Tensor, pose: Tensor, features: HandFeatures | None = None
     ) -> NetworkOutput:
         """Predict one hand in B frames.
 
@@ -155,22 +197,53 @@ class PredictionNetwork(nn.Module):
             side: the hand.
             normals: (B, N, 3) of length 1, world: the posed surface's.
             pose: (B, 16, 3) axis-angle, rad.
-            texture: (N, Ft) of `texture(side)`, where it is at hand already.
+            features: of `features(side)`, where they are at hand already.
 
         Raises:
             UsageError: no such hand.
             ShapeMismatch: not N normals, or not as many poses as frames.
         """
-        x_g = self.geometry(side, normals, pose)
-        x_t = self.texture(side) if texture is None else texture
-        position = self._chart(side).coordinates[:, -POSITION_CHANNELS:]
+        hand = self.features(side) if features is None else features
+        raw, shadow, mean = self._heads(side, normals, pose, hand.hidden)
+        pose_change, transl_change = self.refinement_head(hand.mean, mean)
         return NetworkOutput(
-            raw=self.attribute_head(x_t, x_g, self.initial(side)),
-            shadow=self.shadow_head(x_g),
-            template_offsets=self.template_head(x_t, position.to(x_t.dtype)),
-            refinement=Refinement(*self.refinement_head(x_t, x_g)),
-            texture=x_t,
+            raw=raw,
+            shadow=shadow,
+            template_offsets=hand.template_offsets,
+            refinement=Refinement(pose_change, hand.betas, transl_change),
+            texture=hand.texture,
         )
+
+    def _heads(
+        self, side: str, normals: Tensor, pose: Tensor, hidden: Tensor
+    ) -> tuple[RawAttributes, Tensor, Tensor]:
+        """Heads (i) and (ii), and the (B, Fg) mean of the geometry features."""
+        branch = self.geometry_branch
+        fused = isinstance(branch, CompactGeometry) and self.settings.head_layers == 1
+        if not fused or normals.dtype != torch.float32 or torch.is_autocast_enabled():
+            x_g = self.geometry(side, normals, pose)
+            raw = self.attribute_head(hidden, x_g, self._latent(side), self._initial(side))
+            return raw, self.shadow_head(x_g), x_g.mean(dim=1)
+        chart = self._checked(side, normals, pose)
+        raw, logit, mean = frame_heads(
+            branch,
+            self.attribute_head,
+            self.shadow_head,
+            coordinates=chart.coordinates,
+            normals=normals,
+            pose=pose,
+            hidden=hidden,
+            latent=self._latent(side),
+            initial=self._initial(side),
+        )
+        return RawAttributes.split(raw), self.shadow_head.activate(logit), mean
+
+    def _latent(self, side: str) -> Tensor:
+        """(N, I) identity features that the direct path reads; (N, 0) without it."""
+        chart = self._chart(side)
+        if self.attribute_head.direct is None:
+            return chart.coordinates.new_empty(len(chart), 0)
+        return chart.identity(self.identity(side))
 
     def _chart(self, side: str) -> Chart:
         if side not in self.charts:

@@ -9,6 +9,7 @@ from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
 from hwp_bench.base.errors import UsageError
+from wildghand.gaussians.bags import sum_bags
 
 
 class FixedGather(nn.Module):
@@ -77,6 +78,9 @@ class _Gather(torch.autograd.Function):
 
 
 def _sum_bags(values: Tensor, index: Tensor, weight: Tensor, start: Tensor) -> Tensor:
+    on_cpu = all(tensor.device.type == "cpu" for tensor in (values, index, weight, start))
+    if on_cpu and values.dtype == weight.dtype == torch.float32:
+        return sum_bags(values, index, weight, start)
     return embedding_bag(
         index,
         values.contiguous(),

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from wildghand.gaussians.attributes import CHANNELS, RawAttributes
+from wildghand.gaussians.attributes import CHANNELS
 from wildghand.network.encoding import POSITION_CHANNELS
 from wildghand.network.heads import AttributeHead, RefinementHead, ShadowHead, TemplateHead
 from wildghand.network.settings import network_settings
@@ -32,8 +32,8 @@ def inputs(seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
     return x_t.requires_grad_(), x_g.requires_grad_()
 
 
-def start() -> RawAttributes:
-    return RawAttributes.split(torch.linspace(-1, 1, COUNT * CHANNELS).reshape(COUNT, -1).double())
+def start() -> torch.Tensor:
+    return torch.linspace(-1, 1, COUNT * CHANNELS).reshape(COUNT, -1).double()
 
 
 @pytest.mark.parametrize("direct", [True, False])
@@ -42,7 +42,7 @@ def test_gradients_of_the_attribute_head(direct: bool) -> None:
     head = stirred(AttributeHead(settings, TEXTURE, GEOMETRY))
 
     def predict(x_t: torch.Tensor, x_g: torch.Tensor, *_: torch.Tensor) -> torch.Tensor:
-        return head(x_t, x_g, start()).concatenate()
+        return head(head.texture(x_t), x_g, x_t[:, :15], start()).concatenate()
 
     assert torch.autograd.gradcheck(predict, (*inputs(), *head.parameters()))
 
@@ -62,20 +62,26 @@ def test_gradients_of_the_template_head() -> None:
 
 def test_gradients_of_the_refinement_head() -> None:
     head = stirred(RefinementHead(SETTINGS, TEXTURE, GEOMETRY))
-    assert torch.autograd.gradcheck(lambda t, g, *_: head(t, g), (*inputs(), *head.parameters()))
+    hand, frame = (features.detach().mean(dim=-2).requires_grad_() for features in inputs())
+    assert torch.autograd.gradcheck(
+        lambda t, g, *_: (*head(t, g), head.shape_change(t)), (hand, frame, *head.parameters())
+    )
 
 
 def test_every_head_starts_without_effect() -> None:
     x_t, x_g = inputs()
     no_direct = torch.cat((torch.zeros(COUNT, 15), x_t[:, 15:]), dim=-1)
-    raw = AttributeHead(SETTINGS, TEXTURE, GEOMETRY).double()(no_direct, x_g, start())
-    expected = start().concatenate().expand(FRAMES, -1, -1)
+    head = AttributeHead(SETTINGS, TEXTURE, GEOMETRY).double()
+    raw = head(head.texture(no_direct), x_g, no_direct[:, :15], start())
+    expected = start().expand(FRAMES, -1, -1)
     torch.testing.assert_close(raw.concatenate(), expected, rtol=0, atol=0)
     shadow = ShadowHead(SETTINGS, GEOMETRY).double()(x_g)
     torch.testing.assert_close(shadow, torch.full_like(shadow, SETTINGS.initial_shadow))
     position = torch.rand(COUNT, POSITION_CHANNELS, dtype=torch.float64)
     assert not TemplateHead(SETTINGS, TEXTURE).double()(x_t, position).any()
-    for part in RefinementHead(SETTINGS, TEXTURE, GEOMETRY).double()(x_t, x_g):
+    refinement = RefinementHead(SETTINGS, TEXTURE, GEOMETRY).double()
+    hand = x_t.mean(dim=0)
+    for part in (*refinement(hand, x_g.mean(dim=1)), refinement.shape_change(hand)):
         assert not part.any()
 
 
@@ -83,7 +89,9 @@ def test_bounds_hold_for_huge_features() -> None:
     x_t, x_g = (1e6 * features for features in inputs())
     offsets = stirred(TemplateHead(SETTINGS, TEXTURE))(x_t, x_t.new_ones(COUNT, POSITION_CHANNELS))
     assert 0.0 < offsets.abs().max() <= SETTINGS.max_template_offset
-    pose, betas, transl = stirred(RefinementHead(SETTINGS, TEXTURE, GEOMETRY))(x_t, x_g)
+    refinement = stirred(RefinementHead(SETTINGS, TEXTURE, GEOMETRY))
+    pose, transl = refinement(x_t.mean(dim=0), x_g.mean(dim=1))
+    betas = refinement.shape_change(x_t.mean(dim=0))
     assert pose.shape == (FRAMES, 16, 3)
     assert betas.shape == (10,)
     assert transl.shape == (FRAMES, 3)

@@ -195,11 +195,12 @@ def test_equal_maps_of_two_hands_give_equal_texture_features(size: str) -> None:
     torch.testing.assert_close(net.texture("left"), net.texture("right"), rtol=1e-4, atol=1e-4)
 
 
-def test_texture_at_hand_is_not_computed_again() -> None:
+def test_features_at_hand_are_not_computed_again() -> None:
     net = stir(network("compact"))
-    given_texture = net.texture("right")
-    prediction = net("right", *frames(20, 1), given_texture)
-    assert prediction.texture is given_texture
+    given_features = net.features("right")
+    prediction = net("right", *frames(20, 1), given_features)
+    assert prediction.texture is given_features.texture
+    assert prediction.template_offsets is given_features.template_offsets
     assert torch.equal(prediction.raw.concatenate(), net("right", *frames(20, 1)).raw.concatenate())
 
 
