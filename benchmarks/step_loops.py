@@ -20,7 +20,7 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from hwp_bench.methods.manifest import find_method
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Watchers, optimize
-from wildghand.gaussians.fit_loop import ready_device
+from wildghand.fitting.ready import ready_fit
 from wildghand.model.settings import read_settings
 from wildghand.splat.threads import denormals_flushed
 
@@ -71,7 +71,7 @@ class WildGHandLoop:
 
     def __init__(self, training: TrainingCapture, settings: Mapping[str, Any]) -> None:
         chosen = read_settings({"device": "cpu", **settings})
-        self._fit = Fit(training, chosen, 0, ready_device("cpu"))
+        self._fit = Fit(training, chosen, 0, ready_fit("cpu"))
         self._watchers = Watchers(0)
         self._taken = 0
         # Steps may share work, which one of them does: a block has each of them equally often.

@@ -29,9 +29,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
         "wildghand.network.network:PredictionNetwork.features",
         "wildghand.fitting.shared_features:SharedFeatures._share_out",
     ),
-    "network: heads": (
-        "wildghand.network.network:PredictionNetwork.forward",
-    ),
+    "network: heads": ("wildghand.network.network:PredictionNetwork.forward",),
     "hand poses": (
         "wildghand.gaussians.training:TrainingClip.hand",
         "wildghand.gaussians.training:TrainingClip.poses",

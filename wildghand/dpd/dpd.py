@@ -140,7 +140,6 @@ class DynamicPerturbation(nn.Module):
             made[name] = omega[:, None, None] * (g @ of_g.mT + shift[:, None])
         return RawAttributes(**made)
 
-
     def layer(self, z: Tensor) -> tuple[Tensor, Tensor]:
         """varphi as one linear layer on g: Delta g = omega (A g + c) for every frame.
 

@@ -9,7 +9,7 @@ from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import optimize
-from wildghand.gaussians.fit_loop import ready_device
+from wildghand.fitting.ready import ready_fit
 from wildghand.model.settings import read_settings
 from wildghand.splat.threads import denormals_flushed
 
@@ -30,7 +30,7 @@ class WildGHandMethod:
     def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
         self.settings = read_settings(settings)
         self.seed = seed
-        self.device = ready_device(self.settings.device)
+        self.device = ready_fit(self.settings.device)
 
     @denormals_flushed()
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> WildGHandAvatar:

@@ -24,8 +24,8 @@ from wildghand.avatar.files import save_avatar
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
+from wildghand.fitting.ready import ready_fit
 from wildghand.fitting.saved_state import load_state, save_state
-from wildghand.gaussians.fit_loop import ready_device
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.splat.threads import denormals_flushed
 
@@ -139,7 +139,7 @@ def _fit_in(
     digest = sha256_json(
         [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
     )
-    fit = Fit(training, chosen, run.seed, ready_device(chosen.device), world)
+    fit = Fit(training, chosen, run.seed, ready_fit(chosen.device), world)
     watchers, start, before = Watchers(chosen.schedule.plateau_steps), 0, 0.0
     state = work / STATE
     if state.is_file():

@@ -14,7 +14,7 @@ Features = Mapping[str, HandFeatures]
 
 
 class SharedFeatures:
-    """What the network knows of the hands, evaluated once for a block of steps.
+    """Features of the hands, evaluated once for a block of steps.
 
     Texture features do not depend on the frame. So the steps of a block draw different frames of
     one evaluation of them, as the frames of a batch would. Their gradients are added up, and at

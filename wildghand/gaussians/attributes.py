@@ -91,7 +91,7 @@ class RawAttributes:
                 f"are {tuple(channels.shape)}, expected (..., N, {CHANNELS})", field="channels"
             )
         parts = channels.split(list(SIZES.values()), dim=-1)
-        return cls(*parts, _joined=channels)
+        return cls(**dict(zip(SIZES, parts, strict=True)), _joined=channels)
 
 
 @dataclass(frozen=True, eq=False)

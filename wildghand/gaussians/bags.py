@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import numpy as np
-import torch
 from torch import Tensor
 
 from hwp_bench.base.compiled import compiled

@@ -15,6 +15,7 @@ from hwp_bench.base.errors import DidNotConverge, MissingDependency
 from hwp_bench.methods.contract import Budget, Report
 from wildghand.gaussians.adam import warm_up as warm_up_optimizer
 from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
+from wildghand.gaussians.posing_cpu import warm_up as warm_up_posing
 from wildghand.splat.warmup import warm_up
 
 #: Steps over which the loss is averaged before it is judged.
@@ -63,6 +64,7 @@ def ready_device(name: str) -> torch.device:
         warm_up()
         warm_up_loss()
         warm_up_optimizer()
+        warm_up_posing()
     return device
 
 

@@ -60,7 +60,7 @@ class PosingTables:
 
 @dataclass(frozen=True, eq=False)
 class _Frame:
-    """What the gradient of one frame needs again."""
+    """Arrays of one frame that its gradient needs again."""
 
     pose: np.ndarray
     rest: np.ndarray
@@ -129,6 +129,27 @@ class FollowCpu(torch.autograd.Function):
             gradients[0].sum(dim=1),
             None,
         )
+
+
+def warm_up() -> None:
+    """Make the kernels ready, on a hand of one face: compiled once on a machine, loaded later."""
+    zeros = torch.zeros
+    template = TemplateTensors(
+        vertices=zeros(3, 3),
+        faces=torch.tensor([[0, 1, 2]]),
+        shape_basis=zeros(3, 3, 10),
+        pose_basis=None,
+        joints=zeros(16, 3),
+        joint_basis=zeros(16, 3, 10),
+        weights=torch.full((3, 16), 1 / 16),
+        mean_pose=zeros(15, 3),
+        fingertips=zeros(5, dtype=torch.int64),
+    )
+    anchors = SurfaceAnchors(zeros(1, dtype=torch.int64), torch.full((1, 3), 1 / 3))
+    pose = zeros(1, 16, 3, requires_grad=True)
+    tables = PosingTables.of(template, anchors)
+    with torch.enable_grad():
+        FollowCpu.apply(pose, zeros(10), zeros(1, 3), tables)[0].sum().backward()
 
 
 def _pose_frame(

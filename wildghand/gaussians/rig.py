@@ -87,7 +87,6 @@ class HandRig:
             orientations = matrix_to_quat(anchor_frames(vertices, faces, self.anchors))
         return AnchorPoses(anchor_positions(vertices, faces, self.anchors), orientations)
 
-
     @functools.cached_property
     def tables(self) -> PosingTables:
         """What posing on the CPU reads; made once."""

@@ -101,7 +101,8 @@ class _Dress(torch.autograd.Function):
         )
         active, means, quats, scales, opacities, colors = made
         ctx.save_for_backward(
-            raw, mixing, shift, omega, biased, shares, shadow, orientations, active, scales, opacities
+            raw, mixing, shift, omega, biased, shares, shadow, orientations, active, scales,
+            opacities,
         )  # fmt: skip
         ctx.max_offset = activation.max_offset
         size = torch.tensor(sizes.sum() / max(1, frames * count), dtype=torch.float32)

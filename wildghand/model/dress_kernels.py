@@ -130,8 +130,8 @@ def dress(
 
 @compiled(nogil=True)
 def dress_backward(
-    worker, counters, ends, raw, mixing, shift, omega, biased, share, bound, shadow, orientations, active,
-    scales, opacities, of_means, of_quats, of_scales, of_opacities, of_colors, of_size,
+    worker, counters, ends, raw, mixing, shift, omega, biased, share, bound, shadow, orientations,
+    active, scales, opacities, of_means, of_quats, of_scales, of_opacities, of_colors, of_size,
     of_raw, of_moved, of_shadow, of_mixing, of_shift, of_omega,
 ):  # fmt: skip
     """Gradients of `dress`; `means` have that of the positions.

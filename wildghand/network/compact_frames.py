@@ -13,14 +13,13 @@ import torch
 from torch import Tensor
 from torch.nn.functional import silu
 
+from wildghand.gaussians.attributes import CHANNELS
 from wildghand.gaussians.shading import sh_basis
 from wildghand.gaussians.shading_cpu import fill_harmonics
-from wildghand.gaussians.attributes import CHANNELS
 from wildghand.network.compact import CompactGeometry
 from wildghand.network.encoding import encode_pose
 from wildghand.network.heads import AttributeHead, ShadowHead
 from wildghand.network.surface import COORDINATES
-
 
 #: Attributes and the logit of the shadow coefficient, and zeros up to a multiple of 16.
 _OUTPUTS = 16
@@ -96,8 +95,8 @@ class _FrameHeads(torch.autograd.Function):
     """Two layers to geometry features, two heads side by side on them.
 
     Arguments: points (B, N, C + L + H), of which the last H are filled here; shift (B, H) of the
-    first layer; hidden (N, W); latent (N, I); initial (N, 14); then the parameters in the order in which
-    `frame_heads` gives them. Layers on the same input are joined to one.
+    first layer; hidden (N, W); latent (N, I); initial (N, 14); then the parameters, in the order
+    in which `frame_heads` gives them. Layers on the same input are joined to one.
     """
 
     @staticmethod
@@ -114,7 +113,7 @@ class _FrameHeads(torch.autograd.Function):
         place, normal, second, second_bias = given[:4]
         first = torch.cat((place, normal), dim=1)
         heads, heads_bias = torch.cat(given[4:6]), torch.cat(given[6:8])
-        last, last_bias = _padded(*given[8:12], given[13])
+        last, last_bias = _padded(given[8], given[9], given[10], given[11], given[13])
         linear = given[12][0]
         batch, count, width = len(points), len(hidden), len(second)
         rows = points.view(batch * count, -1)

@@ -150,7 +150,9 @@ class RefinementHead(nn.Module):
         """Means of both features, (Ft,) and (B, Fg), to (B, 16, 3) rad and (B, 3) m."""
         seen = torch.cat((hand.expand(len(frame), -1), frame), dim=-1)
         values = torch.tanh(self.frame(seen))
-        return self.max_pose * values[:, :48].unflatten(1, (16, 3)), self.max_transl * values[:, 48:]
+        return self.max_pose * values[:, :48].unflatten(1, (16, 3)), self.max_transl * values[
+            :, 48:
+        ]
 
 
 def zeroed(layer: nn.Linear) -> nn.Linear:

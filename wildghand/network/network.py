@@ -34,7 +34,7 @@ class Refinement:
 
 @dataclass(frozen=True, eq=False)
 class HandFeatures:
-    """What the network knows of one hand before it sees a frame."""
+    """Predictions of the network for one hand that no frame enters."""
 
     #: (N, Ft) texture features x_t.
     texture: Tensor
@@ -219,8 +219,8 @@ class PredictionNetwork(nn.Module):
     ) -> tuple[RawAttributes, Tensor, Tensor]:
         """Heads (i) and (ii), and the (B, Fg) mean of the geometry features."""
         branch = self.geometry_branch
-        fused = isinstance(branch, CompactGeometry) and self.settings.head_layers == 1
-        if not fused or normals.dtype != torch.float32 or torch.is_autocast_enabled():
+        plain = normals.dtype != torch.float32 or torch.is_autocast_enabled()
+        if plain or not isinstance(branch, CompactGeometry) or self.settings.head_layers != 1:
             x_g = self.geometry(side, normals, pose)
             raw = self.attribute_head(hidden, x_g, self._latent(side), self._initial(side))
             return raw, self.shadow_head(x_g), x_g.mean(dim=1)

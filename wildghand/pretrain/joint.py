@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -46,6 +47,9 @@ class JointFit:
         seed: int,
         device: torch.device,
     ) -> None:
+        # Between two steps on a capture others move the texture branch, which they share.
+        schedule = dataclasses.replace(settings.schedule, texture_every=1)
+        settings = dataclasses.replace(settings, schedule=schedule)
         self.settings = settings
         self.device = device
         self.fits: list[Fit] = []

@@ -16,9 +16,9 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.methods.contract import REQUEST, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.fitting.optimize import Watchers
+from wildghand.fitting.ready import ready_fit
 from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.fitting.session import SAVE_EVERY, STATE, every_frame
-from wildghand.gaussians.fit_loop import ready_device
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.pretrain.joint import JointFit, take_steps
 from wildghand.prior.files import save_prior
@@ -105,7 +105,7 @@ def _fit_in(
         [open_request(request) for request in requests],
         chosen,
         run.seed,
-        ready_device(chosen.device),
+        ready_fit(chosen.device),
     )
     watchers, start, before, state = Watchers(chosen.schedule.plateau_steps), 0, 0.0, work / STATE
     if state.is_file():

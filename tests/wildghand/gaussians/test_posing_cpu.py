@@ -40,7 +40,9 @@ def exact(hand: HandRig) -> tuple[TemplateTensors, SurfaceAnchors]:
         for name, tensor in tensors.items()
         if tensor is not None and tensor.is_floating_point()
     }
-    anchors = SurfaceAnchors(hand.anchors.face_index, torch.as_tensor(hand.anchors.barycentric).double())
+    anchors = SurfaceAnchors(
+        hand.anchors.face_index, torch.as_tensor(hand.anchors.barycentric).double()
+    )
     return dataclasses.replace(hand.template, **changed), anchors
 
 
@@ -80,7 +82,9 @@ def test_positions_frames_and_gradients(correctives: bool, shapes: bool) -> None
         assert value.grad is not None
         assert oracle.grad is not None
         scale = oracle.grad.abs().max()
-        torch.testing.assert_close(value.grad.double() / scale, oracle.grad / scale, rtol=0, atol=1e-5)
+        torch.testing.assert_close(
+            value.grad.double() / scale, oracle.grad / scale, rtol=0, atol=1e-5
+        )
 
 
 @settings(max_examples=25, deadline=None)
@@ -100,9 +104,7 @@ def test_any_angle_turns_as_in_float64(
     positions = hand.follow(mine, torch.zeros(10), torch.zeros(1, 3)).positions
     template, anchors = exact(hand)
     zeros = torch.zeros(10).double(), torch.zeros(1, 3).double()
-    expected = anchor_positions(
-        pose_hand(template, true, *zeros).vertices, template.faces, anchors
-    )
+    expected = anchor_positions(pose_hand(template, true, *zeros).vertices, template.faces, anchors)
     torch.testing.assert_close(positions.double(), expected, rtol=0, atol=2e-6)
     positions.square().sum().backward()
     expected.square().sum().backward()

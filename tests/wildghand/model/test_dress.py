@@ -27,13 +27,19 @@ class Scene:
         def leaf(*shape: int) -> Tensor:
             return torch.randn(*shape, generator=random).to(dtype).requires_grad_()
 
-        self.raw, self.offsets, self.positions = leaf(frames, count, 14), leaf(count, 3), leaf(frames, count, 3)
+        self.raw, self.offsets, self.positions = (
+            leaf(frames, count, 14),
+            leaf(count, 3),
+            leaf(frames, count, 3),
+        )
         with torch.no_grad():
             # Some scales leave their limits on both sides, and a quaternion is almost zero.
             self.raw[..., 3:6] *= 3.0
             self.raw[0, 0, 6:10] *= 1e-6
         self.shadow = torch.rand(frames, count, 1, generator=random).to(dtype).requires_grad_()
-        turns = torch.nn.functional.normalize(torch.randn(frames, count, 4, generator=random), dim=-1)
+        turns = torch.nn.functional.normalize(
+            torch.randn(frames, count, 4, generator=random), dim=-1
+        )
         self.orientations = turns.to(dtype)
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(1)

@@ -1,0 +1,54 @@
+"""Everything that is compiled for a fit of WildGHand, made ready before its clock starts."""
+
+from __future__ import annotations
+
+import functools
+
+import torch
+
+from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
+from wildghand.gaussians.attributes import CHANNELS, Activation, RawAttributes
+from wildghand.gaussians.bags import sum_bags
+from wildghand.gaussians.fit_loop import ready_device
+from wildghand.gaussians.rig import AnchorPoses
+from wildghand.gaussians.shading_cpu import fill_harmonics
+from wildghand.model.dress import dress
+from wildghand.network import NetworkOutput, Refinement
+
+
+def ready_fit(name: str) -> torch.device:
+    """Choose the device of a fit, and compile or load for it what the fit needs.
+
+    Args:
+        name: `auto`, `cpu` or `cuda`.
+
+    Raises:
+        MissingDependency: CUDA was asked for and is not there.
+    """
+    device = ready_device(name)
+    if device.type == "cpu":
+        _warm_up()
+    return device
+
+
+@functools.cache
+def _warm_up() -> None:
+    """Run every kernel of the model, both ways, on one Gaussian."""
+    zeros = torch.zeros
+    anchors = AnchorPoses(zeros(1, 1, 3), zeros(1, 1, 4))
+    with torch.random.fork_rng(devices=[]):
+        module = DynamicPerturbation(1, 1)
+    prediction = NetworkOutput(
+        RawAttributes.split(zeros(1, 1, CHANNELS)),
+        zeros(1, 1, 1),
+        zeros(1, 3),
+        Refinement(zeros(1, 16, 3), zeros(10), zeros(1, 3)),
+        zeros(1, 1),
+    )
+    perturbation = Perturbation(module, module.temporal(torch.tensor([0])))
+    gaussians, size = dress(anchors, prediction, Activation(), perturbation, torch.ones(1))
+    assert size is not None
+    (gaussians.means.sum() + size).backward()
+    first = zeros(1, dtype=torch.int64)
+    sum_bags(zeros(1, 1), first, zeros(1), first)
+    fill_harmonics(zeros(1, 3), 1, zeros(1, 3), 0)
