@@ -161,7 +161,8 @@ class Fit:
         self.weighting.median = None if state["median"] is None else float(state["median"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
-        self.shared.load_state_dict(state["shared"])
+        # States of before have none: their steps shared nothing.
+        self.shared.load_state_dict(state.get("shared", {"steps": 0}))
 
     def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """(B,) bool by side: which frames of a batch keep their biases in this step."""

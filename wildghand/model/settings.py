@@ -134,6 +134,7 @@ MODES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
             "pao": {"variant": "paper"},
             "heads": {"frame_poses": False},
             "prepass": {"enabled": False},
+            "schedule": {"texture_every": 1},
             "terms": {
                 item.name: getattr(PAPER_TERMS, item.name)
                 for item in dataclasses.fields(TermWeights)
