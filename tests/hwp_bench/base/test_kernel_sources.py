@@ -48,7 +48,11 @@ def test_a_name_that_is_no_module_stands_in_the_package(root: Path) -> None:
     [
         ("wildghand.splat.kernels.blend", "wildghand.splat.conventions"),
         ("wildghand.splat.kernels.blend", "wildghand.splat.kernels.simd"),
-        ("wildghand.gaussians.photometric_cpu", None),
+        ("wildghand.gaussians.photometric_kernels", "wildghand.splat.kernels.simd"),
+        ("wildghand.gaussians.adam_kernels", None),
+        ("wildghand.gaussians.posing_kernels", "wildghand.splat.kernels.jobs"),
+        ("wildghand.gaussians.row_kernels", "wildghand.splat.kernels.jobs"),
+        ("wildghand.model.dress_kernels", "wildghand.splat.kernels.jobs"),
         ("hwp_bench.hands.raster", None),
     ],
 )
