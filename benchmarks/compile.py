@@ -21,7 +21,6 @@ from typing import Any
 
 import numba
 import numpy as np
-import torch
 from numba.core import event
 
 from hwp_bench.base.tables import Column, Table, print_table, to_markdown
@@ -54,16 +53,9 @@ class Listener(event.Listener):  # type: ignore[misc]
 
 def ready_to_fit() -> None:
     """Make ready what a fit and its rasterizer call."""
-    from wildghand.gaussians import photometric_cpu
-    from wildghand.gaussians.adam import ClippedAdam
-    from wildghand.splat import warmup
+    from wildghand.fitting.ready import ready_fit
 
-    warmup.warm_up(3)
-    photometric_cpu.warm_up()
-    parameter = torch.zeros(3, requires_grad=True)
-    loss = parameter.sum()
-    loss.backward()
-    ClippedAdam([{"params": [parameter]}], 1.0).take_step(loss)
+    ready_fit("cpu")
 
 
 def use_the_rest() -> None:
