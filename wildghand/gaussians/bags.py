@@ -6,7 +6,7 @@ from torch import Tensor
 
 from wildghand.gaussians.row_kernels import PIECE
 from wildghand.gaussians.row_kernels import sum_bags as kernel
-from wildghand.splat.threads import even_jobs, run, thread_count
+from wildghand.splat.threads import run_pieces
 
 
 def sum_bags(values: Tensor, index: Tensor, weight: Tensor, start: Tensor) -> Tensor:
@@ -24,10 +24,11 @@ def sum_bags(values: Tensor, index: Tensor, weight: Tensor, start: Tensor) -> Te
         (outputs, C).
     """
     out = values.new_empty(len(start), values.shape[1])
-    pieces = -(-len(start) // PIECE)
-    run(
+    run_pieces(
         kernel,
-        even_jobs(pieces, thread_count(pieces, len(index) + len(start))),
+        len(start),
+        PIECE,
+        len(index) + len(start),
         *(tensor.detach().contiguous().numpy() for tensor in (values, index, weight, start)),
         out.numpy(),
     )

@@ -14,6 +14,7 @@ from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.hands.anchors import anchor_frames, anchor_positions
 from wildghand.gaussians.bags import sum_bags
 from wildghand.gaussians.rig import HandRig
+from wildghand.splat.threads import kernels_take
 
 #: Neighbours of each anchor.
 NEIGHBOURS = 6
@@ -165,7 +166,7 @@ class _Product(torch.autograd.Function):
 
 def _times(matrix: Tensor, rows: Tensor) -> Tensor:
     """(N, N) sparse CSR times (N, C)."""
-    if rows.device.type == "cpu" and rows.dtype == torch.float32:
+    if kernels_take(rows):
         starts = matrix.crow_indices()[:-1]
         return sum_bags(rows, matrix.col_indices(), matrix.values(), starts)
     return matrix @ rows

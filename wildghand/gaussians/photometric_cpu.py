@@ -16,7 +16,7 @@ from wildghand.gaussians.photometric_kernels import (
     find_content,
     gather,
 )
-from wildghand.splat.threads import even_jobs, run, thread_count
+from wildghand.splat.threads import even_jobs, kernels_take, run, thread_count
 
 # Values of an image that cost as much as one of the rasterizer's pairs.
 _VALUES_LIKE_A_PAIR = 4
@@ -25,10 +25,7 @@ _VALUES_LIKE_A_PAIR = 4
 def takes(prediction: torch.Tensor, *others: torch.Tensor) -> bool:
     """Whether these images, (B, H, W, C), and their weights can be compared here."""
     wide = prediction.shape[2] * prediction.shape[3] >= LANES
-    return wide and all(
-        tensor.dtype == torch.float32 and tensor.device.type == "cpu"
-        for tensor in (prediction, *others)
-    )
+    return wide and kernels_take(prediction, *others)
 
 
 class PhotometricCpu(torch.autograd.Function):

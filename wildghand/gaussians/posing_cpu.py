@@ -12,7 +12,7 @@ from torch import Tensor
 from hwp_bench.hands import TemplateTensors
 from hwp_bench.hands.anchors import SurfaceAnchors
 from wildghand.gaussians import posing_kernels as kernels
-from wildghand.splat.threads import even_jobs, run, thread_count
+from wildghand.splat.threads import run_pieces
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,15 +84,17 @@ class FollowCpu(torch.autograd.Function):
         count, vertices = len(tables.corners), np.empty_like(tables.template.vertices.numpy())
         positions = np.empty((len(pose), count, 3), np.float32)
         orientations = np.empty((len(pose), count, 4), np.float32)
-        normals, pieces = np.empty_like(vertices), -(-count // kernels.PIECE)
+        normals = np.empty_like(vertices)
         frames = []
         given = pose.detach().numpy(), transl.detach().numpy()
         for f, (turn, move, shape) in enumerate(zip(*given, shapes, strict=True)):
             frame = _pose_frame(turn, shape, tables, vertices)
             kernels.vertex_normals(vertices, tables.faces, normals)
-            run(
+            run_pieces(
                 kernels.place_anchors,
-                even_jobs(pieces, thread_count(pieces, count)),
+                count,
+                kernels.PIECE,
+                count,
                 vertices,
                 normals,
                 move,

@@ -16,6 +16,7 @@ from hwp_bench.hands.anchors import (
     sample_surface,
 )
 from wildghand.gaussians.quaternions import matrix_to_quat
+from wildghand.splat.threads import kernels_take
 
 if TYPE_CHECKING:
     from wildghand.gaussians.posing_cpu import PosingTables
@@ -77,7 +78,7 @@ class HandRig:
             betas: (10,) or (F, 10).
             transl: (F, 3) m.
         """
-        if _float32_on_the_cpu(self.template.vertices, pose, betas, transl):
+        if kernels_take(self.template.vertices, pose, betas, transl):
             from wildghand.gaussians.posing_cpu import FollowCpu
 
             return AnchorPoses(*FollowCpu.apply(pose, betas, transl, self.tables))
@@ -93,10 +94,6 @@ class HandRig:
         from wildghand.gaussians.posing_cpu import PosingTables
 
         return PosingTables.of(self.template, self.anchors)
-
-
-def _float32_on_the_cpu(*tensors: torch.Tensor) -> bool:
-    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
 
 
 def make_rig(

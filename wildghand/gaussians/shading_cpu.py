@@ -6,7 +6,7 @@ from torch import Tensor
 
 from wildghand.gaussians.row_kernels import PIECE
 from wildghand.gaussians.row_kernels import fill_harmonics as kernel
-from wildghand.splat.threads import even_jobs, run, thread_count
+from wildghand.splat.threads import run_pieces
 
 
 def fill_harmonics(normals: Tensor, degree: int, out: Tensor, first: int) -> None:
@@ -18,10 +18,11 @@ def fill_harmonics(normals: Tensor, degree: int, out: Tensor, first: int) -> Non
         out: (M, channels) float32; the columns from `first` on are filled.
         first: column.
     """
-    pieces = -(-len(normals) // PIECE)
-    run(
+    run_pieces(
         kernel,
-        even_jobs(pieces, thread_count(pieces, len(normals))),
+        len(normals),
+        PIECE,
+        len(normals),
         normals.detach().contiguous().numpy(),
         degree,
         out.numpy(),

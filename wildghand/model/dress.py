@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from wildghand.dpd.dpd import Perturbation
@@ -14,6 +13,7 @@ from wildghand.gaussians.quaternions import quat_multiply, quat_rotate
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.model.terms import bias_size
 from wildghand.network import NetworkOutput
+from wildghand.splat.threads import kernels_take
 
 
 @dataclass(frozen=True, eq=False)
@@ -53,8 +53,7 @@ def dress(
     Returns:
         The Gaussians, and `wildghand.model.terms.bias_size` of their biases (None without).
     """
-    tensors = (anchors.positions, prediction.raw.offsets, prediction.shadow)
-    if all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors):
+    if kernels_take(anchors.positions, prediction.raw.offsets, prediction.shadow):
         from wildghand.model.dress_cpu import dress_cpu
 
         made, size = dress_cpu(anchors, prediction, activation, perturbation, shares)

@@ -14,7 +14,7 @@ from wildghand.gaussians.attributes import CHANNELS, Activation
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.model import dress_kernels as kernels
 from wildghand.network import NetworkOutput
-from wildghand.splat.threads import even_jobs, run, thread_count
+from wildghand.splat.threads import piece_count, run_pieces
 
 #: A Gaussian here takes as long as so many of those that `thread_count` counts.
 _WEIGHT = 4
@@ -77,14 +77,15 @@ class _Dress(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         """Return the five tensors of the Gaussians, and the mean size of the biases."""
         frames, count = raw.shape[:2]
-        ends = _shares_of_work(frames, count)
         given = [_array(t) for t in (raw, mixing, shift, omega, biased)]
         made = [torch.empty(frames, count, k) for k in (12, 3, 4, 3)]
         made += [torch.empty(frames, count), torch.empty(frames, count, 3)]
-        sizes = np.zeros(int(ends[-1]))
-        run(
+        sizes = np.zeros(piece_count(count, kernels.PIECE))
+        run_pieces(
             kernels.dress,
-            ends,
+            count,
+            kernels.PIECE,
+            _WEIGHT * frames * count,
             *given,
             np.float32(activation.max_offset),
             np.array(
@@ -114,15 +115,16 @@ class _Dress(torch.autograd.Function):
         """Gradients of all that have one."""
         raw, mixing, shift, omega, biased, shares, shadow, *rest = ctx.saved_tensors
         frames, count = raw.shape[:2]
-        ends = _shares_of_work(frames, count)
-        pieces = int(ends[-1])
+        pieces = piece_count(count, kernels.PIECE)
         of_raw, of_moved = torch.empty_like(raw), torch.empty(count, 3)
         of_shadow = torch.empty(frames, count)
         of_mixing = torch.zeros(pieces, CHANNELS, CHANNELS)
         of_shift, of_omega = torch.zeros(pieces, frames, CHANNELS), torch.zeros(pieces, frames)
-        run(
+        run_pieces(
             kernels.dress_backward,
-            ends,
+            count,
+            kernels.PIECE,
+            _WEIGHT * frames * count,
             *(_array(t) for t in (raw, mixing, shift, omega, biased, shares)),
             np.float32(ctx.max_offset),
             _array(shadow.squeeze(-1)),
@@ -140,11 +142,6 @@ class _Dress(torch.autograd.Function):
             gradients[0],
             *(None,) * 4,
         )
-
-
-def _shares_of_work(frames: int, count: int) -> np.ndarray:
-    pieces = -(-count // kernels.PIECE)
-    return even_jobs(pieces, thread_count(pieces, _WEIGHT * frames * count))
 
 
 def _array(tensor: Tensor) -> np.ndarray:

@@ -10,6 +10,7 @@ from torch.nn.functional import embedding_bag
 
 from hwp_bench.base.errors import UsageError
 from wildghand.gaussians.bags import sum_bags
+from wildghand.splat.threads import kernels_take
 
 
 class FixedGather(nn.Module):
@@ -78,8 +79,8 @@ class _Gather(torch.autograd.Function):
 
 
 def _sum_bags(values: Tensor, index: Tensor, weight: Tensor, start: Tensor) -> Tensor:
-    on_cpu = all(tensor.device.type == "cpu" for tensor in (values, index, weight, start))
-    if on_cpu and values.dtype == weight.dtype == torch.float32:
+    on_cpu = all(tensor.device.type == "cpu" for tensor in (index, start))
+    if on_cpu and kernels_take(values, weight):
         return sum_bags(values, index, weight, start)
     return embedding_bag(
         index,

@@ -68,6 +68,30 @@ def weighted_jobs(before: np.ndarray, threads: int) -> np.ndarray:
     return np.concatenate(([0], inner, [len(before) - 1])).astype(np.int64)
 
 
+def kernels_take(*tensors: torch.Tensor) -> bool:
+    """Whether compiled kernels can read these tensors: float32 on the CPU."""
+    return all(t.dtype == torch.float32 and t.device.type == "cpu" for t in tensors)
+
+
+def piece_count(count: int, piece: int) -> int:
+    """Pieces of at most `piece` things that `count` things make."""
+    return -(-count // piece)
+
+
+def run_pieces(kernel: Callable[..., Any], count: int, piece: int, work: int, *args: Any) -> None:
+    """Calls a kernel whose jobs are pieces of equal length, see `run`.
+
+    Args:
+        kernel: takes jobs; job k is the things from `piece * k` on, at most `piece`.
+        count: things.
+        piece: things of a job.
+        work: how many Gaussians or pairs all of it is like, see `thread_count`.
+        args: the same for all.
+    """
+    pieces = piece_count(count, piece)
+    run(kernel, even_jobs(pieces, thread_count(pieces, work)), *args)
+
+
 def run(kernel: Callable[..., Any], ends: np.ndarray, *args: Any) -> None:
     """Calls `kernel(worker, counters, ends, *args)` on as many threads as there are shares.
 
