@@ -14,6 +14,7 @@ from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading_cpu import fill_harmonics
 from wildghand.model.dress import dress
 from wildghand.network import NetworkOutput, Refinement
+from wildghand.network.frame_heads_cpu import warm_up as warm_up_heads
 
 
 def ready_fit(name: str) -> torch.device:
@@ -52,3 +53,4 @@ def _warm_up() -> None:
     first = zeros(1, dtype=torch.int64)
     sum_bags(zeros(1, 1), first, zeros(1), first)
     fill_harmonics(zeros(1, 3), 1, zeros(1, 3), 0)
+    warm_up_heads()

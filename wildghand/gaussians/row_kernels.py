@@ -8,12 +8,21 @@ from __future__ import annotations
 import math
 
 import numpy as np
+from numba import types
 
 from hwp_bench.base.compiled import compiled
 from wildghand.splat.kernels.jobs import next_job
+from wildghand.splat.kernels.lanes import make_fill, make_load, store
+from wildghand.splat.kernels.simd import Vector
 
 #: Rows that one thread takes at a time.
 PIECE = 512
+#: Channels that are summed together.
+LANES = 16
+
+_FLOATS = Vector(types.float32, LANES)
+_load = make_load(_FLOATS)
+_fill = make_fill(_FLOATS)
 
 _A, _B, _C, _D = (np.float32(math.sqrt(number)) for number in (15.0, 17.5, 10.5, 105.0))
 _THREE, _FIVE, _SEVEN = (np.float32(math.sqrt(number)) for number in (3.0, 5.0, 7.0))
@@ -28,13 +37,21 @@ def sum_bags(worker, counters, ends, values, index, weight, start, out):
     job = next_job(worker, counters, ends)
     while job >= 0:
         for row in range(PIECE * job, min(PIECE * (job + 1), rows)):
-            last = start[row + 1] if row + 1 < rows else len(index)
-            for c in range(channels):
-                out[row, c] = np.float32(0.0)
-            for term in range(start[row], last):
-                source, factor = index[term], weight[term]
+            first, last = start[row], start[row + 1] if row + 1 < rows else len(index)
+            if channels < LANES:
                 for c in range(channels):
-                    out[row, c] += factor * values[source, c]
+                    total = np.float32(0.0)
+                    for term in range(first, last):
+                        total += weight[term] * values[index[term], c]
+                    out[row, c] = total
+                continue
+            for place in range(0, channels, LANES):
+                # The last vector begins where it ends with the row.
+                c = min(place, channels - LANES)
+                sums = _fill(np.float32(0.0))
+                for term in range(first, last):
+                    sums = sums + _load(values, index[term] * channels + c) * weight[term]
+                store(out, row * channels + c, sums)
         job = next_job(worker, counters, ends)
 
 

@@ -1,8 +1,8 @@
 """What `compact` does for every frame, as one function with a gradient written by hand.
 
-It computes what `CompactGeometry` and the heads (i), (ii) compute, with the same parameters: some
-twenty products of matrices in place of a hundred operations of autograd, which cost more than
-their arithmetic.
+It computes what `CompactGeometry` and the heads (i), (ii) compute, with the same parameters: on the
+CPU in compiled code (`frame_heads_cpu`), elsewhere some twenty products of matrices in place of a
+hundred operations of autograd, which cost more than their arithmetic.
 """
 
 from __future__ import annotations
@@ -20,6 +20,7 @@ from wildghand.network.compact import CompactGeometry
 from wildghand.network.encoding import encode_pose
 from wildghand.network.heads import AttributeHead, ShadowHead
 from wildghand.network.surface import COORDINATES
+from wildghand.splat.threads import kernels_take
 
 #: Attributes and the logit of the shadow coefficient, and zeros up to a multiple of 16.
 _OUTPUTS = 16
@@ -49,16 +50,11 @@ def frame_heads(
         initial: (N, 14) raw attributes to which all of this is added, without gradient.
 
     Returns:
-        (B, N, 14) raw attributes, (B, N, 1) logit of the shadow coefficient without its start,
-        and (B, L + width) mean of the geometry features, L harmonics first.
+        (B, N, 14) raw attributes, (B, N, 1) shadow coefficients, and (B, L + width) mean of the
+        geometry features, L harmonics first.
     """
     geometry, detail, last = attributes.geometry[0], shadow.detail[0], shadow.detail[2]
-    return _FrameHeads.apply(
-        _points(branch, coordinates, normals),
-        branch.pose(encode_pose(pose, branch.frequencies)) + branch.place.bias,
-        hidden,
-        latent,
-        initial,
+    weights = (
         branch.place.weight,
         branch.normal.weight,
         branch.mix.weight,
@@ -74,6 +70,33 @@ def frame_heads(
         shadow.light.weight,
         attributes.direct_weight(),
     )
+    encoded = encode_pose(pose, branch.frequencies)
+    if kernels_take(coordinates, normals, encoded, hidden, latent):
+        from wildghand.network.frame_heads_cpu import FrameHeadsCpu
+
+        light = normals.new_empty(*normals.shape[:2], branch.normal.in_features)
+        fill_harmonics(normals.reshape(-1, 3), branch.degree, light.view(-1, light.shape[-1]), 0)
+        return FrameHeadsCpu.apply(
+            coordinates,
+            light,
+            encoded,
+            initial,
+            shadow.start,
+            hidden,
+            latent,
+            branch.pose.weight,
+            branch.place.bias,
+            *weights,
+        )
+    raw, logit, mean = _FrameHeads.apply(
+        _points(branch, coordinates, normals),
+        branch.pose(encoded) + branch.place.bias,
+        hidden,
+        latent,
+        initial,
+        *weights,
+    )
+    return raw, shadow.activate(logit), mean
 
 
 def _points(branch: CompactGeometry, coordinates: Tensor, normals: Tensor) -> Tensor:
@@ -82,12 +105,7 @@ def _points(branch: CompactGeometry, coordinates: Tensor, normals: Tensor) -> Te
     harmonics, width = branch.normal.in_features, branch.mix.out_features
     points = normals.new_empty(batch, count, COORDINATES + harmonics + width)
     points[..., :COORDINATES] = coordinates
-    if normals.device.type == "cpu":
-        flat = points.view(batch * count, -1)
-        fill_harmonics(normals.reshape(-1, 3), branch.degree, flat, COORDINATES)
-    else:
-        light = sh_basis(normals, branch.degree)[..., 1:]
-        points[..., COORDINATES : COORDINATES + harmonics] = light
+    points[..., COORDINATES : COORDINATES + harmonics] = sh_basis(normals, branch.degree)[..., 1:]
     return points
 
 

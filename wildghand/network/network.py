@@ -225,7 +225,7 @@ class PredictionNetwork(nn.Module):
             raw = self.attribute_head(hidden, x_g, self._latent(side), self._initial(side))
             return raw, self.shadow_head(x_g), x_g.mean(dim=1)
         chart = self._checked(side, normals, pose)
-        raw, logit, mean = frame_heads(
+        raw, shadow, mean = frame_heads(
             branch,
             self.attribute_head,
             self.shadow_head,
@@ -236,7 +236,7 @@ class PredictionNetwork(nn.Module):
             latent=self._latent(side),
             initial=self._initial(side),
         )
-        return RawAttributes.split(raw), self.shadow_head.activate(logit), mean
+        return RawAttributes.split(raw), shadow, mean
 
     def _latent(self, side: str) -> Tensor:
         """(N, I) identity features that the direct path reads; (N, 0) without it."""

@@ -16,7 +16,7 @@ from wildghand.gaussians.shading_cpu import fill_harmonics
 @given(
     lengths=st.lists(st.integers(0, 5), min_size=1, max_size=1_200),
     rows=st.integers(1, 40),
-    channels=st.integers(1, 9),
+    channels=st.integers(1, 40),
     seed=st.integers(0, 99),
 )
 def test_sums_are_those_of_embedding_bag(
