@@ -150,7 +150,7 @@ class TrainingClip:
             self._cache = {side: self._pose(side, rows) for side in rigs}
 
     def hand(self, side: str, rows: torch.Tensor) -> AnchorPoses:
-        """The anchors of one hand in a batch, without gradient.
+        """The anchors of one hand in a batch, without gradient; they must not be changed.
 
         Args:
             side: which.
@@ -159,6 +159,9 @@ class TrainingClip:
         if self._cache is None:
             return self._pose(side, rows)
         posed = self._cache[side]
+        if len(rows) == 1 and rows.device.type == "cpu":  # views
+            row = slice(int(rows[0]), int(rows[0]) + 1)
+            return AnchorPoses(posed.positions[row], posed.orientations[row])
         return AnchorPoses(posed.positions[rows], posed.orientations[rows])
 
     def poses(self, rows: torch.Tensor) -> AnchorPoses:

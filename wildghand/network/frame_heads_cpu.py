@@ -53,7 +53,7 @@ class FrameHeadsCpu(torch.autograd.Function):
         shift[:, : w.width] = torch.addmm(bias, encoded, of_pose.mT).numpy()
         inputs = [_flat(tensor) for tensor in (places, harmonics, hidden, latent)]
         seen = lease((frames * piece_count(count, ROWS) * ROWS * w.seen,), np.float32)
-        raw, shadow = torch.empty(frames, count, CHANNELS), torch.empty(frames, count, 1)
+        raw, shadow = _room(frames, count, CHANNELS), _room(frames, count, 1)
         pieces = piece_count(count, kernels.PIECE)
         sums = np.zeros((pieces, frames, _up(w.features, LANES)), np.float32)
         _run(
@@ -90,7 +90,7 @@ class FrameHeadsCpu(torch.autograd.Function):
         pieces = piece_count(count, kernels.PIECE)
         mean = np.zeros((frames, w.point), np.float32)
         mean[:, : w.width] = of_mean.numpy()[:, w.harmonics :] / np.float32(max(1, count))
-        of_hidden, of_latent = torch.zeros(count, w.head), torch.zeros(count, w.latent)
+        of_hidden, of_latent = _room(count, w.head), _room(count, w.latent)
         of_shift = np.zeros((pieces, frames, w.point), np.float32)
         of_packed = np.zeros((pieces, layout.second_back), np.float32)
         _run(
@@ -240,6 +240,11 @@ def _up(number: int, step: int) -> int:
 
 def _run(kernel: Any, frames: int, count: int, *args: Any) -> None:
     run_pieces(kernel, count, kernels.PIECE, _WEIGHT * frames * count, frames, count, *args)
+
+
+def _room(*shape: int) -> Tensor:
+    """Memory that was used before: fresh memory costs more than what is computed here."""
+    return torch.from_numpy(lease(shape, np.float32))
 
 
 def _flat(tensor: Tensor) -> np.ndarray:

@@ -136,7 +136,7 @@ def heads_forward(
                     logits[r] += made[r * LANES + CHANNELS] + start
                 for r in range(0, rows, LANES):
                     store(logits, r, sigmoid(load(logits, r)))
-                copy(logits, _START, _SINGLE, _SINGLE, held, shadow, g, _SINGLE)
+                copy(logits, _START, _START, held, _SINGLE, shadow, g, _START)
                 add(initial, n * CHANNELS, _CHANNELS, _CHANNELS, held, made, _START, _LANES)
                 copy(made, _START, _LANES, _CHANNELS, held, raw, g * CHANNELS, _CHANNELS)
                 add_rows(table, w.places, w.row, w.features, held, sums, (job * frames + b) * room)
@@ -153,7 +153,7 @@ def heads_backward(
     Args:
         of_raw: (B, N, 14); of_shadow: (B, N).
         of_mean: (B, point), gradient of each Gaussian's second layer by the mean of all.
-        of_hidden: (N, head); of_latent: (N, I), zeros, filled.
+        of_hidden: (N, head); of_latent: (N, I), filled.
         of_shift: (pieces, B, point) zeros, to which each piece adds its part.
         of_packed: (pieces, parts of `layout` up to `second_back`) zeros, likewise.
     """
@@ -179,10 +179,17 @@ def heads_backward(
                 for r in range(held):
                     value = shadow[g + r]
                     top[r * LANES + CHANNELS] = of_shadow[g + r] * value * (_ONE - value)
+                    top[r * LANES + CHANNELS + 1] = _ZERO
                 multiply(top, _START, _LANES, CHANNELS + _SINGLE, packed, layout.last_back, w.back,
                          none, _START, rows, of_heads, _START, w.back)  # fmt: skip
-                add(of_heads, _START, w.back, w.head, held, of_hidden, n * w.head, w.head)
-                add(of_heads, w.heads, w.back, w.latent, held, of_latent, n * w.latent, w.latent)
+                if b == 0:
+                    copy(of_heads, _START, w.back, w.head, held, of_hidden, n * w.head, w.head)
+                    copy(of_heads, w.heads, w.back, w.latent, held, of_latent, n * w.latent,
+                         w.latent)  # fmt: skip
+                else:
+                    add(of_heads, _START, w.back, w.head, held, of_hidden, n * w.head, w.head)
+                    add(of_heads, w.heads, w.back, w.latent, held, of_latent, n * w.latent,
+                        w.latent)  # fmt: skip
                 activate_back(seen, at + 2 * w.point, w.seen, w.heads, rows, heads, _START, w.back,
                               of_heads, w.back)  # fmt: skip
                 add(hidden, n * w.head, w.head, w.head, held, heads, _START, w.back)

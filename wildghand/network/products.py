@@ -206,21 +206,50 @@ def add_rows(table, first, step, columns, rows, out, at):
         store(out, at + m, total)
 
 
+@inline
+def _whole_rows(columns, step, rows):
+    """How many rows of a table may be read as whole vectors without reading behind the last."""
+    behind = max(LANES - columns, 0)
+    return max(rows - (behind + step - 1) // max(step, 1), 0) if behind > 0 else rows
+
+
 @part
 def copy(source, at, step, columns, rows, out, to, out_step):
-    """Rows of one table into another."""
+    """Rows of one table into another.
+
+    Behind a row of less than 16 numbers, what follows in the source is written, too, as long as it
+    belongs to one of these rows and lies there before the end of the last.
+    """
     stay_apart()
-    for r in range(rows):
+    whole = _whole_rows(columns, min(step, out_step), rows)
+    for r in range(whole):
+        for k in range(0, columns, LANES):
+            # The last vector begins where it ends with the row.
+            m = max(min(k, columns - LANES), 0)
+            store(out, to + r * out_step + m, load(source, at + r * step + m))
+    for r in range(whole, rows):
         for k in range(columns):
             out[to + r * out_step + k] = source[at + r * step + k]
 
 
 @part
 def add(source, at, step, columns, rows, out, to, out_step):
-    """Rows of one table to those of another."""
+    """Rows of one table to those of another.
+
+    Behind a row of less than 16 numbers, what follows in the source is added, too, as long as it
+    belongs to one of these rows and the rows of the other table have room for it.
+    """
     stay_apart()
-    for r in range(rows):
-        for k in range(columns):
+    whole = columns // LANES * LANES
+    wide = _whole_rows(columns, step, rows) if columns < LANES <= out_step else 0
+    for r in range(wide):
+        i = to + r * out_step
+        store(out, i, load(out, i) + load(source, at + r * step))
+    for r in range(wide, rows):
+        for k in range(0, whole, LANES):
+            i = to + r * out_step + k
+            store(out, i, load(out, i) + load(source, at + r * step + k))
+        for k in range(whole, columns):
             out[to + r * out_step + k] += source[at + r * step + k]
 
 
