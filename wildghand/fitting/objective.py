@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 
 import torch
@@ -10,6 +9,7 @@ from torch import Tensor
 
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fitting.weighting import FrameTarget
+from wildghand.gaussians.attribute_roughness import attribute_roughness
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.laplacian import surface_laplacian
@@ -115,9 +115,7 @@ class Objective:
 
     def _roughness(self, side: str, raw: RawAttributes) -> Tensor | None:
         """Weighted roughness of log scales and colours: one product with the Laplacian."""
-        weights, parts = self.weights, []
-        if weights.laplacian_scales:
-            parts.append(raw.log_scales * math.sqrt(weights.laplacian_scales))
-        if weights.laplacian_colors:
-            parts.append(raw.logit_colors.sigmoid() * math.sqrt(weights.laplacian_colors))
-        return self._laplacians[side].roughness(torch.cat(parts, dim=-1)) if parts else None
+        weights = self.weights.laplacian_scales, self.weights.laplacian_colors
+        if not any(weights):
+            return None
+        return attribute_roughness(self._laplacians[side], raw.concatenate(), *weights)

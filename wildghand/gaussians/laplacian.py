@@ -155,17 +155,22 @@ class _Product(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, values: Tensor, matrix: Tensor, transposed: Tensor) -> Tensor:
         ctx.save_for_backward(transposed)
-        return _times(matrix, values)
+        return sparse_times(matrix, values)
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor, None, None]:
         (transposed,) = ctx.saved_tensors
-        return _times(transposed, gradient), None, None
+        return sparse_times(transposed, gradient), None, None
 
 
-def _times(matrix: Tensor, rows: Tensor) -> Tensor:
-    """(N, N) sparse CSR times (N, C)."""
+def sparse_times(matrix: Tensor, rows: Tensor) -> Tensor:
+    """Product of a matrix of a `SurfaceLaplacian` and rows.
+
+    Args:
+        matrix: (N, N) sparse CSR.
+        rows: (N, C) of the same type; no gradient is recorded on the CPU.
+    """
     if kernels_take(rows):
         starts = matrix.crow_indices()[:-1]
         return sum_bags(rows, matrix.col_indices(), matrix.values(), starts)
