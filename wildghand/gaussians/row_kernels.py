@@ -34,16 +34,24 @@ _ONE = np.float32(1.0)
 def sum_bags(worker, counters, ends, values, index, weight, start, out):
     """See `wildghand.gaussians.bags.sum_bags`; a job is `PIECE` rows."""
     rows, channels = out.shape
+    room = np.zeros(LANES, np.float32)
     job = next_job(worker, counters, ends)
     while job >= 0:
         for row in range(PIECE * job, min(PIECE * (job + 1), rows)):
             first, last = start[row], start[row + 1] if row + 1 < rows else len(index)
             if channels < LANES:
+                sums = _fill(np.float32(0.0))
+                for term in range(first, last):
+                    at = index[term] * channels
+                    if at + LANES <= values.size:
+                        sums = sums + _load(values, at) * weight[term]
+                    else:  # nothing behind the last row is read
+                        for c in range(channels):
+                            room[c] = values[index[term], c]
+                        sums = sums + _load(room, 0) * weight[term]
+                store(room, 0, sums)
                 for c in range(channels):
-                    total = np.float32(0.0)
-                    for term in range(first, last):
-                        total += weight[term] * values[index[term], c]
-                    out[row, c] = total
+                    out[row, c] = room[c]
                 continue
             for place in range(0, channels, LANES):
                 # The last vector begins where it ends with the row.
