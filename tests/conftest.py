@@ -16,7 +16,8 @@ from hwp_bench.results import Results
 
 # Workers of pytest-xdist share the processor, so that each of them and what it starts uses one
 # thread; torch and numba read this when they are imported.
-if "PYTEST_XDIST_WORKER" in os.environ:
+WORKER = "PYTEST_XDIST_WORKER" in os.environ
+if WORKER:
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
@@ -32,6 +33,22 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Run files with slow tests first: no worker waits at the end for another's long file."""
     slow = {item.path for item in items if item.get_closest_marker("slow")}
     items.sort(key=lambda item: item.path not in slow)
+
+
+@pytest.fixture(scope="session")
+def machine_code(tmp_path_factory: pytest.TempPathFactory) -> None:
+    """Everything is compiled that tests need, by the first of the workers that asks for it."""
+    from own_cache import compile_all
+
+    from hwp_bench.base.locks import exclusive
+
+    # All workers' temporary folders lie in one.
+    shared = tmp_path_factory.getbasetemp().parent if WORKER else tmp_path_factory.getbasetemp()
+    done = shared / "compiled"
+    with exclusive(done, wait=True):
+        if not done.exists():
+            compile_all()
+            done.touch()
 
 
 @pytest.fixture

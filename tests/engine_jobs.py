@@ -92,13 +92,15 @@ _METHOD = """
 import time
 import numpy as np
 
+STUCK = ""
+
 class Gray:
     steps = 3
     def __init__(self, settings, seed):
         self.settings, self.seed = settings, seed
     def fit(self, training, budget, report):
         report.progress(1, 2)
-        time.sleep(self.settings["seconds"])
+        time.sleep(600 if STUCK and STUCK in __file__ else self.settings["seconds"])
         pixels = [training.frame(frame)[training.mask(frame) > 127] for frame in training.train]
         noise = np.random.default_rng(self.seed).normal(0, 0.02, 3)
         self.colour = np.concatenate(pixels).mean(axis=0) / 255 + noise
@@ -125,9 +127,12 @@ settings_off = {{flat = true}}
 """
 
 
-def write_gray_method(folder: Path, seconds: float) -> Path:
-    """A method of NumPy alone that waits, then paints the mean colour of the hand."""
+def write_gray_method(folder: Path, seconds: float, stuck: str = "") -> Path:
+    """A method of NumPy alone that waits, then paints the mean colour of the hand.
+
+    Where its own file lies at a place with `stuck` in it, it waits until it is killed.
+    """
     folder.mkdir()
-    (folder / "gray_method.py").write_text(_METHOD)
+    (folder / "gray_method.py").write_text(_METHOD.replace('STUCK = ""', f"STUCK = {stuck!r}"))
     (folder / "method.toml").write_text(_MANIFEST.format(seconds=seconds))
     return folder

@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 from own_cache import make_own_cache
 
+from hwp_bench.cli.main import main
+
 
 def mean_psnr(results: Path) -> dict[str, float]:
     """Mean PSNR of each capture by id."""
@@ -23,10 +25,14 @@ def mean_psnr(results: Path) -> dict[str, float]:
 
 
 @pytest.mark.slow
-def test_the_demo_renders_fits_scores_and_draws(tmp_path: Path) -> None:
+@pytest.mark.usefixtures("machine_code")
+def test_the_demo_renders_fits_scores_and_draws(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "demo"
     command = [sys.executable, "-m", "hwp_bench.cli.main", "demo", "--out", str(out)]
-    environment = {**os.environ, "HWP_CACHE": str(make_own_cache(tmp_path / "cache"))}
+    cache = make_own_cache(tmp_path / "cache", skins=True)
+    environment = {**os.environ, "HWP_CACHE": str(cache)}
     first = subprocess.run(
         command, env=environment, capture_output=True, text=True, check=False, cwd=tmp_path
     )
@@ -40,21 +46,16 @@ def test_the_demo_renders_fits_scores_and_draws(tmp_path: Path) -> None:
         assert capture["curve"]
         assert (out / "captures" / capture["id"] / "pictures" / "comparison.png").is_file()
     # Oracle: the same avatar after one step, which knows a hand's place and its mean colour.
-    unfitted = [*command[:3], "evaluate", "plain", "--suite", "smoke", "--steps", "1"]
-    subprocess.run(
-        [*unfitted, "--out", str(tmp_path / "unfitted")],
-        env=environment,
-        capture_output=True,
-        check=True,
-        cwd=tmp_path,
-    )
+    monkeypatch.setenv("HWP_CACHE", str(cache))
+    monkeypatch.chdir(tmp_path)
+    unfitted = ["evaluate", "plain", "--suite", "smoke", "--steps", "1"]
+    assert main([*unfitted, "--out", str(tmp_path / "unfitted")]) == 0
     start = mean_psnr(tmp_path / "unfitted" / "results.json")
     end = mean_psnr(out / "results.json")
     assert all(end[name] > start[name] for name in start)
     # Over the suite it is more than a decibel; on capture0 perturbations eat most of the gain.
     assert np.mean(list(end.values())) > np.mean(list(start.values())) + 1
-    again = subprocess.run(
-        command, env=environment, capture_output=True, text=True, check=True, cwd=tmp_path
-    )
+    capsys.readouterr()
+    assert main(command[3:]) == 0
     assert json.loads((out / "results.json").read_text())["captures"] == results["captures"]
-    assert "Rendering" not in again.stderr
+    assert "Rendering" not in capsys.readouterr().err

@@ -65,6 +65,7 @@ def submission(folder: Path, captures: list[Path]) -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("machine_code")
 def test_the_page_leads_to_a_scored_table(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -21,7 +21,7 @@ KILLS = 2
 
 
 @pytest.fixture(scope="module")
-def targets(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Target]:
+def targets(tmp_path_factory: pytest.TempPathFactory, machine_code: None) -> dict[str, Target]:
     return {target.name: target for target in make_targets(tmp_path_factory.mktemp("faults"))}
 
 

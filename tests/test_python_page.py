@@ -12,6 +12,7 @@ PAGE = Path(__file__).resolve().parents[1] / "docs" / "python.md"
 
 
 @pytest.mark.slow
+@pytest.mark.usefixtures("machine_code")
 def test_the_code_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (code,) = re.findall(r"```python\n(.*?)```", PAGE.read_text("utf-8"), re.DOTALL)
     lines = [line for line in code.splitlines() if line and not line.startswith("#")]

@@ -69,14 +69,14 @@ class Nodes:
 
 
 @pytest.fixture(scope="module")
-def nodes(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Nodes]:
+def nodes(tmp_path_factory: pytest.TempPathFactory, machine_code: None) -> Iterator[Nodes]:
     tests = str(Path(__file__).resolve().parents[3])
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_USAGE_STATS_ENABLED", "0")
         patch.setenv("PYTHONPATH", os.pathsep.join([tests, os.environ.get("PYTHONPATH", "")]))
         folder = tmp_path_factory.mktemp("nodes")
         for name in Nodes.NAMES:
-            make_own_cache(folder / name)
+            make_own_cache(folder / name, skins=True)
         patch.setenv("HWP_CACHE", "")
         started = Nodes(folder)
     yield started
@@ -104,8 +104,9 @@ def test_a_node_is_killed_in_the_middle_and_the_results_are_those_without_ray(
 
     names = ("one", "two")
     captures = [make_capture(name, frames=20, size=32, perturbations={}).root for name in names]
-    # Long enough that a busy machine kills the node before the fit on it ends.
-    manifest = read_manifest(write_gray_method(tmp_path / "gray", seconds=4.0))
+    # On the second node no fit ends: however busy the machine is, the kill comes first.
+    stuck = f"/{nodes.NAMES[1]}/"
+    manifest = read_manifest(write_gray_method(tmp_path / "gray", seconds=0.0, stuck=stuck))
     design = make_design(manifest, [], [])
     settings = EvaluationSettings()
     killed: list[int] = []
@@ -140,7 +141,7 @@ def test_a_capture_is_rendered_to_the_same_digest(nodes: Nodes, tmp_path: Path) 
     from hwp_bench.sim.produce.suites import RenderCapture, render_job
     from hwp_bench.sim.scene.reader import load_scene
 
-    work = RenderCapture(load_scene("capture2"), frame_count=10, size=32, workers=1)
+    work = RenderCapture(load_scene("capture0"), frame_count=10, size=32, workers=1)
     with RayEngine(nodes.address) as engine:
         engine.run([render_job(work, tmp_path / "ray", Needs())], lambda index: None)
     work.render(tmp_path / "turn")

@@ -28,9 +28,11 @@ def _distances(name: str, moment: float) -> tuple[float, float]:
     parameters = Stage(scene, RenderCost()).parameters(hands_at(scene, moment * scene.duration))
     right, normals = hands["right"].pose(*parameters["right"])
     left, _ = hands["left"].pose(*parameters["left"])
-    distance, nearest = cKDTree(right).query(left)
-    inside = np.einsum("ni,ni->n", left - right[nearest], normals[nearest]) < 0
-    inside &= distance < 0.03  # farther away the nearest normal tells nothing
+    # Farther away than 30 mm the nearest normal tells nothing; there the distance is infinite.
+    distance, nearest = cKDTree(right).query(left, distance_upper_bound=0.03)
+    near = np.flatnonzero(np.isfinite(distance))
+    away = left[near] - right[nearest[near]]
+    inside = near[np.einsum("ni,ni->n", away, normals[nearest[near]]) < 0]
     return float(distance[inside].max(initial=0.0)), float(distance.min())
 
 
