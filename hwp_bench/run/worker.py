@@ -106,7 +106,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
     explain = getattr(avatar, "write_diagnostics", None)
     if callable(explain):
         explain(output / DIAGNOSTICS)
-    report.take(final_step, avatar)
+    report.take(final_step, avatar, fit_seconds)
     render_seconds = 0.0
     for frame in training.targets.tolist():
         started = time.perf_counter()
@@ -209,9 +209,15 @@ class ReportClock:
         if in_time or in_steps or not self.checkpoints:
             self.take(step, avatar)
 
-    def take(self, step: int, avatar: Avatar) -> None:
-        """Take a checkpoint now; the clock stands still meanwhile."""
-        seconds = self.elapsed
+    def take(self, step: int, avatar: Avatar, seconds: float | None = None) -> None:
+        """Take a checkpoint now; the clock stands still meanwhile.
+
+        Args:
+            step: of the avatar.
+            avatar: what is rendered.
+            seconds: what the clock said when the avatar was made; what it says now if None.
+        """
+        seconds = self.elapsed if seconds is None else seconds
         entered = time.perf_counter()
         self._due = [moment for moment in self._due if moment > seconds]
         self._due_steps = [due for due in self._due_steps if due > step]

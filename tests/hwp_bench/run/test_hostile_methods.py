@@ -20,7 +20,7 @@ import pytest
 from hwp_bench.base.errors import MethodFailed
 from hwp_bench.evaluation.scoring import read_prediction
 from hwp_bench.methods.manifest import read_manifest
-from hwp_bench.run.runner import RunRecord, run_method
+from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement
 
 MODES = ("required", "none")
@@ -35,7 +35,7 @@ def attack(tmp_path: Path, namespaces: bool):
         if mode == "required" and not namespaces:
             pytest.skip("no user namespaces on this machine")
         method = _method(tmp_path / "method", script)
-        time_limit = limits.pop("time_limit", 60.0)
+        time_limit = limits.pop("time_limit", DEFAULT_TIME_LIMIT)
         confinement = Confinement(mode, **limits)
         record = run_method(
             read_manifest(method),
@@ -276,7 +276,7 @@ for _ in range(2):
     if os.fork() == 0:
         break
 held = bytearray(os.urandom(1)) * 80_000_000
-time.sleep(60)
+time.sleep(600)
 """
     problem = r"hostile took more than 0\.2 GB of memory on tiny. Raise --memory-limit"
     with pytest.raises(MethodFailed, match=problem):
@@ -288,8 +288,8 @@ def test_a_storm_of_processes_is_ended(attack, monkeypatch: pytest.MonkeyPatch) 
     script = """
 for _ in range(60):
     if os.fork() == 0:
-        time.sleep(60)
-time.sleep(60)
+        time.sleep(600)
+time.sleep(600)
 """
     with pytest.raises(MethodFailed, match="processes at once on tiny"):
         attack(script)
