@@ -7,6 +7,7 @@ highest, and this test reads them.
 from __future__ import annotations
 
 import ast
+import functools
 import re
 from collections.abc import Iterator
 from pathlib import Path
@@ -55,7 +56,12 @@ def room(name: str) -> str:
 
 
 MODULES = modules()
-IMPORTS = {name: sorted(set(imports(name, path, MODULES))) for name, path in MODULES.items()}
+
+
+@functools.cache
+def every_import() -> dict[str, list[str]]:
+    """What each module imports; read by the first test that asks, and not by every worker."""
+    return {name: sorted(set(imports(name, path, MODULES))) for name, path in MODULES.items()}
 
 
 @pytest.mark.parametrize("package", PACKAGES)
@@ -69,7 +75,7 @@ def test_rooms_import_only_what_lies_below(package: str) -> None:
     rank = {name: place for place, name in enumerate(layers(package))}
     wrong = [
         f"{name} imports {target}"
-        for name, targets in IMPORTS.items()
+        for name, targets in every_import().items()
         for target in targets
         if name.split(".")[0] == target.split(".")[0] == package
         and room(name)
@@ -82,7 +88,7 @@ def test_rooms_import_only_what_lies_below(package: str) -> None:
 def test_the_benchmark_never_imports_the_methods() -> None:
     wrong = [
         f"{name} imports {target}"
-        for name, targets in IMPORTS.items()
+        for name, targets in every_import().items()
         for target in targets
         if name.startswith("hwp_bench") and target.startswith("wildghand")
     ]
@@ -93,7 +99,7 @@ def test_the_rasterizer_imports_nothing_of_the_method() -> None:
     allowed = ("wildghand.splat", "hwp_bench.base", "hwp_bench.stability")
     wrong = [
         f"{name} imports {target}"
-        for name, targets in IMPORTS.items()
+        for name, targets in every_import().items()
         for target in targets
         if name.startswith("wildghand.splat") and not target.startswith(allowed)
     ]
@@ -132,7 +138,7 @@ def test_the_search_for_circles_finds_one() -> None:
 def test_no_modules_import_one_another_in_a_circle() -> None:
     # What is imported for types, or when a function runs, counts too. A package's `__init__`
     # that gives out the names of its modules stands above them.
-    graph = {name: {to for to in targets if to != name} for name, targets in IMPORTS.items()}
+    graph = {name: {to for to in targets if to != name} for name, targets in every_import().items()}
     assert circles(graph) == []
 
 
@@ -146,7 +152,7 @@ def test_parts_of_a_package_do_not_import_one_another_in_a_circle(parent: str) -
         )
 
     graph: dict[str, set[str]] = {}
-    for name, targets in IMPORTS.items():
+    for name, targets in every_import().items():
         if part(name):
             others = {part(target) for target in targets} - {"", part(name)}
             graph.setdefault(part(name), set()).update(others)
