@@ -100,6 +100,9 @@ class MethodManifest:
     presets: Mapping[str, Mapping[str, Any]]
     #: Components and alternatives for ablations, by name, in the order of the file.
     switches: Mapping[str, Switch] = field(default_factory=dict)
+    #: Names of the components that an ablation crosses when nothing is asked for; empty where
+    #: the file does not say.
+    crossed: tuple[str, ...] = ()
     #: Who made it; empty where the file does not say.
     authors: str = ""
     #: Terms of use; empty where the file does not say.
@@ -244,6 +247,7 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         entry=tuple(entry) if isinstance(entry, list) else entry,
         presets=table.presets,
         switches=_switches(table.switches, where),
+        crossed=tuple(table.crossed),
         authors=table.authors,
         licence=table.licence,
         url=table.url,
@@ -253,7 +257,21 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         manifest.check_setting_names(preset, f"presets.{name}")
     for name, switch in manifest.switches.items():
         manifest.check_setting_names(switch.settings, f"switches.{name}")
+    _check_crossed(manifest, where)
     return manifest
+
+
+def _check_crossed(manifest: MethodManifest, where: Path) -> None:
+    """Refuse names in `crossed` that are no components, or are there twice."""
+    components = [item.name for item in manifest.switches.values() if not item.alternative]
+    for name in manifest.crossed:
+        if name not in components or manifest.crossed.count(name) > 1:
+            raise BadMethod(
+                f"{name!r} is there twice" if name in components else f"{name!r} is no component",
+                where=where,
+                field="crossed",
+                remedy=f"Name each of these at most once: {', '.join(components) or 'none'}.",
+            )
 
 
 def _switches(tables: Mapping[str, _SwitchTable], where: Path) -> dict[str, Switch]:
@@ -328,3 +346,4 @@ class _Manifest:
     settings: list[_SettingName] = field(default_factory=list)
     presets: dict[str, dict[str, Any]] = field(default_factory=dict)
     switches: dict[_SwitchName, _SwitchTable] = field(default_factory=dict)
+    crossed: Annotated[list[_SwitchName], Meta(max_length=4)] = field(default_factory=list)

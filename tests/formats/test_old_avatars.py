@@ -53,9 +53,9 @@ def test_its_settings_have_todays_names() -> None:
     assert not settings.dpd.enabled
     assert not settings.dpd.gains
     assert settings.dpd.omega_scale == 0.1
-    assert (settings.pao.enabled, settings.pao.variant, settings.pao.beta) == (True, "judged", 500)
+    assert (settings.pao.enabled, settings.pao.variant, settings.pao.beta) == (True, "scaled", 500)
     assert settings.heads.refinement
-    assert settings.heads.frame_poses
+    assert settings.prepass.frame_poses
     assert (settings.prepass.enabled, settings.prepass.weight_floor) == (True, 0.05)
     assert settings.schedule.steps == 2000
     assert settings.schedule.rates.pose == 0.0002

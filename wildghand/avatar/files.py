@@ -23,7 +23,7 @@ from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.model.assemble import make_model
-from wildghand.model.settings import read_settings, read_version_1
+from wildghand.model.settings import read_stored, read_version_1
 
 #: Version of the folder.
 SCHEMA = "wildghand-avatar/2"
@@ -126,7 +126,7 @@ def load_avatar(
         if value.schema == VERSION_1:
             settings = read_version_1(value.settings)
         elif value.schema == SCHEMA:
-            settings = read_settings(value.settings)
+            settings = read_stored(value.settings)
         else:
             raise BadInput(f"is {value.schema!r} where {SCHEMA!r} is read", field="schema")
         _check_description(value)

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.methods.settings import number
+from wildghand.dpd.field import BiasField
 from wildghand.gaussians.attributes import SIZES, RawAttributes
 
 #: K of the paper: the encoding has the octaves 0 to K.
@@ -25,6 +26,14 @@ class DpdSettings:
 
     #: Component: explain perturbations as biases of the attributes.
     enabled: bool = True
+    #: Addition: rank of the field of biases over place and normal (`wildghand.dpd.field`); 0: all
+    #: Gaussians of a frame share their shift, as in the paper.
+    rank: int = number(6, 0, 64)
+    #: Add the biases. Off: the temporal weights remain, which PAO reads.
+    biases: bool = True
+    #: Addition: residual, in those of clean frames, at which the canonical hand learns a third of a
+    #: frame that its biases explain (`wildghand.dpd.pay_back`); 0: explaining pays nothing back.
+    pay_back: float = number(0.0, 0.0, 1000.0)
     #: Addition: a gain of each frame's colours, held near that of clean frames.
     gains: bool = True
     #: Weight of the square of the log gains, for a frame that is surely clean.
@@ -32,9 +41,9 @@ class DpdSettings:
     #: Chance that a frame's biases are left out of a step. With the pre-pass, that of clean frames
     #: holds instead (`prepass.omega_dropout`).
     omega_dropout: float = number(0.3, 0.0, 1.0)
-    #: Addition: temporal weight that a frame which the pre-pass finds perturbed starts at and is
+    #: Addition: temporal weight that a frame of the least weight in the pre-pass starts at and is
     #: held near. 0: all start at 0, and only those of clean frames are held there.
-    omega_scale: float = number(0.05, 0.0, 0.9)
+    omega_scale: float = number(0.5, 0.0, 0.9)
     #: Weight of the squared distance of the temporal weights from what the pre-pass says.
     omega_weight: float = number(1.0)
 
@@ -50,7 +59,9 @@ class Temporal:
 
 
 class DynamicPerturbation(nn.Module):
-    """Delta g_l = omega_l * varphi([z_l, g_l]) for every frame of a clip.
+    """Delta g_l = omega_l * (varphi([z_l, g_l]) + F_l) for every frame of a clip.
+
+    F, the field, is an addition to the paper.
 
     `psi` starts at zero, hence omega, hence every bias. `varphi` does not, so that psi gets a
     gradient at the first step and the others from the second: learning starts.
@@ -58,9 +69,13 @@ class DynamicPerturbation(nn.Module):
     Args:
         frame_count: L, the frames that have a temporal embedding, at least 1.
         width: of the embedding; 256 makes the paper's 75,323 parameters.
+        rank: of the field that is added to varphi; 0: no field, as in the paper.
+
+    Attributes:
+        field: the field; None without.
 
     Raises:
-        UsageError: `frame_count` or `width` is below 1.
+        UsageError: `frame_count` or `width` is below 1, or `rank` below 0.
 
     Source: WildGHand, section "Dynamic Perturbation Disentanglement"; `docs/dpd_pao.md` lists
     what the paper leaves open. Initial weights are torch's, from its global generator.
@@ -68,7 +83,7 @@ class DynamicPerturbation(nn.Module):
 
     encoding: Tensor
 
-    def __init__(self, frame_count: int, width: int = 256) -> None:
+    def __init__(self, frame_count: int, width: int = 256, rank: int = 0) -> None:
         super().__init__()
         if frame_count < 1:
             raise UsageError(f"is {frame_count}", field="frame_count", remedy="Use 1 or more.")
@@ -79,6 +94,7 @@ class DynamicPerturbation(nn.Module):
         nn.init.zeros_(self.psi.weight)
         nn.init.zeros_(self.psi.bias)
         self.varphi = nn.ModuleDict({name: nn.Linear(width + k, k) for name, k in SIZES.items()})
+        self.field = BiasField(rank, width) if rank else None
         # It follows from the number of frames, so checkpoints do not hold it.
         table = encode_frames(torch.arange(frame_count), frame_count)
         self.register_buffer("encoding", table, persistent=False)
@@ -108,7 +124,9 @@ class DynamicPerturbation(nn.Module):
         z = self.phi(self.encoding[frames])
         return Temporal(z, 2.0 * torch.sigmoid(self.psi(z).squeeze(-1)) - 1.0)
 
-    def biases(self, raw: RawAttributes, z: Tensor, omega: Tensor) -> RawAttributes:
+    def biases(
+        self, raw: RawAttributes, z: Tensor, omega: Tensor, field: Tensor | None = None
+    ) -> RawAttributes:
         """Delta g, to be added to the attributes before their activation.
 
         The linear layer on [z, g] is split into one on z, once for each frame, and one on g:
@@ -118,6 +136,7 @@ class DynamicPerturbation(nn.Module):
             raw: g: (B, N, k) each, or (N, k) where all frames share it.
             z: (B, width).
             omega: (B,).
+            field: (B, N, 14) of `field`, added to varphi; None: nothing.
 
         Returns:
             (B, N, k) each.
@@ -133,11 +152,13 @@ class DynamicPerturbation(nn.Module):
                 field="raw, z, omega",
             )
         made = {}
+        local = {} if field is None else dict(RawAttributes.split(field).items())
         for name, g in raw.items():
             layer = cast(nn.Linear, self.varphi[name])
             of_z, of_g = layer.weight.split([z.shape[-1], g.shape[-1]], dim=1)
             shift = nn.functional.linear(z, of_z, layer.bias)
-            made[name] = omega[:, None, None] * (g @ of_g.mT + shift[:, None])
+            value = g @ of_g.mT + shift[:, None]
+            made[name] = omega[:, None, None] * (value + local.get(name, 0.0))
         return RawAttributes(**made)
 
     def layer(self, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -167,13 +188,15 @@ class Perturbation:
     temporal: Temporal
     #: (B,) bool: frames that have biases in this step; None: all.
     kept: Tensor | None = None
+    #: (B, N, 14) field of the module's at the Gaussians; None: no field.
+    field: Tensor | None = None
 
     def biases(self, raw: RawAttributes) -> RawAttributes:
         """(B, N, k) Delta g; 0 in frames that have none."""
         omega = self.temporal.omega
         if self.kept is not None:
             omega = torch.where(self.kept.to(omega.device), omega, omega.new_zeros(()))
-        return self.module.biases(raw, self.temporal.z, omega)
+        return self.module.biases(raw, self.temporal.z, omega, self.field)
 
 
 def encode_frames(frames: Tensor, frame_count: int) -> Tensor:

@@ -13,7 +13,9 @@ from torch import Tensor, nn
 from wildghand.dpd.dpd import DynamicPerturbation
 
 #: Steps of Adam, and the size of the first, that bring temporal weights to their start.
-_STEPS, _RATE = 50, 3e-3
+_STEPS, _RATE = 100, 5e-3
+#: A frame that the pre-pass gives less counts as having this.
+_LEAST_WEIGHT = 1e-3
 #: Frames that one step of the fit looks at, at most.
 _LOOKED_AT = 64
 
@@ -32,17 +34,26 @@ class TemporalTarget:
     hold: Tensor
 
     @classmethod
-    def judged(cls, clean: Tensor, scale: float) -> TemporalTarget:
+    def judged(
+        cls, clean: Tensor, frame_weights: Tensor, scale: float, floor: float
+    ) -> TemporalTarget:
         """The targets by the pre-pass.
+
+        1 / (1 + beta omega) is the weight of a frame in PAO. With beta = (1 / floor - 1) / scale it
+        is here what the pre-pass found.
 
         Args:
             clean: (R,) probability that nothing perturbs a frame.
-            scale: omega of a frame that is surely perturbed. 0: omega of clean frames should be
-                0, and the others are free.
+            frame_weights: (R,) the pre-pass's, from the floor to 1.
+            scale: omega of a frame with the least weight. 0: omega of clean frames should be 0,
+                and the others are free.
+            floor: the least weight, above 0.
         """
-        if scale > 0.0:
-            return cls(scale * (1.0 - clean), torch.ones_like(clean))
-        return cls(torch.zeros_like(clean), clean)
+        if scale <= 0.0:
+            return cls(torch.zeros_like(clean), clean)
+        span = max(1.0 / max(floor, _LEAST_WEIGHT) - 1.0, 1e-6)
+        target = scale * (1.0 / frame_weights.clamp(min=_LEAST_WEIGHT) - 1.0) / span
+        return cls(target, torch.ones_like(clean))
 
     def begin(self, modules: Sequence[DynamicPerturbation]) -> None:
         """Bring temporal weights to their targets, and biases to zero.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
+import functools
 import math
 from collections.abc import Mapping
 from typing import Any
@@ -70,7 +71,7 @@ class Fit:
         self.clip = TrainingClip(training, self.frames.indices, self.model.rigs, device)
         assessment = assess_frames(training, self.frames, settings)
         self.weighting = Weighting(self.frames, len(training.sides), assessment, settings, device)
-        temporal = begin_temporal_weights(self.model, self.weighting.clean, settings)
+        temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
         self.generator = torch.Generator().manual_seed(seed)
@@ -101,7 +102,7 @@ class Fit:
             PeerLost: another process has ended.
         """
         set_rates(self.optimizer, self.settings, fraction)
-        loss = self._loss(rows, fraction)
+        loss = self._loss(rows)
         mean = self.world.average_(loss.detach() + self.shared.value)
         known: Loss = float(mean) if self.device.type == "cpu" else mean
         if isinstance(known, float) and not math.isfinite(known):
@@ -116,14 +117,14 @@ class Fit:
         self.optimizer.take_step(waiting)
         return known
 
-    def _loss(self, rows: torch.Tensor, fraction: float) -> torch.Tensor:
+    def _loss(self, rows: torch.Tensor) -> torch.Tensor:
         """The loss of this process's part of a batch, without the terms that no frame enters."""
         weighting, part = self.weighting, self.world.shard(len(rows))
         mine = rows[part]
         kept = {side: keep[part] for side, keep in self._keep(rows).items()}
         features = self.shared.features()
         drawing = self.draw(mine, kept, move=weighting.moves(rows), features=features)
-        target = weighting(rows, drawing, fraction, self.world)
+        target = weighting(rows, drawing, self.world)
         return self.objective(self.model, drawing, target, mine, weighting.clean[mine])
 
     def require_same(self, step: int) -> None:
@@ -145,10 +146,12 @@ class Fit:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that steps change, for `load_state_dict`."""
+        pay_back = self.weighting.pay_back
         return {
             "model": self.model.state_dict(),
             "thresholds": self.weighting.pao.state_dict(),
             "median": self.weighting.saved_median,
+            "residuals": None if pay_back is None else pay_back.residuals,
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             "shared": self.shared.state_dict(),
@@ -159,6 +162,8 @@ class Fit:
         self.model.load_state_dict(state["model"])
         self.weighting.pao.load_state_dict(state["thresholds"])
         self.weighting.median = None if state["median"] is None else float(state["median"])
+        if self.weighting.pay_back is not None and state.get("residuals") is not None:
+            self.weighting.pay_back.residuals.copy_(state["residuals"])
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
         # States of before have none: their steps shared nothing.
@@ -167,6 +172,8 @@ class Fit:
     def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """(B,) bool by side: which frames of a batch keep their biases in this step."""
         chances = self.weighting.drop_probability[rows]
+        if not self.settings.dpd.biases:
+            chances = torch.ones_like(chances)
         return {
             side: upload(draw_kept(chances, self.generator), self.device)
             for side in self.model.perturbation
@@ -195,7 +202,7 @@ class Fit:
                 self.training.width,
                 self.training.height,
                 kept=kept,
-                shares=self.weighting.shares(rows),
+                teach=functools.partial(self.weighting.shares, rows),
                 move=self.weighting.moves(rows) if move is None else move,
                 refine=self.settings.heads.refinement,
                 features=features,
@@ -233,11 +240,11 @@ class Fit:
         The paper's equations have no bound: with them 255 is the largest weight of the frame.
         """
         masks = {}
-        unbounded = self.settings.pao.variant == "paper"
+        unbounded = self.settings.pao.variant == "printed"
         if self.settings.pao.enabled:
             for row, frame in enumerate(self.frames.indices.tolist()):
                 rows = torch.tensor([row])
-                weights = self.weighting(rows, self.draw(rows), 1.0).weights[0]
+                weights = self.weighting(rows, self.draw(rows)).weights[0]
                 largest = weights.max().clamp(min=1e-12 if unbounded else 1.0)
                 masks[frame] = (255.0 * weights / largest).byte().cpu().numpy()
         return masks
@@ -275,19 +282,24 @@ def start_from_prior(
 
 
 def begin_temporal_weights(
-    model: WildGHandModel, clean: torch.Tensor, settings: WildGHandSettings
+    model: WildGHandModel, weighting: Weighting, settings: WildGHandSettings
 ) -> TemporalTarget | None:
     """Bring temporal weights to what the pre-pass found; None without it or without DPD.
 
     Args:
         model: it is changed.
-        clean: (R,) probability that a frame is clean.
+        weighting: knows what it found.
         settings: of the fit.
     """
     if not (settings.dpd.enabled and settings.prepass.enabled):
         return None
     device = model.log_gains.device
-    temporal = TemporalTarget.judged(clean.to(device), settings.dpd.omega_scale)
+    temporal = TemporalTarget.judged(
+        weighting.clean.to(device),
+        weighting.frame_weights.to(device),
+        settings.dpd.omega_scale,
+        settings.prepass.weight_floor,
+    )
     temporal.begin(model.biases)
     return temporal
 

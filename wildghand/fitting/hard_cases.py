@@ -23,14 +23,22 @@ from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.model import terms
 from wildghand.pao.pao import PaoSettings, PerturbationAwareWeights, Weights
 from wildghand.pao.regions.frame_regions import FrameRegions, overlapping, partition, stack_regions
-from wildghand.pao.robust import blended_residual, residual_weights, running_median
 
 #: Largest relative L2 distance of a float32 gradient from that of float64.
 GRADIENT_TOLERANCE = 1e-4
 
 _SIZE = 16
 _GAUSSIANS = 24
-_PRINTED = PaoSettings(normalise_errors=False, share_of="hand")
+_PRINTED = PaoSettings(
+    variant="printed",
+    temporal="regions",
+    errors="absolute",
+    alpha=100.0,
+    beta=1000.0,
+    error_threshold=1.0,
+    share_threshold=0.3,
+    share_of="hand",
+)
 _Entry = tuple[str, str, Callable[[Context], Measured]]
 
 
@@ -184,8 +192,9 @@ def _run_one_frame(context: Context) -> Measured:
 
 
 def _run_begun(clean: list[float], context: Context) -> Measured:
-    module, scale = _module(len(clean)), 0.05
-    target = TemporalTarget.judged(torch.tensor(clean), scale)
+    module, scale, floor = _module(len(clean)), 0.5, 0.02
+    weights = floor + (1.0 - floor) * torch.tensor(clean)
+    target = TemporalTarget.judged(torch.tensor(clean), weights, scale, floor)
     target.begin([module])
     biases = _biases(module, len(clean))
     (biases.square().sum() + target.temporal_loss([module], 0)).backward()
@@ -222,7 +231,7 @@ def _run_regions(regions: FrameRegions, hand: Tensor, context: Context) -> Measu
 
 
 def _run_constant(context: Context) -> Measured:
-    module = PerturbationAwareWeights()
+    module = PerturbationAwareWeights(replace(_PRINTED, errors="batch"))
     # 0.4 has rounding in its sums, which must not be stretched either.
     error = torch.full((1, _SIZE, _SIZE), 0.4)
     made = module(error, stack_regions([_halves()]), _hand(), torch.zeros(1))
@@ -246,23 +255,26 @@ def _run_no_weight(context: Context) -> Measured:
 
 
 def _run_frame(frame: Tensor, hand: Tensor, context: Context) -> Measured:
-    image = _noise(1, _SIZE, _SIZE, 3, seed=4).requires_grad_(True)
+    leaf = _noise(1, _SIZE, _SIZE, 3, seed=4).requires_grad_(True)
     regions = stack_regions([_halves()])
-    error = (image.detach() - frame).abs().mean(dim=-1)
-    module = PerturbationAwareWeights()
-    weights = module(error, regions, hand, torch.zeros(1)).weights
-    residual = blended_residual(error, regions, hand)
-    robust = residual_weights(residual, running_median(None, residual, hand))
-    loss = terms.reconstruction(image, frame, weights * robust, 0.2)
-    loss = loss + terms.weight_reward(weights) + FilterBankLoss()(image, frame, weights)
+    error = (leaf.detach() - frame).abs().mean(dim=-1)
+    modules = [PerturbationAwareWeights(), PerturbationAwareWeights(_PRINTED)]
+    made = [module(error, regions, hand, torch.zeros(1)) for module in modules]
+    weights = torch.cat([found.weights for found in made])
+    image, frame = leaf.expand(2, -1, -1, -1), frame.expand(2, -1, -1, -1)
+    loss = terms.reconstruction(image, frame, weights, 0.2)
+    loss = (
+        loss - made[0].sizes.mean() - made[1].sizes.mean() + FilterBankLoss()(image, frame, weights)
+    )
     loss.backward()
     bad = ~frame.isfinite().all(dim=-1)
+    learnt = [value.grad for module in modules for value in module.parameters()]
     passed = (
-        _finite(loss, weights, robust, image.grad, *(p.grad for p in module.parameters()))
+        _finite(loss, weights, leaf.grad, *(grad for grad in learnt if grad is not None))
         and bool((weights >= 0.0).all())
         and not bool(weights[bad].any())
     )
-    return Measured(passed, f"loss {loss.item():.3g}, gradient {_gradient(image):.0e}")
+    return Measured(passed, f"loss {loss.item():.3g}, gradient {_gradient(leaf):.0e}")
 
 
 def _run_gradient(

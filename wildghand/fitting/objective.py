@@ -76,8 +76,8 @@ class Objective:
             total = total + weights.perceptual * found
         if weights.silhouette:
             total = total + weights.silhouette * terms.silhouette(drawing.coverage, target.hand)
-        if weights.weight_reward and target.weights.requires_grad:
-            total = total + weights.weight_reward * terms.weight_reward(target.weights)
+        if weights.weight_reward and target.sizes is not None:
+            total = total + weights.weight_reward * terms.weight_reward(target.sizes)
         for side, hand in drawing.hands.items():
             if weights.bias and hand.bias_size is not None:
                 total = total + weights.bias * hand.bias_size
@@ -104,7 +104,7 @@ class Objective:
             features: of the network, by side.
         """
         weights, found = self.weights, []
-        if weights.laplacian_offsets and self.settings.heads.enabled:
+        if weights.laplacian_offsets and self.settings.heads.template:
             for side, hand in features.items():
                 rough = self._laplacians[side].offsets(hand.template_offsets)
                 found.append(weights.laplacian_offsets * rough)

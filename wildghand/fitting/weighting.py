@@ -9,15 +9,16 @@ import torch
 from torch import Tensor
 
 from hwp_bench.methods.contract import TrainingCapture
+from wildghand.dpd.pay_back import PayBack
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
-from wildghand.gaussians.frame_table import FrameTable, soft_weights, upload
+from wildghand.gaussians.frame_table import FrameTable, shares_of_255, soft_weights
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.model import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.pao.pao import PerturbationAwareWeights, binary_weights
-from wildghand.pao.regions import ClipRegions, Regions
+from wildghand.pao.regions import ClipRegions
 from wildghand.pao.regions.superpixels import RegionCache, Superpixels
-from wildghand.pao.robust import blended_residual, residual_weights, running_median
+from wildghand.pao.running_median import running_median
 from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
 
 
@@ -31,6 +32,8 @@ class FrameTarget:
     hand: Tensor
     #: (B, H, W) weight of each pixel within its frame.
     weights: Tensor
+    #: (B,) means of PAO's weights, which the loss rewards; None without regions.
+    sizes: Tensor | None = None
 
 
 def assess_frames(
@@ -55,10 +58,9 @@ def assess_frames(
 class Weighting:
     """Weights of frames and pixels, by the settings' components.
 
-    Without PAO a pixel counts as the estimated mask says. The variants of PAO: with `judged` the
-    canonical hand learns less from frames that the pre-pass finds perturbed (`shares`), and pixels
-    that it finds covered count less, or, later in a `robust` fit, pixels with large residuals;
-    with `paper` the paper's equations weigh regions; with `binary` the mask is cut at a half.
+    PAO weighs regions by the paper's equations, and frames by the temporal weights of DPD; its
+    variant `binary` cuts the mask at a half. The pre-pass lowers pixels that it finds covered, with
+    PAO and without. Without both a pixel counts as the estimated mask says.
 
     Args:
         frames: the R frames that are fitted.
@@ -69,11 +71,13 @@ class Weighting:
 
     Attributes:
         clean: (R,) probability that a frame is clean; ones without the pre-pass.
+        frame_weights: (R,) by the pre-pass, from its floor to 1; ones without it. DPD's temporal
+            weights start from them.
         drop_probability: (R,) chance that a frame's biases are left out.
-        frame_weights: (R,) how much the canonical hand learns from each frame; ones without the
-            pre-pass or without PAO.
         pao: the paper's weights, whose thresholds are learnt.
-        median: running median of the residuals in a robust fit; None before the first.
+        median: running median of the regions' errors; None before the first, and where PAO does
+            not count in it.
+        pay_back: what the frames' biases explain; None where that is not asked for.
     """
 
     def __init__(
@@ -88,16 +92,18 @@ class Weighting:
         self.frames, self.settings, self.device = frames, settings, device
         self.clean = torch.ones(count)
         self.drop_probability = torch.full((count,), settings.dpd.omega_dropout)
-        self.frame_weights = torch.ones(count, device=device)
+        self.frame_weights = torch.ones(count)
         self.pao = PerturbationAwareWeights(pao, hands).to(device)
         self.median: float | Tensor | None = None
         self._refine_pose = torch.zeros(count, dtype=torch.bool)
-        self._weighs_frames = False
+        self._weighs_regions = pao.enabled and pao.variant != "binary"
         self._pixel_weights: Tensor | None = None
         self._regions: ClipRegions | None = None
         if assessment is not None:
             self._follow(assessment)
-        if pao.robust or (pao.enabled and pao.variant == "paper"):
+        tolerance = settings.dpd.pay_back
+        self.pay_back = PayBack(self.clean.to(device), tolerance) if tolerance else None
+        if self._weighs_regions:
             regions = RegionCache().clip(frames.images.numpy(), Superpixels())
             self._regions = ClipRegions(regions, device)
         self._images, self._hands = frames.images_on(device), frames.masks_on(device)
@@ -111,16 +117,29 @@ class Weighting:
 
     def moves(self, rows: Tensor) -> bool:
         """Whether the pose of any frame of a batch is refined."""
-        return self.settings.heads.frame_poses and bool(self._refine_pose[rows].any())
+        return self.settings.prepass.frame_poses and bool(self._refine_pose[rows].any())
 
-    def shares(self, rows: Tensor) -> Tensor | None:
-        """How much the canonical hand learns from each frame of a batch, (B,); None: all."""
-        if not self._weighs_frames:
+    def shares(self, rows: Tensor, omega: Tensor) -> Tensor | None:
+        """How much the canonical hand learns from each frame of a batch.
+
+        Args:
+            rows: (B,) int64, which of the R frames; on the CPU.
+            omega: (B,) their temporal weights, without gradient.
+
+        Returns:
+            (B,) in (0, 1]; None: everything.
+        """
+        if not (self._weighs_regions and self.settings.pao.temporal == "teaching"):
             return None
-        return self.frame_weights[upload(rows, self.device)]
+        if not self.settings.dpd.enabled:
+            return None
+        shares = self.pao.temporal_factor(omega)
+        if self.pay_back is not None:
+            shares = torch.maximum(shares, self.pay_back.shares(rows))
+        return shares
 
     def __call__(
-        self, rows: Tensor, drawing: RenderedFrames, fraction: float, world: World = SINGLE_PROCESS
+        self, rows: Tensor, drawing: RenderedFrames, world: World = SINGLE_PROCESS
     ) -> FrameTarget:
         """Return what a batch, or this process's part of it, is compared with.
 
@@ -129,66 +148,62 @@ class Weighting:
         Args:
             rows: (B,) int64, which of the R frames are in the batch.
             drawing: of this process's part of them.
-            fraction: share of the budget that is used up.
             world: the processes.
         """
         mine = rows[world.shard(len(rows))]
         hand, image = self._hands(mine), self._images(mine)
-        pao = self.settings.pao
-        if pao.enabled and pao.variant == "paper":
-            weights = self._paper_weights(rows, image, drawing, world)
-        elif pao.robust and fraction >= pao.robust_start:
-            weights = self._soft(hand) * self._robust_weights(rows, image, drawing, world)
-        else:
-            weights = self._fixed(mine)
-        return FrameTarget(image, hand, weights)
+        error = None
+        if self._weighs_regions or self.pay_back is not None:
+            error = world.gather((drawing.image.detach() - image).abs().mean(dim=-1))
+        if error is not None and self.pay_back is not None:
+            self.pay_back.watch(rows, error, self._fixed(rows) * self._hands(rows))
+        if error is None or not self._weighs_regions:
+            return FrameTarget(image, hand, self._fixed(mine))
+        weights, sizes = self._region_weights(rows, error, drawing, world)
+        return FrameTarget(image, hand, weights, sizes)
 
-    def _soft(self, hand: Tensor) -> Tensor:
-        return soft_weights(hand, self.settings.terms.outside_weight)
+    def _region_weights(
+        self, rows: Tensor, error: Tensor, drawing: RenderedFrames, world: World
+    ) -> tuple[Tensor, Tensor]:
+        """The paper's equations on all frames of the batch.
+
+        Returns:
+            This process's part of the weights, and (B,) their means.
+        """
+        assert self._regions is not None
+        regions, hands = self._regions(rows), self._hands(rows)
+        part = world.shard(len(rows))
+        omega = world.gather(drawing.omega)
+        if world.size > 1:  # what is gathered has no gradient
+            omega = torch.cat([omega[: part.start], drawing.omega, omega[part.stop :]])
+        found = self.pao(error, regions, hands, omega, self.median)
+        if self.settings.pao.errors == "median":
+            self.median = running_median(self.median, found.mean_errors, found.shares > 0.0)
+        weights = found.weights[part]
+        if self.settings.pao.variant == "scaled":
+            weights = weights + self.settings.terms.outside_weight * (1.0 - hands[part])
+        if self._pixel_weights is not None:
+            weights = weights * self._uncovered(rows[part])
+        return weights, found.sizes[part]
 
     def _fixed_weights(self, rows: Tensor) -> Tensor:
         """(B, H, W) weights that do not follow from the drawing."""
         hand, pao = self._hands(rows), self.settings.pao
         if pao.enabled and pao.variant == "binary":
-            return binary_weights(hand, pao.binary_outside)
-        if self._pixel_weights is None:
-            return self._soft(hand)
-        return self._soft(hand) * upload(self._pixel_weights[rows], self.device).float() / 255.0
+            weights = binary_weights(hand, pao.binary_outside)
+        else:
+            weights = soft_weights(hand, self.settings.terms.outside_weight)
+        return weights if self._pixel_weights is None else weights * self._uncovered(rows)
+
+    def _uncovered(self, rows: Tensor) -> Tensor:
+        """(B, H, W) in [0, 1] what the pre-pass leaves of the pixels."""
+        assert self._pixel_weights is not None
+        return shares_of_255(self._pixel_weights[rows], self.device)
 
     def _follow(self, assessment: FrameAssessment) -> None:
         """Take from the pre-pass what the components use."""
         self.clean = torch.from_numpy(assessment.clean).float()
         self.drop_probability = torch.from_numpy(assessment.omega_dropout).float()
         self._refine_pose = torch.from_numpy(assessment.refine_pose)
-        if self.settings.pao.enabled and self.settings.pao.variant == "judged":
-            self._weighs_frames = True
-            weights = torch.from_numpy(assessment.frame_weights).float()
-            self.frame_weights = weights.to(self.device)
-            self._pixel_weights = torch.from_numpy(assessment.pixel_weights)
-
-    def _paper_weights(
-        self, rows: Tensor, image: Tensor, drawing: RenderedFrames, world: World
-    ) -> Tensor:
-        """The paper's equations on all frames of the batch; this process's part of the weights."""
-        error, omega = _error(image, drawing), world.gather(drawing.omega)
-        found = self.pao(world.gather(error), self._batch_regions(rows), self._hands(rows), omega)
-        return found.weights[world.shard(len(rows))]
-
-    def _robust_weights(
-        self, rows: Tensor, image: Tensor, drawing: RenderedFrames, world: World
-    ) -> Tensor:
-        """Weights from the residuals of all frames of the batch; this process's part of them."""
-        hands = self._hands(rows)
-        error = world.gather(_error(image, drawing))
-        residual = blended_residual(error, self._batch_regions(rows), hands)
-        self.median = running_median(self.median, residual, hands)
-        return residual_weights(residual[world.shard(len(rows))], self.median)
-
-    def _batch_regions(self, rows: Tensor) -> Regions:
-        assert self._regions is not None
-        return self._regions(rows)
-
-
-def _error(image: Tensor, drawing: RenderedFrames) -> Tensor:
-    """(B, H, W) mean over channels of |drawing - image|, without gradient."""
-    return (drawing.image.detach() - image).abs().mean(dim=-1)
+        self.frame_weights = torch.from_numpy(assessment.frame_weights).float()
+        self._pixel_weights = torch.from_numpy(assessment.pixel_weights)

@@ -39,7 +39,15 @@ def make_model(
     network = PredictionNetwork(settings.network, surfaces, seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
-        model = WildGHandModel(rigs, network, frame_count, dpd=settings.dpd.enabled)
+        dpd = settings.dpd
+        model = WildGHandModel(
+            rigs,
+            network,
+            frame_count,
+            dpd=dpd.enabled,
+            rank=dpd.rank,
+            template=settings.heads.template,
+        )
     return model.to(device)
 
 

@@ -36,15 +36,18 @@ def dress_cpu(
     frames = len(raw)
     ones = torch.ones(frames)
     mixing, shift = raw.new_zeros(CHANNELS, CHANNELS), raw.new_zeros(frames, CHANNELS)
+    field = raw.new_zeros(frames, 0, CHANNELS)
     omega, biased = ones, torch.zeros(frames, dtype=torch.bool)
     if perturbation is not None:
         mixing, shift = perturbation.module.layer(perturbation.temporal.z)
         omega, kept = perturbation.temporal.omega, perturbation.kept
+        field = field if perturbation.field is None else perturbation.field
         biased = torch.ones(frames, dtype=torch.bool) if kept is None else kept
     *made, size = _Dress.apply(
         raw,
         mixing,
         shift,
+        field,
         omega,
         prediction.template_offsets,
         prediction.shadow,
@@ -66,6 +69,7 @@ class _Dress(torch.autograd.Function):
         raw: Tensor,
         mixing: Tensor,
         shift: Tensor,
+        field: Tensor,
         omega: Tensor,
         moved: Tensor,
         shadow: Tensor,
@@ -77,7 +81,7 @@ class _Dress(torch.autograd.Function):
     ) -> tuple[Tensor, ...]:
         """Return the five tensors of the Gaussians, and the mean size of the biases."""
         frames, count = raw.shape[:2]
-        given = [_array(t) for t in (raw, mixing, shift, omega, biased)]
+        given = [_array(t) for t in (raw, mixing, shift, field, omega, biased)]
         made = [torch.empty(frames, count, k) for k in (12, 3, 4, 3)]
         made += [torch.empty(frames, count), torch.empty(frames, count, 3)]
         sizes = np.zeros(piece_count(count, kernels.PIECE))
@@ -102,8 +106,8 @@ class _Dress(torch.autograd.Function):
         )
         active, means, quats, scales, opacities, colors = made
         ctx.save_for_backward(
-            raw, mixing, shift, omega, biased, shares, shadow, orientations, active, scales,
-            opacities,
+            raw, mixing, shift, field, omega, biased, shares, shadow, orientations, active,
+            scales, opacities,
         )  # fmt: skip
         ctx.max_offset = activation.max_offset
         size = torch.tensor(sizes.sum() / max(1, frames * count), dtype=torch.float32)
@@ -113,11 +117,11 @@ class _Dress(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         """Gradients of all that have one."""
-        raw, mixing, shift, omega, biased, shares, shadow, *rest = ctx.saved_tensors
+        raw, mixing, shift, field, omega, biased, shares, shadow, *rest = ctx.saved_tensors
         frames, count = raw.shape[:2]
         pieces = piece_count(count, kernels.PIECE)
         of_raw, of_moved = torch.empty_like(raw), torch.empty(count, 3)
-        of_shadow = torch.empty(frames, count)
+        of_shadow, of_field = torch.empty(frames, count), torch.empty_like(field)
         of_mixing = torch.zeros(pieces, CHANNELS, CHANNELS)
         of_shift, of_omega = torch.zeros(pieces, frames, CHANNELS), torch.zeros(pieces, frames)
         run_pieces(
@@ -125,17 +129,21 @@ class _Dress(torch.autograd.Function):
             count,
             kernels.PIECE,
             _WEIGHT * frames * count,
-            *(_array(t) for t in (raw, mixing, shift, omega, biased, shares)),
+            *(_array(t) for t in (raw, mixing, shift, field, omega, biased, shares)),
             np.float32(ctx.max_offset),
             _array(shadow.squeeze(-1)),
             *(_array(t) for t in (*rest, *gradients[:-1])),
             np.float32(float(gradients[-1]) / max(1, frames * count)),
-            *(t.numpy() for t in (of_raw, of_moved, of_shadow, of_mixing, of_shift, of_omega)),
+            *(
+                t.numpy()
+                for t in (of_raw, of_moved, of_shadow, of_mixing, of_shift, of_field, of_omega)
+            ),
         )
         return (
             of_raw,
             of_mixing.sum(dim=0),
             of_shift.sum(dim=0),
+            of_field,
             of_omega.sum(dim=0),
             of_moved,
             of_shadow[..., None],

@@ -33,8 +33,8 @@ def _sigmoid(x):
 
 @compiled(nogil=True)
 def dress(
-    worker, counters, ends, raw, mixing, shift, omega, biased, bound, log_scales, moved, shadow,
-    positions, orientations, active, means, quats, scales, opacities, colors, sizes,
+    worker, counters, ends, raw, mixing, shift, field, omega, biased, bound, log_scales, moved,
+    shadow, positions, orientations, active, means, quats, scales, opacities, colors, sizes,
 ):  # fmt: skip
     """Make the Gaussians of B frames.
 
@@ -42,7 +42,8 @@ def dress(
         worker, counters, ends: see `wildghand.splat.threads.run`; a job is `PIECE` Gaussians.
         raw: (B, N, 14) float32.
         mixing: (14, 14) float32, of which the blocks of the attributes are read; shift: (B, 14).
-            The bias of frame b is omega[b] (mixing g + shift[b]).
+            The bias of frame b is omega[b] (mixing g + shift[b] + field[b]).
+        field: (B, N, 14) float32; or (B, 0, 14), which stands for zeros.
         omega: (B,) float32; biased: (B,) bool, whether a frame has biases at all.
         bound: largest displacement, m.
         log_scales: (3,) float32: bias, least and greatest of the log scales.
@@ -55,7 +56,7 @@ def dress(
         means, quats, scales, opacities, colors: (B, N, k) float32, filled.
         sizes: (pieces,) float64, filled: sum of |bias| over a piece.
     """
-    frames, count = raw.shape[0], raw.shape[1]
+    frames, count, local = raw.shape[0], raw.shape[1], field.shape[1] > 0
     given, bias = np.empty(14, np.float32), np.empty(14, np.float32)
     job = next_job(worker, counters, ends)
     while job >= 0:
@@ -69,6 +70,8 @@ def dress(
                     for start, stop in _BLOCKS:
                         for i in range(start, stop):
                             value = shift[b, i]
+                            if local:
+                                value += field[b, n, i]
                             for k in range(start, stop):
                                 value += mixing[i, k] * given[k]
                             bias[i] = omega[b] * value
@@ -130,9 +133,9 @@ def dress(
 
 @compiled(nogil=True)
 def dress_backward(
-    worker, counters, ends, raw, mixing, shift, omega, biased, share, bound, shadow, orientations,
-    active, scales, opacities, of_means, of_quats, of_scales, of_opacities, of_colors, of_size,
-    of_raw, of_moved, of_shadow, of_mixing, of_shift, of_omega,
+    worker, counters, ends, raw, mixing, shift, field, omega, biased, share, bound, shadow,
+    orientations, active, scales, opacities, of_means, of_quats, of_scales, of_opacities, of_colors,
+    of_size, of_raw, of_moved, of_shadow, of_mixing, of_shift, of_field, of_omega,
 ):  # fmt: skip
     """Gradients of `dress`; `means` have that of the positions.
 
@@ -141,10 +144,11 @@ def dress_backward(
         of_means, ..., of_colors: gradients of what `dress` filled.
         of_size: gradient of the sum of |bias|.
         of_raw: (B, N, 14), of_moved: (N, 3), of_shadow: (B, N) float32, filled.
+        of_field: as `field`, float32, filled.
         of_mixing: (pieces, 14, 14), of_shift: (pieces, B, 14), of_omega: (pieces, B) float32
             zeros, to which each piece adds its part.
     """
-    frames, count = raw.shape[0], raw.shape[1]
+    frames, count, local = raw.shape[0], raw.shape[1], field.shape[1] > 0
     given, top, unmixed = (
         np.empty(14, np.float32),
         np.empty(14, np.float32),
@@ -210,6 +214,8 @@ def dress_backward(
                 if not biased[b]:
                     for i in range(14):
                         of_raw[b, n, i] = share[b] * top[i]
+                        if local:
+                            of_field[b, n, i] = _ZERO
                     continue
                 for i in range(14):
                     given[i] = raw[b, n, i]
@@ -217,6 +223,8 @@ def dress_backward(
                 for start, stop in _BLOCKS:
                     for i in range(start, stop):
                         value = shift[b, i]
+                        if local:
+                            value += field[b, n, i]
                         for k in range(start, stop):
                             value += mixing[i, k] * given[k]
                         grad = top[i]
@@ -228,6 +236,8 @@ def dress_backward(
                         of_omega[job, b] += grad * value
                         grad *= omega[b]
                         of_shift[job, b, i] += grad
+                        if local:
+                            of_field[b, n, i] = grad
                         for k in range(start, stop):
                             of_mixing[job, i, k] += grad * given[k]
                             unmixed[k] += grad * mixing[i, k]

@@ -23,10 +23,9 @@ NAMES: Mapping[str, str] = MappingProxyType(
         "omega_dropout": "dpd.omega_dropout",
         "omega_scale": "dpd.omega_scale",
         "omega_weight": "dpd.omega_weight",
-        "robust": "pao.robust",
-        "robust_start": "pao.robust_start",
         "refinement": "heads.refinement",
-        "frame_poses": "heads.frame_poses",
+        "frame_poses": "prepass.frame_poses",
+        "heads.frame_poses": "prepass.frame_poses",
         "dssim_weight": "terms.dssim_weight",
         "outside_weight": "terms.outside_weight",
         "steps": "schedule.steps",
@@ -43,6 +42,13 @@ NAMES: Mapping[str, str] = MappingProxyType(
 TABLES: Mapping[str, str] = MappingProxyType(
     {"weights": "pao", "judge": "prepass", "rates": "schedule.rates"}
 )
+
+#: Settings without a successor of the same meaning. `robust`, weights by the residuals of pixels,
+#: was never on by default and is not read any more.
+GONE = ("robust", "robust_start", "pao.robust", "pao.robust_start", "pao.normalise_errors")
+
+#: Former values of `pao.variant`. `weights`, in version 1, meant the mode's.
+_VARIANTS = {"judged": "scaled", "paper": "printed"}
 
 #: The default of `weights.background_threshold`, which stood for 10 where two hands were fitted.
 _SINGLE_HAND = 3.0
@@ -72,7 +78,13 @@ def current_names(values: Mapping[str, Any]) -> dict[str, Any]:
 def _today(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     """The settings that stand today for one setting; there may be two, or none."""
     table, _, field = name.partition(".")
-    if name in SWITCHES and isinstance(value, bool):
+    if field == "normalise_errors" and table in ("pao", "weights"):
+        yield "pao.errors", "batch" if value else "absolute"
+    elif name.rpartition(".")[2] in ("robust", "robust_start"):
+        return
+    elif name in ("pao.variant", "weights.variant") and value in _VARIANTS:
+        yield "pao.variant", _VARIANTS[value]
+    elif name in SWITCHES and isinstance(value, bool):
         yield f"{name}.enabled", value
     elif name in NAMES:
         yield NAMES[name], value

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
-from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
+from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal
+from wildghand.dpd.field import bone_features
 from wildghand.dpd.scale_gradients import scale_refinement
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
@@ -47,9 +48,20 @@ class RenderedFrames:
     @property
     def omega(self) -> Tensor:
         """(B,) the temporal weight of largest magnitude among the hands."""
-        weights = torch.stack([hand.omega for hand in self.hands.values()])
-        chosen = weights.abs().argmax(dim=0, keepdim=True)
-        return weights.gather(0, chosen)[0]
+        return largest([hand.omega for hand in self.hands.values()])
+
+
+def largest(omegas: Sequence[Tensor]) -> Tensor:
+    """The temporal weights of largest magnitude among the hands, (B,).
+
+    Args:
+        omegas: (B,) of each hand, at least one.
+    """
+    if len(omegas) == 1:
+        return omegas[0]
+    weights = torch.stack([*omegas])
+    chosen = weights.abs().argmax(dim=0, keepdim=True)
+    return weights.gather(0, chosen)[0]
 
 
 class WildGHandModel(nn.Module):
@@ -61,6 +73,8 @@ class WildGHandModel(nn.Module):
         frame_count: R, training frames that are fitted.
         dpd: model perturbations as biases of the attributes.
         embedding: width of the temporal embedding.
+        rank: of the field of biases; 0: none.
+        template: apply the network's displacement of the template (head iii).
 
     Attributes:
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
@@ -76,13 +90,20 @@ class WildGHandModel(nn.Module):
         *,
         dpd: bool = True,
         embedding: int = 256,
+        rank: int = 0,
+        template: bool = True,
     ) -> None:
         super().__init__()
+        self._template = template
         self.rigs = dict(rigs)
         self.network = network
         self.perturbation = nn.ModuleDict(
-            {side: DynamicPerturbation(frame_count, embedding) for side in rigs} if dpd else {}
+            {side: DynamicPerturbation(frame_count, embedding, rank) for side in rigs}
+            if dpd
+            else {}
         )
+        for side, rig in self.rigs.items() if dpd and rank else ():
+            self.register_buffer(f"bones_{side}", bone_features(rig), persistent=False)
         self.log_gains = nn.Parameter(torch.zeros(frame_count, 3))
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
@@ -114,7 +135,7 @@ class WildGHandModel(nn.Module):
         height: int,
         *,
         kept: Mapping[str, Tensor] | None = None,
-        shares: Tensor | None = None,
+        teach: Callable[[Tensor], Tensor | None] | None = None,
         move: bool = False,
         refine: bool = False,
         features: Mapping[str, HandFeatures] | None = None,
@@ -126,11 +147,14 @@ class WildGHandModel(nn.Module):
             rows: (B,) int64 positions among the training frames.
             width, height: px.
             kept: (B,) bool by side: False leaves a frame's biases out; None: never.
-            shares: (B,) how much the canonical hand learns from each frame, 0-1; None: all.
+            teach: from (B,) temporal weights, before dropout and without gradient, to how much the
+                canonical hand learns from each frame, (B,) in [0, 1], or None: all. None: all.
             move: add `pose_steps` and `transl_steps` to the given parameters.
             refine: apply the network's refinement of the parameters (head iv).
             features: of the network by side, where they are at hand already.
         """
+        temporal = {side: self.biases_of(side).temporal(rows) for side in self.perturbation}
+        shares = None if teach is None else teach(self._largest_omega(temporal, rows))
         states, parts = {}, []
         for index, (side, rig) in enumerate(self.rigs.items()):
             anchors = clip.hand(side, rows)
@@ -151,10 +175,10 @@ class WildGHandModel(nn.Module):
                 anchors = rig.follow(pose, betas, transl)
             perturbation, omega = None, pose.new_zeros(len(rows))
             if side in self.perturbation:
-                module = self.biases_of(side)
-                temporal = module.temporal(rows)
-                omega = temporal.omega
-                perturbation = Perturbation(module, temporal, None if kept is None else kept[side])
+                omega = temporal[side].omega
+                perturbation = self._perturbation(
+                    side, temporal[side], anchors, None if kept is None else kept[side]
+                )
             gaussians, bias_size = dress(
                 anchors, prediction, self.network.activation, perturbation, shares
             )
@@ -164,6 +188,24 @@ class WildGHandModel(nn.Module):
         # The image lies over black, so a gain on it is one on every Gaussian.
         image = image * self.log_gains[rows].exp()[:, None, None]
         return RenderedFrames(image, coverage, states)
+
+    def _largest_omega(self, temporal: Mapping[str, Temporal], rows: Tensor) -> Tensor:
+        """(B,) the temporal weight of largest magnitude among the hands, without gradient."""
+        if not temporal:
+            return self.log_gains.new_zeros(len(rows))
+        return largest([hand.omega.detach() for hand in temporal.values()])
+
+    def _perturbation(
+        self, side: str, temporal: Temporal, anchors: AnchorPoses, kept: Tensor | None
+    ) -> Perturbation:
+        """The perturbation of one hand in B frames, with its field where that can be seen."""
+        module, field = self.biases_of(side), None
+        # Off the CPU the question would wait for the device.
+        unseen = kept is not None and kept.device.type == "cpu" and not bool(kept.any())
+        if module.field is not None and not unseen:
+            normals = quat_third_axis(anchors.orientations)
+            field = module.field(temporal.z, self.get_buffer(f"bones_{side}"), normals)
+        return Perturbation(module, temporal, kept, field)
 
     def draw(
         self,
@@ -215,7 +257,10 @@ class WildGHandModel(nn.Module):
     def _predict(
         self, side: str, anchors: AnchorPoses, pose: Tensor, features: HandFeatures | None = None
     ) -> NetworkOutput:
-        return self.network(side, quat_third_axis(anchors.orientations), pose, features)
+        made = self.network(side, quat_third_axis(anchors.orientations), pose, features)
+        if self._template:
+            return made
+        return replace(made, template_offsets=torch.zeros_like(made.template_offsets))
 
 
 def _rasterize(

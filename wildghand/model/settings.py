@@ -33,10 +33,10 @@ class HeadSettings:
 
     #: Component: template offsets (head iii) and refinement of the hand parameters (head iv).
     enabled: bool = True
+    #: Head iii acts; without it the template stands.
+    template: bool = True
     #: Head iv acts; without it the given hand parameters stand.
     refinement: bool = True
-    #: Addition: refine the pose of frames whose mask disagrees with it (needs the pre-pass).
-    frame_poses: bool = True
 
 
 @dataclass(frozen=True)
@@ -109,7 +109,8 @@ class WildGHandSettings:
     pao: PaoSettings = field(default_factory=PaoSettings)
     #: Component: heads iii and iv.
     heads: HeadSettings = field(default_factory=HeadSettings)
-    #: Addition: the judge of the frames, for DPD and PAO. It leaves the biases out of every clean
+    #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
+    #: covered, and which poses need refining. It leaves the biases out of every clean
     #: frame, not out of three in ten: what little they took from these, the avatar lacked
     #: (docs/wildghand.md).
     prepass: PrepassSettings = field(
@@ -123,23 +124,52 @@ class WildGHandSettings:
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
 
 
+#: What the paper and the authors' code have in common, in place of the defaults.
+_PUBLISHED: Mapping[str, Any] = MappingProxyType(
+    {
+        "dpd": {"rank": 0, "gains": False},
+        "pao": {
+            "variant": "printed",
+            "errors": "batch",
+            "alpha": 100.0,
+            "beta": 1000.0,
+            "error_threshold": 1.0,
+            "share_threshold": 0.3,
+        },
+        "prepass": {"enabled": False},
+        "schedule": {
+            "batch": 4,
+            "texture_every": 1,
+            "decay": "halving",
+            "rates": {"dpd": 1e-4},
+        },
+        "terms": {
+            item.name: getattr(PAPER_TERMS, item.name)
+            for item in dataclasses.fields(TermWeights)
+            if item.name != "outside_weight"
+        },
+    }
+)
+
 #: The modes: settings by name, in place of the defaults. `default`: what measurements keep.
-#: `paper`: the formulas as printed, made well-posed, without the additions.
+#: `paper`: the formulas as printed, in the reading that works. `released`: what the authors' code
+#: does, where the temporal factor is a constant 1. docs/dpd_pao.md compares the three.
 MODES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "default": {},
-        "paper": {
-            "prior": "",
-            "dpd": {"gains": False},
-            "pao": {"variant": "paper"},
-            "heads": {"frame_poses": False},
-            "prepass": {"enabled": False},
-            "schedule": {"texture_every": 1},
-            "terms": {
-                item.name: getattr(PAPER_TERMS, item.name)
-                for item in dataclasses.fields(TermWeights)
-                if item.name not in ("dssim_weight", "outside_weight")
-            },
+        "paper": merged(_PUBLISHED, {"pao": {"temporal": "all"}}),
+        "released": merged(_PUBLISHED, {"pao": {"temporal": "none"}}),
+    }
+)
+
+
+#: What the mode `paper` of version 1 overruled.
+_PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
+    {
+        "dpd": {"gains": False},
+        "prepass": {"enabled": False},
+        "terms": {
+            name: value for name, value in _PUBLISHED["terms"].items() if name != "dssim_weight"
         },
     }
 )
@@ -149,7 +179,7 @@ def read_settings(values: Mapping[str, Any]) -> WildGHandSettings:
     """Make the settings of a mode with some of them changed.
 
     A setting that is given wins over the mode's. Parts of a component that is off are off in what
-    is returned, and so is a pre-pass that neither DPD nor PAO reads.
+    is returned.
 
     Args:
         values: `mode`, a name of `MODES` (without it `default`); and any of the fields of
@@ -172,6 +202,23 @@ def read_settings(values: Mapping[str, Any]) -> WildGHandSettings:
     return _without_idle_parts(settings_from(WildGHandSettings, chosen, WHERE))
 
 
+def read_stored(values: Mapping[str, Any]) -> WildGHandSettings:
+    """Read the settings that an avatar of today's version stores.
+
+    They are complete, but for settings that came later: what these name was as it is here.
+
+    Raises:
+        BadMethod: as for `read_settings`.
+    """
+    tree = current_names(values)
+    heads = tree.get("heads", {})
+    if isinstance(heads, Mapping) and "template" not in heads:
+        # Without heads iii and iv, the third acted.
+        acting = heads.get("enabled", True) and heads.get("refinement", True)
+        tree["heads"] = {**heads, "enabled": True, "template": True, "refinement": acting}
+    return read_settings(merged({"dpd": {"rank": 0}}, tree))
+
+
 def read_version_1(values: Mapping[str, Any]) -> WildGHandSettings:
     """Read the settings that an avatar of version 1 stores.
 
@@ -185,14 +232,15 @@ def read_version_1(values: Mapping[str, Any]) -> WildGHandSettings:
     paper = _mode_of(tree) == "paper"
     if paper:
         named = tree.get("prior")
-        tree = merged(tree, MODES["paper"])
+        tree = merged(tree, _PAPER_OF_VERSION_1)
         tree["prior"] = "" if named in (None, "shipped") else named
     # In the mode `default`, `weights.variant` had no effect.
     weights = values.get("weights")
     printed = weights.get("variant") if isinstance(weights, Mapping) else None
     binary = values.get("binary_mask") is True or (paper and printed == "binary")
-    variant = "binary" if binary else "paper" if paper else "judged"
-    return read_settings(merged(tree, {"pao": {"variant": variant}}))
+    variant = "binary" if binary else "printed" if paper else "scaled"
+    weighed = {"variant": variant, "temporal": "regions" if paper else "teaching"}
+    return read_stored(merged(tree, {"pao": weighed}))
 
 
 def _mode_of(changes: dict[str, Any]) -> str:
@@ -233,18 +281,19 @@ def _check_names(changes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
 
 def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
     """The same settings; what could not act is off."""
-    dpd, pao, heads = settings.dpd, settings.pao, settings.heads
-    robust = pao.enabled and pao.variant == "judged" and pao.robust
+    dpd, heads, prepass = settings.dpd, settings.heads, settings.prepass
     return dataclasses.replace(
         settings,
-        dpd=dataclasses.replace(dpd, gains=dpd.enabled and dpd.gains),
-        pao=dataclasses.replace(pao, robust=robust),
+        dpd=dataclasses.replace(
+            dpd,
+            rank=dpd.rank if dpd.enabled and dpd.biases else 0,
+            gains=dpd.enabled and dpd.gains,
+            pay_back=dpd.pay_back if dpd.enabled and dpd.biases else 0.0,
+        ),
         heads=HeadSettings(
             enabled=heads.enabled,
+            template=heads.enabled and heads.template,
             refinement=heads.enabled and heads.refinement,
-            frame_poses=heads.enabled and heads.frame_poses,
         ),
-        prepass=dataclasses.replace(
-            settings.prepass, enabled=settings.prepass.enabled and (dpd.enabled or pao.enabled)
-        ),
+        prepass=dataclasses.replace(prepass, frame_poses=prepass.enabled and prepass.frame_poses),
     )

@@ -62,6 +62,7 @@ class TermWeights:
 #: The paper's weights; reconstruction, silhouette, the two other Laplacians, the texture term
 #: and the perceptual weight are the authors', whom the paper does not contradict.
 PAPER_TERMS = TermWeights(
+    dssim_weight=0.0,
     reconstruction=100.0,
     bias=0.1,
     shadow=0.001,
@@ -147,9 +148,9 @@ def silhouette(coverage: Tensor, hand: Tensor) -> Tensor:
     return (coverage - hand.to(coverage)).square().mean()
 
 
-def weight_reward(weights: Tensor) -> Tensor:
-    """Minus the mean of W, (B, H, W): lowest where nothing is weighed down."""
-    return -weights.mean()
+def weight_reward(sizes: Tensor) -> Tensor:
+    """Minus the mean of W, from W or its means by frame: lowest where nothing is weighed down."""
+    return -sizes.mean()
 
 
 def cross_hand(left: Tensor, right: Tensor) -> Tensor:

@@ -10,8 +10,8 @@ import torch
 from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
-from hwp_bench.methods.settings import number
 from wildghand.pao.regions.frame_regions import Regions
+from wildghand.pao.running_median import running_median
 
 #: Colour channels: the paper's background error is their sum, its region error their mean.
 _CHANNELS = 3.0
@@ -21,27 +21,30 @@ _EQUAL = 1e-4
 
 @dataclass(frozen=True)
 class PaoSettings:
-    """Perturbation-aware weights; the numbers are the paper's."""
+    """Perturbation-aware weights; the modes `paper` and `released` have the paper's numbers."""
 
-    #: Component: weigh frames and pixels. Without it a pixel counts as the estimated mask says.
+    #: Component: weigh frames and regions. Without it a pixel counts as the estimated mask says.
     enabled: bool = True
-    #: Where the weights come from. `judged`: the pre-pass, for frames and pixels. `paper`: the
-    #: paper's equations, region by region. `binary`: the hand's mask (the paper's table).
-    variant: Literal["judged", "paper", "binary"] = "judged"
-    #: Addition to `judged`: robust weights of residuals later in the fit, in place of the
-    #: pre-pass's pixel weights. Off: where it was measured it cost more than it brought
-    #: (docs/wildghand.md).
-    robust: bool = False
-    #: Share of the budget after which residuals decide the weights.
-    robust_start: float = number(0.25, 0.0, 1.0)
+    #: `scaled`: the paper's equations with weights up to alpha on the hand, and the constant
+    #: `terms.outside_weight` outside. `printed`: as printed. `binary`: the hand's mask alone (the
+    #: paper's table).
+    variant: Literal["scaled", "printed", "binary"] = "scaled"
+    #: What the temporal factor 1 / (1 + beta |omega|) scales. `teaching`: what the canonical hand
+    #: learns from a frame, while the frame's biases learn from all of it. `all`: W. `regions`: the
+    #: weights of regions alone, as printed. `none`: nothing, as in the authors' code.
+    temporal: Literal["teaching", "all", "regions", "none"] = "teaching"
+    #: What E_u is counted in. `median`: the running median of the regions' errors. `batch`: from
+    #: the smallest to the largest of a batch on [0, 1], as the authors do. `absolute`: colours in
+    #: [0, 1], as printed.
+    errors: Literal["median", "batch", "absolute"] = "median"
     #: Factor of every region's weight.
-    alpha: float = 100.0
-    #: How strongly the temporal weight of a frame lowers its regions' weights; 0 = not at all.
-    beta: float = 1000.0
+    alpha: float = 1.0
+    #: How strongly the temporal weight of a frame lowers its weight; 0 = not at all.
+    beta: float = 100.0
     #: T_E at the start: regions with a mean error above it have weight 0.
-    error_threshold: float = 1.0
+    error_threshold: float = 3.0
     #: T_mu at the start: regions with a smaller share of hand have weight 0.
-    share_threshold: float = 0.3
+    share_threshold: float = 0.0
     #: T_b at the start: background pixels whose error, summed over channels, is above it have
     #: weight 0. For a single hand.
     background_threshold: float = 3.0
@@ -52,8 +55,6 @@ class PaoSettings:
     #: sentence, which superpixels can reach too. "auto" takes the formula where regions may
     #: overlap (Segment Anything's) and the sentence for a partition into superpixels.
     share_of: Literal["auto", "hand", "region"] = "auto"
-    #: Stretch the errors of a batch's regions to [0, 1], as the authors do; equal ones become 0.
-    normalise_errors: bool = True
     #: Weight outside the hand in the variant `binary`.
     binary_outside: float = 0.0
 
@@ -65,7 +66,9 @@ class PaoSettings:
                     f"is {value}", field=item.name, remedy="Use a finite number, 0 or more."
                 )
         for name, known in (
-            ("variant", ("judged", "paper", "binary")),
+            ("variant", ("scaled", "printed", "binary")),
+            ("temporal", ("teaching", "all", "regions", "none")),
+            ("errors", ("median", "batch", "absolute")),
             ("share_of", ("auto", "hand", "region")),
         ):
             if getattr(self, name) not in known:
@@ -86,10 +89,15 @@ class Weights:
     lambdas: Tensor
     #: (B, U) E_u, as compared with T_E; 0 where a region has no hand.
     errors: Tensor
+    #: (B, U) the regions' mean errors before they were counted in anything.
+    mean_errors: Tensor
     #: (B, U) mu_u in [0, 1].
     shares: Tensor
     #: (B,) 1 / (1 + beta |omega|) in (0, 1].
     temporal: Tensor
+    #: (B,) means of W, which -lambda_W |W| rewards. With `temporal` "all" omega has a gradient
+    #: here, and nowhere else.
+    sizes: Tensor
 
 
 class PerturbationAwareWeights(nn.Module):
@@ -100,8 +108,9 @@ class PerturbationAwareWeights(nn.Module):
         hands: one or two; the background threshold differs.
 
     The thresholds need their own learning rate (the paper's is 1e-6). Gradients reach nothing
-    but them: a gradient through the errors would reward errors that lower a weight, and omega
-    is detached because a larger one would buy a lower loss.
+    but them: a gradient through the errors would reward errors that lower a weight, and a gradient
+    through omega a larger omega. The size of W, which the loss rewards, has one of omega: as
+    printed it draws omega to 0.
 
     Source: WildGHand, section "Perturbation-aware Optimization", equations of lambda_u and W,
     read so that they are defined everywhere; `docs/dpd_pao.md` lists the differences.
@@ -117,7 +126,14 @@ class PerturbationAwareWeights(nn.Module):
             background = settings.background_threshold_both
         self.T_b = nn.Parameter(torch.tensor(background))
 
-    def forward(self, error: Tensor, regions: Regions, hand: Tensor, omega: Tensor) -> Weights:
+    def forward(
+        self,
+        error: Tensor,
+        regions: Regions,
+        hand: Tensor,
+        omega: Tensor,
+        median: float | Tensor | None = None,
+    ) -> Weights:
         """Weigh B frames.
 
         Args:
@@ -126,6 +142,8 @@ class PerturbationAwareWeights(nn.Module):
             regions: y_u of the frames.
             hand: (B, H, W) y_h: bool, or coverage in [0, 1], hand where above a half.
             omega: (B,) temporal weights.
+            median: running median of `Weights.mean_errors`; None: that of these frames. Only
+                `errors` "median" reads it.
 
         Raises:
             ShapeMismatch: the arguments do not describe the same frames.
@@ -135,25 +153,62 @@ class PerturbationAwareWeights(nn.Module):
         finite = error.isfinite()
         error = torch.where(finite, error, torch.zeros_like(error))
         on_hand = hand if hand.dtype == torch.bool else hand > 0.5
-        errors, shares = self._measure(error, regions, on_hand & finite, on_hand)
-        temporal = 1.0 / (1.0 + self.settings.beta * omega.detach().abs())
+        means, shares, present = self._measure(error, regions, on_hand & finite, on_hand)
+        errors = self._counted(means, present, median)
+        live = self.temporal_factor(omega)
+        temporal = live.detach()
+        of_regions = temporal if self.settings.temporal in ("all", "regions") else None
         outside = (finite & ~on_hand).to(error)
-        gates = torch.relu(self.T_E - errors) * torch.relu(shares - self.T_mu)
+        gates = self._gates(errors, shares)
         # A region without hand has no error; it must stay out even if T_mu learns to be < 0.
-        lambdas = self.settings.alpha * gates * (shares > 0.0) * temporal[:, None]
-        background = outside * torch.relu(self.T_b - _CHANNELS * error)
-        weights = regions.spread(lambdas) * finite + background
-        return Weights(weights, background, lambdas, errors, shares, temporal)
+        lambdas = self.settings.alpha * gates * (shares > 0.0)
+        lambdas = lambdas if of_regions is None else lambdas * of_regions[:, None]
+        if self.settings.variant == "scaled":
+            background = torch.zeros_like(error)
+            weights = regions.spread(lambdas) * finite * hand
+        else:
+            background = outside * torch.relu(self.T_b - _CHANNELS * error)
+            if self.settings.temporal == "all":
+                background = background * temporal[:, None, None]
+            weights = regions.spread(lambdas) * finite + background
+        sizes = weights.mean(dim=(1, 2))
+        if self.settings.temporal == "all":
+            # Its value is that of W; its gradient reaches omega.
+            sizes = sizes * (live / temporal)
+        return Weights(weights, background, lambdas, errors, means, shares, temporal, sizes)
+
+    def temporal_factor(self, omega: Tensor) -> Tensor:
+        """1 / (1 + beta |omega|), in (0, 1]; the paper's has no absolute value.
+
+        Args:
+            omega: (B,) temporal weights.
+        """
+        return 1.0 / (1.0 + self.settings.beta * omega.abs())
+
+    def _gates(self, errors: Tensor, shares: Tensor) -> Tensor:
+        """kappa(T_E - E_u) kappa(mu_u - T_mu), (B, U); `scaled`: at most 1."""
+        found = torch.relu(self.T_E - errors) * torch.relu(shares - self.T_mu)
+        if self.settings.variant != "scaled":
+            return found
+        most = self.T_E.detach() * (1.0 - self.T_mu.detach())
+        return found / most.clamp(min=1e-6)
+
+    def _counted(self, means: Tensor, present: Tensor, median: float | Tensor | None) -> Tensor:
+        """E_u in what the settings say, (B, U)."""
+        if self.settings.errors == "batch":
+            return _stretch(means, present)
+        if self.settings.errors == "absolute":
+            return means
+        unit = running_median(None, means, present) if median is None else median
+        return means / unit
 
     @torch.no_grad()
     def _measure(
         self, error: Tensor, regions: Regions, counted: Tensor, on_hand: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """E_u and mu_u, (B, U) each."""
+    ) -> tuple[Tensor, Tensor, Tensor]:
+        """The regions' mean errors, mu_u, and which have any hand, (B, U) each."""
         pixels = regions.sums(counted.to(error))
         errors = regions.sums(error * counted) / pixels.clamp(min=1.0)
-        if self.settings.normalise_errors:
-            errors = _stretch(errors, pixels > 0.0)
         share_of = self.settings.share_of
         if share_of == "auto":
             share_of = "region" if regions.membership is None else "hand"
@@ -161,7 +216,7 @@ class PerturbationAwareWeights(nn.Module):
             whole = on_hand.flatten(1).sum(dim=1, keepdim=True).to(error)
         else:
             whole = regions.sums(torch.ones_like(error))
-        return errors, pixels / whole.clamp(min=1.0)
+        return errors, pixels / whole.clamp(min=1.0), pixels > 0.0
 
 
 def binary_weights(hand: Tensor, outside: float = 0.0) -> Tensor:

@@ -11,6 +11,8 @@ class PrepassSettings:
 
     #: Judge the frames before the fit.
     enabled: bool = True
+    #: Refine the pose of frames whose mask disagrees with it.
+    frame_poses: bool = True
     #: Edge of the cells that share one albedo, m on the rest surface.
     patch_size: float = 0.004
     #: Pixels of all frames together from which the intensity model is fitted.

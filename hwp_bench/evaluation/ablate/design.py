@@ -11,7 +11,7 @@ from typing import Any
 from hwp_bench.base.errors import UsageError
 from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
 
-#: Components that are crossed when nothing is asked for.
+#: Components that are crossed when nothing is asked for and the method names none.
 DEFAULT_FACTORS = 2
 #: Most components that are crossed: 2^4 variants.
 MAX_FACTORS = 4
@@ -66,7 +66,8 @@ def make_design(
 ) -> Design:
     """Choose the variants.
 
-    Without names the first two components that the method declares are crossed: 2 x 2 variants.
+    Without names those components are crossed that the method names for it, or else the first two
+    that it declares: 2^k variants.
     `crossed` crosses the named components instead: 2^k variants. `thrown` asks what each named
     switch does to the full method: the full method, the method with only one of them thrown,
     and, of two components or more, with all of them out. (With two that is the 2 x 2 again.)
@@ -87,7 +88,9 @@ def make_design(
     switches = [_switch(manifest, name) for name in dict.fromkeys([*thrown, *crossed])]
     if not switches:
         declared = [item for item in manifest.switches.values() if not item.alternative]
-        switches = declared[:DEFAULT_FACTORS]
+        named = [manifest.switches[name] for name in manifest.crossed]
+        switches = named or declared[:DEFAULT_FACTORS]
+        crossed = [item.name for item in switches]
         if not switches:
             raise UsageError(
                 "declares no component that could be taken out",
@@ -103,6 +106,9 @@ def make_design(
     outs = _all_subsets(components) if factorial else _one_by_one(components)
     variants = [_variant(out) for out in sorted(outs, key=len, reverse=True)]
     effects = _factorial_effects(components) if factorial else _out_effects(components)
+    if factorial and len(components) > DEFAULT_FACTORS:
+        # With two they follow from the main effects and the interaction at a glance.
+        effects += _out_effects(components)
     for alternative in alternatives:
         variants.append(_variant((alternative,)))
         contrast = {FULL: 1.0, alternative.variant_name: -1.0}

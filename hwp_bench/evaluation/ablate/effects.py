@@ -151,8 +151,11 @@ def cost_effects(ablation: AblationRuns, *, seed: int = 0) -> list[CostEffect]:
     Captures on which a variant says nothing of its time are left out.
     """
     found = []
-    for effect in ablation.design.effects:
-        if effect.kind != "interaction":
+    effects = ablation.design.effects
+    # Where components are crossed, their mean over the others says what they cost.
+    crossed = any(effect.kind == "main" for effect in effects)
+    for effect in effects:
+        if effect.kind != "interaction" and not (crossed and effect.kind == "out"):
             rows = [_cost_effect(ablation, effect, quantity, seed) for quantity in QUANTITIES]
             found += [row for row in rows if row is not None]
     return found

@@ -11,7 +11,11 @@ from wildghand.dpd.dpd import DynamicPerturbation
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.gaussians.attributes import RawAttributes
 
-SCALE = 0.05
+SCALE, FLOOR = 0.5, 0.02
+
+
+def judged(clean: torch.Tensor, scale: float = SCALE) -> TemporalTarget:
+    return TemporalTarget.judged(clean, FLOOR + (1.0 - FLOOR) * clean, scale, FLOOR)
 
 
 def episodes(count: int = 48) -> torch.Tensor:
@@ -39,16 +43,30 @@ def omega_of(learnt: DynamicPerturbation) -> torch.Tensor:
 @pytest.mark.parametrize("count", [48, 560])
 def test_weights_begin_at_what_was_judged(count: int) -> None:
     clean, learnt = episodes(count), module(count)
-    TemporalTarget.judged(clean, SCALE).begin([learnt])
-    error = (omega_of(learnt) - SCALE * (1.0 - clean)).square().mean().sqrt()
+    target = judged(clean)
+    target.begin([learnt])
+    error = (omega_of(learnt) - target.omega).square().mean().sqrt()
     # A tenth of the scale; episodes begin abruptly, which the code of a long clip cannot follow
     # as closely.
     assert error < (0.1 if count < 100 else 0.2) * SCALE
 
 
+def test_the_factor_of_pao_is_what_the_prepass_found() -> None:
+    """Oracle: the weights that were given."""
+    clean = episodes()
+    weights = FLOOR + (1.0 - FLOOR) * clean
+    target = judged(clean)
+    beta = (1.0 / FLOOR - 1.0) / SCALE
+    torch.testing.assert_close(1.0 / (1.0 + beta * target.omega), weights)
+    assert float(target.omega.max()) == pytest.approx(SCALE)
+    # Weights of 0 are no division by 0.
+    none = TemporalTarget.judged(torch.zeros(3), torch.zeros(3), SCALE, 0.0)
+    assert none.omega.isfinite().all()
+
+
 def test_biases_begin_at_zero_and_learn_from_the_first_step() -> None:
     learnt = module()
-    TemporalTarget.judged(episodes(), SCALE).begin([learnt])
+    judged(episodes()).begin([learnt])
     frames = torch.arange(48)
     temporal = learnt.temporal(frames)
     biases = learnt.biases(attributes(48, 5), temporal.z, temporal.omega).concatenate()
@@ -61,7 +79,7 @@ def test_biases_begin_at_zero_and_learn_from_the_first_step() -> None:
 def test_without_a_scale_the_start_is_the_papers() -> None:
     clean, learnt = episodes(), module()
     before = {name: value.clone() for name, value in learnt.state_dict().items()}
-    target = TemporalTarget.judged(clean, 0.0)
+    target = judged(clean, 0.0)
     target.begin([learnt])
     assert all(torch.equal(before[name], value) for name, value in learnt.state_dict().items())
     assert (target.omega == 0.0).all()
@@ -70,7 +88,7 @@ def test_without_a_scale_the_start_is_the_papers() -> None:
 
 def test_where_every_frame_is_clean_the_start_is_the_papers() -> None:
     learnt = module()
-    TemporalTarget.judged(torch.ones(48), SCALE).begin([learnt])
+    judged(torch.ones(48)).begin([learnt])
     assert (omega_of(learnt) == 0.0).all()
     assert learnt.varphi["logit_colors"].weight.abs().max() > 0.0
 
@@ -78,7 +96,7 @@ def test_where_every_frame_is_clean_the_start_is_the_papers() -> None:
 def test_the_start_repeats_exactly() -> None:
     first, second = module(), module()
     for learnt in (first, second):
-        TemporalTarget.judged(episodes(), SCALE).begin([learnt])
+        judged(episodes()).begin([learnt])
     assert torch.equal(omega_of(first), omega_of(second))
 
 
@@ -132,7 +150,7 @@ def test_every_frame_of_a_long_clip_is_looked_at_by_some_step() -> None:
 def test_holding_keeps_the_weights_and_letting_go_does_not() -> None:
     """A pull on all weights, as a fit that explains frames by larger biases would make it."""
     errors = []
-    target = TemporalTarget.judged(episodes(), SCALE)
+    target = judged(episodes())
     for weight in (0.0, 100.0):
         learnt = module()
         target.begin([learnt])
@@ -151,7 +169,7 @@ def test_holding_keeps_the_weights_and_letting_go_does_not() -> None:
 @given(clean=st.lists(st.floats(0.0, 1.0, width=32), min_size=1, max_size=12))
 def test_any_judgement_gives_weights_in_range(clean: list[float]) -> None:
     learnt = module(len(clean))
-    target = TemporalTarget.judged(torch.tensor(clean), SCALE)
+    target = judged(torch.tensor(clean))
     target.begin([learnt])
     omega = omega_of(learnt)
     assert omega.isfinite().all()

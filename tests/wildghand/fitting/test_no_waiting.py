@@ -35,8 +35,9 @@ QUICK: dict[str, Any] = {
 VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "two hands": {},
-    "robust": {"pao.robust": True, "pao.robust_start": 0.0},
+    "pay back": {"dpd.pay_back": 1.5},
     "paper": {"mode": "paper"},
+    "released": {"mode": "released"},
     "binary": {"pao.variant": "binary"},
     "bare": {"dpd.enabled": False, "pao.enabled": False, "heads.enabled": False},
     "batch of 4": {"schedule.batch": 4},

@@ -44,8 +44,8 @@ TINY: dict[str, Any] = {
 VARIANTS: dict[str, dict[str, Any]] = {
     # Every other frame keeps its biases: processes must draw the same chances.
     "default": {"dpd.omega_dropout": 0.5},
-    # The weights compare the frames of a batch.
-    "robust": {"pao.robust": True, "pao.robust_start": 0.0},
+    "pay back": {"dpd.pay_back": 1.5},
+    # The weights compare the frames of a batch, and omega learns from their size.
     "paper": {"mode": "paper", "dpd.omega_dropout": 0.5},
 }
 TrainingMaker = Callable[..., TrainingCapture]

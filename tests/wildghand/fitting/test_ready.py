@@ -27,7 +27,7 @@ def versions() -> dict[str, int]:
 
 def test_a_step_compiles_nothing(make_training: Callable[..., TrainingCapture]) -> None:
     device = ready_fit("cpu")
-    settings = read_settings({"gaussians": 600, "device": "cpu", "pao.robust": True})
+    settings = read_settings({"gaussians": 600, "device": "cpu"})
     fit = Fit(make_training(), settings, 0, device)
     before = versions()
     assert sum(before.values()) > 20

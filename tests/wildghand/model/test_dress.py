@@ -47,8 +47,11 @@ class Scene:
             torch.nn.init.normal_(self.module.psi.weight)
         self.module = self.module.to(dtype)
         self.frames = torch.arange(frames) + 3
+        self.field = leaf(frames, count, 14)
 
-    def dressed(self, *, biased: bool, kept: Tensor | None, shares: Tensor | None) -> list[Tensor]:
+    def dressed(
+        self, *, biased: bool, kept: Tensor | None, shares: Tensor | None, field: bool = False
+    ) -> list[Tensor]:
         none = torch.zeros(1, dtype=self.raw.dtype)
         prediction = NetworkOutput(
             RawAttributes.split(self.raw),
@@ -59,7 +62,12 @@ class Scene:
         )
         perturbation = None
         if biased:
-            perturbation = Perturbation(self.module, self.module.temporal(self.frames), kept)
+            perturbation = Perturbation(
+                self.module,
+                self.module.temporal(self.frames),
+                kept,
+                self.field if field else None,
+            )
         anchors = AnchorPoses(self.positions, self.orientations)
         made, size = dress(anchors, prediction, ACTIVATION, perturbation, shares)
         assert (size is None) == (not biased)
@@ -77,22 +85,26 @@ class Scene:
             "offsets": self.offsets,
             "positions": self.positions,
             "shadow": self.shadow,
+            "field": self.field,
             **dict(self.module.named_parameters()),
         }
         return {name: leaf.grad for name, leaf in leaves.items() if leaf.grad is not None}
 
 
-@pytest.mark.parametrize("biased", [False, True])
+@pytest.mark.parametrize(("biased", "field"), [(False, False), (True, False), (True, True)])
 @pytest.mark.parametrize("kept", [None, KEPT])
 @pytest.mark.parametrize("shares", [None, SHARES])
-def test_values_and_gradients(biased: bool, kept: Tensor | None, shares: Tensor | None) -> None:
+def test_values_and_gradients(
+    biased: bool, field: bool, kept: Tensor | None, shares: Tensor | None
+) -> None:
     mine, true = Scene(torch.float32), Scene(torch.float64)
-    made = mine.dressed(biased=biased, kept=kept, shares=shares)
-    expected = true.dressed(biased=biased, kept=kept, shares=shares)
+    made = mine.dressed(biased=biased, kept=kept, shares=shares, field=field)
+    expected = true.dressed(biased=biased, kept=kept, shares=shares, field=field)
     for value, oracle in zip(made, expected, strict=True):
         torch.testing.assert_close(value.double(), oracle, rtol=1e-5, atol=1e-6)
     found, exact = mine.gradients(made), true.gradients(expected)
     assert found.keys() == exact.keys()
+    assert ("field" in found) == field
     for name, oracle in exact.items():
         # The quaternion that is almost zero turns by a million times its gradient: by itself.
         parts = [(found[name].double(), oracle)]
@@ -106,10 +118,14 @@ def test_values_and_gradients(biased: bool, kept: Tensor | None, shares: Tensor 
 
 def test_a_frame_without_biases_passes_no_gradient_to_them() -> None:
     scene = Scene(torch.float32)
-    made = scene.dressed(biased=True, kept=torch.zeros(FRAMES, dtype=torch.bool), shares=None)
+    made = scene.dressed(
+        biased=True, kept=torch.zeros(FRAMES, dtype=torch.bool), shares=None, field=True
+    )
     found = scene.gradients(made)
     assert float(made[-1].detach()) == 0.0
-    assert all(not found[name].any() for name in found if name.startswith(("psi", "varphi")))
+    assert all(
+        not found[name].any() for name in found if name.startswith(("psi", "varphi", "field"))
+    )
 
 
 def test_threads_change_no_bit() -> None:
@@ -119,7 +135,7 @@ def test_threads_change_no_bit() -> None:
             torch.set_num_threads(threads)
             scene = Scene(torch.float32, frames=2, count=6_000)
             scene.frames = scene.frames[:2]
-            made = scene.dressed(biased=True, kept=None, shares=SHARES[:2])
+            made = scene.dressed(biased=True, kept=None, shares=SHARES[:2], field=True)
             found.append([*made, *scene.gradients(made).values()])
     finally:
         torch.set_num_threads(before)

@@ -10,15 +10,17 @@ import pytest
 from hwp_bench.base.errors import BadMethod
 from hwp_bench.base.records import flattened
 from hwp_bench.methods.manifest import find_method, read_manifest
-from wildghand.model.former_settings import NAMES, TABLES
+from wildghand.model.former_settings import GONE, NAMES, TABLES
 from wildghand.model.settings import (
     MODES,
     WildGHandSettings,
     read_settings,
+    read_stored,
     read_version_1,
 )
 from wildghand.model.terms import PAPER_TERMS
 from wildghand.network import network_settings
+from wildghand.pao.pao import PerturbationAwareWeights
 
 #: Every setting by its dotted name, with its default.
 EVERY = dict(flattened(dataclasses.asdict(WildGHandSettings())))
@@ -55,8 +57,10 @@ def test_a_dotted_name_reaches_every_setting(name: str) -> None:
     # What a setting changes besides itself: parts of a component that it takes out.
     changed = {n for n in EVERY if value_of(made, n) != EVERY[n]} - {name}
     idle = {
-        "dpd.enabled": {"dpd.gains"},
-        "heads.enabled": {"heads.refinement", "heads.frame_poses"},
+        "dpd.enabled": {"dpd.gains", "dpd.rank"},
+        "dpd.biases": {"dpd.rank"},
+        "heads.enabled": {"heads.refinement", "heads.template"},
+        "prepass.enabled": {"prepass.frame_poses"},
     }
     assert changed == idle.get(name, set())
 
@@ -67,19 +71,37 @@ def test_stored_settings_are_read_as_they_were() -> None:
         assert read_settings(dataclasses.asdict(made)) == made
 
 
-def test_the_mode_paper_has_no_addition() -> None:
-    made = read_settings({"mode": "paper"})
-    assert made.terms == PAPER_TERMS
-    assert made.pao.variant == "paper"
-    assert made.prior == ""
+@pytest.mark.parametrize(("mode", "temporal"), [("paper", "all"), ("released", "none")])
+def test_the_published_modes_have_no_addition(mode: str, temporal: str) -> None:
+    made = read_settings({"mode": mode})
+    outside = WildGHandSettings().terms.outside_weight
+    assert made.terms == dataclasses.replace(PAPER_TERMS, outside_weight=outside)
+    assert made.terms.dssim_weight == 0.0
+    assert (made.pao.variant, made.pao.temporal, made.pao.errors) == ("printed", temporal, "batch")
+    thresholds = (made.pao.error_threshold, made.pao.share_threshold)
+    assert (*thresholds, made.pao.background_threshold) == (1.0, 0.3, 3.0)
+    assert made.pao.background_threshold_both == 10.0
+    assert (made.schedule.batch, made.schedule.decay, made.schedule.rates.dpd) == (
+        4,
+        "halving",
+        1e-4,
+    )
     assert not made.prepass.enabled
     assert not made.dpd.gains
-    assert not made.heads.frame_poses
+    assert not made.dpd.rank
+    assert not made.prepass.frame_poses
     assert made.dpd.enabled
     assert made.pao.enabled
     assert made.heads.refinement
     differing = {name for name in EVERY if value_of(made, name) != EVERY[name]}
-    assert differing == {name for name, _ in flattened(MODES["paper"])}
+    assert differing <= {name for name, _ in flattened(MODES[mode])} | {"prepass.frame_poses"}
+
+
+@pytest.mark.parametrize("changes", [{}, {"pao.beta": 5.0}, {"weights": {"alpha": 2.0}}])
+def test_two_hands_keep_their_background_threshold(changes: dict[str, Any]) -> None:
+    for mode in MODES:
+        pao = read_settings({"mode": mode, **changes}).pao
+        assert PerturbationAwareWeights(pao, hands=2).T_b.item() == 10.0
 
 
 def test_a_setting_that_is_given_wins_over_the_modes() -> None:
@@ -99,17 +121,17 @@ def test_a_table_in_part_leaves_the_rest_of_it() -> None:
     assert made.prepass.omega_dropout == 1.0
 
 
-def test_the_prepass_is_off_where_nothing_reads_it() -> None:
-    off = {"dpd.enabled": False, "pao.enabled": False}
-    assert not read_settings(off).prepass.enabled
-    for name in off:
-        assert read_settings({name: False}).prepass.enabled
+def test_the_prepass_is_a_component_of_its_own() -> None:
+    made = read_settings({"dpd.enabled": False, "pao.enabled": False})
+    assert made.prepass.enabled
+    assert made.prepass.frame_poses
+    assert not read_settings({"prepass.enabled": False}).prepass.frame_poses
 
 
-def test_residuals_decide_in_one_variant_only() -> None:
-    assert read_settings({"pao.robust": True}).pao.robust
-    for changes in ({"mode": "paper"}, {"pao.variant": "binary"}, {"pao.enabled": False}):
-        assert not read_settings({"pao.robust": True, **changes}).pao.robust
+def test_without_heads_the_rest_stays() -> None:
+    made = read_settings({"heads.enabled": False})
+    assert (made.heads.template, made.heads.refinement) == (False, False)
+    assert made == dataclasses.replace(read_settings({}), heads=made.heads)
 
 
 def test_the_size_chooses_the_network() -> None:
@@ -120,20 +142,20 @@ def test_the_size_chooses_the_network() -> None:
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"robus": True}, r"robus: is not a setting.*Did you mean 'pao\.robust'\?"),
+        ({"tempral": True}, r"tempral: is not a setting.*Did you mean 'pao\.temporal'\?"),
         ({"dpd.omega_scle": 1}, r"dpd\.omega_scle.*Did you mean 'dpd\.omega_scale'\?"),
         ({"dpd": {"omega_scle": 1}}, r"dpd\.omega_scle.*Did you mean 'dpd\.omega_scale'\?"),
         ({"network.sizes": "paper"}, r"network\.sizes.*Did you mean 'network\.size'\?"),
         ({"moed": "paper"}, "moed.*Did you mean 'mode'"),
-        ({"dpd.rank": 4}, r"dpd\.rank: is not a setting.*Known: dpd\.enabled"),
+        ({"dpd.zzz": 4}, r"dpd\.zzz: is not a setting.*Known: dpd\.enabled"),
         ({"zzz": 4}, "zzz: is not a setting.*Known: mode, prior"),
-        ({"mode": "papr"}, "mode: is 'papr'.*default, paper"),
+        ({"mode": "papr"}, "mode: is 'papr'.*default, paper, released"),
         ({"mode": 3}, "mode: is '3'"),
         ({"schedule": 3}, "schedule: must be a table"),
         ({"dpd": 1}, "dpd: must be a table"),
         ({"prior.name": "x"}, r"prior\.name: is not a setting"),
         ({"dpd.omega_dropout": 1.5}, r"dpd\.omega_dropout: is 1\.5"),
-        ({"pao.variant": "printed"}, r"pao\.variant: is 'printed'"),
+        ({"pao.variant": "masks"}, r"pao\.variant: is 'masks'"),
         ({"pao.alpha": -1}, r"pao\.alpha: is -1"),
         ({"schedule.rates.dpd": "fast"}, r"schedule\.rates\.dpd: is 'fast'"),
         ({"network.plane_resolution": 42}, "plane_resolution: is 42"),
@@ -172,6 +194,12 @@ def test_former_names_are_read(former: str) -> None:
         ({"judge.weight_floor": 0.1}, {"prepass.weight_floor": 0.1}),
         ({"judge": {"tolerance": 2.0}}, {"prepass.tolerance": 2.0}),
         ({"weights.beta": 5.0}, {"pao.beta": 5.0}),
+        ({"pao.variant": "paper"}, {"pao.variant": "printed"}),
+        ({"pao.variant": "judged"}, {}),
+        ({"pao.normalise_errors": True}, {"pao.errors": "batch"}),
+        ({"weights.normalise_errors": False}, {"pao.errors": "absolute"}),
+        ({"robust": True, "pao.robust_start": 0.5}, {}),
+        ({"heads.frame_poses": False}, {"prepass.frame_poses": False}),
         ({"weights": {"variant": "weights"}}, {}),
         ({"weights": {"variant": "binary"}}, {"pao.variant": "binary"}),
         (
@@ -214,9 +242,14 @@ def version_1(**changes: Any) -> dict[str, Any]:
             for name, value in EVERY.items()
             if name.rpartition(".")[0] == table
         }
-    for name in ("enabled", "robust", "robust_start", "background_threshold_both"):
+    for name in ("enabled", "temporal", "errors", "background_threshold_both"):
         stored["weights"].pop(name)
-    stored["judge"].pop("enabled")
+    stored["weights"] |= {"normalise_errors": True, "robust": False, "robust_start": 0.25}
+    stored["judge"] = {
+        name: value
+        for name, value in stored["judge"].items()
+        if name not in ("enabled", "frame_poses")
+    }
     stored["weights"]["variant"] = "weights"
     stored |= dict.fromkeys(("dpd", "pao", "heads", "prepass"), True)
     stored |= {"mode": "default", "prior": "shipped", "binary_mask": False, "gaussians": 12_337}
@@ -230,22 +263,37 @@ def version_1(**changes: Any) -> dict[str, Any]:
     return stored | changes
 
 
+#: What the mode `paper` of version 1 was, under today's names.
+PAPER_1: dict[str, Any] = {
+    "prior": "",
+    "dpd.gains": False,
+    "pao.variant": "printed",
+    "pao.temporal": "regions",
+    "prepass.enabled": False,
+    **{
+        f"terms.{item.name}": getattr(PAPER_TERMS, item.name)
+        for item in dataclasses.fields(PAPER_TERMS)
+        if item.name not in ("dssim_weight", "outside_weight")
+    },
+}
+
+
 @pytest.mark.parametrize(
     ("changes", "today"),
     [
         ({}, {}),
-        ({"mode": "paper"}, {"mode": "paper"}),
-        ({"mode": "paper", "robust": True}, {"mode": "paper"}),
-        ({"mode": "paper", "prior": "/p"}, {"mode": "paper", "prior": "/p"}),
-        ({"mode": "paper", "binary_mask": True}, {"mode": "paper", "pao.variant": "binary"}),
-        ({"mode": "paper", "pao": False}, {"mode": "paper", "pao.enabled": False}),
-        ({"mode": "paper", "dssim_weight": 0.0}, {"mode": "paper", "terms.dssim_weight": 0.0}),
+        ({"mode": "paper"}, PAPER_1),
+        ({"mode": "paper", "robust": True}, PAPER_1),
+        ({"mode": "paper", "prior": "/p"}, {**PAPER_1, "prior": "/p"}),
+        ({"mode": "paper", "binary_mask": True}, {**PAPER_1, "pao.variant": "binary"}),
+        ({"mode": "paper", "pao": False}, {**PAPER_1, "pao.enabled": False}),
+        ({"mode": "paper", "dssim_weight": 0.0}, {**PAPER_1, "terms.dssim_weight": 0.0}),
         ({"prepass": False, "prior": ""}, {"prepass.enabled": False, "prior": ""}),
         ({"dpd": False, "pao": False}, {"dpd.enabled": False, "pao.enabled": False}),
         ({"weights": {"variant": "binary"}}, {}),
         (
             {"weights": {"variant": "binary"}, "mode": "paper"},
-            {"mode": "paper", "pao.variant": "binary"},
+            {**PAPER_1, "pao.variant": "binary"},
         ),
     ],
     ids=str,
@@ -253,10 +301,25 @@ def version_1(**changes: Any) -> dict[str, Any]:
 def test_stored_settings_of_version_1_say_what_ran(
     changes: dict[str, Any], today: dict[str, Any]
 ) -> None:
-    assert read_version_1(version_1(**changes)) == read_settings(today)
+    stored = version_1()
+    stored = stored | {"weights": stored["weights"] | changes.pop("weights", {}), **changes}
+    expected = read_settings({"pao.errors": "batch", **today, "dpd.rank": 0})
+    assert read_version_1(stored) == expected
+
+
+def test_avatars_from_before_the_field_and_the_switch_of_head_iii_draw_as_they_did() -> None:
+    stored = dataclasses.asdict(read_settings({}))
+    del stored["dpd"]["rank"], stored["heads"]["template"], stored["prepass"]["frame_poses"]
+    stored["heads"] |= {"enabled": False, "refinement": False, "frame_poses": False}
+    made = read_stored(stored)
+    assert made.dpd.rank == 0
+    assert (made.heads.template, made.heads.refinement) == (True, False)
+    assert not made.prepass.frame_poses
+    today = read_settings({"heads.enabled": False})
+    assert read_stored(dataclasses.asdict(today)) == today
 
 
 @pytest.mark.parametrize("name", ["wildghand", "interaction-gaussian"])
 def test_the_manifest_lists_every_setting_and_every_former_name(name: str) -> None:
     listed = read_manifest(find_method(name)).settings
-    assert list(listed) == ["mode", *EVERY, *NAMES, "binary_mask", *TABLES]
+    assert list(listed) == ["mode", *EVERY, *NAMES, *GONE, "binary_mask", *TABLES]

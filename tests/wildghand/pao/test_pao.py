@@ -14,7 +14,17 @@ from hwp_bench.base.errors import ShapeMismatch, UsageError
 from wildghand.pao.pao import PaoSettings, PerturbationAwareWeights, binary_weights
 from wildghand.pao.regions import FrameRegions, Regions, overlapping, partition, stack_regions
 
-PRINTED = PaoSettings(normalise_errors=False, share_of="hand")
+PRINTED = PaoSettings(
+    variant="printed",
+    temporal="regions",
+    errors="absolute",
+    alpha=100.0,
+    beta=1000.0,
+    error_threshold=1.0,
+    share_threshold=0.3,
+    share_of="hand",
+)
+STRETCHED = replace(PRINTED, errors="batch")
 SIZE = 12
 
 
@@ -76,7 +86,7 @@ def test_a_partition_is_the_same_regions_as_its_masks() -> None:
 
 def test_normalised_errors_span_the_batch_and_equal_ones_are_zero() -> None:
     error, masks, hand = scene()
-    module = PerturbationAwareWeights()
+    module = PerturbationAwareWeights(STRETCHED)
     made = module(error, regions_of(masks), hand, torch.zeros(2))
     assert made.errors.min() == 0.0
     assert made.errors.max() == 1.0
@@ -136,7 +146,7 @@ def test_superpixels_qualify_unless_the_formula_is_asked_for() -> None:
     masks = np.stack([labels == u for u in range(36)])
 
     def share(share_of: str, regions: Regions) -> float:
-        module = PerturbationAwareWeights(PaoSettings(share_of=share_of))
+        module = PerturbationAwareWeights(replace(STRETCHED, share_of=share_of))
         weights = module(error, regions, hand, torch.zeros(1)).weights.detach()
         return float((weights[hand] > 0.0).double().mean())
 
@@ -159,6 +169,58 @@ def test_a_covered_region_counts_less_than_a_visible_one() -> None:
     assert float(ratio.detach()) == pytest.approx(0.4 / 0.98, rel=1e-5)
 
 
+def test_scaled_weights_are_the_docs_equation() -> None:
+    """Oracle: docs/dpd_pao.md, region by region in numpy; 1e-5."""
+    error, masks, _ = scene()
+    coverage = torch.from_numpy(np.random.default_rng(3).uniform(size=(2, SIZE, SIZE)))
+    chosen = PaoSettings(error_threshold=1.5, share_threshold=0.1, share_of="region", alpha=0.7)
+    omega, median = torch.tensor([0.4, 0.0], dtype=torch.float64), 0.4
+    made = PerturbationAwareWeights(chosen).double()(
+        error, regions_of(masks), coverage, omega, median
+    )
+    for frame in range(2):
+        hand, expected = coverage[frame].numpy() > 0.5, np.zeros((SIZE, SIZE))
+        for mask in masks[frame]:
+            both = mask & hand
+            gate = max(1.0 - error[frame].numpy()[both].mean() / median / 1.5, 0.0)
+            gate *= max(both.sum() / mask.sum() - 0.1, 0.0) / 0.9
+            expected += 0.7 * gate * mask
+        expected *= coverage[frame].numpy()
+        np.testing.assert_allclose(made.weights[frame].detach(), expected, atol=1e-5)
+        assert float(made.temporal[frame]) == pytest.approx(1.0 / (1.0 + 100.0 * omega[frame]))
+
+
+def test_without_a_running_median_that_of_the_frames_counts() -> None:
+    error, masks, hand = scene()
+    module = PerturbationAwareWeights()
+    made = module(error, regions_of(masks), hand, torch.zeros(2))
+    assert float(made.errors.median()) == pytest.approx(1.0)
+    again = module(2.0 * error, regions_of(masks), hand, torch.zeros(2))
+    torch.testing.assert_close(again.weights, made.weights)
+
+
+@pytest.mark.parametrize("temporal", ["regions", "all", "none", "teaching"])
+def test_what_the_temporal_factor_scales(temporal: str) -> None:
+    error, masks, hand = scene()
+    module = PerturbationAwareWeights(replace(PRINTED, temporal=temporal))
+    omega = torch.tensor([0.01, 0.0], requires_grad=True)
+    made = module(error, regions_of(masks), hand, omega)
+    plain = module(error, regions_of(masks), hand, torch.zeros(2))
+    lambdas = (made.lambdas / plain.lambdas).nan_to_num(-1.0)[0]
+    expected = 1.0 / 11.0 if temporal in ("regions", "all") else 1.0
+    assert all(float(x) in (-1.0,) or x == pytest.approx(expected) for x in lambdas.detach())
+    assert (lambdas > 0.0).any()
+    inside = made.background[0][~hand[0]] / plain.background[0][~hand[0]]
+    wanted = 1.0 / 11.0 if temporal == "all" else 1.0
+    torch.testing.assert_close(inside.detach(), torch.full_like(inside, wanted).detach())
+    assert float(made.sizes.detach().mean()) == pytest.approx(float(made.weights.detach().mean()))
+    # Omega learns from the reward of the size alone, and only where the factor is on all of W.
+    (-made.sizes.sum()).backward()
+    assert (omega.grad is not None) == (temporal == "all")
+    if temporal == "all":
+        assert omega.grad[0] > 0.0
+
+
 @settings(max_examples=30, deadline=None)
 @given(
     omega=st.one_of(st.floats(-1.0, 1.0), st.sampled_from([-1e-3, 1e-3, -1.0, 1.0])),
@@ -167,9 +229,16 @@ def test_a_covered_region_counts_less_than_a_visible_one() -> None:
     region=st.sampled_from(["whole", "pixels", "none", "empty mask", "whole mask"]),
     share_of=st.sampled_from(["hand", "region"]),
     threshold=st.sampled_from([-0.1, 0.0, 0.3, 1.0]),
+    chosen=st.sampled_from([PaoSettings(), PRINTED, STRETCHED, replace(PRINTED, temporal="all")]),
 )
 def test_weights_are_finite_and_not_negative_everywhere(
-    omega: float, value: float, hand: str, region: str, share_of: str, threshold: float
+    omega: float,
+    value: float,
+    hand: str,
+    region: str,
+    share_of: str,
+    threshold: float,
+    chosen: PaoSettings,
 ) -> None:
     error = torch.full((1, SIZE, SIZE), value)
     mask = torch.zeros(1, SIZE, SIZE, dtype=torch.bool)
@@ -182,14 +251,16 @@ def test_weights_are_finite_and_not_negative_everywhere(
         "empty mask": overlapping(~ones),
         "whole mask": overlapping(ones),
     }[region]
-    module = PerturbationAwareWeights(PaoSettings(share_of=share_of))
+    module = PerturbationAwareWeights(replace(chosen, share_of=share_of))
     with torch.no_grad():
         module.T_mu.fill_(threshold)
     made = module(error, stack_regions([regions]), mask, torch.tensor([omega]))
     assert made.weights.isfinite().all()
     assert (made.weights >= 0.0).all()
-    made.weights.sum().backward()
-    assert all(parameter.grad.isfinite() for parameter in module.parameters())
+    (made.weights.sum() + made.sizes.sum()).backward()
+    learnt = [value.grad for value in module.parameters() if value.grad is not None]
+    assert len(learnt) >= 2
+    assert all(grad.isfinite() for grad in learnt)
     if not np.isfinite(value):
         assert (made.weights == 0.0).all()
 

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import pytest
 
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.base.progress import clock, remaining
 from hwp_bench.evaluation.ablate.design import make_design
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
@@ -75,9 +76,9 @@ def test_three_components_are_crossed_on_request(manifest) -> None:
     assert names(design)[0] == "no-a+no-b+no-c"
     for effect in design.effects:
         assert sum(effect.contrast.values()) == pytest.approx(0)
-        gain = 1 if effect.kind == "main" else 2
+        gain = 2 if effect.kind == "interaction" else 1
         assert sum(f for f in effect.contrast.values() if f > 0) == pytest.approx(gain)
-    assert [effect.title for effect in design.effects][3:] == ["A x B", "A x C", "B x C"]
+    assert [effect.title for effect in design.effects][3:6] == ["A x B", "A x C", "B x C"]
 
 
 def test_what_cannot_be_ablated_is_refused(manifest, tmp_path: Path) -> None:
@@ -96,3 +97,21 @@ def test_the_remaining_time_ignores_what_was_found_finished() -> None:
     assert remaining([], 3) is None
     assert remaining([0.01, 0.02, 10.0, 12.0], 4) == pytest.approx(44)
     assert (clock(59.6), clock(3723)) == ("1:00", "1:02:03")
+
+
+def test_a_method_says_what_is_crossed_when_nothing_is_asked_for(manifest, tmp_path: Path) -> None:
+    named = dataclasses.replace(manifest, crossed=("a", "b", "c"))
+    assert make_design(named) == make_design(manifest, crossed=["a", "b", "c"])
+    kinds = [effect.kind for effect in make_design(named).effects]
+    # Three main effects, three interactions; each out of the full method, and all of them.
+    assert kinds == ["main"] * 3 + ["interaction"] * 3 + ["out"] * 4
+    root = tmp_path / "method"
+    root.mkdir()
+    text = (manifest.root / "method.toml").read_text()
+    for wrong, message in (
+        ('["a", "nothing"]', "'nothing' is no component"),
+        ('["a", "a"]', "twice"),
+    ):
+        (root / "method.toml").write_text(text.replace("[entry]", f"crossed = {wrong}\n[entry]"))
+        with pytest.raises(BadMethod, match=message):
+            read_manifest(root)
