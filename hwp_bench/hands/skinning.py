@@ -11,10 +11,8 @@ from hwp_bench.hands.rotations import axis_angle_to_matrix
 from hwp_bench.hands.skeleton import landmark_order
 from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, TemplateTensors
 
-# The joints at each distance from the wrist; every template has this tree.
-_LEVELS = ((1, 4, 7, 10, 13), (2, 5, 8, 11, 14), (3, 6, 9, 12, 15))
-# Where each joint stands once the levels are joined: the wrist, then one level after the other.
-_LEVEL_ORDER = (0, 1, 6, 11, 2, 7, 12, 3, 8, 13, 4, 9, 14, 5, 10, 15)
+# The joints at each distance from the wrist, one of each finger; every template has this tree.
+_LEVELS = (slice(1, None, 3), slice(2, None, 3), slice(3, None, 3))
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,16 +154,19 @@ def _forward_kinematics(
 ) -> tuple[torch.Tensor, torch.Tensor]:
     """World rotation (B, 16, 3, 3) and place (B, 16, 3) of every joint, level by level."""
     turn, place, parents = rotations[:, :1], rest_joints[:, :1], rest_joints[:, :1]
-    turns, places = [turn], [place]
+    wrist_turn, wrist_place = turn, place
+    turns, places = [], []
     for level in _LEVELS:
-        rest = rest_joints[:, list(level)]
+        rest = rest_joints[:, level]
         place = place + (turn @ (rest - parents)[..., None])[..., 0]
-        turn = turn @ rotations[:, list(level)]
+        turn = turn @ rotations[:, level]
         parents = rest
         turns.append(turn)
         places.append(place)
-    order = list(_LEVEL_ORDER)
-    return torch.cat(turns, dim=1)[:, order], torch.cat(places, dim=1)[:, order]
+    return (
+        torch.cat([wrist_turn, torch.stack(turns, dim=2).flatten(1, 2)], dim=1),
+        torch.cat([wrist_place, torch.stack(places, dim=2).flatten(1, 2)], dim=1),
+    )
 
 
 def _blend_skin(

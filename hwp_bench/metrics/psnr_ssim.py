@@ -10,9 +10,7 @@ import numpy as np
 from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.metrics.pixels import bounding_box, check_same_shape, composite, crop
 from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PSNR_CAP, SsimSettings
-
-# Rows that are scored together: the arithmetic between the window means then stays in the cache.
-_STRIP = 32
+from hwp_bench.metrics.ssim_kernel import similarity
 
 
 def decibels(mse: float, cap: float = PSNR_CAP) -> float:
@@ -48,45 +46,15 @@ def ssim_map(x: np.ndarray, y: np.ndarray, settings: SsimSettings = HWP_V1.ssim)
     if min(x.shape[:2]) < settings.size:
         raise ShapeMismatch(f"an image of {x.shape[:2]} is smaller than the window")
     means = [_window_mean(image, settings) for image in (x, y, x * x, y * y, x * y)]
-    similarity: np.ndarray = np.empty(x.shape[:2])
-    for top in range(0, len(x), _STRIP):
-        rows = slice(top, top + _STRIP)
-        similarity[rows] = _similarity([mean[rows] for mean in means], settings)
-    r = settings.radius
-    return similarity[r : similarity.shape[0] - r, r : similarity.shape[1] - r]
-
-
-def _similarity(means: list[np.ndarray], settings: SsimSettings) -> np.ndarray:
-    """SSIM (H, W) from the window means (H, W, 3) of x, y, x * x, y * y and x * y."""
-    mean_x, mean_y, square_x, square_y, product = means
+    mean_x, mean_y, square_x, square_y, product = (mean.reshape(-1) for mean in means)
     pixels = settings.size**2
     correction = pixels / (pixels - 1) if settings.sample_covariance else 1.0
     c1 = (settings.k1 * settings.data_range) ** 2
     c2 = (settings.k2 * settings.data_range) ** 2
-    mean_xx, mean_yy, numerator = mean_x * mean_x, mean_y * mean_y, mean_x * mean_y
-    variance_x, variance_y = square_x - mean_xx, square_y - mean_yy
-    np.maximum(variance_x, 0.0, out=variance_x)
-    np.maximum(variance_y, 0.0, out=variance_y)
-    bound = variance_x * variance_y
-    np.sqrt(bound, out=bound)
-    covariance = product - numerator
-    np.minimum(covariance, bound, out=covariance)
-    np.maximum(covariance, np.negative(bound, out=bound), out=covariance)
-
-    numerator *= 2.0
-    numerator += c1
-    covariance *= 2.0 * correction
-    covariance += c2
-    numerator *= covariance
-    denominator, variances = mean_xx, variance_x
-    denominator += mean_yy
-    denominator += c1
-    variances += variance_y
-    variances *= correction
-    variances += c2
-    denominator *= variances
-    numerator /= denominator
-    return cv2.transform(numerator, np.full((1, 3), 1.0 / 3.0))
+    similarity((mean_x, mean_y), (square_x, square_y), product, (c1, c2, correction))
+    by_pixel = cv2.transform(means[-1], np.full((1, 3), 1.0 / 3.0))
+    r = settings.radius
+    return by_pixel[r : by_pixel.shape[0] - r, r : by_pixel.shape[1] - r]
 
 
 def ssim_box(

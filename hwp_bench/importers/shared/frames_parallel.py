@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import TypeVar
 
+Frame = TypeVar("Frame")
 Result = TypeVar("Result")
 
 #: Most threads; each frame's work is mostly OpenCV and compiled code, which let others run.
@@ -15,12 +16,12 @@ MOST_THREADS = 4
 _AHEAD = 4
 
 
-def each_frame(work: Callable[[int], Result], frames: Iterable[int]) -> Iterator[Result]:
+def each_frame(work: Callable[[Frame], Result], frames: Iterable[Frame]) -> Iterator[Result]:
     """Call a function for each frame in several threads.
 
     Args:
-        work: gets the frame's number; called from several threads.
-        frames: which frames.
+        work: gets one of the frames; called from several threads.
+        frames: numbers of frames, or whatever else `work` takes; read as they are needed.
 
     Yields:
         The results in the order of `frames`, so that they do not depend on the number of threads;

@@ -14,6 +14,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.progress import progress
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter
 from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.importers.shared.frames_parallel import each_frame
 
 #: Name of the overlay sheet among the capture's extra files.
 SHEET_NAME = "overlay.png"
@@ -65,9 +66,14 @@ def write_capture(
         CaptureWriter(out, info, hands, cameras, overwrite=overwrite) as writer,
         progress("writing the capture", info.frame_count) as update,
     ):
-        for frame, (image, mask) in enumerate(frames):
+
+        def store(numbered: tuple[int, tuple[np.ndarray, np.ndarray]]) -> int:
+            frame, (image, mask) = numbered
             writer.frame(frame, image)
             writer.mask(frame, mask)
+            return frame
+
+        for frame in each_frame(store, enumerate(frames)):
             update(frame + 1)
         writer.extra(SHEET_NAME, cv2.imencode(".png", sheet()[:, :, ::-1])[1].tobytes())
         writer.extra(REPORT_NAME, json.dumps(dict(facts), indent=1) + "\n")

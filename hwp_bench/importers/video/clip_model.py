@@ -60,6 +60,20 @@ class PosedClip:
     pose: torch.Tensor
 
 
+@dataclass(frozen=True, eq=False)
+class SomeVertices:
+    """Vertices chosen in every frame, with what posing them needs; read once for many steps."""
+
+    #: (F, P) int64.
+    index: torch.Tensor
+    #: (F, P, 3) m, rest place without the shape: template and correctives.
+    rest: torch.Tensor
+    #: (F, P, 3, 10) m per unit of shape.
+    shape_basis: torch.Tensor
+    #: (F, P, 16) skinning weights.
+    weights: torch.Tensor
+
+
 class ClipModel:
     """Poses a clip from its variables.
 
@@ -120,20 +134,34 @@ class ClipModel:
             pose=pose,
         )
 
-    def vertices(self, posed: PosedClip, index: torch.Tensor, rest: torch.Tensor) -> torch.Tensor:
+    def choose(self, index: torch.Tensor) -> SomeVertices:
+        """Choose vertices (F, P) int64 of each frame; correctives stay as they are now."""
+        rest = self.tensors.vertices[index]
+        basis = self.tensors.pose_basis
+        if basis is not None:
+            with torch.no_grad():
+                turns = axis_angle_to_matrix(self.variables.fingers)
+                feature = (turns - torch.eye(3)).flatten(1)
+                rest = rest + torch.stack(
+                    [basis[some] @ row for some, row in zip(index, feature, strict=True)]
+                )
+        return SomeVertices(
+            index, rest, self.tensors.shape_basis[index], self.tensors.weights[index]
+        )
+
+    def vertices(self, posed: PosedClip, some: SomeVertices) -> torch.Tensor:
         """Pose some vertices of each frame.
 
         Args:
             posed: this clip.
-            index: (F, P) int64 vertices.
-            rest: (F, P, 3) m, their rest place without the shape: template and correctives.
+            some: which.
 
         Returns:
             (F, P, 3) m, camera axes.
         """
-        shaped = rest + self.tensors.shape_basis[index] @ self.variables.betas
+        shaped = some.rest + some.shape_basis @ self.variables.betas
         motion = posed.transforms[:, :, :3].flatten(start_dim=2)
-        blended = (self.tensors.weights[index] @ motion).unflatten(-1, (3, 4))
+        blended = (some.weights @ motion).unflatten(-1, (3, 4))
         skinned = (blended[..., :3] @ shaped[..., None])[..., 0] + blended[..., 3]
         return _moved(skinned, posed.rotation, posed.place)
 

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 
 from hwp_bench.hands.raster import draw_silhouette
-from hwp_bench.hands.rotations import axis_angle_to_matrix
 from hwp_bench.hands.topology import boundary_vertices
 from hwp_bench.importers.shared.frames_parallel import each_frame
 from hwp_bench.importers.shared.windows import CropWindows
@@ -78,33 +77,19 @@ class ContourEnergy:
             matches.append(found)
             if update is not None:
                 update(len(matches))
-        self.index = torch.as_tensor(np.stack([match.index for match in matches]))
         self.normal = torch.as_tensor(np.stack([match.normal for match in matches]))
         self.target = torch.as_tensor(np.stack([match.target for match in matches]))
-        self.rest = self._rest(model)
+        self.outline = model.choose(torch.as_tensor(np.stack([match.index for match in matches])))
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy, a scalar."""
-        pixels = self._in_field(model.pixels(model.vertices(posed, self.index, self.rest)))
+        pixels = self._in_field(model.pixels(model.vertices(posed, self.outline)))
         # A vertex without a match has a zero normal and a zero target.
         distance = (pixels * self.normal).sum(dim=-1) - self.target
         return self.weight * geman_mcclure((distance / self.scale) ** 2, turn=4.0).sum()
 
     def _in_field(self, pixels: torch.Tensor) -> torch.Tensor:
         return (pixels - self.corners) * self.ratio
-
-    def _rest(self, model: ClipModel) -> torch.Tensor:
-        """Rest place (F, P, 3) of the chosen vertices; correctives are held during a round."""
-        rest = model.tensors.vertices[self.index]
-        basis = model.tensors.pose_basis
-        if basis is None:
-            return rest
-        with torch.no_grad():
-            feature = (axis_angle_to_matrix(model.variables.fingers) - torch.eye(3)).flatten(1)
-            correctives = [
-                basis[index] @ row for index, row in zip(self.index, feature, strict=True)
-            ]
-        return rest + torch.stack(correctives)
 
 
 @dataclass(frozen=True, eq=False)

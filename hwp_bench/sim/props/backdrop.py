@@ -104,7 +104,10 @@ def backdrop_colors(name: str, seed: int, directions: np.ndarray) -> np.ndarray:
     import cv2
 
     slope = directions[..., :2] / np.maximum(directions[..., 2:], 1e-3)
-    place = ((slope + 1.0) / 2.0 * (_TEXTURE - 1)).astype(np.float32)
+    slope += 1.0
+    slope /= 2.0
+    slope *= _TEXTURE - 1
+    place = slope.astype(np.float32)
     return cv2.remap(
         _texture(name, seed),
         np.ascontiguousarray(place[..., 0]),

@@ -65,7 +65,8 @@ def exposed(stage: Stage, window: Window, sky: dict[str, np.ndarray], lens: Lens
         else:
             with stage.cost.time("hands"):
                 body = stage.traced(between((first, middle, last), s))
-            things = stage.things(objects_at(scene, recipe, window.seconds(s)), window.hands(s))
+            placements = objects_at(scene, recipe, window.seconds(s))
+            things = stage.things(placements, window.hands(s)) if placements else None
         image = render_instant(scene, moved, body, things, lights, stage.cost)
         color += image.color / recipe.subframes
         coverage += image.coverage / recipe.subframes

@@ -91,12 +91,15 @@ def _taps(
     x = uv[0] * columns - 0.5
     y = (1.0 - uv[1]) * rows - 0.5
     left, top = np.floor(x), np.floor(y)
-    x0, y0 = np.int64(left) % columns, np.int64(top) % rows
-    return (
-        x0,
-        (x0 + 1) % columns,
-        y0,
-        (y0 + 1) % rows,
-        np.float32(x - left),
-        np.float32(y - top),
-    )
+    x0, y0 = np.int64(left), np.int64(top)
+    # Nearly every place lies inside, and a remainder takes as long as a texel.
+    if x0 < 0 or x0 >= columns:
+        x0 %= columns
+    if y0 < 0 or y0 >= rows:
+        y0 %= rows
+    x1, y1 = x0 + 1, y0 + 1
+    if x1 == columns:
+        x1 = 0
+    if y1 == rows:
+        y1 = 0
+    return x0, x1, y0, y1, np.float32(x - left), np.float32(y - top)

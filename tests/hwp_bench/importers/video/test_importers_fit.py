@@ -193,8 +193,8 @@ def test_outline_vertices_are_those_of_the_hand_model(correctives: bool) -> None
     contour = ContourEnergy(fields, clip.landmarks.detected, windows, quick, 150.0)
     contour.rematch(fitted.model)
     everything = posed_vertices(fitted.model)
-    some = fitted.model.vertices(fitted.model.posed(), contour.index, contour.rest)
-    expected = np.take_along_axis(everything, contour.index.numpy()[..., None], axis=1)
+    some = fitted.model.vertices(fitted.model.posed(), contour.outline)
+    expected = np.take_along_axis(everything, contour.outline.index.numpy()[..., None], axis=1)
     np.testing.assert_allclose(some.detach().numpy(), expected, atol=1e-5)
 
 
