@@ -86,12 +86,12 @@ def bump(
 @compiled(nogil=True)
 def _taps(
     uv: np.ndarray, rows: int, columns: int
-) -> tuple[np.int64, np.int64, np.int64, np.int64, np.float32, np.float32]:
+) -> tuple[int, int, int, int, np.float32, np.float32]:
     """Columns and rows of the four texels around a place (2,), and how far it is between them."""
     x = uv[0] * columns - 0.5
     y = (1.0 - uv[1]) * rows - 0.5
     left, top = np.floor(x), np.floor(y)
-    x0, y0 = np.int64(left), np.int64(top)
+    x0, y0 = int(left), int(top)
     # Nearly every place lies inside, and a remainder takes as long as a texel.
     if x0 < 0 or x0 >= columns:
         x0 %= columns
