@@ -25,6 +25,9 @@ def command_tree() -> Command:
             "judge": Command(
                 "judge the frames of a capture: clean or perturbed", "wildghand.cli.judge"
             ),
+            "explain": Command(
+                "show what the biases took out of training frames", "wildghand.cli.explain"
+            ),
             "info": Command("show what renders here, and check it", "wildghand.cli.info"),
         },
     )
