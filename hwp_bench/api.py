@@ -21,6 +21,7 @@ from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
+from hwp_bench.methods.setting_files import check_settings
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.evaluation_tables import HEADLINE, all_tables
 from hwp_bench.results import Results, read_all
@@ -83,7 +84,7 @@ def evaluate(
         run=RunSettings(dict(settings or {}), seed, Budget(seconds, steps), frames),
     )
     folder = Path(out) if out is not None else default_folder(os.fspath(method), plan)
-    read_manifest(find_method(os.fspath(method))).check_setting_names(settings or {})
+    check_settings(read_manifest(find_method(os.fspath(method))), settings or {})
     view = JobsView()
     engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
     with engine, view if engine.in_turn else nullcontext():

@@ -118,6 +118,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluation.evaluate import default_folder, evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
+    from hwp_bench.methods.setting_files import check_settings
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.run.engine.options import engine_for, needs_of
 
@@ -126,7 +127,7 @@ def run(args: argparse.Namespace) -> int:
     if sealed is not None:
         settings = replace(settings, suite=f"sealed-{sealed.commitment[:12]}")
     # A wrong method directory is reported before a suite is rendered for it.
-    read_manifest(find_method(args.method)).check_setting_names(settings.run.settings, "--set")
+    check_settings(read_manifest(find_method(args.method)), settings.run.settings, "--set")
     out = Path(args.out) if args.out else default_folder(args.method, settings)
     splits = read_splits(args.splits) if args.splits else None
     if sealed is not None:

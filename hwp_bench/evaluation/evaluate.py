@@ -20,6 +20,7 @@ from hwp_bench.evaluation.capture_evaluation import (
 )
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
+from hwp_bench.methods.setting_files import find_setting_files
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
@@ -92,7 +93,9 @@ def evaluate(
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
         HwpError: another evaluation is writing to `out`, or it cannot be written.
     """
-    plan = make_plan(read_manifest(find_method(method)), open_captures(captures, splits), settings)
+    manifest = read_manifest(find_method(method))
+    settings = with_setting_files(manifest, settings)
+    plan = make_plan(manifest, open_captures(captures, splits), settings)
     folders = [out / "captures" / item.capture.info.id for item in plan.evaluations]
     jobs = [
         evaluation_job(evaluation, folder, folder.name, needs or Needs())
@@ -103,6 +106,23 @@ def evaluate(
         results = plan.results([read_result(folder) for folder in folders])
         write_results(out / "results.json", results)
     return results
+
+
+def with_setting_files(
+    manifest: MethodManifest, settings: EvaluationSettings
+) -> EvaluationSettings:
+    """Expose the files that a person's settings name, with absolute paths in the settings.
+
+    Raises:
+        UsageError: one of them is not there.
+    """
+    chosen, files = find_setting_files(manifest, settings.run.settings)
+    exposed = tuple(dict.fromkeys((*settings.confinement.exposed, *files)))
+    return replace(
+        settings,
+        run=replace(settings.run, settings=chosen),
+        confinement=replace(settings.confinement, exposed=exposed),
+    )
 
 
 @dataclass(frozen=True)

@@ -53,6 +53,7 @@ _SwitchName = Annotated[
 _SettingName = Annotated[
     str, _matching(r"[A-Za-z_]\w{0,63}(\.[A-Za-z_]\w{0,63}){0,7}", "a name of a setting")
 ]
+_KindName = Annotated[str, _matching(r"[a-z][a-z0-9-]{0,31}", "a word of letters and digits")]
 _SwitchSettings = Annotated[
     dict[_SettingName, Any], Meta(min_length=1, description="a table of at least one setting")
 ]
@@ -112,6 +113,10 @@ class MethodManifest:
     #: Names of its settings, dotted within tables; empty where the file does not say. A name
     #: stands for everything below it.
     settings: tuple[str, ...] = ()
+    #: Settings whose value may be `KIND:PATH`, a file or folder of a person's: the kinds, by name.
+    files: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    #: `module:callable` that checks such files before a method that ships is run; may be empty.
+    check_files: str = ""
 
     def check_setting_names(self, values: Mapping[str, Any], field: str = "settings") -> None:
         """Refuse a setting that the method does not have, before anything runs.
@@ -252,7 +257,10 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
         licence=table.licence,
         url=table.url,
         settings=tuple(table.settings),
+        files={name: tuple(kinds) for name, kinds in table.files.items()},
+        check_files=table.check_files or "",
     )
+    manifest.check_setting_names(manifest.files, "files")
     for name, preset in manifest.presets.items():
         manifest.check_setting_names(preset, f"presets.{name}")
     for name, switch in manifest.switches.items():
@@ -344,6 +352,8 @@ class _Manifest:
     licence: Line = ""
     url: Line = ""
     settings: list[_SettingName] = field(default_factory=list)
+    files: dict[_SettingName, list[_KindName]] = field(default_factory=dict)
+    check_files: _PythonEntry | None = None
     presets: dict[str, dict[str, Any]] = field(default_factory=dict)
     switches: dict[_SwitchName, _SwitchTable] = field(default_factory=dict)
     crossed: Annotated[list[_SwitchName], Meta(max_length=4)] = field(default_factory=list)

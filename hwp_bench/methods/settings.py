@@ -7,13 +7,13 @@ overrides of the command line, into a frozen dataclass, or says which name or va
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 
-from hwp_bench.base.errors import BadMethod
+from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.base.records import choice, number, parse_record, unfold
 
-__all__ = ["choice", "number", "settings_from"]
+__all__ = ["check_source", "choice", "number", "settings_from", "source_path"]
 
 Settings = TypeVar("Settings")
 
@@ -36,3 +36,28 @@ def settings_from(cls: type[Settings], values: Mapping[str, Any], where: str) ->
             value outside its range.
     """
     return parse_record(cls, unfold(values), where=where, error=BadMethod, numbers=(0.0, math.inf))
+
+
+def check_source(value: str, field: str, words: Sequence[str], kinds: Sequence[str]) -> None:
+    """Refuse a setting that is neither one of some words nor `KIND:PATH`.
+
+    Args:
+        value: of the setting.
+        field: its name, for the message.
+        words: those that stand for themselves.
+        kinds: of files that a person brings; `files` in `method.toml` lists them too.
+
+    Raises:
+        UsageError: it is something else.
+    """
+    kind, colon, place = value.partition(":")
+    if value in words or (colon and place and kind in kinds):
+        return
+    known = [*words, *(f"{kind}:PATH" for kind in kinds)]
+    raise UsageError(f"is {value[:100]!r}", field=field, remedy=f"Use {' or '.join(known)}.")
+
+
+def source_path(value: str) -> str | None:
+    """Return the path in a setting's value `KIND:PATH`; None where it is a word."""
+    _, colon, place = value.partition(":")
+    return place if colon else None

@@ -17,6 +17,7 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.fitting.hand_masks import hand_masks
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
 from wildghand.fitting.shared_features import SharedFeatures
@@ -45,6 +46,7 @@ class Fit:
 
     Raises:
         BadInput: no training frame can be used, or the prior is damaged or of another kind.
+        HwpError: a checkpoint that the settings name cannot be used.
     """
 
     def __init__(
@@ -70,9 +72,11 @@ class Fit:
         self.source |= start_from_prior(self.model, settings, training.hand_model)
         self.clip = TrainingClip(training, self.frames.indices, self.model.rigs, device)
         assessment = assess_frames(training, self.frames, settings)
+        masks = hand_masks(training, self.frames, settings.pao.hand, device)
+        self.frames = dataclasses.replace(self.frames, masks=masks)
         self.weighting = Weighting(self.frames, len(training.sides), assessment, settings, device)
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
-        self.objective = Objective(settings, self.model.rigs, temporal)
+        self.objective = Objective(settings, self.model.rigs, temporal, device)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
         self.generator = torch.Generator().manual_seed(seed)
         self._record = FitRecord(

@@ -8,17 +8,20 @@ import torch
 from torch import Tensor
 
 from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.fitting.networks import choose_perceptual
 from wildghand.fitting.weighting import FrameTarget
 from wildghand.gaussians.attribute_roughness import attribute_roughness
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.laplacian import surface_laplacian
-from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.gaussians.rig import HandRig
 from wildghand.model import terms
 from wildghand.model.model import RenderedFrames, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import HandFeatures
+
+#: Where batches are unless a fit says otherwise.
+CPU = torch.device("cpu")
 
 
 class Objective:
@@ -28,6 +31,11 @@ class Objective:
         settings: weights of the terms.
         rigs: by side.
         temporal: what holds the temporal weights; None: nothing.
+        device: where the batches are.
+
+    Raises:
+        UsageError: a perceptual network was chosen for a term of weight 0.
+        HwpError: its weights cannot be used.
     """
 
     def __init__(
@@ -35,6 +43,7 @@ class Objective:
         settings: WildGHandSettings,
         rigs: Mapping[str, HandRig],
         temporal: TemporalTarget | None = None,
+        device: torch.device = CPU,
     ) -> None:
         self.settings = settings
         self.temporal = temporal
@@ -47,7 +56,7 @@ class Objective:
         self._laplacians = (
             {side: surface_laplacian(rig) for side, rig in rigs.items()} if any(smooth) else {}
         )
-        self._perceptual = FilterBankLoss() if self.weights.perceptual else None
+        self._perceptual = choose_perceptual(settings, device)
 
     def __call__(
         self,

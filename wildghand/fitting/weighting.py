@@ -10,6 +10,7 @@ from torch import Tensor
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.dpd.pay_back import PayBack
+from wildghand.fitting.networks import choose_segmenter
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.gaussians.frame_table import FrameTable, shares_of_255, soft_weights
 from wildghand.gaussians.training import TrainingFrames
@@ -17,7 +18,7 @@ from wildghand.model.model import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.pao.pao import PerturbationAwareWeights, binary_weights
 from wildghand.pao.regions import ClipRegions
-from wildghand.pao.regions.superpixels import RegionCache, Superpixels
+from wildghand.pao.regions.superpixels import RegionCache
 from wildghand.pao.running_median import running_median
 from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
 
@@ -104,7 +105,8 @@ class Weighting:
         tolerance = settings.dpd.pay_back
         self.pay_back = PayBack(self.clean.to(device), tolerance) if tolerance else None
         if self._weighs_regions:
-            regions = RegionCache().clip(frames.images.numpy(), Superpixels())
+            segmenter = choose_segmenter(settings.pao.regions, device)
+            regions = RegionCache().clip(frames.images.numpy(), segmenter)
             self._regions = ClipRegions(regions, device)
         self._images, self._hands = frames.images_on(device), frames.masks_on(device)
         size = 4 * frames.masks[0].numel()

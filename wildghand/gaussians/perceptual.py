@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from hwp_bench.base.colors import LUMA
 from hwp_bench.base.errors import BadInput, ShapeMismatch
+from hwp_bench.base.tensor_files import read_tensors
 
 #: Octaves of the filter bank.
 SCALES = 4
@@ -21,6 +22,8 @@ _VGG_LAYERS = {0: 64, 2: 64, 5: 128, 7: 128, 10: 256, 12: 256, 14: 256, 16: 256,
 _VGG_POOLS = (4, 9, 18, 27)
 # Slices end behind relu2_1, relu3_1, relu4_1 and relu5_1.
 _VGG_WEIGHTS = {5: 1 / 16, 10: 1 / 8, 19: 1 / 4, 28: 1.0}
+# Largest file that is read; torchvision's has 575 MB.
+_MAX_BYTES = 1 << 30
 _MEAN, _STD = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)
 
 
@@ -84,9 +87,10 @@ class Vgg19(nn.Module):
         self.layers = nn.ModuleDict()
         before = 3
         for place, channels in _VGG_LAYERS.items():
-            self.layers[str(place)] = nn.Conv2d(before, channels, 3, padding=1)
+            # Without memory: its tensors are those of the file.
+            self.layers[str(place)] = nn.Conv2d(before, channels, 3, padding=1, device="meta")
             before = channels
-        _fill(self.layers, _read(Path(weights)), Path(weights))
+        _fill(self.layers, read_tensors(weights, _MAX_BYTES), Path(weights))
         self.requires_grad_(False)
         self.register_buffer("mean", torch.tensor(_MEAN)[:, None, None], persistent=False)
         self.register_buffer("std", torch.tensor(_STD)[:, None, None], persistent=False)
@@ -150,34 +154,18 @@ def _pool(images: Tensor) -> Tensor:
     return nn.functional.avg_pool2d(images, 2, ceil_mode=True)
 
 
-def _read(path: Path) -> dict[str, Tensor]:
-    if not path.is_file():
-        raise BadInput("does not exist", where=path, remedy="Name a file with VGG-19's weights.")
-    try:
-        if path.suffix == ".safetensors":
-            from safetensors.torch import load_file
-
-            return load_file(path)
-        loaded = torch.load(path, map_location="cpu", weights_only=True)
-    # A damaged file may raise anything in its reader.
-    except Exception as error:
-        raise BadInput(f"cannot be read ({type(error).__name__}: {error})", where=path) from error
-    if not isinstance(loaded, dict):
-        raise BadInput("is not a table of parameters", where=path)
-    return loaded
-
-
 def _fill(layers: nn.ModuleDict, values: dict[str, Tensor], path: Path) -> None:
-    with torch.no_grad():
-        for place, layer in layers.items():
-            for kind, parameter in layer.named_parameters():
-                name = f"features.{place}.{kind}"
-                value = values.get(name)
-                if not isinstance(value, Tensor) or value.shape != parameter.shape:
-                    raise BadInput(
-                        f"is missing or not of shape {tuple(parameter.shape)}",
-                        where=path,
-                        field=name,
-                        remedy="The file must hold torchvision's VGG-19.",
-                    )
-                parameter.copy_(value)
+    for place, layer in layers.items():
+        found = {}
+        for kind, parameter in layer.named_parameters():
+            name = f"features.{place}.{kind}"
+            value = values.get(name)
+            if value is None or value.shape != parameter.shape or not value.is_floating_point():
+                raise BadInput(
+                    f"is missing or not of shape {tuple(parameter.shape)}",
+                    where=path,
+                    field=name,
+                    remedy="The file must hold torchvision's VGG-19.",
+                )
+            found[kind] = value.float()
+        layer.load_state_dict(found, assign=True)

@@ -15,7 +15,7 @@ from typing import Any
 
 from hwp_bench.base.errors import BadMethod
 from hwp_bench.base.records import flattened, merged
-from hwp_bench.methods.settings import choice, number, settings_from
+from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.model.former_settings import current_names
 from wildghand.model.terms import PAPER_TERMS, TermWeights
@@ -120,8 +120,14 @@ class WildGHandSettings:
     network: NetworkSettings = field(default_factory=NetworkSettings)
     #: Weights of the terms of the loss.
     terms: TermWeights = field(default_factory=TermWeights)
+    #: The perceptual distance of the loss, where `terms.perceptual` is above 0: `filter-bank`, or
+    #: `vgg19:PATH`, torchvision's weights.
+    perceptual: str = "filter-bank"
     #: Steps of the optimizer.
     schedule: ScheduleSettings = field(default_factory=ScheduleSettings)
+
+    def __post_init__(self) -> None:
+        check_source(self.perceptual, "perceptual", ("filter-bank",), ("vgg19",))
 
 
 #: What the paper and the authors' code have in common, in place of the defaults.
@@ -281,7 +287,7 @@ def _check_names(changes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
 
 def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
     """The same settings; what could not act is off."""
-    dpd, heads, prepass = settings.dpd, settings.heads, settings.prepass
+    dpd, pao, heads, prepass = settings.dpd, settings.pao, settings.heads, settings.prepass
     return dataclasses.replace(
         settings,
         dpd=dataclasses.replace(
@@ -289,6 +295,11 @@ def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
             rank=dpd.rank if dpd.enabled and dpd.biases else 0,
             gains=dpd.enabled and dpd.gains,
             pay_back=dpd.pay_back if dpd.enabled and dpd.biases else 0.0,
+        ),
+        pao=dataclasses.replace(
+            pao,
+            regions=pao.regions if pao.enabled else "superpixels",
+            hand=pao.hand if pao.enabled else "estimated",
         ),
         heads=HeadSettings(
             enabled=heads.enabled,

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.methods.settings import check_source
 from wildghand.pao.regions.frame_regions import Regions
 from wildghand.pao.running_median import running_median
 
@@ -29,6 +30,11 @@ class PaoSettings:
     #: `terms.outside_weight` outside. `printed`: as printed. `binary`: the hand's mask alone (the
     #: paper's table).
     variant: Literal["scaled", "printed", "binary"] = "scaled"
+    #: The regions y_u: `superpixels`, or `sam:PATH`, the masks of a Segment Anything checkpoint.
+    regions: str = "superpixels"
+    #: The hand y_h: the `estimated` mask of the capture; `graph-cut`, prompted by the projected
+    #: hand; or `sam:PATH`, Segment Anything at the projected hand root, as in the paper.
+    hand: str = "estimated"
     #: What the temporal factor 1 / (1 + beta |omega|) scales. `teaching`: what the canonical hand
     #: learns from a frame, while the frame's biases learn from all of it. `all`: W. `regions`: the
     #: weights of regions alone, as printed. `none`: nothing, as in the authors' code.
@@ -65,6 +71,8 @@ class PaoSettings:
                 raise UsageError(
                     f"is {value}", field=item.name, remedy="Use a finite number, 0 or more."
                 )
+        check_source(self.regions, "regions", ("superpixels",), ("sam",))
+        check_source(self.hand, "hand", ("estimated", "graph-cut"), ("sam",))
         for name, known in (
             ("variant", ("scaled", "printed", "binary")),
             ("temporal", ("teaching", "all", "regions", "none")),

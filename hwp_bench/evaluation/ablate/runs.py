@@ -11,7 +11,13 @@ from hwp_bench.base.locks import exclusive
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.ablate.design import Design, Variant
 from hwp_bench.evaluation.capture_evaluation import evaluation_job, read_result
-from hwp_bench.evaluation.evaluate import EvaluationSettings, Plan, make_plan, open_captures
+from hwp_bench.evaluation.evaluate import (
+    EvaluationSettings,
+    Plan,
+    make_plan,
+    open_captures,
+    with_setting_files,
+)
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.results import CaptureResult, Results, write_results
@@ -78,6 +84,7 @@ def run_ablation(
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
         HwpError: another run is writing to `out`, or nobody can.
     """
+    settings = with_setting_files(manifest, settings)
     opened = open_captures(captures, splits)
     networks = load_available()
     plans = {

@@ -9,19 +9,22 @@ from wildghand.pao.regions.frame_regions import (
     stack_regions,
 )
 from wildghand.pao.regions.hand import graph_cut_hands, hand_of_mask
-from wildghand.pao.regions.sam import SegmentAnything, open_sam
+from wildghand.pao.regions.sam import PromptedHand, SegmentAnything, check_sam, mask_of, open_sam
 from wildghand.pao.regions.superpixels import RegionCache, Segmenter, Superpixels
 
 __all__ = [
     "ClipRegions",
     "FrameRegions",
+    "PromptedHand",
     "RegionCache",
     "Regions",
     "SegmentAnything",
     "Segmenter",
     "Superpixels",
+    "check_sam",
     "graph_cut_hands",
     "hand_of_mask",
+    "mask_of",
     "open_sam",
     "overlapping",
     "partition",

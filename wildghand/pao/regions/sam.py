@@ -1,178 +1,136 @@
-"""Segment Anything, where the user has a checkpoint: nothing is ever downloaded."""
+"""Regions and hands of Segment Anything, where the user has a checkpoint."""
 
 from __future__ import annotations
 
-import functools
-import importlib
 import os
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict, dataclass
 
 import numpy as np
+import torch
 
-from hwp_bench.base.errors import BadInput, MissingDependency, UsageError
-from hwp_bench.base.files import sha256_file, sha256_json
+from hwp_bench.base.files import sha256_json
 from wildghand.pao.regions.frame_regions import FrameRegions, overlapping
+from wildghand.sam import (
+    AutomaticSettings,
+    SamNetwork,
+    SeenImage,
+    automatic_masks,
+    check_checkpoint,
+    checkpoint_digest,
+    load_network,
+)
 
-#: Model types of the package segment-anything, as its checkpoint files are named.
-MODEL_TYPES = ("vit_h", "vit_l", "vit_b")
+#: Which automatic masks are kept by default, as in the public code.
+PUBLIC = AutomaticSettings()
 
 
 class SegmentAnything:
     """Overlapping regions of an image, and the object at a pixel.
 
+    The network is loaded when the first image is cut that no cache has.
+
     Args:
-        identity: digest of the model and its options.
-        masks: gives the automatic masks of an image, (U, H, W) bool.
-        at: gives the best mask at a pixel (x, y) of an image, (H, W) bool.
+        identity: digest of the network, where it runs, and its options.
+        load: loads the network.
+        settings: which automatic masks are kept.
     """
 
     def __init__(
         self,
         identity: str,
-        masks: Callable[[np.ndarray], np.ndarray],
-        at: Callable[[np.ndarray, tuple[float, float]], np.ndarray],
+        load: Callable[[], SamNetwork],
+        settings: AutomaticSettings = PUBLIC,
     ) -> None:
-        self.identity = identity
-        self._masks = masks
-        self._at = at
+        self.identity = sha256_json([identity, asdict(settings)])
+        self._load = load
+        self._settings = settings
+        self._network: SamNetwork | None = None
+
+    @property
+    def network(self) -> SamNetwork:
+        """The network, loaded when it is needed first."""
+        if self._network is None:
+            self._network = self._load()
+        return self._network
 
     def regions(self, image: np.ndarray) -> FrameRegions:
         """The automatic masks of an (H, W, 3) uint8 sRGB image; there may be none."""
-        masks = np.asarray(self._masks(image), dtype=bool)
-        return overlapping(masks.reshape(-1, *image.shape[:2]))
+        return overlapping(automatic_masks(self.network, image, self._settings))
 
-    def hand(self, image: np.ndarray, root: tuple[float, float]) -> np.ndarray:
-        """y_h: the mask prompted by the projected hand root.
+    def hand(self, image: np.ndarray, roots: tuple[tuple[float, float], ...]) -> np.ndarray:
+        """y_h: the best of three masks at each projected hand root, all hands together.
 
         Args:
             image: (H, W, 3) uint8 sRGB.
-            root: (x, y) px, the centre of the top left pixel at 0.5.
+            roots: (x, y) px of each hand, the centre of the top left pixel at 0.5.
 
         Returns:
-            (H, W) bool, empty where the root is off the image.
+            (H, W) bool; roots off the image add nothing.
         """
         height, width = image.shape[:2]
-        if not (0.0 <= root[0] < width and 0.0 <= root[1] < height):
-            return np.zeros((height, width), dtype=bool)
-        return np.asarray(self._at(image, root), dtype=bool).reshape(height, width)
+        mask = np.zeros((height, width), dtype=bool)
+        inside = [(x, y) for x, y in roots if 0.0 <= x < width and 0.0 <= y < height]
+        if inside:
+            seen = self.network.see(image)
+            for root in inside:
+                mask |= _best_mask(seen, root)
+        return mask
+
+
+@dataclass(frozen=True)
+class PromptedHand:
+    """The hand of one frame as a segmenter, so that the cache of regions keeps it."""
+
+    #: Finds it.
+    sam: SegmentAnything
+    #: (x, y) px of each hand's root.
+    roots: tuple[tuple[float, float], ...]
+
+    @property
+    def identity(self) -> str:
+        """Digest of network and prompts; a thousandth of a pixel decides nothing."""
+        places = [[str(round(part, 3)) for part in root] for root in self.roots]
+        return sha256_json(["hand", self.sam.identity, places])
+
+    def regions(self, image: np.ndarray) -> FrameRegions:
+        """The hand as the only region."""
+        return overlapping(self.sam.hand(image, self.roots)[None])
+
+
+def mask_of(regions: FrameRegions) -> np.ndarray:
+    """The union of overlapping regions, (H, W) bool."""
+    assert regions.membership is not None
+    return np.asarray(regions.membership.any(axis=1))[regions.labels]
 
 
 def open_sam(checkpoint: str | os.PathLike[str], device: str = "cpu") -> SegmentAnything:
-    """Load a Segment Anything model from the user's disk.
+    """Open a Segment Anything checkpoint on the user's disk; nothing is downloaded.
 
     Args:
         checkpoint: a folder in the layout of `transformers` (config.json and weights), or a
-            .pth file of the package `segment-anything` with the model type in its name.
+            .pth file of the package `segment-anything`. Neither package is needed.
         device: torch device.
 
     Raises:
-        MissingDependency: the checkpoint or a package that reads it is not there.
-        BadInput: the checkpoint cannot be read.
-        UsageError: the file's name does not tell the model type.
+        BadInput: it is missing; when the first image is cut, also: it cannot be read, or is of
+            another network.
     """
-    path = Path(checkpoint)
-    if not path.exists():
-        raise MissingDependency(
-            "does not exist",
-            where=path,
-            remedy="Name a local checkpoint of Segment Anything, or use superpixels.",
-        )
-    return _open_folder(path, device) if path.is_dir() else _open_file(path, device)
+    # A graphics card rounds differently, and a mask may turn on it.
+    identity = sha256_json([checkpoint_digest(checkpoint), torch.device(device).type])
+    return SegmentAnything(identity, lambda: load_network(checkpoint, device))
 
 
-def _open_folder(path: Path, device: str) -> SegmentAnything:
-    transformers = _package("transformers", path)
-    torch = importlib.import_module("torch")
-    try:
-        model = transformers.SamModel.from_pretrained(str(path), local_files_only=True)
-        processor = transformers.SamProcessor.from_pretrained(str(path), local_files_only=True)
-    # A damaged checkpoint raises whatever its reader stumbles over.
-    except Exception as error:
-        raise _unreadable(path, error) from error
-    model = model.to(device).eval()
-    pil_image = _package("PIL.Image", path)
+def check_sam(checkpoint: str | os.PathLike[str]) -> None:
+    """Check that a checkpoint holds a Segment Anything network, without loading it.
 
-    @functools.cache
-    def generator() -> Any:
-        _package("torchvision", path)  # transformers says so only after the first image
-        return transformers.pipeline(
-            "mask-generation", model=model, image_processor=processor.image_processor, device=device
-        )
-
-    def masks(image: np.ndarray) -> np.ndarray:
-        found = generator()(pil_image.fromarray(image), points_per_batch=64)["masks"]
-        return np.stack([np.asarray(mask) for mask in found]) if len(found) else np.zeros(0)
-
-    def at(image: np.ndarray, root: tuple[float, float]) -> np.ndarray:
-        inputs = processor(
-            pil_image.fromarray(image), input_points=[[list(root)]], return_tensors="pt"
-        ).to(device)
-        with torch.no_grad():
-            outputs = model(**inputs, multimask_output=True)
-        found = processor.image_processor.post_process_masks(
-            outputs.pred_masks.cpu(),
-            inputs["original_sizes"].cpu(),
-            inputs["reshaped_input_sizes"].cpu(),
-        )[0][0]
-        return found[int(outputs.iou_scores.flatten().argmax())].numpy()
-
-    files = sorted(item for item in path.iterdir() if item.is_file())
-    digest = sha256_json(["transformers", *((item.name, sha256_file(item)) for item in files)])
-    return SegmentAnything(digest, masks, at)
+    Raises:
+        BadInput: it is missing, unreadable, or a tensor is missing or of another shape.
+    """
+    check_checkpoint(checkpoint)
 
 
-def _open_file(path: Path, device: str) -> SegmentAnything:
-    package = _package("segment_anything", path)
-    torch = importlib.import_module("torch")
-    kinds = [kind for kind in MODEL_TYPES if kind in path.name]
-    if len(kinds) != 1:
-        raise UsageError(
-            "the name does not tell the model type",
-            where=path,
-            remedy=f"Let it hold one of {', '.join(MODEL_TYPES)}.",
-        )
-    try:
-        # The package's own loader would run what the file asks for.
-        weights = torch.load(path, map_location="cpu", weights_only=True)
-        model = package.sam_model_registry[kinds[0]]()
-        model.load_state_dict(weights)
-    except Exception as error:
-        raise _unreadable(path, error) from error
-    model = model.to(device).eval()
-    generator = package.SamAutomaticMaskGenerator(model)
-    predictor = package.SamPredictor(model)
-
-    def masks(image: np.ndarray) -> np.ndarray:
-        return np.array([item["segmentation"] for item in generator.generate(image)])
-
-    def at(image: np.ndarray, root: tuple[float, float]) -> np.ndarray:
-        predictor.set_image(image)
-        found, scores, _ = predictor.predict(
-            point_coords=np.array([root]), point_labels=np.ones(1, int), multimask_output=True
-        )
-        return found[int(np.argmax(scores))]
-
-    digest = sha256_json(["segment-anything", kinds[0], sha256_file(path)])
-    return SegmentAnything(digest, masks, at)
-
-
-def _package(name: str, path: Path) -> Any:
-    try:
-        return importlib.import_module(name)
-    # A package that does not fit the others (torchvision of another torch) fails in its own way.
-    except (ImportError, RuntimeError) as error:
-        shown = name.replace("_", "-")
-        raise MissingDependency(
-            f"the package {shown} is needed to use it ({error})",
-            where=path,
-            remedy=f"Install {shown}, or use superpixels.",
-        ) from error
-
-
-def _unreadable(path: Path, error: Exception) -> BadInput:
-    return BadInput(
-        f"is not a readable Segment Anything checkpoint ({type(error).__name__}: {error})",
-        where=path,
-    )
+def _best_mask(seen: SeenImage, root: tuple[float, float]) -> np.ndarray:
+    coarse, quality = seen.masks_at(torch.tensor([root], dtype=torch.float64))
+    best = coarse[0, quality[0].argmax()]
+    return (seen.full(best[None])[0] > 0.0).cpu().numpy()

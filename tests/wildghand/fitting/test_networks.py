@@ -1,0 +1,207 @@
+"""SAM and VGG-19 in a fit, from the command lines. Oracles: fits without; the cache's files."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny_networks import write_sam_file, write_sam_folder, write_vgg19
+
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.capture import Capture
+from hwp_bench.cli.main import main as hwp_bench
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.avatar.files import load_avatar
+from wildghand.cli.main import main as wildghand
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.hand_masks import hand_masks, hand_roots
+from wildghand.fitting.networks import check_networks
+from wildghand.model.settings import read_settings
+
+QUICK: dict[str, Any] = {
+    "gaussians": 300,
+    "schedule.steps": 3,
+    "device": "cpu",
+    "network.identity_resolution": 40,
+    "network.plane_resolution": 20,
+}
+TrainingMaker = Callable[..., TrainingCapture]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Checkpoints of every kind."""
+    made = tmp_path_factory.mktemp("checkpoints")
+    write_sam_file(made / "sam.pth")
+    write_sam_folder(made / "sam")
+    write_vgg19(made / "vgg19.pth")
+    return made
+
+
+@pytest.fixture(autouse=True)
+def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "cache"))
+
+
+def weights(training: TrainingCapture, **changes: Any) -> torch.Tensor:
+    fit = Fit(training, read_settings({**QUICK, **changes}), 0, torch.device("cpu"))
+    rows = torch.arange(3)
+    with torch.no_grad():
+        return fit.weighting(rows, fit.draw(rows), 1.0).weights
+
+
+def options(settings: dict[str, Any]) -> list[str]:
+    return [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
+
+
+def test_regions_and_hand_reach_the_weights_and_are_found_once(
+    folder: Path, make_training: TrainingMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training = make_training()
+    plain = weights(training, mode="paper")
+    chosen = {"mode": "paper", "pao.regions": f"sam:{folder / 'sam.pth'}"}
+    regions = weights(training, **chosen)
+    assert not torch.equal(regions, plain)
+    both = weights(training, **chosen, **{"pao.hand": f"sam:{folder / 'sam.pth'}"})
+    assert not torch.equal(both, regions)
+    kept = len(list((tmp_path / "cache" / "wildghand" / "regions").iterdir()))
+    assert kept == 3 * len(training.train)  # superpixels, masks, hands
+
+    def load(*_: object) -> None:
+        raise AssertionError("the network was loaded again")
+
+    monkeypatch.setattr("wildghand.pao.regions.sam.load_network", load)
+    again = weights(training, **chosen, **{"pao.hand": f"sam:{folder / 'sam.pth'}"})
+    assert torch.equal(again, both)
+
+
+@pytest.mark.parametrize("source", ["graph-cut", "sam"])
+def test_the_binary_mask_is_the_hand_that_was_chosen(
+    source: str, folder: Path, make_training: TrainingMaker
+) -> None:
+    training = make_training()
+    hand = f"sam:{folder / 'sam'}" if source == "sam" else source
+    found = weights(training, **{"pao.variant": "binary", "pao.hand": hand})
+    settings = read_settings({**QUICK, "pao.variant": "binary"})
+    fit = Fit(training, settings, 0, torch.device("cpu"))
+    masks = hand_masks(training, fit.frames, hand, torch.device("cpu"))
+    assert torch.equal(found, (masks[:3] > 127).float())
+    assert not torch.equal(masks, fit.frames.masks)
+    if source == "graph-cut":  # the painted hand is where its parameters say, and alone
+        shared = ((masks > 127) & (fit.frames.masks > 127)).sum()
+        assert shared / ((masks > 127) | (fit.frames.masks > 127)).sum() > 0.8
+
+
+def test_without_pao_no_checkpoint_is_opened(make_training: TrainingMaker) -> None:
+    missing = {"pao.regions": "sam:/none", "pao.hand": "sam:/none", "pao.enabled": False}
+    weights(make_training(), **missing)
+    settings = read_settings(missing)
+    assert (settings.pao.regions, settings.pao.hand) == ("superpixels", "estimated")
+
+
+@pytest.mark.parametrize("hands", ["right", "both"])
+def test_roots_are_the_wrists_in_the_image(hands: str, make_training: TrainingMaker) -> None:
+    training = make_training(hands)
+    roots = hand_roots(training, training.train)
+    assert roots.shape == (len(training.train), len(training.sides), 2)
+    # The wrist lies before the camera, within the image or a hand's length from it.
+    assert (np.abs(roots - training.width / 2) < training.width).all()
+
+
+def test_a_fit_from_the_command_line_with_every_network(
+    folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
+) -> None:
+    settings = {
+        **QUICK,
+        "mode": "paper",
+        "pao.regions": f"sam:{folder / 'sam'}",
+        "pao.hand": f"sam:{folder / 'sam.pth'}",
+        "perceptual": f"vgg19:{folder / 'vgg19.pth'}",
+    }
+    out = tmp_path / "avatar"
+    command = ["fit", str(make_painted().root), "-o", str(out)]
+    assert wildghand([*command, *options(settings)]) == 0
+    avatar = load_avatar(out)
+    assert avatar.model.finite()
+    assert avatar.settings.perceptual == settings["perceptual"]
+    assert avatar.settings.pao.regions == settings["pao.regions"]
+    refused = [*command[:-1], str(tmp_path / "b"), *options({**QUICK, "perceptual": "vgg19:/none"})]
+    assert wildghand([*refused, "--set", "terms.perceptual=0.001"]) != 0
+    assert "/none: does not exist" in capsys.readouterr().err
+
+
+def test_an_evaluation_in_the_sandbox_sees_the_files(
+    folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
+) -> None:
+    settings = {
+        **QUICK,
+        "mode": "paper",
+        "pao.regions": f"sam:{folder / 'sam.pth'}",
+        "pao.hand": f"sam:{folder / 'sam'}",
+        "perceptual": f"vgg19:{folder / 'vgg19.pth'}",
+    }
+    out = tmp_path / "runs"
+    command = ["--capture", str(make_painted().root), "-o", str(out), *options(settings)]
+    assert hwp_bench(["evaluate", "wildghand", *command]) == 0, capsys.readouterr().err
+    result = json.loads((out / "results.json").read_text())["captures"][0]
+    assert result["failure"] is None
+    assert result["steps"] == 3
+    # Other weights are another evaluation.
+    write_sam_file(folder / "sam.pth", seed=1)
+    hwp_bench(["evaluate", "wildghand", *command])
+    again = json.loads((out / "results.json").read_text())["captures"][0]
+    assert again["key"] != result["key"]
+    write_sam_file(folder / "sam.pth")
+
+
+def test_an_ablation_takes_the_networks_too(
+    folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
+) -> None:
+    settings = {**QUICK, "mode": "paper", "pao.hand": f"sam:{folder / 'sam.pth'}"}
+    settings["pao.regions"] = f"sam:{folder / 'sam.pth'}"
+    command = ["ablate", "--binary-mask", "--seeds", "1", "-o", str(tmp_path / "runs")]
+    command += ["--capture", str(make_painted().root), *options(settings)]
+    assert hwp_bench(command) == 0, capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("settings", "problem"),
+    [
+        ({"pao.regions": "sam:/none/sam.pth"}, "does not exist"),
+        ({"pao.hand": "sam:VGG"}, "not a checkpoint of Segment Anything"),
+        ({"perceptual": "vgg19:SAM"}, "torchvision's VGG-19"),
+        ({"perceptual": "vgg19:TEXT"}, "cannot be read"),
+        ({"pao.regions": "slic"}, "superpixels or sam:PATH"),
+        ({"pao.hand": "mask"}, "estimated or graph-cut or sam:PATH"),
+        ({"perceptual": "vgg16:x"}, "filter-bank or vgg19:PATH"),
+    ],
+    ids=str,
+)
+def test_what_cannot_work_is_refused_before_a_suite_is_rendered(
+    settings: dict[str, str], problem: str, folder: Path, tmp_path: Path, capsys: Any
+) -> None:
+    (tmp_path / "text").write_text("no weights")
+    places = {"VGG": folder / "vgg19.pth", "SAM": folder / "sam.pth", "TEXT": tmp_path / "text"}
+    for word, place in places.items():
+        settings = {name: value.replace(word, str(place)) for name, value in settings.items()}
+    with pytest.raises((BadInput, UsageError), match=problem):
+        check_networks(settings)
+    if "PATH" not in problem:
+        out = tmp_path / "runs"
+        for command in ("evaluate", "ablate"):
+            words = [command, "wildghand", "--suite", "full", "-o", str(out), *options(settings)]
+            assert hwp_bench(words) != 0
+            assert problem in capsys.readouterr().err
+        assert not out.exists()
+
+
+def test_a_network_for_a_term_of_weight_0_is_refused(
+    folder: Path, make_training: TrainingMaker
+) -> None:
+    with pytest.raises(UsageError, match=r"terms\.perceptual is 0"):
+        weights(make_training(), perceptual=f"vgg19:{folder / 'vgg19.pth'}")
