@@ -15,13 +15,21 @@ from tiny_networks import write_sam_file, write_sam_folder, write_vgg19
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.cli.main import main as hwp_bench
-from hwp_bench.methods.contract import TrainingCapture
+from hwp_bench.evaluation.evaluate import (
+    EvaluationSettings,
+    make_plan,
+    open_captures,
+    with_setting_files,
+)
+from hwp_bench.methods import find_method, read_manifest
+from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main as wildghand
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.hand_masks import hand_masks, hand_roots
 from wildghand.fitting.networks import check_networks
 from wildghand.model.settings import read_settings
+from wildghand.sam import AutomaticSettings
 
 QUICK: dict[str, Any] = {
     "gaussians": 300,
@@ -43,9 +51,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-@pytest.fixture(autouse=True)
-def _own_cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "cache"))
+@pytest.fixture
+def _fewer_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Prompt a tenth of the points; the sandboxed fits prompt all of them."""
+    monkeypatch.setattr("wildghand.pao.regions.sam.PUBLIC", AutomaticSettings(points=10))
 
 
 def weights(training: TrainingCapture, **changes: Any) -> torch.Tensor:
@@ -59,9 +68,12 @@ def options(settings: dict[str, Any]) -> list[str]:
     return [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
 
 
+@pytest.mark.usefixtures("_fewer_points")
 def test_regions_and_hand_reach_the_weights_and_are_found_once(
     folder: Path, make_training: TrainingMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    # Of the regions only: the cache also holds compiled kernels.
+    monkeypatch.setattr("wildghand.pao.regions.superpixels.cache_root", lambda: tmp_path / "cache")
     training = make_training()
     plain = weights(training, mode="paper")
     chosen = {"mode": "paper", "pao.regions": f"sam:{folder / 'sam.pth'}"}
@@ -113,6 +125,7 @@ def test_roots_are_the_wrists_in_the_image(hands: str, make_training: TrainingMa
     assert (np.abs(roots - training.width / 2) < training.width).all()
 
 
+@pytest.mark.usefixtures("_fewer_points")
 def test_a_fit_from_the_command_line_with_every_network(
     folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
@@ -151,11 +164,22 @@ def test_an_evaluation_in_the_sandbox_sees_the_files(
     result = json.loads((out / "results.json").read_text())["captures"][0]
     assert result["failure"] is None
     assert result["steps"] == 3
-    # Other weights are another evaluation.
-    write_sam_file(folder / "sam.pth", seed=1)
-    hwp_bench(["evaluate", "wildghand", *command])
+    # The same files are the same evaluation, other weights another one.
+    assert hwp_bench(["evaluate", "wildghand", *command]) == 0
     again = json.loads((out / "results.json").read_text())["captures"][0]
-    assert again["key"] != result["key"]
+    assert again == result
+    manifest = read_manifest(find_method("wildghand"))
+    captures = open_captures([make_painted().root])
+
+    def key() -> str:
+        values = {"pao.regions": settings["pao.regions"]}
+        chosen = EvaluationSettings(run=RunSettings(values))
+        plan = make_plan(manifest, captures, with_setting_files(manifest, chosen), {})
+        return plan.evaluations[0].key
+
+    before = key()
+    write_sam_file(folder / "sam.pth", seed=1)
+    assert key() != before
     write_sam_file(folder / "sam.pth")
 
 

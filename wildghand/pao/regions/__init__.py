@@ -8,7 +8,7 @@ from wildghand.pao.regions.frame_regions import (
     partition,
     stack_regions,
 )
-from wildghand.pao.regions.hand import graph_cut_hands, hand_of_mask
+from wildghand.pao.regions.hand import graph_cut_hands
 from wildghand.pao.regions.sam import PromptedHand, SegmentAnything, check_sam, mask_of, open_sam
 from wildghand.pao.regions.superpixels import RegionCache, Segmenter, Superpixels
 
@@ -23,7 +23,6 @@ __all__ = [
     "Superpixels",
     "check_sam",
     "graph_cut_hands",
-    "hand_of_mask",
     "mask_of",
     "open_sam",
     "overlapping",

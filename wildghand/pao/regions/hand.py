@@ -1,4 +1,4 @@
-"""The hand's mask y_h without a network."""
+"""The hand's mask y_h of raw frames, without a network."""
 
 from __future__ import annotations
 
@@ -7,18 +7,6 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from hwp_bench.base.errors import ShapeMismatch
-
-
-def hand_of_mask(mask: np.ndarray) -> np.ndarray:
-    """y_h from a capture's estimated mask, the default.
-
-    Args:
-        mask: (..., H, W) uint8 coverage, 255 = hand.
-
-    Returns:
-        (..., H, W) bool, pixels that are hand by more than a half.
-    """
-    return np.asarray(mask) > 127
 
 
 def graph_cut_hands(

@@ -33,18 +33,18 @@ class SegmentAnything:
     Args:
         identity: digest of the network, where it runs, and its options.
         load: loads the network.
-        settings: which automatic masks are kept.
+        settings: which automatic masks are kept; None: as in the public code.
     """
 
     def __init__(
         self,
         identity: str,
         load: Callable[[], SamNetwork],
-        settings: AutomaticSettings = PUBLIC,
+        settings: AutomaticSettings | None = None,
     ) -> None:
-        self.identity = sha256_json([identity, asdict(settings)])
+        self._settings = settings or PUBLIC
+        self.identity = sha256_json([identity, asdict(self._settings)])
         self._load = load
-        self._settings = settings
         self._network: SamNetwork | None = None
 
     @property

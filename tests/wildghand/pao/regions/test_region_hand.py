@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hwp_bench.base.errors import ShapeMismatch
-from wildghand.pao.regions import graph_cut_hands, hand_of_mask
+from wildghand.pao.regions import graph_cut_hands
 
 
 def drawn(shift: int, size: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -41,9 +41,3 @@ def test_no_hand_no_mask() -> None:
     assert list(graph_cut_hands([], [])) == []
     with pytest.raises(ShapeMismatch, match="silhouettes"):
         list(graph_cut_hands([image], [silhouette[1:]]))
-
-
-def test_a_captures_mask_is_hand_above_a_half() -> None:
-    assert hand_of_mask(np.array([[0, 127, 128, 255]], np.uint8)).tolist() == [
-        [False, False, True, True]
-    ]
