@@ -6,6 +6,7 @@ an entry that is not needed any more.
 
 PlainMethod  # the entry of baselines/plain/method.toml
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/interaction-gaussian
+check_networks  # `check_files` of wildghand/method.toml and of baselines/interaction-gaussian
 modified  # part of the cache's key: a changed file is read again
 _.maxlong  # reprlib reads it
 _.maxother  # reprlib reads it
