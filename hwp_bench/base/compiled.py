@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+import functools
+import gc
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import numba
@@ -31,12 +34,50 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
         dispatcher: Any = _njit(**settings)(function)
         if hasattr(dispatcher, "signatures"):  # not if NUMBA_DISABLE_JIT is set
             dispatcher._cache = MachineCode(function, settings)
+            dispatcher.compile = _without_collections(dispatcher.compile)
         return dispatcher
 
     return compile_function
+
+
+def helper(function: Callable[..., Any]) -> Any:
+    """Decorator: compile a function for the compiled functions that call it.
+
+    Python cannot call it, and the disk does not keep it: its code is part of theirs.
+    """
+    return _njit(
+        boundscheck=False, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
+    )(function)
 
 
 def on_disk(dispatcher: Any) -> bool:
     """Return whether the disk holds machine code of a compiled function, as far as can be told."""
     cache = getattr(dispatcher, "_cache", None)
     return isinstance(cache, MachineCode) and cache.on_disk()
+
+
+def _without_collections(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function; while it runs, Python looks for no garbage.
+
+    A compiler makes millions of objects that stay until it is done. Looking through them, and
+    through those of torch, again and again takes a sixth of its time.
+    """
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        with _no_collections():
+            return function(*args, **options)
+
+    return call
+
+
+@contextlib.contextmanager
+def _no_collections() -> Iterator[None]:
+    """Switches the collector off, if it is on, and on again."""
+    on = gc.isenabled()
+    gc.disable()
+    try:
+        yield
+    finally:
+        if on:
+            gc.enable()

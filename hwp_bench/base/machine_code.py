@@ -89,7 +89,8 @@ class MachineCode:
         key = self._key(sig, data.codegen)
         if key is None or data.lifted or data.library.has_dynamic_globals:
             return
-        content = dumps(((key, sig), data._reduce()))
+        # The annotated source is for people who inspect a function, and slow to make.
+        content = dumps(((key, sig), data._replace(type_annotation="")._reduce()))
         digest = hashlib.sha256(content).digest()
         if write_private(code_folder() / self._name(key), digest + content):
             trim(code_folder(), _SUFFIX, MAX_CACHE_BYTES)

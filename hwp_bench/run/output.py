@@ -47,6 +47,8 @@ class RunFacts:
 
     #: Seconds on the method's clock.
     fit_seconds: float | None = None
+    #: Seconds before that clock started, in which the method was made: what it compiles or loads.
+    ready_seconds: float | None = None
     #: Seconds to render the test frames.
     render_seconds: float | None = None
     #: Seconds spent on checkpoints, outside the method's clock.

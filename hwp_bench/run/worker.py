@@ -20,6 +20,7 @@ import numpy as np
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
+from hwp_bench.base.progress import notice
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.methods.contract import Avatar, Budget, MethodFactory, TrainingCapture
 from hwp_bench.methods.request import open_request
@@ -97,7 +98,10 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
             folder = output / CHECKPOINTS / f"{index:03d}"
             write_image(folder / frame_name(frame), render(avatar, training, frame))
 
+    entered = time.perf_counter()
     method = factory(training.run.settings, training.run.seed)
+    ready_seconds = time.perf_counter() - entered
+    notice(f"Made ready in {ready_seconds:.1f} s, which the seconds of the fit leave out.")
     report = ReportClock(training.run.budget, record, output / PROGRESS)
     avatar = method.fit(training, training.run.budget, report)
     fit_seconds = report.elapsed
@@ -115,6 +119,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
         write_image(output / PREDICTIONS / frame_name(frame), pixels)
     facts = RunFacts(
         fit_seconds=fit_seconds,
+        ready_seconds=ready_seconds,
         render_seconds=render_seconds,
         curve_seconds=report.paused,
         steps=final_step,

@@ -139,7 +139,12 @@ def _fit_in(
     digest = sha256_json(
         [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
     )
-    fit = Fit(training, chosen, run.seed, ready_fit(chosen.device), world)
+    entered = time.perf_counter()
+    device = ready_fit(chosen.device)
+    if world.is_main:
+        ready = time.perf_counter() - entered
+        notice(f"Kernels made ready in {ready:.1f} s, which the seconds of the fit leave out.")
+    fit = Fit(training, chosen, run.seed, device, world)
     watchers, start, before = Watchers(chosen.schedule.plateau_steps), 0, 0.0
     state = work / STATE
     if state.is_file():

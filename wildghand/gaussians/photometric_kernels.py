@@ -141,8 +141,8 @@ def _sum_moments(images, image, row, first, last, window, blurred):
 def _clear_ends(blurred, pad, first, last):
     """Zeros where windows reach beyond what was summed."""
     for m in range(blurred.shape[0]):
-        blurred[m, first : first + pad] = _ZERO
-        blurred[m, pad + last : 2 * pad + last] = _ZERO
+        for k in range(pad):
+            blurred[m, first + k] = blurred[m, pad + last + k] = _ZERO
 
 
 @inline

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.compiled import compiled, helper
 from wildghand.splat.kernels.jobs import next_job
 
 #: Anchors that one thread places at a time.
@@ -25,7 +25,7 @@ _SMALL = 1e-3
 _TINY = np.float32(1e-30)
 
 
-@compiled(nogil=True)
+@helper
 def _factors(squared):
     """Rodrigues' a = sin t / t and b = (1 - cos t) / t^2, and their slopes in t^2."""
     if squared < _SMALL:
@@ -130,7 +130,7 @@ def chain_backward(pose, rest, rotations, turns, of_turns, of_shifts, of_rotatio
     return of_pose, of_rest
 
 
-@compiled(nogil=True)
+@helper
 def _rodrigues_backward(vector, g, out):
     """Gradient of R = I + a K + b K^2 with K^2 = v v^T - |v|^2 I in the vector v."""
     x, y, z = float(vector[0]), float(vector[1]), float(vector[2])
@@ -259,7 +259,7 @@ def vertex_normals(vertices, faces, normals):
         normals[v, 0], normals[v, 1], normals[v, 2] = x, y, z
 
 
-@compiled(nogil=True)
+@helper
 def _unit(x, y, z):
     """The direction of a vector; (0, 0, 1) of none."""
     squared = x * x + y * y + z * z
@@ -315,7 +315,7 @@ def place_anchors(
         job = next_job(worker, counters, ends)
 
 
-@compiled(nogil=True)
+@helper
 def _perpendicular(x, y, z):
     """A direction across a unit vector: across the axis that it is farthest from."""
     zero = np.float32(0.0)
@@ -326,7 +326,7 @@ def _perpendicular(x, y, z):
     return y, -x, zero
 
 
-@compiled(nogil=True)
+@helper
 def _quaternion(tx, ty, tz, bx, by, bz, nx, ny, nz, out):
     """Shepperd's quaternion of the rotation with the columns t, b and n."""
     one = np.float32(1.0)

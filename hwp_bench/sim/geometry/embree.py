@@ -18,7 +18,7 @@ import numpy as np
 from numba import types
 from numba.experimental import function_type  # noqa: F401  (lets addresses pass as arguments)
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.compiled import compiled, helper
 from hwp_bench.base.errors import HwpError
 
 # From the headers of Embree 4: rtcore_common.h, rtcore_buffer.h, rtcore_scene.h, rtcore_device.h.
@@ -165,7 +165,7 @@ def _rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.n
     return np.ascontiguousarray(origins, np.float64), np.ascontiguousarray(directions, np.float64)
 
 
-@compiled(nogil=True)
+@helper
 def _new_ray() -> np.ndarray:
     """A ray with room for its hit (RTCRayHit, 96 bytes), at a multiple of 64 bytes."""
     room = np.zeros(48, np.float32)
@@ -173,7 +173,7 @@ def _new_ray() -> np.ndarray:
     return room[start : start + 32]
 
 
-@compiled(nogil=True)
+@helper
 def _aim(ray: np.ndarray, numbers: np.ndarray, origin: np.ndarray, direction: np.ndarray) -> None:
     """Write a ray: origin, near end, direction, time, far end, mask, id, flags; no hit yet."""
     ray[0], ray[1], ray[2], ray[3] = origin[0], origin[1], origin[2], 0.0

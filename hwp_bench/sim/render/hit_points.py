@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.compiled import compiled, helper
 
 
 @compiled(nogil=True)
@@ -73,7 +73,7 @@ def spread(
     return out
 
 
-@compiled(nogil=True)
+@helper
 def to_unit(vector: np.ndarray) -> None:
     """Bring a vector (3,) to length 1; zero stays zero."""
     length = np.sqrt(vector[0] * vector[0] + vector[1] * vector[1] + vector[2] * vector[2])

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.compiled import compiled, helper
 
 _ONE, _LEAST_ROUGH, _MOST_GLOSS = np.float32(1.0), np.float32(0.05), np.float32(0.8)
 
@@ -55,7 +55,7 @@ def radiance(
     return out
 
 
-@compiled(nogil=True)
+@helper
 def _gloss(
     normal: np.ndarray,
     view: np.ndarray,
@@ -84,12 +84,12 @@ def _gloss(
     return lobe * shape * fresnel * nl, 0.5 * edge * (_ONE - _MOST_GLOSS * roughness)
 
 
-@compiled(nogil=True)
+@helper
 def _fifth(x: float) -> float:
     square = x * x
     return square * square * x
 
 
-@compiled(nogil=True)
+@helper
 def _dot(a: np.ndarray, b: np.ndarray) -> float:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

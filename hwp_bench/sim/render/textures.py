@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.compiled import compiled, helper
 from hwp_bench.sim.render.hit_points import to_unit
 
 # Largest slope of a bump.
@@ -83,7 +83,7 @@ def bump(
         to_unit(normals[i])
 
 
-@compiled(nogil=True)
+@helper
 def _taps(
     uv: np.ndarray, rows: int, columns: int
 ) -> tuple[int, int, int, int, np.float32, np.float32]:

@@ -1,16 +1,72 @@
-"""Kernels are made ready before a fit; oracle: which versions numba holds after it."""
+"""Kernels are made ready before a fit, and its clock leaves that out.
+
+Oracles: which versions numba holds before and after a fit, and a clock that jumps while kernels are
+made ready.
+"""
 
 from __future__ import annotations
 
+import json
+import os
+import subprocess
 import sys
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
 
+import pytest
 import torch
+from painted import SilentReport
 
-from hwp_bench.methods.contract import TrainingCapture
+from hwp_bench.capture import Capture
+from hwp_bench.methods.contract import Budget, TrainingCapture
+from hwp_bench.methods.request import open_request
+from hwp_bench.run import worker
+from hwp_bench.run.output import RUN, read_facts
+from wildghand.fitting import session
 from wildghand.fitting.fit import Fit
+from wildghand.fitting.method import WildGHandMethod
 from wildghand.fitting.ready import ready_fit
 from wildghand.model.settings import read_settings
+
+QUICK: dict[str, Any] = {
+    "gaussians": 600,
+    "device": "cpu",
+    "network.identity_resolution": 40,
+    "network.plane_resolution": 20,
+}
+#: Settings that call other kernels, or the same ones in another way.
+VARIANTS: tuple[dict[str, Any], ...] = (
+    {},
+    {"mode": "paper"},
+    {"pao.variant": "binary"},
+    {"pao.robust": True, "pao.robust_start": 0.0},
+    {"schedule.batch": 4},
+    {"prior": ""},
+    {"dpd.enabled": False},
+    {"heads.enabled": False},
+    {"prepass.enabled": False},
+)
+_PROGRAM = """
+import json, sys
+from test_ready import made_within_fits
+print(json.dumps(made_within_fits(sys.argv[1:])))
+"""
+
+
+def made_within_fits(requests: list[str]) -> list[str]:
+    """Versions that fits of these requests, in every variant, made or loaded after their start."""
+    found: list[str] = []
+    for request in requests:
+        training = open_request(Path(request))
+        for changes in VARIANTS:
+            method = WildGHandMethod({**QUICK, **changes}, 0)
+            before = versions()
+            avatar = method.fit(training, Budget(steps=3), SilentReport())
+            avatar.render(training.hand_poses(0), training.camera(0))
+            found += [name for name, count in versions().items() if count > before.get(name, 0)]
+    return found
 
 
 def versions() -> dict[str, int]:
@@ -35,3 +91,65 @@ def test_a_step_compiles_nothing(make_training: Callable[..., TrainingCapture]) 
         fit.step(torch.tensor([0]), 0.9)
     after = {name: count for name, count in versions().items() if count}
     assert after == {name: count for name, count in before.items() if count}
+
+
+def test_no_setting_compiles_on_the_clock(make_training: Callable[..., TrainingCapture]) -> None:
+    requests = [str(make_training(hands).root) for hands in ("right", "both")]
+    done = subprocess.run(
+        [sys.executable, "-c", _PROGRAM, *requests],
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(map(str, sys.path))},
+        cwd=Path(__file__).parent,
+        stdout=subprocess.PIPE,
+        check=True,
+    )
+    assert json.loads(done.stdout) == []
+
+
+class Jump:
+    """A clock that jumps when it is told to."""
+
+    def __init__(self) -> None:
+        self.ahead = 0.0
+
+    def perf_counter(self) -> float:
+        """Seconds."""
+        return time.perf_counter() + self.ahead
+
+
+def test_a_slow_compiler_is_not_in_the_seconds_of_wildghand_fit(
+    make_painted: Callable[..., Capture],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    jump = Jump()
+
+    def slow(name: str) -> torch.device:
+        jump.ahead += 1e6
+        return ready_fit(name)
+
+    monkeypatch.setattr(session, "time", jump)
+    monkeypatch.setattr(session, "ready_fit", slow)
+    avatar = session.fit_capture(make_painted().root, settings=QUICK, budget=Budget(steps=2))
+    assert 0.0 < avatar.record.seconds < 1e5
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if "made ready" in line]
+    assert float(line.partition(" s,")[0].rpartition(" ")[2]) >= 1e6
+
+
+def test_a_slow_compiler_is_not_in_the_seconds_of_an_evaluation(
+    make_training: Callable[..., TrainingCapture], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    jump = Jump()
+
+    def slow(settings: Mapping[str, Any], seed: int) -> WildGHandMethod:
+        method = WildGHandMethod({**QUICK, "schedule.steps": 2}, seed)
+        jump.ahead += 1e6
+        return method
+
+    monkeypatch.setattr(worker, "time", jump)
+    worker.run(make_training(), slow, tmp_path / "out")
+    facts = read_facts(tmp_path / "out" / RUN)
+    assert facts.steps == 2
+    assert facts.fit_seconds is not None
+    assert 0.0 < facts.fit_seconds < 1e5
+    assert facts.ready_seconds is not None
+    assert facts.ready_seconds >= 1e6

@@ -26,6 +26,9 @@ from numba.extending import lower_builtin, models, register_model
 #: Untyped: the types that numba declares differ between its versions.
 intrinsic: Any = numba_intrinsic
 
+#: What is declared for the CPU is asked before what is declared for every target. Numba's own
+#: templates of an operator are fifty, and each that does not fit words an error.
+_FIRST = {"target": "cpu"}
 _LLVM = {types.float32: ir.FloatType(), types.float64: ir.DoubleType()}
 
 
@@ -103,6 +106,8 @@ def _define_operator(
     """Teaches numba `function` for a vector and a vector or scalar."""
 
     class Template(AbstractTemplate):
+        metadata = _FIRST
+
         def generic(self, args: tuple[types.Type, ...], kws: dict[str, types.Type]) -> Any:
             vector = vector_of(args) if not kws else None
             if vector is None:
@@ -156,6 +161,8 @@ for _function, _name in (
 
 def _define_mask_operator(function: Callable[..., Any], name: str) -> None:
     class Template(AbstractTemplate):
+        metadata = _FIRST
+
         def generic(self, args: tuple[types.Type, ...], kws: dict[str, types.Type]) -> Any:
             if len(args) == 2 and isinstance(args[0], Mask) and args[0] == args[1]:
                 return signature(args[0], *args)
