@@ -41,7 +41,7 @@ VARIANTS: tuple[dict[str, Any], ...] = (
     {},
     {"mode": "paper"},
     {"pao.variant": "binary"},
-    {"pao.robust": True, "pao.robust_start": 0.0},
+    {"mode": "released"},
     {"schedule.batch": 4},
     {"prior": ""},
     {"dpd.enabled": False},
