@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import functools
 
+import numpy as np
 import torch
 
+from hwp_bench.hands.raster import draw_faces, mix_corners
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
 from wildghand.gaussians.attributes import CHANNELS, Activation, RawAttributes
 from wildghand.gaussians.bags import sum_bags
@@ -54,3 +56,7 @@ def _warm_up() -> None:
     sum_bags(zeros(1, 1), first, zeros(1), first)
     fill_harmonics(zeros(1, 3), 1, zeros(1, 3), 0)
     warm_up_heads()
+    # The pre-pass draws the hands.
+    faces = np.zeros((1, 3), np.int64)
+    face, mix = draw_faces(np.zeros((1, 2)), np.zeros(1), faces, (1, 1))
+    mix_corners(np.zeros((1, 1)), faces, face.reshape(-1)[:0], mix.reshape(-1, 2)[:0])
