@@ -15,7 +15,8 @@ if TYPE_CHECKING:
     from hwp_bench.evaluation.ablate.runs import AblationRuns
 
 _EXAMPLES = """examples:
-  hwp-bench ablate --suite mini                          # 2 x 2 of DPD and PAO, three seeds
+  hwp-bench ablate --suite mini                          # DPD x PAO x pre-pass, three seeds
+  hwp-bench ablate --no-dpd --no-pao                     # DPD x PAO
   hwp-bench ablate --no-dpd                              # the full method, and without DPD
   hwp-bench ablate --no-dpd --no-pao --no-heads          # each out of the full method, all out
   hwp-bench ablate --binary-mask                         # a binary mask in place of PAO's weights
@@ -24,7 +25,8 @@ _EXAMPLES = """examples:
   hwp-bench ablate --suite full --engine ray://10.0.0.1:6379 --job-gpus 1
 
 Which variants are run:
-  no flag         the first two components that the method declares, crossed: 2 x 2
+  no flag         the components that the method names for it, or else the first two that it
+                  declares, crossed: 2^k
   --only A B ...  the named components, crossed: 2^k
   other flags     the full method; each of the named components out of it (alternatives: put in);
                   and, of two components or more, all of them out

@@ -270,12 +270,14 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
 
 
 def _check_crossed(manifest: MethodManifest, where: Path) -> None:
-    """Refuse names in `crossed` that are no components, or are there twice."""
+    """Refuse names in `crossed` that do not name a component, or are there twice."""
     components = [item.name for item in manifest.switches.values() if not item.alternative]
     for name in manifest.crossed:
         if name not in components or manifest.crossed.count(name) > 1:
             raise BadMethod(
-                f"{name!r} is there twice" if name in components else f"{name!r} is no component",
+                f"{name!r} is there twice"
+                if name in components
+                else f"{name!r} is not a component",
                 where=where,
                 field="crossed",
                 remedy=f"Name each of these at most once: {', '.join(components) or 'none'}.",

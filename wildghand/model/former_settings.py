@@ -43,8 +43,8 @@ TABLES: Mapping[str, str] = MappingProxyType(
     {"weights": "pao", "judge": "prepass", "rates": "schedule.rates"}
 )
 
-#: Settings without a successor of the same meaning. `robust`, weights by the residuals of pixels,
-#: was never on by default and is not read any more.
+#: Settings without a successor of the same meaning: `robust`, weights by the residuals of pixels,
+#: was never on by default and has no effect; `pao.normalise_errors` chose among `pao.errors`.
 GONE = ("robust", "robust_start", "pao.robust", "pao.robust_start", "pao.normalise_errors")
 
 #: Former values of `pao.variant`. `weights`, in version 1, meant the mode's.
@@ -80,7 +80,7 @@ def _today(name: str, value: Any) -> Iterator[tuple[str, Any]]:
     table, _, field = name.partition(".")
     if field == "normalise_errors" and table in ("pao", "weights"):
         yield "pao.errors", "batch" if value else "absolute"
-    elif name.rpartition(".")[2] in ("robust", "robust_start"):
+    elif name.replace("weights.", "pao.", 1) in GONE:
         return
     elif name in ("pao.variant", "weights.variant") and value in _VARIANTS:
         yield "pao.variant", _VARIANTS[value]

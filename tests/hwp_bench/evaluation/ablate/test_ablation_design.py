@@ -109,7 +109,7 @@ def test_a_method_says_what_is_crossed_when_nothing_is_asked_for(manifest, tmp_p
     root.mkdir()
     text = (manifest.root / "method.toml").read_text()
     for wrong, message in (
-        ('["a", "nothing"]', "'nothing' is no component"),
+        ('["a", "nothing"]', "'nothing' is not a component"),
         ('["a", "a"]', "twice"),
     ):
         (root / "method.toml").write_text(text.replace("[entry]", f"crossed = {wrong}\n[entry]"))
