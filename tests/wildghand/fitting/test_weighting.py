@@ -1,0 +1,137 @@
+"""Who weighs what. Oracles: the formulas by hand, the pre-pass's own arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.weighting import assess_frames
+from wildghand.model.settings import read_settings
+
+CPU = torch.device("cpu")
+QUICK: dict[str, Any] = {
+    "gaussians": 300,
+    "prior": "",
+    "network.identity_resolution": 24,
+    "network.plane_resolution": 12,
+    "device": "cpu",
+}
+ROWS = torch.tensor([0, 3])
+TrainingMaker = Callable[..., TrainingCapture]
+
+
+def fit_of(training: TrainingCapture, **changes: Any) -> Fit:
+    return Fit(training, read_settings({**QUICK, **changes}), 0, CPU)
+
+
+def test_frames_teach_by_their_temporal_weights(make_training: TrainingMaker) -> None:
+    fit = fit_of(make_training())
+    omega = torch.tensor([0.0, -0.2])
+    shares = fit.weighting.shares(ROWS, omega)
+    np.testing.assert_allclose(shares, [1.0, 1.0 / (1.0 + 100.0 * 0.2)], rtol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"dpd.enabled": False},
+        {"pao.enabled": False},
+        {"pao.variant": "binary"},
+        {"pao.temporal": "none"},
+        {"mode": "paper"},
+    ],
+    ids=str,
+)
+def test_all_frames_teach_alike_where_a_part_of_it_is_missing(
+    changes: dict[str, Any], make_training: TrainingMaker
+) -> None:
+    assert fit_of(make_training(), **changes).weighting.shares(ROWS, torch.ones(2)) is None
+
+
+def test_what_is_explained_teaches(make_training: TrainingMaker) -> None:
+    fit = fit_of(make_training(), **{"dpd.pay_back": 2.0})
+    weighting, omega = fit.weighting, torch.tensor([0.4, 0.4])
+    assert weighting.pay_back is not None
+    before = weighting.shares(ROWS, omega)
+    weighting.clean[:] = 1.0
+    weighting.pay_back._clean[:] = True
+    weighting.pay_back.residuals[:] = 0.01
+    assert float(weighting.shares(ROWS, omega)[0]) == pytest.approx(np.exp(-0.25), rel=1e-5)
+    assert float(before[0]) < 0.03
+    # Drawing a frame is what tells how well it is explained.
+    weighting.pay_back.residuals.zero_()
+    weighting(ROWS, fit.draw(ROWS))
+    assert (weighting.pay_back.residuals[ROWS] > 0.0).all()
+    assert int((weighting.pay_back.residuals > 0.0).sum()) == 2
+
+
+@pytest.mark.parametrize("pao", [True, False])
+def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
+    pao: bool, make_training: TrainingMaker
+) -> None:
+    training = make_training()
+    fit, bare = (
+        fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on}) for on in (True, False)
+    )
+    assessment = assess_frames(training, fit.frames, fit.settings)
+    assert assessment is not None
+    drawing = fit.draw(ROWS)
+    weights, whole = fit.weighting(ROWS, drawing).weights, bare.weighting(ROWS, drawing).weights
+    expected = whole * torch.from_numpy(assessment.pixel_weights[ROWS.numpy()]).float() / 255.0
+    torch.testing.assert_close(weights.detach(), expected.detach(), rtol=1e-5, atol=1e-6)
+
+
+def test_regions_that_are_drawn_badly_count_less(make_training: TrainingMaker) -> None:
+    fit = fit_of(make_training(), **{"prepass.enabled": False, "pao.temporal": "none"})
+    row = torch.tensor([0])
+    drawing = fit.draw(row)
+    target = fit.weighting(row, drawing)
+    hand = fit.weighting(row, drawing).hand[0] > 0.9
+    error = (drawing.image[0].detach() - target.image[0]).abs().mean(dim=-1)
+    worst, best = (error >= error[hand].quantile(0.9)), (error <= error[hand].quantile(0.1))
+    weights = target.weights[0].detach()
+    assert weights[hand & worst].mean() < 0.8 * weights[hand & best].mean()
+    assert fit.weighting.median is not None
+
+
+def test_omega_starts_where_the_factor_is_the_prepass_weight(make_training: TrainingMaker) -> None:
+    fit = fit_of(make_training())
+    rows = torch.arange(len(fit.frames))
+    omega = fit.model.biases[0].temporal(rows).omega.detach()
+    target = fit.objective.temporal.omega
+    assert float((omega - target).abs().mean()) < 0.05
+    torch.testing.assert_close(
+        fit.weighting.pao.temporal_factor(target), fit.weighting.frame_weights, rtol=0.03, atol=1e-4
+    )
+
+
+def test_without_heads_the_template_stands_and_nothing_else_changes(
+    make_training: TrainingMaker,
+) -> None:
+    training = make_training()
+    fit, bare = fit_of(training), fit_of(training, **{"heads.enabled": False})
+    for made in (fit, bare):
+        with torch.no_grad():
+            for value in made.model.network.template_head.parameters():
+                value.fill_(0.05)
+    row = torch.tensor([0])
+    moved = fit.draw(row).hands["right"].prediction.template_offsets
+    still = bare.draw(row).hands["right"].prediction.template_offsets
+    assert moved.abs().max() > 0.0
+    assert (still == 0.0).all()
+    raw = (made.draw(row).hands["right"].prediction.raw.concatenate() for made in (fit, bare))
+    assert torch.equal(*raw)
+    loss = bare.objective(
+        bare.model, bare.draw(row), bare.weighting(row, bare.draw(row)), row, torch.ones(1)
+    )
+    loss.backward()
+    assert all(
+        value.grad is None or not value.grad.any()
+        for value in bare.model.network.template_head.parameters()
+    )
