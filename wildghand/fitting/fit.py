@@ -150,12 +150,9 @@ class Fit:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything that steps change, for `load_state_dict`."""
-        pay_back = self.weighting.pay_back
         return {
             "model": self.model.state_dict(),
-            "thresholds": self.weighting.pao.state_dict(),
-            "median": self.weighting.saved_median,
-            "residuals": None if pay_back is None else pay_back.residuals,
+            **self.weighting.state_dict(),
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             "shared": self.shared.state_dict(),
@@ -164,10 +161,7 @@ class Fit:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
         self.model.load_state_dict(state["model"])
-        self.weighting.pao.load_state_dict(state["thresholds"])
-        self.weighting.median = None if state["median"] is None else float(state["median"])
-        if self.weighting.pay_back is not None and state.get("residuals") is not None:
-            self.weighting.pay_back.residuals.copy_(state["residuals"])
+        self.weighting.load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
         # States of before have none: their steps shared nothing.

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -112,10 +114,20 @@ class Weighting:
         size = 4 * frames.masks[0].numel()
         self._fixed = FrameTable(self._fixed_weights, count, size, device)
 
-    @property
-    def saved_median(self) -> float | None:
-        """`median` as a number; it may wait for the device."""
-        return None if self.median is None else float(self.median)
+    def state_dict(self) -> dict[str, Any]:
+        """What steps change, for `load_state_dict`; it may wait for the device."""
+        return {
+            "thresholds": self.pao.state_dict(),
+            "median": None if self.median is None else float(self.median),
+            "residuals": None if self.pay_back is None else self.pay_back.residuals.clone(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.pao.load_state_dict(state["thresholds"])
+        self.median = None if state["median"] is None else float(state["median"])
+        if self.pay_back is not None and state.get("residuals") is not None:
+            self.pay_back.residuals.copy_(state["residuals"])
 
     def moves(self, rows: Tensor) -> bool:
         """Whether the pose of any frame of a batch is refined."""

@@ -113,8 +113,7 @@ class JointFit:
         """Everything that steps change, for `load_state_dict`."""
         return {
             "models": self._tensors(),
-            "thresholds": [fit.weighting.pao.state_dict() for fit in self.fits],
-            "medians": [fit.weighting.saved_median for fit in self.fits],
+            "weightings": [fit.weighting.state_dict() for fit in self.fits],
             "generators": [fit.generator.get_state() for fit in self.fits],
             "optimizer": self.optimizer.state_dict(),
         }
@@ -122,12 +121,9 @@ class JointFit:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Go on from a saved state."""
         self.restore(state["models"])
-        parts = zip(
-            self.fits, state["thresholds"], state["medians"], state["generators"], strict=True
-        )
-        for fit, thresholds, median, generator in parts:
-            fit.weighting.pao.load_state_dict(thresholds)
-            fit.weighting.median = None if median is None else float(median)
+        parts = zip(self.fits, state["weightings"], state["generators"], strict=True)
+        for fit, weighting, generator in parts:
+            fit.weighting.load_state_dict(weighting)
             fit.generator.set_state(generator.cpu())
         self.optimizer.load_state_dict(state["optimizer"])
 
