@@ -168,7 +168,7 @@ class Weighting:
         hand, image = self._hands(mine), self._images(mine)
         error = None
         if self._weighs_regions or self.pay_back is not None:
-            error = world.gather((drawing.image.detach() - image).abs().mean(dim=-1))
+            error = world.gather(_mean_error(drawing.image, image))
         if error is not None and self.pay_back is not None:
             self.pay_back.watch(rows, error, self._fixed(rows) * self._hands(rows))
         if error is None or not self._weighs_regions:
@@ -221,3 +221,10 @@ class Weighting:
         self._refine_pose = torch.from_numpy(assessment.refine_pose)
         self.frame_weights = torch.from_numpy(assessment.frame_weights).float()
         self._pixel_weights = torch.from_numpy(assessment.pixel_weights)
+
+
+def _mean_error(drawing: Tensor, image: Tensor) -> Tensor:
+    """(B, H, W) mean over channels of |drawing - image|, without gradient."""
+    # A product takes a third of the time of a mean over three numbers.
+    thirds = image.new_full((image.shape[-1],), 1.0 / image.shape[-1])
+    return (drawing.detach() - image).abs() @ thirds

@@ -158,27 +158,34 @@ class PerturbationAwareWeights(nn.Module):
         """
         _check_shapes(error, regions, hand, omega)
         error = error.detach()
-        finite = error.isfinite()
-        error = torch.where(finite, error, torch.zeros_like(error))
         on_hand = hand if hand.dtype == torch.bool else hand > 0.5
-        means, shares, present = self._measure(error, regions, on_hand & finite, on_hand)
+        # Off the CPU the question would wait for the device.
+        sound = error.device.type == "cpu" and bool(error.sum().isfinite())
+        finite = None if sound else error.isfinite()
+        counted = on_hand
+        if finite is not None:
+            error = torch.where(finite, error, torch.zeros_like(error))
+            counted = on_hand & finite
+        means, shares, present = self._measure(error, regions, counted, on_hand)
         errors = self._counted(means, present, median)
         live = self.temporal_factor(omega)
         temporal = live.detach()
         of_regions = temporal if self.settings.temporal in ("all", "regions") else None
-        outside = (finite & ~on_hand).to(error)
         gates = self._gates(errors, shares)
         # A region without hand has no error; it must stay out even if T_mu learns to be < 0.
         lambdas = self.settings.alpha * gates * (shares > 0.0)
         lambdas = lambdas if of_regions is None else lambdas * of_regions[:, None]
+        weights = regions.spread(lambdas)
         if self.settings.variant == "scaled":
             background = torch.zeros_like(error)
-            weights = regions.spread(lambdas) * finite * hand
+            weights = weights * hand
         else:
-            background = outside * torch.relu(self.T_b - _CHANNELS * error)
+            background = ~on_hand * torch.relu(self.T_b - _CHANNELS * error)
             if self.settings.temporal == "all":
                 background = background * temporal[:, None, None]
-            weights = regions.spread(lambdas) * finite + background
+            weights = weights + background
+        if finite is not None:
+            weights, background = weights * finite, background * finite
         sizes = weights.mean(dim=(1, 2))
         if self.settings.temporal == "all":
             # Its value is that of W; its gradient reaches omega.
@@ -215,15 +222,16 @@ class PerturbationAwareWeights(nn.Module):
         self, error: Tensor, regions: Regions, counted: Tensor, on_hand: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The regions' mean errors, mu_u, and which have any hand, (B, U) each."""
-        pixels = regions.sums(counted.to(error))
-        errors = regions.sums(error * counted) / pixels.clamp(min=1.0)
+        ones = counted.to(error)
+        pixels = regions.sums(ones)
+        errors = regions.sums(error * ones) / pixels.clamp(min=1.0)
         share_of = self.settings.share_of
         if share_of == "auto":
             share_of = "region" if regions.membership is None else "hand"
         if share_of == "hand":
             whole = on_hand.flatten(1).sum(dim=1, keepdim=True).to(error)
         else:
-            whole = regions.sums(torch.ones_like(error))
+            whole = regions.sizes().to(error)
         return errors, pixels / whole.clamp(min=1.0), pixels > 0.0
 
 

@@ -99,11 +99,19 @@ class Regions:
     atoms: int
     #: (B, A, U) of 0 and 1; None where atom u is region u.
     membership: Tensor | None = None
+    #: (B, U) pixels of each region, where they are known already.
+    known_sizes: Tensor | None = None
 
     @property
     def count(self) -> int:
         """U."""
         return self.atoms if self.membership is None else self.membership.shape[2]
+
+    def sizes(self) -> Tensor:
+        """Pixels of each region, (B, U) float32."""
+        if self.known_sizes is not None:
+            return self.known_sizes
+        return self.sums(torch.ones(self.index.shape, device=self.index.device))
 
     def sums(self, values: Tensor) -> Tensor:
         """Sum of the pixels of each region.
@@ -136,7 +144,8 @@ class Regions:
         """
         if self.membership is not None:
             values = torch.einsum("bu,bau->ba", values, self.membership.to(values))
-        return values.flatten()[self.index]
+        # Its gradient is a sum, which that of an index is not on the CPU.
+        return values.flatten().index_select(0, self.index.flatten()).view(self.index.shape)
 
 
 def stack_regions(frames: Sequence[FrameRegions], device: torch.device | str = "cpu") -> Regions:
@@ -180,10 +189,14 @@ class ClipRegions:
         cache_bytes: int = TABLE_BYTES,
     ) -> None:
         self._frames, self._device = frames, device
-        whole = None
+        self._whole: Regions | None = None
         if 8 * len(frames) * frames[0].labels.size <= cache_bytes:
             whole = stack_regions(frames, device)
-        self._whole = whole
+            # Atoms are numbered frame by frame here, and through the batch where they are used.
+            first = whole.atoms * torch.arange(len(frames), device=device)
+            self._whole = Regions(
+                whole.index - first[:, None, None], whole.atoms, whole.membership, whole.sizes()
+            )
 
     def __call__(self, rows: Tensor) -> Regions:
         """The regions of B frames.
@@ -194,8 +207,13 @@ class ClipRegions:
         whole = self._whole
         if whole is None:
             return stack_regions([self._frames[row] for row in rows.tolist()], self._device)
-        # Atoms are numbered through the clip; in the batch they are numbered through the batch.
-        moved = upload(whole.atoms * (torch.arange(len(rows)) - rows), self._device)
+        assert whole.known_sizes is not None
+        if len(rows) == 1:  # views
+            part = slice(int(rows[0]), int(rows[0]) + 1)
+            member = None if whole.membership is None else whole.membership[part]
+            return Regions(whole.index[part], whole.atoms, member, whole.known_sizes[part])
+        first = upload(whole.atoms * torch.arange(len(rows)), self._device)
         rows = upload(rows, self._device)
         member = None if whole.membership is None else whole.membership[rows]
-        return Regions(whole.index[rows] + moved[:, None, None], whole.atoms, member)
+        index = whole.index[rows] + first[:, None, None]
+        return Regions(index, whole.atoms, member, whole.known_sizes[rows])
