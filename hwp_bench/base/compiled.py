@@ -40,13 +40,22 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     return compile_function
 
 
-def helper(function: Callable[..., Any]) -> Any:
+def helper(function: Callable[..., Any], **options: Any) -> Any:
     """Decorator: compile a function for the compiled functions that call it.
 
-    Python cannot call it, and the disk does not keep it: its code is part of theirs.
+    Python cannot call it, and the disk does not keep it: its code is part of theirs. Wrappers for
+    callers outside would take a tenth of the time.
+
+    Args:
+        function: to compile.
+        options: further options of `numba.njit`.
     """
     return _njit(
-        boundscheck=False, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True
+        boundscheck=False,
+        error_model="numpy",
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        **options,
     )(function)
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -14,12 +12,9 @@ from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Capture
-from hwp_bench.capture.splits import Split
-from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
-from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.gaussians.training import TrainingClip
-from wildghand.model.model import WildGHandModel
+from wildghand.model.model import WildGHandModel, largest
 from wildghand.splat.threads import denormals_flushed
 
 #: How much a difference of colours is stretched around grey in a picture.
@@ -69,19 +64,18 @@ def explain_frames(
             f"was fitted to {str(origin)[:100]!r}, not to {capture.info.id!r}", field="avatar"
         )
     rows = torch.arange(len(fitted))
-    omegas = torch.stack([b.temporal(rows).omega.abs() for b in model.biases]).amax(dim=0)
+    omegas = largest([hand.temporal(rows).omega for hand in model.biases]).abs()
     if frames is None:
         frames = sorted(fitted[row] for row in omegas.argsort(descending=True)[:8].tolist())
     for frame in frames:
         if frame not in fitted:
             raise UsageError(f"{frame} was not fitted", field="frames")
-    training = _as_fitted(capture)
-    clip = TrainingClip(training, np.array(fitted), model.rigs, torch.device("cpu"))
+    clip = TrainingClip(capture, np.array(fitted), model.rigs, torch.device("cpu"))
     found = []
     for frame in frames:
         row = fitted.index(frame)
         biased, canonical = (
-            _drawn(model, clip, row, training, avatar.settings.heads.refinement, biases=on)
+            _drawn(model, clip, row, capture, avatar.settings.heads.refinement, biases=on)
             for on in (True, False)
         )
         mask = capture.mask(frame)[..., None] / 255.0
@@ -120,30 +114,20 @@ def explanation_sheet(
     return sheet(tiles, 4)
 
 
-def _as_fitted(capture: Capture) -> TrainingCapture:
-    """The capture as a fit sees it: estimated hands."""
-    count = len(capture)
-    parts = (0, count - 2), (count - 2, count - 1), (count - 1, count)
-    split = Split(capture.info.id, count, *parts)
-    with tempfile.TemporaryDirectory() as folder:
-        root = Path(folder) / "request"
-        write_request(root, capture, split, RunSettings({}, 0, Budget()))
-        return open_request(root)
-
-
 def _drawn(
     model: WildGHandModel,
     clip: TrainingClip,
     row: int,
-    training: TrainingCapture,
+    capture: Capture,
     refine: bool,
     *,
     biases: bool,
 ) -> np.ndarray:
     rows = torch.tensor([row])
     kept = {side: torch.tensor([biases]) for side in model.perturbation}
+    info = capture.info
     drawing = model.draw_frames(
-        clip, rows, training.width, training.height, kept=kept, move=True, refine=refine
+        clip, rows, info.width, info.height, kept=kept, move=True, refine=refine
     )
     image = drawing.image[0]
     if not biases:

@@ -170,8 +170,6 @@ class Fit:
     def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """(B,) bool by side: which frames of a batch keep their biases in this step."""
         chances = self.weighting.drop_probability[rows]
-        if not self.settings.dpd.biases:
-            chances = torch.ones_like(chances)
         return {
             side: upload(draw_kept(chances, self.generator), self.device)
             for side in self.model.perturbation

@@ -21,7 +21,7 @@ from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
 from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.model import terms
-from wildghand.pao.pao import PaoSettings, PerturbationAwareWeights, Weights
+from wildghand.pao.pao import PAPER_PAO, PerturbationAwareWeights, Weights
 from wildghand.pao.regions.frame_regions import FrameRegions, overlapping, partition, stack_regions
 
 #: Largest relative L2 distance of a float32 gradient from that of float64.
@@ -29,16 +29,7 @@ GRADIENT_TOLERANCE = 1e-4
 
 _SIZE = 16
 _GAUSSIANS = 24
-_PRINTED = PaoSettings(
-    variant="printed",
-    temporal="regions",
-    errors="absolute",
-    alpha=100.0,
-    beta=1000.0,
-    error_threshold=1.0,
-    share_threshold=0.3,
-    share_of="hand",
-)
+_PRINTED = replace(PAPER_PAO, share_of="hand")
 _Entry = tuple[str, str, Callable[[Context], Measured]]
 
 

@@ -12,7 +12,8 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.methods.settings import source_path
 from wildghand.gaussians.perceptual import FilterBankLoss, Vgg19
 from wildghand.model.settings import WildGHandSettings, read_settings
-from wildghand.pao.regions import Segmenter, Superpixels, check_sam, open_sam
+from wildghand.pao.regions import Segmenter, Superpixels, open_sam
+from wildghand.sam import check_checkpoint
 
 
 def check_networks(values: Mapping[str, Any]) -> None:
@@ -27,7 +28,7 @@ def check_networks(values: Mapping[str, Any]) -> None:
     """
     settings = read_settings(values)
     for path in {source_path(settings.pao.regions), source_path(settings.pao.hand)} - {None}:
-        check_sam(str(path))
+        check_checkpoint(str(path))
     perceptual = source_path(settings.perceptual)
     if perceptual is not None:
         Vgg19(perceptual)  # as light as a check: its tensors stay on the disk

@@ -80,7 +80,7 @@ class Weighting:
         pao: the paper's weights, whose thresholds are learnt.
         median: running median of the regions' errors; None before the first, and where PAO does
             not count in it.
-        pay_back: what the frames' biases explain; None where that is not asked for.
+        pay_back: what the frames' biases explain; None where nothing follows from it.
     """
 
     def __init__(
@@ -104,7 +104,11 @@ class Weighting:
         self._regions: ClipRegions | None = None
         if assessment is not None:
             self._follow(assessment)
-        tolerance = settings.dpd.pay_back
+        if not settings.dpd.biases:
+            self.drop_probability = torch.ones(count)
+        # Without DPD there is no omega.
+        self._teaches = self._weighs_regions and pao.temporal == "teaching" and settings.dpd.enabled
+        tolerance = settings.dpd.pay_back if self._teaches else 0.0
         self.pay_back = PayBack(self.clean.to(device), tolerance) if tolerance else None
         if self._weighs_regions:
             segmenter = choose_segmenter(settings.pao.regions, device)
@@ -143,9 +147,7 @@ class Weighting:
         Returns:
             (B,) in (0, 1]; None: everything.
         """
-        if not (self._weighs_regions and self.settings.pao.temporal == "teaching"):
-            return None
-        if not self.settings.dpd.enabled:
+        if not self._teaches:
             return None
         shares = self.pao.temporal_factor(omega)
         if self.pay_back is not None:
@@ -166,13 +168,11 @@ class Weighting:
         """
         mine = rows[world.shard(len(rows))]
         hand, image = self._hands(mine), self._images(mine)
-        error = None
-        if self._weighs_regions or self.pay_back is not None:
-            error = world.gather(_mean_error(drawing.image, image))
-        if error is not None and self.pay_back is not None:
-            self.pay_back.watch(rows, error, self._fixed(rows) * self._hands(rows))
-        if error is None or not self._weighs_regions:
+        if not self._weighs_regions:
             return FrameTarget(image, hand, self._fixed(mine))
+        error = world.gather(_mean_error(drawing.image, image))
+        if self.pay_back is not None:
+            self.pay_back.watch(rows, error, self._fixed(rows) * self._hands(rows))
         weights, sizes = self._region_weights(rows, error, drawing, world)
         return FrameTarget(image, hand, weights, sizes)
 

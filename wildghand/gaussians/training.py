@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadInput
+from hwp_bench.capture import Cameras
+from hwp_bench.hands import HandParameters
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.frame_table import FrameTable, shares_of_255, upload
 from wildghand.gaussians.rig import AnchorPoses, HandRig
@@ -105,6 +108,18 @@ def load_frames(training: TrainingCapture) -> TrainingFrames:
     )
 
 
+class GivenFrames(Protocol):
+    """Frames whose hands and cameras are given: a training capture, or a whole capture."""
+
+    @property
+    def hands(self) -> Mapping[str, HandParameters]:
+        """Estimated hand parameters by side."""
+
+    @property
+    def cameras(self) -> Cameras:
+        """The camera of each frame."""
+
+
 class TrainingClip:
     """The given parameters of R frames; they are constant, so anchors are posed once.
 
@@ -123,7 +138,7 @@ class TrainingClip:
 
     def __init__(
         self,
-        training: TrainingCapture,
+        training: GivenFrames,
         indices: np.ndarray,
         rigs: Mapping[str, HandRig],
         device: torch.device,

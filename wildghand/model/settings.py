@@ -20,7 +20,7 @@ from wildghand.dpd.dpd import DpdSettings
 from wildghand.model.former_settings import current_names
 from wildghand.model.terms import PAPER_TERMS, TermWeights
 from wildghand.network.settings import NetworkSettings, network_settings
-from wildghand.pao.pao import PaoSettings
+from wildghand.pao.pao import PAPER_PAO, PaoSettings
 from wildghand.prepass import PrepassSettings
 
 #: Where messages place a wrong setting.
@@ -135,12 +135,12 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
     {
         "dpd": {"rank": 0, "gains": False},
         "pao": {
-            "variant": "printed",
+            "variant": PAPER_PAO.variant,
             "errors": "batch",
-            "alpha": 100.0,
-            "beta": 1000.0,
-            "error_threshold": 1.0,
-            "share_threshold": 0.3,
+            "alpha": PAPER_PAO.alpha,
+            "beta": PAPER_PAO.beta,
+            "error_threshold": PAPER_PAO.error_threshold,
+            "share_threshold": PAPER_PAO.share_threshold,
         },
         "prepass": {"enabled": False},
         "schedule": {

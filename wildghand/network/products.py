@@ -9,14 +9,13 @@ vectors of 16 lanes and rows in groups of 8, so callers keep room for them.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
-import numba
 import numpy as np
 from llvmlite import ir
 from numba import types
 
+from hwp_bench.base.compiled import helper
 from wildghand.splat.kernels.alpha import exp2
 from wildghand.splat.kernels.jit import inline
 from wildghand.splat.kernels.lanes import fma, make_fill, make_load, select, store, store_sums
@@ -32,20 +31,6 @@ load = make_load(FLOATS)
 fill = make_fill(FLOATS)
 _ZERO, _ONE = np.float32(0.0), np.float32(1.0)
 _LOG2_E, _LARGEST = np.float32(1.4426950408889634), np.float32(126.0)
-
-#: Untyped: the types that numba declares differ between its versions.
-_njit: Any = numba.njit
-
-
-def part(function: Callable[..., Any]) -> Any:
-    """Decorator: compiles a function that kernels call; Python cannot call it."""
-    return _njit(
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-        nogil=True,
-        boundscheck=False,
-        error_model="numpy",
-    )(function)
 
 
 @intrinsic
@@ -73,7 +58,7 @@ def spread(typingctx: Any, array: Any, index: Any) -> Any:
     return FLOATS(array, types.intp), codegen
 
 
-@part
+@helper
 def multiply(
     left,
     left_at,
@@ -120,7 +105,7 @@ def multiply(
             store(out, o + 7 * out_step, c7)
 
 
-@part
+@helper
 def add_products(
     left, left_at, left_step, inner, right, right_at, right_step, columns, rows, out, out_at
 ):
@@ -170,7 +155,7 @@ def sigmoid(x):
     return fill(_ONE) / (exp2(power) + _ONE)
 
 
-@part
+@helper
 def activate(seen, at, step, columns, rows, out, to, out_step):
     """SiLU from one table to another."""
     stay_apart()
@@ -180,7 +165,7 @@ def activate(seen, at, step, columns, rows, out, to, out_step):
             store(out, to + r * out_step + m, x * sigmoid(x))
 
 
-@part
+@helper
 def activate_back(seen, at, step, columns, rows, made, to, made_step, of_made, of_step):
     """SiLU again into `made`; its slope is multiplied to `of_made`."""
     stay_apart()
@@ -195,7 +180,7 @@ def activate_back(seen, at, step, columns, rows, made, to, made_step, of_made, o
             store(of_made, i, load(of_made, i) * (share + y * (_ONE - share)))
 
 
-@part
+@helper
 def add_rows(table, first, step, columns, rows, out, at):
     """Sums of columns."""
     stay_apart()
@@ -213,7 +198,7 @@ def _whole_rows(columns, step, rows):
     return max(rows - (behind + step - 1) // max(step, 1), 0) if behind > 0 else rows
 
 
-@part
+@helper
 def copy(source, at, step, columns, rows, out, to, out_step):
     """Rows of one table into another.
 
@@ -232,7 +217,7 @@ def copy(source, at, step, columns, rows, out, to, out_step):
             out[to + r * out_step + k] = source[at + r * step + k]
 
 
-@part
+@helper
 def add(source, at, step, columns, rows, out, to, out_step):
     """Rows of one table to those of another.
 
@@ -253,7 +238,7 @@ def add(source, at, step, columns, rows, out, to, out_step):
             out[to + r * out_step + k] += source[at + r * step + k]
 
 
-@part
+@helper
 def project(table, at, step, columns, rows, weights, weights_at, out):
     """Product of each row with one vector, eight rows at a time, into `out`."""
     stay_apart()
@@ -274,7 +259,7 @@ def project(table, at, step, columns, rows, weights, weights_at, out):
         store_sums(out, r, (s0, s1, s2, s3, s4, s5, s6, s7))
 
 
-@part
+@helper
 def add_outer(column, column_at, column_step, rows, row, row_at, columns, out, to, out_step):
     """Each row of a table gets a multiple of one vector."""
     stay_apart()
@@ -285,7 +270,7 @@ def add_outer(column, column_at, column_step, rows, row, row_at, columns, out, t
             store(out, i, fma(factor, load(row, row_at + k), load(out, i)))
 
 
-@part
+@helper
 def add_weighted(column, column_at, column_step, rows, table, at, step, columns, out, to):
     """A vector gets the sum of a table's rows, each times a factor."""
     stay_apart()

@@ -85,6 +85,19 @@ class PaoSettings:
                 )
 
 
+#: The equations as printed, with the paper's thresholds; alpha and beta, which it does not print,
+#: are those of the authors' code.
+PAPER_PAO = PaoSettings(
+    variant="printed",
+    temporal="regions",
+    errors="absolute",
+    alpha=100.0,
+    beta=1000.0,
+    error_threshold=1.0,
+    share_threshold=0.3,
+)
+
+
 @dataclass(frozen=True, eq=False)
 class Weights:
     """Weights of the pixels of B frames, and what they are made of."""

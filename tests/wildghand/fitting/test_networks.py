@@ -127,17 +127,22 @@ def test_roots_are_the_wrists_in_the_image(hands: str, make_training: TrainingMa
     assert (np.abs(roots - training.width / 2) < training.width).all()
 
 
+def with_every_network(folder: Path, regions: str, hand: str) -> dict[str, Any]:
+    """Settings of the mode `paper` with each of its networks from a file."""
+    return {
+        **QUICK,
+        "mode": "paper",
+        "pao.regions": f"sam:{folder / regions}",
+        "pao.hand": f"sam:{folder / hand}",
+        "perceptual": f"vgg19:{folder / 'vgg19.pth'}",
+    }
+
+
 @pytest.mark.usefixtures("_fewer_points")
 def test_a_fit_from_the_command_line_with_every_network(
     folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
-    settings = {
-        **QUICK,
-        "mode": "paper",
-        "pao.regions": f"sam:{folder / 'sam'}",
-        "pao.hand": f"sam:{folder / 'sam.pth'}",
-        "perceptual": f"vgg19:{folder / 'vgg19.pth'}",
-    }
+    settings = with_every_network(folder, "sam", "sam.pth")
     out = tmp_path / "avatar"
     command = ["fit", str(make_painted().root), "-o", str(out)]
     assert wildghand([*command, *options(settings)]) == 0
@@ -153,13 +158,7 @@ def test_a_fit_from_the_command_line_with_every_network(
 def test_an_evaluation_in_the_sandbox_sees_the_files(
     folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
-    settings = {
-        **QUICK,
-        "mode": "paper",
-        "pao.regions": f"sam:{folder / 'sam.pth'}",
-        "pao.hand": f"sam:{folder / 'sam'}",
-        "perceptual": f"vgg19:{folder / 'vgg19.pth'}",
-    }
+    settings = with_every_network(folder, "sam.pth", "sam")
     out = tmp_path / "runs"
     command = ["--capture", str(make_painted().root), "-o", str(out), *options(settings)]
     assert hwp_bench(["evaluate", "wildghand", *command]) == 0, capsys.readouterr().err

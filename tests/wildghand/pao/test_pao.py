@@ -11,19 +11,15 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
-from wildghand.pao.pao import PaoSettings, PerturbationAwareWeights, binary_weights
+from wildghand.pao.pao import (
+    PAPER_PAO,
+    PaoSettings,
+    PerturbationAwareWeights,
+    binary_weights,
+)
 from wildghand.pao.regions import FrameRegions, Regions, overlapping, partition, stack_regions
 
-PRINTED = PaoSettings(
-    variant="printed",
-    temporal="regions",
-    errors="absolute",
-    alpha=100.0,
-    beta=1000.0,
-    error_threshold=1.0,
-    share_threshold=0.3,
-    share_of="hand",
-)
+PRINTED = replace(PAPER_PAO, share_of="hand")
 STRETCHED = replace(PRINTED, errors="batch")
 SIZE = 12
 

@@ -9,7 +9,7 @@ from wildghand.pao.regions.frame_regions import (
     stack_regions,
 )
 from wildghand.pao.regions.hand import graph_cut_hands
-from wildghand.pao.regions.sam import PromptedHand, SegmentAnything, check_sam, mask_of, open_sam
+from wildghand.pao.regions.sam import PromptedHand, SegmentAnything, mask_of, open_sam
 from wildghand.pao.regions.superpixels import RegionCache, Segmenter, Superpixels
 
 __all__ = [
@@ -21,7 +21,6 @@ __all__ = [
     "SegmentAnything",
     "Segmenter",
     "Superpixels",
-    "check_sam",
     "graph_cut_hands",
     "mask_of",
     "open_sam",

@@ -16,7 +16,6 @@ from wildghand.sam import (
     SamNetwork,
     SeenImage,
     automatic_masks,
-    check_checkpoint,
     checkpoint_digest,
     load_network,
 )
@@ -119,15 +118,6 @@ def open_sam(checkpoint: str | os.PathLike[str], device: str = "cpu") -> Segment
     # A graphics card rounds differently, and a mask may turn on it.
     identity = sha256_json([checkpoint_digest(checkpoint), torch.device(device).type])
     return SegmentAnything(identity, lambda: load_network(checkpoint, device))
-
-
-def check_sam(checkpoint: str | os.PathLike[str]) -> None:
-    """Check that a checkpoint holds a Segment Anything network, without loading it.
-
-    Raises:
-        BadInput: it is missing, unreadable, or a tensor is missing or of another shape.
-    """
-    check_checkpoint(checkpoint)
 
 
 def _best_mask(seen: SeenImage, root: tuple[float, float]) -> np.ndarray:

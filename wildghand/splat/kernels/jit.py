@@ -6,12 +6,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import numba
-
 from hwp_bench.base import compiled as compiler
-
-#: Untyped: the types that numba declares differ between its versions.
-_njit: Any = numba.njit
 
 
 class Kernel:
@@ -41,12 +36,4 @@ def kernel(function: Callable[..., Any]) -> Kernel:
 
 def inline(function: Callable[..., Any]) -> Any:
     """Decorator: compiles a function into the kernels that call it; Python cannot call it."""
-    # Without wrappers for callers outside, which would take a tenth of the time.
-    return _njit(
-        forceinline=True,
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-        nogil=True,
-        boundscheck=False,
-        error_model="numpy",
-    )(function)
+    return compiler.helper(function, forceinline=True)

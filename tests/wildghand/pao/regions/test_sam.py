@@ -15,10 +15,10 @@ from wildghand.pao.regions import (
     PromptedHand,
     RegionCache,
     SegmentAnything,
-    check_sam,
     mask_of,
     open_sam,
 )
+from wildghand.sam import check_checkpoint
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (40, 48, 3), dtype=np.uint8)
 
@@ -73,7 +73,7 @@ def test_roots_prompt_the_best_mask_of_each_hand_once(tmp_path: Path) -> None:
 @pytest.mark.parametrize("write", [write_sam_file, write_sam_folder])
 def test_a_checkpoint_gives_regions_and_a_hand(tmp_path: Path, write: Any) -> None:
     path = write(tmp_path / "sam")
-    check_sam(path)
+    check_checkpoint(path)
     sam = open_sam(path)
     regions = sam.regions(PICTURE)
     assert regions.labels.shape == (40, 48)
