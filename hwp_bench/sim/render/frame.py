@@ -12,6 +12,7 @@ from hwp_bench.sim.effects.plan import FramePlan, hands_at, lights_at, objects_a
 from hwp_bench.sim.geometry.raycast import RenderCost
 from hwp_bench.sim.render.exposure import Rows, Window, exposed
 from hwp_bench.sim.render.instant import Lens, LinearImage, render_instant
+from hwp_bench.sim.render.metering import metered_gain
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.optics import intrinsics, steady_light, viewmat
 from hwp_bench.sim.scene.schema import Scene
@@ -92,6 +93,11 @@ def _developed(
 ) -> list[np.ndarray]:
     """Images of the same frame as the sensor stores them: (S, S, 3) uint8 sRGB each."""
     sensor = registered(SENSOR)
+    colors = tuple(image.color for image in images)
+    if scene.sensor.auto is not None:
+        with cost.time("auto"):
+            gain = metered_gain(scene, scene.sensor.auto, recipe.seconds, cost)
+            colors = tuple(color * gain for color in colors)
     with cost.time("sensor"):
-        colors = sensor.record(scene, recipe.frame, tuple(image.color for image in images))
+        colors = sensor.record(scene, recipe.frame, colors)
         return [sensor.store(scene, eight_bit_srgb(color)) for color in colors]

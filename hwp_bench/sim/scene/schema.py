@@ -19,6 +19,7 @@ from hwp_bench.base.records import number
 from hwp_bench.base.text import ODD_CHARACTERS
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.gestures import gesture
+from hwp_bench.sim.scene.recorder import AutoControl, without_defaults
 from hwp_bench.taxonomy import MAX_SEVERITY
 
 #: Version of the scene format; part of every scene digest.
@@ -102,6 +103,14 @@ class Sensor:
     #: Rolling shutter: s from the reading of the first row to that of the last; 0 reads all at
     #: once.
     rolling_shutter: float = number(0.0, 0.0, 0.05)
+    #: Strength of the unsharp mask on the brightness; 0 leaves edges as they are.
+    sharpening: float = number(0.0, 0.0, 3.0)
+    #: Exposure and white balance that follow the image, or None: both are fixed.
+    auto: AutoControl | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON values, without later fields that change nothing."""
+        return without_defaults(self, ("noise", "jpeg_quality", "rolling_shutter"))
 
 
 @dataclass(frozen=True)
@@ -209,6 +218,7 @@ class Scene:
     def to_json(self) -> dict[str, Any]:
         """Return the whole content as JSON values, laid out as a scene file is."""
         content = {"schema": SCHEMA, **asdict(self)}
+        content["sensor"] = self.sensor.to_json()
         if self.sensor == Sensor(self.sensor.noise):
             content["noise"] = content.pop("sensor")["noise"]
         return content
