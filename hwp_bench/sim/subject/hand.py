@@ -21,6 +21,8 @@ if TYPE_CHECKING:
 
 #: Midpoint subdivisions on top of the template: 1,609 vertices become 25,609.
 FINE = 2
+#: A rig is not refined beyond so many triangles; the free hand has 51,136.
+RIG_FACES = 60_000
 #: Subdivisions of what moves during an exposure: finer detail would be blurred away.
 MOVING = 1
 
@@ -126,12 +128,17 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
     corner_uv = template.uv[template.face_uv]
     lift = None
     count = len(template.vertices)
+    if template is not model:
+        # Files come with triangles of any size; small ones need no refinement.
+        while subdivisions and len(faces) * 4**subdivisions > RIG_FACES:
+            subdivisions -= 1
     for _ in range(subdivisions):
         step, fine = subdivision(faces, count)
         corner_uv = _subdivide_corners(corner_uv)
         lift = step if lift is None else step @ lift
         faces, count = fine, step.shape[0]
-    lift = (smoothing(faces, count, rounds=2 * subdivisions - 1) @ lift).tocsr()
+    smooth = smoothing(faces, count, rounds=max(2 * subdivisions - 1, 0))
+    lift = smooth if lift is None else (smooth @ lift).tocsr()
     joints = template.joints + template.joint_basis @ betas
     normal_sum = normal_operator(faces, count)
     rest = lift @ (template.vertices + template.shape_basis @ betas)

@@ -1,66 +1,49 @@
 """Rigged hands from glTF files, brought into the hand model's joints, size and rest frame.
 
-The rig keeps its own mesh, skinning weights and texture. Two naming schemes of joints are
-understood: WebXR (`index-finger-phalanx-proximal`) and OpenXR as Godot writes it
-(`Index_Proximal_R`). A left hand is made of a right one by mirroring, and the other way round.
+The rig keeps its own mesh, skinning weights and texture. A left hand is made of a right one by
+mirroring, and the other way round. Meshes of any topology are taken, open or closed at the
+wrist, with a forearm or a whole body: see `wrist`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
 from hwp_bench.base.errors import BadHandModel, MissingDependency
 from hwp_bench.hands import HandTemplate, mirror_template
 from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, make_template
-from hwp_bench.sim.subject.gltf import Gltf
+from hwp_bench.sim.subject.joint_names import hand_joints, is_elsewhere, side_of_name
+from hwp_bench.sim.subject.rest_pose import into_rest_pose
+from hwp_bench.sim.subject.rig_mesh import RigMesh, kept
+from hwp_bench.sim.subject.skinned_mesh import SkinnedMesh, read_skinned_mesh
+from hwp_bench.sim.subject.wrist import opened_at_wrist
 
-#: Joints of the hand model, in its order, as WebXR names them.
-WEBXR = (
-    "wrist",
-    *(
-        f"{finger}-finger-phalanx-{part}"
-        for finger in ("index", "middle", "pinky", "ring")
-        for part in ("proximal", "intermediate", "distal")
-    ),
-    "thumb-metacarpal",
-    "thumb-phalanx-proximal",
-    "thumb-phalanx-distal",
-)
-#: The same as OpenXR rigs name them, without the side's suffix.
-OPENXR = (
-    "wrist",
-    *(
-        f"{finger}_{part}"
-        for finger in ("index", "middle", "little", "ring")
-        for part in ("proximal", "intermediate", "distal")
-    ),
-    "thumb_metacarpal",
-    "thumb_proximal",
-    "thumb_distal",
-)
-# Joints that the hand model does not have; their weights go to the joint named here.
-_FOLDED: Mapping[str, str] = MappingProxyType({"metacarpal": "wrist", "palm": "wrist"})
+#: Most triangles of a hand; more are no use at the sizes of images here.
+MAX_HAND_FACES = 250_000
+# Joints of the palm, which the hand model does not have; the wrist takes their weights.
+_FOLDED = ("metacarpal", "palm")
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
+# Last joints of the fingers, in that order.
+_LAST = (15, 3, 6, 12, 9)
 
 
 def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, np.ndarray | None]:
     """Read a rigged hand.
 
     Args:
-        path: a `.glb` or `.gltf` file with one skinned hand.
+        path: a `.glb` or `.gltf` file with a skinned hand.
         side: the hand to return; a rig of the other side is mirrored.
-        model: the hand model of that side, whose size the rig takes.
+        model: the hand model of that side, whose size and rest pose the rig takes.
 
     Returns:
-        The rig as a template without shape parameters, and its base colour, (H, W, 3) uint8
-        sRGB, or None if it has none.
+        The rig as a template without shape parameters, open at the wrist only, and its base
+        colour, (H, W, 3) uint8 sRGB, or None if it has none.
 
     Raises:
-        BadHandModel: the file is missing or damaged, or joints are missing; it names them.
+        BadHandModel: the file is missing or damaged, joints are missing (it names them), or the
+            mesh has no wrist.
         MissingDependency: pygltflib is not installed.
     """
     try:
@@ -69,100 +52,101 @@ def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, n
         raise MissingDependency(
             "reading a glTF hand needs pygltflib", remedy="pip install 'hwp-bench[gltf]'"
         ) from error
-    file = Gltf(Path(path))
-    names = [name.lower() for name in file.joint_names]
-    index = _joint_index(names, path)
+    file = read_skinned_mesh(Path(path))
+    index, told = hand_joints(file.joint_names, side, path)
     places = file.joint_places[index]
-    own = _side_of(path, names, places)
-    template = _template(file, names, index, own, places, model, path)
+    own = told or side_of_name(Path(path).stem) or _side_by_curl(places)
+    template = _template(file, index, told, own, model, path)
     if template.side != side:
         template = mirror_template(template)
-    return template, file.texture
+    return template, file.sheet.texture
 
 
-def _joint_index(names: list[str], path: str) -> list[int]:
-    plain = [_plain(name) for name in names]
-    for scheme in (WEBXR, OPENXR):
-        if all(name in plain for name in scheme):
-            return [plain.index(name) for name in scheme]
-    missing = [name for name in WEBXR if name not in plain]
-    raise BadHandModel(
-        f"{len(missing)} joints are missing, the first is {missing[0]!r}",
-        where=path,
-        field="skins[0].joints",
-        remedy="WebXR and OpenXR names are understood.",
-    )
-
-
-def _plain(name: str) -> str:
-    for ending in ("_r", "_l", ".r", ".l", "_right", "_left"):
-        name = name.removesuffix(ending)
-    return name
-
-
-def _side_of(path: str, names: list[str], places: np.ndarray) -> str:
-    """The side by the file's or the joints' names, or by where the fingers curl.
+def _side_by_curl(places: np.ndarray) -> str:
+    """The side of a hand by where its fingers curl.
 
     Args:
-        path: the file.
-        names: of the rig's joints.
         places: (16, 3) of the hand model's joints in the rig.
     """
-    words = [Path(path).stem.lower(), *names]
-    for side in ("right", "left"):
-        endings = (side, f"_{side[0]}", f".{side[0]}")
-        if any(word.endswith(endings) for word in words):
-            return side
     back_if_right = np.cross(places[4] - places[0], places[1] - places[7])
-    curl = sum(places[i + 2] - 2.0 * places[i + 1] + places[i] for i in (1, 4, 7, 10))
-    curl = curl + places[13] - places[0]
+    curl = sum(places[i + 2] - places[i] for i in (1, 4, 7, 10, 13))
     return "right" if curl @ back_if_right < 0 else "left"
 
 
 def _template(
-    file: Gltf,
-    names: list[str],
+    file: SkinnedMesh,
     index: list[int],
+    told: str | None,
     side: str,
-    places: np.ndarray,
     model: HandTemplate,
     path: str,
 ) -> HandTemplate:
-    target = model.joints if model.side == side else model.joints * [-1.0, 1.0, 1.0]
-    turn, scale = _alignment(places, target)
+    flip = np.array([1.0 if model.side == side else -1.0, 1.0, 1.0])
+    target, target_tips = model.joints * flip, model.vertices[model.fingertips] * flip
+    places = file.joint_places[index]
+    turn, scale = _alignment(places, target, path)
     joints = (places - places[0]) @ turn.T * scale + target[0]
-    # Files repeat the vertices along the texture's seams; a closed surface needs them once.
-    _, first, welded = np.unique(
-        np.round(file.vertices * scale, 6), axis=0, return_index=True, return_inverse=True
+    mesh = _welded(file, index, told, scale)
+    vertices = (mesh.vertices - places[0] * scale) @ turn.T + target[0]
+    mesh = RigMesh(vertices, mesh.weights, mesh.faces, mesh.uv, mesh.face_uv)
+    forward = np.array([-1.0 if side == "right" else 1.0, 0.0, 0.0])
+    mesh = opened_at_wrist(mesh, joints, forward, path)
+    if len(mesh.faces) > MAX_HAND_FACES:
+        raise BadHandModel(
+            f"the hand has {len(mesh.faces)} triangles, at most {MAX_HAND_FACES}",
+            where=path,
+            remedy="Decimate the mesh.",
+        )
+    tips = _fingertips(mesh, joints, path)
+    vertices, joints = into_rest_pose(
+        mesh.vertices, mesh.weights, joints, mesh.vertices[tips], target, target_tips
     )
-    welded = welded.reshape(-1)
-    vertices = (file.vertices[first] - places[0]) @ turn.T * scale + target[0]
-    weights = np.zeros((len(vertices), JOINT_COUNT))
-    for column, owner in enumerate(_owners(names, index, file.joint_parents)):
-        weights[:, owner] += file.weights[first, column]
-    tips = [
-        _farthest(vertices, weights[:, joint], joints[joint] - joints[joint - 1])
-        for joint in (15, 3, 6, 12, 9)
-    ]
     return make_template(
         name=f"gltf:{Path(path).name}",
         side=side,
         vertices=vertices,
-        faces=welded[file.faces],
+        faces=mesh.faces,
         shape_basis=np.zeros((len(vertices), 3, SHAPE_COUNT)),
         pose_basis=None,
         joints=joints,
         joint_basis=np.zeros((JOINT_COUNT, 3, SHAPE_COUNT)),
-        weights=weights / np.maximum(weights.sum(axis=1, keepdims=True), 1e-9),
+        weights=mesh.weights,
         mean_pose=np.zeros(3 * (JOINT_COUNT - 1)),
-        uv=file.uv,
-        face_uv=file.faces,
-        fingertips=np.array(tips),
+        uv=mesh.uv,
+        face_uv=mesh.face_uv,
+        fingertips=tips,
         where=path,
     )
 
 
-def _alignment(places: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, float]:
+def _welded(file: SkinnedMesh, index: list[int], told: str | None, scale: float) -> RigMesh:
+    """The file's mesh in metres with the hand model's weights, without the rest of a body.
+
+    Files repeat vertices along the texture's seams; a closed surface needs them once.
+    """
+    _, first, welded = np.unique(
+        np.round(file.vertices * scale, 6), axis=0, return_index=True, return_inverse=True
+    )
+    faces = welded.reshape(-1)[file.faces]
+    owner = np.zeros((len(file.joint_names), JOINT_COUNT))
+    owner[np.arange(len(owner)), _owners(file.joint_names, index, file.joint_parents)] = 1.0
+    elsewhere = np.array(
+        [is_elsewhere(name, told) and row not in index for row, name in enumerate(file.joint_names)]
+    )
+    shares = file.weights[first]
+    total = np.maximum(np.asarray(shares.sum(axis=1)).reshape(-1), 1e-9)
+    weights = np.asarray((shares @ owner) / total[:, None])
+    # A vertex that nothing moves stays with the palm.
+    weights[weights.sum(axis=1) < 0.5, 0] = 1.0
+    weights /= weights.sum(axis=1, keepdims=True)
+    away = np.asarray(shares @ elsewhere.astype(np.float64)) / total
+    solid = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    sheet = file.sheet
+    mesh = RigMesh(file.vertices[first] * scale, weights, faces, sheet.uv, sheet.faces)
+    return kept(mesh, solid & (away[faces].mean(axis=1) < 0.5))
+
+
+def _alignment(places: np.ndarray, target: np.ndarray, path: str) -> tuple[np.ndarray, float]:
     """Rotation and scale that bring the rig's palm onto the hand model's.
 
     Source: the Kabsch algorithm over the wrist and the four knuckles.
@@ -170,30 +154,38 @@ def _alignment(places: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, floa
     palm = [0, 1, 4, 7, 10]
     a = places[palm] - places[palm].mean(axis=0)
     b = target[palm] - target[palm].mean(axis=0)
-    u, _, vt = np.linalg.svd(b.T @ a)
+    size = float(np.linalg.norm(a))
+    if size < 1e-9:
+        raise BadHandModel("has all joints of its palm in one place", where=path)
+    u, _, vt = np.linalg.svd(b.T @ (a / size))
     turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
-    return turn, float(np.linalg.norm(b)) / max(float(np.linalg.norm(a)), 1e-9)
+    return turn, float(np.linalg.norm(b)) / size
 
 
 def _owners(names: list[str], index: list[int], parents: list[int]) -> list[int]:
     """Joint of the hand model that each joint of the rig hands its weights to."""
     owners = []
     for joint, name in enumerate(names):
-        plain = _plain(name)
-        folded = next((to for part, to in _FOLDED.items() if part in plain), None)
+        folded = any(part in name.lower() for part in _FOLDED)
+        ancestor = joint
+        while ancestor >= 0 and ancestor not in index:
+            ancestor = parents[ancestor]
         if joint in index:
             owners.append(index.index(joint))
-        elif folded is not None:
+        elif folded or ancestor < 0:
             owners.append(0)
         else:
-            ancestor = joint
-            while ancestor >= 0 and ancestor not in index:
-                ancestor = parents[ancestor]
-            owners.append(index.index(ancestor) if ancestor >= 0 else 0)
+            owners.append(index.index(ancestor))
     return owners
 
 
-def _farthest(vertices: np.ndarray, weight: np.ndarray, direction: np.ndarray) -> int:
-    """Vertex of a finger's last segment that lies farthest along it."""
-    reach = np.where(weight > 0.5, vertices @ direction, -np.inf)
-    return int(np.argmax(reach))
+def _fingertips(mesh: RigMesh, joints: np.ndarray, path: str) -> np.ndarray:
+    """Vertices of the fingers' last segments that lie farthest along them: (5,)."""
+    tips = []
+    for finger, joint in zip(_FINGERS, _LAST, strict=True):
+        weight = mesh.weights[:, joint]
+        if weight.max() < 0.01:
+            raise BadHandModel(f"no skin follows the last joint of the {finger}", where=path)
+        along = mesh.vertices @ (joints[joint] - joints[joint - 1])
+        tips.append(int(np.argmax(np.where(weight > 0.5 * weight.max(), along, -np.inf))))
+    return np.array(tips)

@@ -9,64 +9,21 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from rig_files import split_at_seams, write_rig
 
 from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.schema import Scene
-from hwp_bench.sim.subject.rigs import OPENXR, WEBXR, load_rig
+from hwp_bench.sim.subject.joint_names import OPENXR, WEBXR
+from hwp_bench.sim.subject.rigs import load_rig
 
-pygltflib = pytest.importorskip("pygltflib")
-
-# Another frame and unit: turned, ten times larger, elsewhere.
-_TURN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
-_SCALE, _SHIFT = 10.0, np.array([1.0, 2.0, 3.0])
+pytest.importorskip("pygltflib")
 
 
 def write_gltf(path: Path, template: HandTemplate, names: tuple[str, ...]) -> Path:
     """Write a template as a binary glTF, its vertices split along the seams."""
-    corners = template.faces.reshape(-1)
-    pairs, faces = np.unique(
-        np.stack([corners, template.face_uv.reshape(-1)], axis=1), axis=0, return_inverse=True
-    )
-
-    def moved(points: np.ndarray) -> np.ndarray:
-        return _SCALE * points @ _TURN.T + _SHIFT
-
-    weights = template.weights[pairs[:, 0]]
-    strongest = np.argsort(-weights, axis=1)[:, :4]
-    inverse = np.tile(np.eye(4), (len(names), 1, 1))
-    inverse[:, :3, 3] = -moved(template.joints)
-    arrays = [
-        (moved(template.vertices)[pairs[:, 0]].astype("<f4"), "VEC3", 5126),
-        ((template.uv[pairs[:, 1]] * [1, -1] + [0, 1]).astype("<f4"), "VEC2", 5126),
-        (strongest.astype("<u2"), "VEC4", 5123),
-        (np.take_along_axis(weights, strongest, axis=1).astype("<f4"), "VEC4", 5126),
-        (faces.reshape(-1).astype("<u4"), "SCALAR", 5125),
-        (inverse.transpose(0, 2, 1).reshape(-1, 16).astype("<f4"), "MAT4", 5126),
-    ]
-    file = pygltflib.GLTF2()
-    blob = b""
-    for array, kind, component in arrays:
-        view = pygltflib.BufferView(buffer=0, byteOffset=len(blob), byteLength=array.nbytes)
-        file.bufferViews.append(view)
-        file.accessors.append(
-            pygltflib.Accessor(
-                bufferView=len(file.accessors), componentType=component, count=len(array), type=kind
-            )
-        )
-        blob += array.tobytes()
-    file.buffers.append(pygltflib.Buffer(byteLength=len(blob)))
-    attributes = pygltflib.Attributes(POSITION=0, TEXCOORD_0=1, JOINTS_0=2, WEIGHTS_0=3)
-    primitive = pygltflib.Primitive(attributes=attributes, indices=4)
-    file.meshes.append(pygltflib.Mesh(primitives=[primitive]))
-    joints = list(range(1, len(names) + 1))
-    file.skins.append(pygltflib.Skin(joints=joints, inverseBindMatrices=5))
-    file.nodes.append(pygltflib.Node(mesh=0, skin=0))
-    file.nodes += [pygltflib.Node(name=name) for name in names]
-    file.set_binary_blob(blob)
-    file.save_binary(str(path))
-    return path
+    return write_rig(path, [split_at_seams(template)], names, template=template)
 
 
 @pytest.mark.parametrize("side", ["right", "left"])
