@@ -20,7 +20,7 @@ from hwp_bench.sim.subject.rig_mesh import RigMesh, kept
 from hwp_bench.sim.subject.skinned_mesh import SkinnedMesh, read_skinned_mesh
 from hwp_bench.sim.subject.wrist import opened_at_wrist
 
-#: Most triangles of a hand; more are no use at the sizes of images here.
+#: Most triangles of a hand; images here are too small to show more.
 MAX_HAND_FACES = 250_000
 # Joints of the palm, which the hand model does not have; the wrist takes their weights.
 _FOLDED = ("metacarpal", "palm")

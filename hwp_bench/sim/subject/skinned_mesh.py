@@ -1,7 +1,7 @@
 """The skinned meshes of a glTF file as one mesh in the bind pose.
 
 A file may hold several meshes, each with several primitives and a skin of its own. They are put
-together through the joints that they share. Meshes that hang on a joint without a skin (often
+together through the joints that they share. Meshes without a skin below a joint (often
 nails or rings) move with that joint.
 """
 
