@@ -10,7 +10,7 @@ from hwp_bench.base.colors import lamp_color
 from hwp_bench.sim.effects.base import Effect
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.scene.effect_settings import Illumination, read_settings
-from hwp_bench.sim.scene.optics import CastShadow, Lights
+from hwp_bench.sim.scene.optics import CastShadow, Lights, focus_point
 from hwp_bench.sim.scene.schema import EffectCall, Episode, Scene
 
 
@@ -39,9 +39,7 @@ class _Illumination(Effect):
         if mode in ("warm", "cool"):
             kelvin = 5500.0 * 2.0 ** ((-0.8 if mode == "warm" else 0.9) * strength)
             tint = lamp_color(kelvin) / lamp_color(5500.0)
-            return replace(
-                lights, key=lights.key * tint, sky=lights.sky * tint, ground=lights.ground * tint
-            )
+            return lights.tinted(tint)
         if mode == "shadow":
             return replace(lights, cast=_passing_shadow(call.episodes[number], moment, strength))
         return _moved(lights, strength)
@@ -62,12 +60,14 @@ def _passing_shadow(episode: Episode, moment: float, strength: float) -> CastSha
 
 
 def _moved(lights: Lights, strength: float) -> Lights:
-    """The key light swung around the vertical and lowered: 70 degrees at strength 1."""
+    """All lamps swung around the vertical, 70 degrees at strength 1; the key light lowered too."""
     from scipy.spatial.transform import Rotation
 
     swing = Rotation.from_euler("y", 70.0 * strength, degrees=True)
     direction = swing.apply(lights.direction) + np.array([0.0, 0.25 * strength, 0.0])
-    return replace(lights, direction=unit(direction))
+    turn, focus = swing.as_matrix(), focus_point()
+    lamps = tuple(lamp.turned(turn, focus) for lamp in lights.lamps)
+    return replace(lights, direction=unit(direction), lamps=lamps)
 
 
 EFFECT = _Illumination()

@@ -80,6 +80,8 @@ def plan(
         fours = np.ceil(way / SUBFRAME_STEP / 4.0)
         subframes = int(np.clip(4 * fours, 4, MAX_SUBFRAMES))
     passes = ["hands", "shadow", "sky", "backdrop"]
+    passes += ["lamps"] if scene.light.lamps else []
+    passes += ["room"] if scene.light.room is not None else []
     for kind in (*(kind for kind in ORDER if kind in acting), SENSOR):
         passes += registered(kind).passes(scene)
     return FramePlan(

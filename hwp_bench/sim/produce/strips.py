@@ -15,6 +15,7 @@ from hwp_bench.base.progress import track
 from hwp_bench.sim.effects.base import registered
 from hwp_bench.sim.effects.plan import hands_at
 from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.produce.light_strips import captioned, light_sheet
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.scene.motion import hand_parameters
 from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
@@ -72,7 +73,7 @@ def write_preview(
 
 
 def write_gallery(folder: Path) -> list[Path]:
-    """Write `captureN.jpg` for every scene and `severity-KIND.jpg` for every perturbation.
+    """Write `captureN.jpg` for every scene, `severity-KIND.jpg` for every perturbation, lights.
 
     Args:
         folder: where to.
@@ -84,6 +85,7 @@ def write_gallery(folder: Path) -> list[Path]:
     for kind, name in track(SHOWN_IN, "Strips of the severities"):
         image = strip(_severity_strip(load_scene(name), kind), MAX_SEVERITY + 1)
         paths.append(_write(folder / f"severity-{kind}.jpg", image))
+    paths.append(_write(folder / "lights.jpg", light_sheet()))
     return paths
 
 
@@ -164,18 +166,10 @@ def strip(results: list[SimulatedFrame], columns: int) -> np.ndarray:
 
 
 def _captioned(result: SimulatedFrame) -> np.ndarray:
-    import cv2
-
-    image = result.rgb.copy()
     severity = [
         f"{_SHORT.get(name, name)}{value}" for name, value in result.plan.severity.items() if value
     ]
-    text = " ".join([str(result.plan.frame), *severity])
-    scale = len(image) / 420.0
-    for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
-        place = (4, int(36 * scale))
-        cv2.putText(image, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, color, width, cv2.LINE_AA)
-    return image
+    return captioned(result.rgb, " ".join([str(result.plan.frame), *severity]))
 
 
 def _animation(results: list[SimulatedFrame]) -> bytes:

@@ -8,6 +8,7 @@ import numpy as np
 
 from hwp_bench.sim.geometry.raycast import Hits, RenderCost, Tracer
 from hwp_bench.sim.props.backdrop import backdrop_colors
+from hwp_bench.sim.render.lamps import lamp_light, room_light
 from hwp_bench.sim.render.samples import gather
 from hwp_bench.sim.render.shading import lit, shade
 from hwp_bench.sim.render.stage import Body
@@ -84,9 +85,18 @@ def render_instant(
             samples = gather(layer.surface, hits, rays)
         with cost.time("shadow"):
             row, column = samples.ray // columns, samples.ray % columns
-            reached = lit(samples, lights, tracers, (row % 2 * 2 + column % 2 + lens.turn) % 4)
+            turn = (row % 2 * 2 + column % 2 + lens.turn) % 4
+            reached = lit(samples, lights, tracers, turn)
         with cost.time(name):
-            shown[samples.ray] = shade(samples, lights, reached)
+            towards = shade(samples, lights, reached)
+        if lights.lamps:
+            with cost.time("lamps"):
+                towards += lamp_light(samples, lights, tracers, turn)
+        if lights.room is not None:
+            with cost.time("room"):
+                towards += room_light(samples, lights)
+        with cost.time(name):
+            shown[samples.ray] = towards
             depth[samples.ray] = samples.distance
             hand[samples.ray] = samples.hand
     color[top:bottom, left:right] = _pool(shown.reshape(rows, columns, 3), lens.grid)
@@ -102,7 +112,7 @@ def _backdrop(scene: Scene, lens: Lens, lights: Lights) -> np.ndarray:
         _, last = pixel_rays(lens.K, lens.rows[1], whole, 1)
         directions = first + (last - first) * np.linspace(0.0, 1.0, lens.size)[:, None, None]
     seen = backdrop_colors(scene.background, scene.seed, directions)
-    return seen * (0.45 * lights.key + 0.5 * lights.sky) * lights.exposure
+    return seen * lights.on_backdrop() * lights.exposure
 
 
 def _box(lens: Lens, clouds: list[np.ndarray]) -> tuple[int, int, int, int] | None:

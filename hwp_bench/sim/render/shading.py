@@ -83,6 +83,8 @@ def lit(samples: Samples, lights: Lights, tracers: list[Tracer], turn: np.ndarra
         (H,) 0 or 1. A point that faces away from the lamp is 1: its normal darkens it.
     """
     reached = np.ones(len(samples.ray))
+    if not lights.key.any():
+        return reached
     facing = np.flatnonzero(samples.flat @ lights.direction > 0.0)
     helper = np.array([0.0, 0.0, 1.0])
     if abs(lights.direction[2]) > 0.9:

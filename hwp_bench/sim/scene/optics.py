@@ -1,14 +1,20 @@
-"""Camera and light of a scene: intrinsics, path and rays; key light, sky and passing shadows."""
+"""Camera and light of a scene: intrinsics, path and rays; all lights, and passing shadows."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hwp_bench.base.colors import lamp_color
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.scene.area_lights import (
+    BACKDROP_DISTANCE,
+    AreaLight,
+    area_light,
+    wall_radiance,
+)
 from hwp_bench.sim.scene.schema import Light, Scene
 
 #: Distance from the camera to the point that it looks at, m.
@@ -109,13 +115,43 @@ class Lights:
     exposure: float = 1.0
     #: Shadow that something outside the image casts, or None.
     cast: CastShadow | None = None
+    #: Lamps and windows besides the key light.
+    lamps: tuple[AreaLight, ...] = ()
+    #: (6, 3) radiance of the walls in +x, -x, +y, -y, +z, -z in place of the sky's, or None.
+    room: np.ndarray | None = None
+    #: Factor on the light that falls on the backdrop.
+    backdrop: float = 1.0
+
+    def tinted(self, tint: np.ndarray) -> Lights:
+        """The same light behind a filter with a colour (3,)."""
+        return replace(
+            self,
+            key=self.key * tint,
+            sky=self.sky * tint,
+            ground=self.ground * tint,
+            lamps=tuple(replace(lamp, irradiance=lamp.irradiance * tint) for lamp in self.lamps),
+            room=None if self.room is None else self.room * tint,
+        )
+
+    def on_backdrop(self) -> np.ndarray:
+        """Light that the backdrop returns where it is white: (3,)."""
+        light = 0.45 * self.key + 0.5 * (self.sky if self.room is None else self.room.mean(axis=0))
+        wall = focus_point() + np.array([0.0, 0.0, BACKDROP_DISTANCE])
+        for lamp in self.lamps:
+            light = light + lamp.at(wall, np.array([0.0, 0.0, -1.0]))
+        return np.asarray(light if self.backdrop == 1.0 else self.backdrop * light)
 
 
 def steady_light(light: Light) -> Lights:
     """The scene's light where no effect changes it."""
+    # Walls take the place of the sky: none of it is left.
+    sky = light.sky if light.room is None else 0.0
     return Lights(
         direction=unit(np.array(light.direction)),
         key=light.key * lamp_color(light.kelvin),
-        sky=light.sky * lamp_color(7000.0),
-        ground=0.55 * light.sky * lamp_color(4800.0),
+        sky=sky * lamp_color(7000.0),
+        ground=0.55 * sky * lamp_color(4800.0),
+        lamps=tuple(area_light(lamp, focus_point()) for lamp in light.lamps),
+        room=None if light.room is None else wall_radiance(light.room, light.sky),
+        backdrop=light.backdrop,
     )

@@ -19,6 +19,7 @@ from hwp_bench.base.records import number
 from hwp_bench.base.text import ODD_CHARACTERS
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.gestures import gesture
+from hwp_bench.sim.scene.lighting import Lamp, Room
 from hwp_bench.sim.scene.recorder import AutoControl, without_defaults
 from hwp_bench.taxonomy import MAX_SEVERITY
 
@@ -86,10 +87,20 @@ class Light:
     sky: _Brightness
     #: Colour temperature of the key light, kelvin.
     kelvin: Annotated[float, Meta(ge=1500.0, le=15000.0)]
+    #: Lamps and windows besides it.
+    lamps: Annotated[tuple[Lamp, ...], Meta(max_length=4)] = ()
+    #: Coloured walls in place of the sky, or None.
+    room: Room | None = None
+    #: Factor on the light that falls on the backdrop.
+    backdrop: float = number(1.0, 0.0, 50.0)
 
     def __post_init__(self) -> None:
         if not any(self.direction):
             raise UsageError("is zero", field="direction")
+
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON values, without later fields that change nothing."""
+        return without_defaults(self, ("direction", "key", "sky", "kelvin"))
 
 
 @dataclass(frozen=True)
@@ -218,7 +229,7 @@ class Scene:
     def to_json(self) -> dict[str, Any]:
         """Return the whole content as JSON values, laid out as a scene file is."""
         content = {"schema": SCHEMA, **asdict(self)}
-        content["sensor"] = self.sensor.to_json()
+        content |= {"sensor": self.sensor.to_json(), "light": self.light.to_json()}
         if self.sensor == Sensor(self.sensor.noise):
             content["noise"] = content.pop("sensor")["noise"]
         return content
