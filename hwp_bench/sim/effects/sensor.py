@@ -1,6 +1,7 @@
 """The sensor: noise, rows that are read in turn, sharpened edges, and the JPEG that is stored.
 
-It is not a perturbation: a frame and its clean version both pass it, with the same noise.
+It is not a perturbation: a frame and its clean version both pass it, with the same noise. H.264
+needs the whole clip; `hwp_bench.sim.produce.video_encoding` is its pass over the stored frames.
 """
 
 from __future__ import annotations
@@ -27,6 +28,7 @@ class _Sensor(Effect):
             "sensor": sensor.noise,
             "sharpening": sensor.sharpening,
             "jpeg": sensor.jpeg_quality,
+            "h264": sensor.h264,
         }
         return tuple(name for name, setting in asked.items() if setting)
 

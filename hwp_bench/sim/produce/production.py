@@ -6,6 +6,7 @@ import json
 import os
 import shutil
 import time
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,6 +35,7 @@ from hwp_bench.sim.produce.frames import (
     render_frames,
     render_in_processes,
 )
+from hwp_bench.sim.produce.video_encoding import check_encoder, through_h264
 from hwp_bench.sim.scene.motion import hand_parameters
 from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
 from hwp_bench.sim.scene.reader import load_scene
@@ -96,6 +98,8 @@ def render_capture(
     count = scene.frame_count if frame_count is None else frame_count
     edge = DEFAULT_SIZE if size is None else size
     _check(count, edge, workers)
+    if scene.sensor.h264:
+        check_encoder(scene.id)
     out = Path(out)
     if out.exists() and not overwrite and (out.is_file() or any(out.iterdir())):
         raise UsageError("exists already", where=out, remedy="Choose another place or overwrite.")
@@ -163,18 +167,15 @@ def _assemble(
     with CaptureWriter(
         out, info, estimate_hands(scene, truth, plans), cameras, overwrite=overwrite
     ) as writer:
+        videos = [_video(scene, waiting, info, name) for name in ("rgb", "clean")]
         for item in plans:
-            arrays = read_frame(waiting, item.frame)
-            if arrays is None:
-                frame_file(waiting, item.frame).unlink(missing_ok=True)
-                raise HwpError(
-                    f"frame {item.frame} was damaged while it waited",
-                    where=waiting,
-                    remedy="Run the same command again; only this frame is rendered again.",
-                )
+            arrays = _waiting_frame(waiting, item.frame)
+            rgb, clean = arrays["rgb"], arrays["clean"]
+            if scene.sensor.h264:
+                rgb, clean = (next(video) for video in videos)
             coverage = arrays["coverage"].astype(np.float64)
-            writer.frame(item.frame, arrays["rgb"])
-            writer.clean(item.frame, arrays["clean"])
+            writer.frame(item.frame, rgb)
+            writer.clean(item.frame, clean)
             writer.true_mask(item.frame, _eight_bits(coverage))
             clean_coverage = arrays["clean_coverage"].astype(np.float64)
             writer.clean_mask(item.frame, _eight_bits(clean_coverage))
@@ -186,6 +187,28 @@ def _assemble(
         writer.true_hands(truth)
         writer.extra("scene.json", canonical_json(scene.to_json()))
         writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
+
+
+def _video(scene: Scene, waiting: Path, info: CaptureInfo, name: str) -> Iterator[np.ndarray]:
+    """The frames, or their clean versions, out of the video that the device stores.
+
+    It is encoded here, in one process, over the whole clip: frames that were rendered by any
+    number of processes in any order give the same stream.
+    """
+    images = (_waiting_frame(waiting, frame)[name] for frame in range(info.frame_count))
+    return through_h264(images, scene.sensor.h264, info.fps, scene.id)
+
+
+def _waiting_frame(waiting: Path, frame: int) -> dict[str, np.ndarray]:
+    arrays = read_frame(waiting, frame)
+    if arrays is None:
+        frame_file(waiting, frame).unlink(missing_ok=True)
+        raise HwpError(
+            f"frame {frame} was damaged while it waited",
+            where=waiting,
+            remedy="Run the same command again; only this frame is rendered again.",
+        )
+    return arrays
 
 
 def _eight_bits(coverage: np.ndarray) -> np.ndarray:

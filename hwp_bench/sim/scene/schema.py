@@ -118,6 +118,9 @@ class Sensor:
     sharpening: float = number(0.0, 0.0, 3.0)
     #: Exposure and white balance that follow the image, or None: both are fixed.
     auto: AutoControl | None = None
+    #: Bits a pixel of the H.264 video that the device stores; 0 stores frame by frame. A phone's
+    #: camera writes 0.1 to 0.3, a messenger 0.03 to 0.1.
+    h264: float = number(0.0, 0.0, 4.0)
 
     def to_json(self) -> dict[str, Any]:
         """Return JSON values, without later fields that change nothing."""
