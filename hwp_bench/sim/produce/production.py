@@ -42,6 +42,7 @@ from hwp_bench.sim.scene.reader import load_scene
 from hwp_bench.sim.scene.schema import Scene
 from hwp_bench.sim.subject.atlas import skin_atlas
 from hwp_bench.sim.subject.hand import scene_hands
+from hwp_bench.sim.subject.painting import of_side
 
 #: Version of the pixels that the renderer makes; part of every render key.
 RENDERER = 9
@@ -136,7 +137,8 @@ def _render_missing(
         return
     # Built once here, so that no two processes paint the same skin.
     scene_hands(scene)
-    skin_atlas(scene.subject)
+    for side in scene.sides:
+        skin_atlas(of_side(scene.subject, side))
     if workers is None:
         workers = max(1, min(os.cpu_count() or 1, len(missing) // _FRAMES_PER_WORKER))
     with progress(f"Rendering {scene.id}", len(missing)) as update:

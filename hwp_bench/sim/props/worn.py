@@ -78,8 +78,17 @@ def _dollop(variant: int) -> Surface:
 
 
 def _watch(variant: int) -> Surface:
-    """Build a watch around the x axis, its dial to +y."""
-    leather = plain(srgb_to_linear(np.array([0.32, 0.18, 0.10])), gloss=0.55)
+    return wrist_watch(_WRIST, (0.32, 0.18, 0.10))
+
+
+def wrist_watch(wrist: tuple[float, float], color: tuple[float, float, float]) -> Surface:
+    """Build a watch around the x axis, its dial to +y.
+
+    Args:
+        wrist: half axes of the strap along z and y, m.
+        color: sRGB of the strap.
+    """
+    leather = plain(srgb_to_linear(np.array(color)), gloss=0.55)
     steel = plain((0.6, 0.6, 0.62), gloss=0.18, specular=0.6)
     angles = np.linspace(0.0, 2.0 * np.pi, 41)
     profile = ((-1.0, 0.0), (-1.0, 0.0028), (1.0, 0.0028), (1.0, 0.0))
@@ -87,8 +96,8 @@ def _watch(variant: int) -> Surface:
         np.stack(
             [
                 np.full_like(angles, side * _STRAP),
-                (_WRIST[1] + lift) * np.cos(angles),
-                (_WRIST[0] + lift) * np.sin(angles),
+                (wrist[1] + lift) * np.cos(angles),
+                (wrist[0] + lift) * np.sin(angles),
             ],
             axis=1,
         )
@@ -103,14 +112,14 @@ def _watch(variant: int) -> Surface:
     )
     face = Material(albedo=albedo(_dial()), gloss=0.15)
     dial = _flat_disc(0.0182, 0.0088, face)
-    return join([strap, *(transformed(part, _upright()) for part in (case, dial))])
+    return join([strap, *(transformed(part, _upright(wrist[1])) for part in (case, dial))])
 
 
-def _upright() -> np.ndarray:
-    """z to +y, on top of the wrist."""
+def _upright(top: float) -> np.ndarray:
+    """z to +y, on top of a wrist of that height, m."""
     move = np.eye(4)
     move[:3, :3] = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 1.0], [0.0, -1.0, 0.0]])
-    move[1, 3] = _WRIST[1] + 0.001
+    move[1, 3] = top + 0.001
     return move
 
 

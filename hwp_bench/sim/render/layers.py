@@ -1,7 +1,8 @@
 """Linear light and geometry of a frame as a layered OpenEXR file.
 
 Channels: R, G, B (linear light of the clean instant), Z (depth, m), N.X N.Y N.Z (normal in
-camera axes), id (0 backdrop, 1 right hand, 2 left hand, 3 sleeve, 4 object), motion.X motion.Y
+camera axes), id (0 backdrop, 1 right hand, 2 left hand, 3 sleeve, arm
+or worn on the wrist, 4 object), motion.X motion.Y
 (way on the screen to the next frame, px). One ray through the centre of each pixel; the
 backdrop has depth 0.
 """
@@ -17,17 +18,16 @@ import numpy as np
 from hwp_bench.base.errors import HwpError
 from hwp_bench.sim.effects.plan import hands_at, lights_at, objects_at
 from hwp_bench.sim.geometry.raycast import RenderCost, Tracer
-from hwp_bench.sim.geometry.surface import Surface, join
+from hwp_bench.sim.geometry.surface import join
 from hwp_bench.sim.render.frame import SimulatedFrame
 from hwp_bench.sim.render.instant import Lens, render_instant
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.optics import intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.scene.schema import Scene
-from hwp_bench.sim.subject.hand import scene_hands
 
 #: Names of the channels, in their order.
 CHANNELS = ("R", "G", "B", "Z", "N.X", "N.Y", "N.Z", "id", "motion.X", "motion.Y")
-_RIGHT, _LEFT, _SLEEVE, _OBJECT = 1, 2, 3, 4
+_OBJECT = 4
 
 
 def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: int) -> np.ndarray:
@@ -44,7 +44,7 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
     image = render_instant(scene, lens, body, things, lights_at(scene, recipe), RenderCost())
     future_hands = hands_at(scene, later)
     now, then = body.surface, stage.surface(future_hands)
-    owner = _body_ids(scene, now)
+    owner = stage.owners(hands)
     if things is not None:
         later_things = stage.things(objects_at(scene, recipe, later), future_hands)
         assert later_things is not None
@@ -98,15 +98,6 @@ def write_layers(
         reason = file.geterror() if file is not None else oiio.geterror()
         raise HwpError(f"cannot be written ({reason.strip()})", where=path)
     os.replace(temporary, path)
-
-
-def _body_ids(scene: Scene, body: Surface) -> np.ndarray:
-    ids = np.full(len(body.faces), _SLEEVE)
-    start = 0
-    for side, subject in scene_hands(scene).items():
-        ids[start : start + len(subject.faces)] = _RIGHT if side == "right" else _LEFT
-        start += len(subject.faces)
-    return ids
 
 
 def _pixels(points: np.ndarray, K: np.ndarray, view: np.ndarray) -> np.ndarray:

@@ -3,30 +3,24 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
-from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.sim.effects.base import Placement
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.raycast import RenderCost, Tracer
-from hwp_bench.sim.geometry.surface import Material, Surface, join, transformed
+from hwp_bench.sim.geometry.surface import Surface, join, transformed
+from hwp_bench.sim.render.person import OWNERS, Part, person_openness, person_parts
 from hwp_bench.sim.render.shading import openness
 from hwp_bench.sim.scene.motion import HandMoment, hand_parameters, heading_matrix
 from hwp_bench.sim.scene.optics import focus_point
-from hwp_bench.sim.scene.schema import Scene, Subject
-from hwp_bench.sim.subject.atlas import skin_atlas
-from hwp_bench.sim.subject.hand import FINE, SubjectHand, scene_hands, subject_hand
-from hwp_bench.sim.subject.sleeve import sleeve, sleeve_material, wrist_rim
-
-# How far light wraps around the terminator inside skin, per linear channel.
-_WRAP = (0.28, 0.12, 0.07)
+from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.subject.hand import FINE, scene_hands
 
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """Hands and sleeves at one instant."""
+    """Hands, sleeves and what is worn, at one instant."""
 
     #: All of them as one surface.
     surface: Surface
@@ -62,27 +56,30 @@ class Stage:
         subdivisions: int = FINE,
         parameters: dict[str, tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> Surface:
-        """Hands and sleeves, posed.
+        """Hands, sleeves and what is worn, posed.
 
         Args:
             hands: what the hands do.
             subdivisions: of the hands' mesh.
             parameters: pose and translation instead of the ones that follow from `hands`.
         """
+        return join([part.surface for part in self._parts(hands, subdivisions, parameters)])
+
+    def owners(self, hands: dict[str, HandMoment]) -> np.ndarray:
+        """Who owns each face of `surface(hands)`, as `OWNERS` numbers them: (F,)."""
+        parts = self._parts(hands, FINE, None)
+        return np.concatenate(
+            [np.full(len(part.surface.faces), OWNERS[part.side]) for part in parts]
+        )
+
+    def _parts(
+        self,
+        hands: dict[str, HandMoment],
+        subdivisions: int,
+        parameters: dict[str, tuple[np.ndarray, np.ndarray]] | None,
+    ) -> list[Part]:
         parameters = parameters or self.parameters(hands)
-        cloth = sleeve_material(self.scene.subject.sleeve, self.scene.subject.seed)
-        subjects = scene_hands(self.scene, subdivisions)
-        focus = focus_point()
-        skins, sleeves = [], []
-        for side, moment in hands.items():
-            subject = subjects[side]
-            vertices, normals = subject.pose(*parameters[side])
-            skins.append(_hand_surface(subject, vertices, normals, _skin(self.scene.subject, side)))
-            rim = vertices[wrist_rim(subject.template)]
-            turn = heading_matrix(moment.heading, side)
-            forward = turn @ np.array([-1.0 if side == "right" else 1.0, 0.0, 0.0])
-            sleeves.append(sleeve(rim, forward, focus + _elbow(side), cloth))
-        return join(skins + sleeves)
+        return person_parts(self.scene.subject, hands, parameters, subdivisions)
 
     def traced(self, surface: Surface) -> Body:
         """A surface made ready for rays."""
@@ -108,9 +105,10 @@ class Stage:
     ) -> Surface:
         """The surface with the share of the sky that each of its vertices sees."""
         subjects = scene_hands(self.scene, subdivisions)
-        parts = [subjects[side].lift @ share for side, share in seen.items()]
-        sleeves = np.ones(len(surface.vertices) - sum(len(part) for part in parts))
-        return replace(surface, openness=np.clip(np.concatenate([*parts, sleeves]), 0.0, 1.0))
+        shares = {side: subjects[side].lift @ share for side, share in seen.items()}
+        count = len(surface.vertices)
+        sky = person_openness(self.scene.subject, shares, count, subdivisions)
+        return replace(surface, openness=sky)
 
     def things(
         self, placements: tuple[Placement, ...], hands: dict[str, HandMoment]
@@ -152,43 +150,3 @@ def between(bodies: tuple[Surface, Surface, Surface], s: float | np.ndarray) -> 
         vertices=a * first.vertices + b * middle.vertices + c * last.vertices,
         normals=unit(a * first.normals + b * middle.normals + c * last.normals),
     )
-
-
-def _hand_surface(
-    subject: SubjectHand, vertices: np.ndarray, normals: np.ndarray, skin: Material
-) -> Surface:
-    return Surface(
-        vertices=vertices,
-        normals=normals,
-        faces=subject.faces,
-        corner_uv=subject.corner_uv,
-        material=np.zeros(len(subject.faces), dtype=np.int64),
-        materials=(skin,),
-        hand=np.ones(len(subject.faces), dtype=bool),
-    )
-
-
-@lru_cache(maxsize=4)
-def _skin(subject: Subject, side: str) -> Material:
-    texture = subject_hand(subject, side).texture
-    if texture is not None:
-        return Material(
-            albedo=srgb_to_linear(texture / 255.0).astype(np.float32),
-            gloss=0.55,
-            specular=0.028,
-            wrap=_WRAP,
-        )
-    atlas = skin_atlas(subject)
-    return Material(
-        albedo=atlas.albedo,
-        roughness=atlas.roughness,
-        specular=0.028,
-        height=atlas.height,
-        wrap=_WRAP,
-    )
-
-
-def _elbow(side: str) -> np.ndarray:
-    """Place of the elbow, m from the point looked at."""
-    mirror = 1.0 if side == "right" else -1.0
-    return np.array([0.10 * mirror, 0.42, 0.02])

@@ -20,6 +20,7 @@ from hwp_bench.base.text import ODD_CHARACTERS
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.gestures import gesture
 from hwp_bench.sim.scene.lighting import Lamp, Room
+from hwp_bench.sim.scene.looks import PLAIN, Looks
 from hwp_bench.sim.scene.recorder import AutoControl, without_defaults
 from hwp_bench.taxonomy import MAX_SEVERITY
 
@@ -52,8 +53,8 @@ class Subject:
 
     #: Identity: shape parameters, surface detail, mottling.
     seed: Seed
-    #: Skin tone, 0 (light) to 1 (dark).
-    tone: Annotated[float, Meta(ge=0.0, le=1.0)]
+    #: Skin tone, 0 (light) to 1 (dark); -0.4 is the palest skin and 1.4 the darkest.
+    tone: Annotated[float, Meta(ge=-0.4, le=1.4)]
     #: Years; deepens creases, veins and tendons.
     age: Annotated[float, Meta(ge=5.0, le=100.0)]
     #: sRGB colour of the sleeve, 0-1 each.
@@ -61,6 +62,8 @@ class Subject:
     #: Surface: `anny` (the free hand), `mano:PATH` or `mano-hd:PATH` where the user has it, or
     #: `gltf:PATH`, a rigged hand.
     model: Words = "anny"
+    #: Marks on the skin and what the person wears.
+    looks: Looks = PLAIN
 
 
 @dataclass(frozen=True)
@@ -233,6 +236,10 @@ class Scene:
         """Return the whole content as JSON values, laid out as a scene file is."""
         content = {"schema": SCHEMA, **asdict(self)}
         content |= {"sensor": self.sensor.to_json(), "light": self.light.to_json()}
+        looks = self.subject.looks.to_json()
+        content["subject"] |= {"looks": looks}
+        if not looks:
+            del content["subject"]["looks"]
         if self.sensor == Sensor(self.sensor.noise):
             content["noise"] = content.pop("sensor")["noise"]
         return content

@@ -83,7 +83,7 @@ class Anatomy:
 
     def palm_creases(self, rng: np.random.Generator) -> np.ndarray:
         """The three lines of the palm and finer ones: (N,), 0-1."""
-        along, across = self._palm_coordinates()
+        along, across = self.palm_coordinates()
         wobble = fractal_noise(self.points, 0.012, rng, octaves=2) * 0.012
         place = np.stack([along + wobble, across + wobble], axis=1)
         total = np.zeros(len(self.points))
@@ -114,7 +114,7 @@ class Anatomy:
 
     def veins(self, rng: np.random.Generator) -> np.ndarray:
         """A few winding veins on the back of the hand: (N,), 0-1."""
-        along, across = self._palm_coordinates()
+        along, across = self.palm_coordinates()
         wobble = fractal_noise(self.points, 0.02, rng, octaves=2) * 0.035
         place = np.stack([along + wobble, across - wobble], axis=1)
         total = np.zeros(len(self.points))
@@ -134,7 +134,7 @@ class Anatomy:
         for row in range(len(FINGERS)):
             distance = np.linalg.norm(self.points - self.tips[row], axis=1)
             total += np.exp(-((distance / 0.016) ** 2))
-        along, across = self._palm_coordinates()
+        along, across = self.palm_coordinates()
         heel = np.exp(-(((along - 0.3) / 0.25) ** 2)) * (1.0 - self.back)
         return np.clip(total + 0.5 * heel * np.abs(2.0 * across - 1.0), 0.0, 1.0)
 
@@ -165,7 +165,10 @@ class Anatomy:
     def _tip(self, finger: str) -> np.ndarray:
         return self.tips[FINGERS.index(finger)]
 
-    def _palm_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
+    def palm_coordinates(self) -> tuple[np.ndarray, np.ndarray]:
+        """Along (0 at the wrist, 1 at the middle knuckle) and across (0 at the little finger's
+        knuckle, 1 at the index finger's): (N,) each.
+        """
         wrist, index, middle, little = (self.joints[i] for i in (0, 1, 4, 7))
         forward = middle - wrist
         sideways = index - little

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 from collections import Counter
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -17,12 +19,14 @@ from hwp_bench.sim.geometry.mesh import surface_normals, unit
 from hwp_bench.sim.geometry.raycast import Tracer
 from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.hand import SubjectHand, anatomy_at, subject_hand
-from hwp_bench.sim.subject.skin import sample_skin
+from hwp_bench.sim.subject.painting import painted
 
 #: Edge of the skin atlas in texels; about 0.25 mm of skin each.
 ATLAS = 1024
 #: Version of the skin painting; part of the cache key.
 SKIN_VERSION = 2
+#: Version of what looks add to it; part of the key where a subject has looks.
+LOOKS_VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,9 +43,32 @@ class SkinAtlas:
 
 @lru_cache(maxsize=2)
 def skin_atlas(subject: Subject) -> SkinAtlas:
-    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored."""
+    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored.
+
+    Args:
+        subject: whose; `painting.of_side` where the hands look different.
+    """
     hand = subject_hand(subject, "right")
-    person = [subject.seed, subject.tone, subject.age]
+    return kept(hand, subject, "", lambda: _paint(hand, subject))
+
+
+def kept(
+    hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], SkinAtlas]
+) -> SkinAtlas:
+    """Read a painting from the cache, or paint and keep it.
+
+    Args:
+        hand: on which it lies.
+        subject: whose skin.
+        part: what is painted besides the hand; empty for the hand itself.
+        paint: makes it.
+    """
+    person: list[Any] = [subject.seed, subject.tone, subject.age]
+    looks = replace(subject.looks, rings=(), wrist=()).to_json()
+    if looks:
+        person.append([LOOKS_VERSION, looks])
+    if part:
+        person.append(part)
     key = sha256_json([SKIN_VERSION, ATLAS, hand.template.digest, hand.betas.tolist(), person])
     path = cache_root() / "sim" / "skin" / f"{key}.npz"
     if path.exists():
@@ -50,7 +77,7 @@ def skin_atlas(subject: Subject) -> SkinAtlas:
             return SkinAtlas(*(arrays[name] for name in ("albedo", "height", "roughness")))
         except (BadInput, KeyError):
             path.unlink(missing_ok=True)
-    atlas = _paint(hand, subject)
+    atlas = paint()
     _store(path, atlas)
     return atlas
 
@@ -82,7 +109,7 @@ def _paint(hand: SubjectHand, subject: Subject) -> SkinAtlas:
 
     weights = spread(hand.lift @ template.weights)
     anatomy = anatomy_at(template, hand.betas, spread(rest), unit(spread(normals)), weights)
-    skin = sample_skin(anatomy, subject)
+    skin = painted(anatomy, subject, fine=True)
     layers = np.zeros((ATLAS * ATLAS, 5), dtype=np.float32)
     layers[hits.ray] = np.column_stack([skin.albedo, skin.height, skin.roughness])
     empty = np.ones(ATLAS * ATLAS, dtype=bool)

@@ -12,7 +12,7 @@ from hwp_bench.sim.geometry.mesh import normal_operator, smoothing, subdivision,
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.schema import Scene, Subject
 from hwp_bench.sim.subject.anatomy import Anatomy
-from hwp_bench.sim.subject.skin import sample_skin
+from hwp_bench.sim.subject.painting import of_side, painted
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -155,7 +155,7 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
         faces=faces,
         corner_uv=corner_uv,
         normal_sum=normal_sum,
-        relief=sample_skin(anatomy, subject).height,
+        relief=painted(anatomy, of_side(subject, side), fine=False).height,
         texture=texture,
     )
 

@@ -15,10 +15,29 @@ from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.anatomy import Anatomy
 
-# sRGB of skin from light to dark, back of the hand and palm.
-_TONES = (0.0, 0.35, 0.65, 1.0)
-_BACK = np.array([[234, 192, 168], [212, 160, 128], [158, 106, 76], [92, 60, 45]]) / 255.0
-_PALM = np.array([[240, 190, 172], [226, 172, 148], [204, 152, 124], [170, 120, 98]]) / 255.0
+# sRGB of skin from light to dark, back of the hand and palm. The ends lie near the steps 3
+# and 9 of the Monk Skin Tone scale, in lightness.
+_TONES = (-0.4, 0.0, 0.35, 0.65, 1.0, 1.4)
+_BACK = (
+    np.array(
+        [
+            *([244, 214, 196], [234, 192, 168], [212, 160, 128]),
+            *([158, 106, 76], [92, 60, 45], [60, 42, 34]),
+        ]
+    )
+    / 255.0
+)
+_PALM = (
+    np.array(
+        [
+            *([246, 205, 190], [240, 190, 172], [226, 172, 148]),
+            *([204, 152, 124], [170, 120, 98], [138, 96, 80]),
+        ]
+    )
+    / 255.0
+)
+# Share of the palm's colour on the inner side of a bare forearm.
+_INNER_ARM = 0.3
 
 
 @dataclass(frozen=True)
@@ -69,11 +88,16 @@ def sample_skin(anatomy: Anatomy, subject: Subject) -> SkinSample:
     tone = np.array([np.interp(subject.tone, _TONES, _BACK[:, c]) for c in range(3)])
     pale = np.array([np.interp(subject.tone, _TONES, _PALM[:, c]) for c in range(3)])
     albedo = srgb_to_linear(tone * back[:, None] + pale * palm[:, None])
+    if subject.looks.arm == "bare":
+        inner = palm * _palm_fades(anatomy)
+        albedo = srgb_to_linear(tone + inner[:, None] * (pale - tone))
     blood = 0.10 * coarse + 0.10 * middle + 0.55 * anatomy.flushed() + 0.35 * joint_swell * back
     albedo = albedo * np.exp(blood[:, None] * np.array([0.10, -0.30, -0.26]))
     melanin = 0.5 * middle + 0.5 * fine + (0.3 + old) * _spots(points, rng) * back
     albedo = albedo * np.exp(-(0.05 + 0.05 * old) * melanin[:, None] * np.array([0.7, 1.0, 1.25]))
-    albedo = albedo * np.exp(-veins[:, None] * np.array([0.22, 0.10, 0.04]) * (1.1 - subject.tone))
+    albedo = albedo * np.exp(
+        -veins[:, None] * np.array([0.22, 0.10, 0.04]) * max(1.1 - subject.tone, 0.02)
+    )
     dark = 0.45 * joint_lines + 0.55 * palm_lines * palm + 0.5 * groove + 0.03 * np.abs(pores)
     albedo = albedo * np.exp(-dark[:, None] * np.array([0.55, 0.9, 1.0]))
     plate = srgb_to_linear(0.55 * pale + 0.45 * np.array([0.93, 0.74, 0.70]))
@@ -86,6 +110,13 @@ def sample_skin(anatomy: Anatomy, subject: Subject) -> SkinSample:
         height=height,
         roughness=np.clip(roughness, 0.2, 0.9),
     )
+
+
+def _palm_fades(anatomy: Anatomy) -> np.ndarray:
+    """Share of the palm's colour where the palm runs out into the forearm: (N,)."""
+    along, _ = anatomy.palm_coordinates()
+    x = np.clip((along + 0.12) / 0.34, 0.0, 1.0)
+    return _INNER_ARM + (1.0 - _INNER_ARM) * x * x * (3.0 - 2.0 * x)
 
 
 def _spots(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
