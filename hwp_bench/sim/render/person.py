@@ -23,7 +23,7 @@ from hwp_bench.sim.subject.worn import ring_mounts, wrist_mounts
 
 # How far light wraps around the terminator inside skin, per linear channel.
 _WRAP = (0.28, 0.12, 0.07)
-#: Who owns a part of the image: the hands, and what is no hand.
+#: Who owns a part of the image: a hand, or nothing that counts as one.
 OWNERS = {"right": 1, "left": 2, "": 3}
 
 

@@ -81,7 +81,7 @@ class Ring:
 
 @dataclass(frozen=True)
 class WristWear:
-    """What is worn around the wrist; it is not hand."""
+    """A watch or a bracelet; it does not count as hand."""
 
     #: A watch on a strap, a smooth bangle, or a string of beads.
     kind: Literal["watch", "bangle", "beads"]
@@ -177,9 +177,12 @@ class Looks:
     @property
     def passes(self) -> tuple[str, ...]:
         """Names of the passes that every frame needs because of what is worn."""
-        worn = ("bare_arm",) if self.arm == "bare" else ()
-        worn += ("rings",) if self.rings else ()
-        return worn + (("wrist_wear",) if self.wrist else ())
+        there = {
+            "bare_arm": self.arm == "bare",
+            "rings": bool(self.rings),
+            "wrist_wear": bool(self.wrist),
+        }
+        return tuple(name for name, worn in there.items() if worn)
 
 
 #: Looks that add nothing.

@@ -30,14 +30,14 @@ _BACK = np.array(
         *(0.11, 0.135, 0.165, 0.2, 0.24, 0.285, 0.33),
     ]
 )
-_PLACES = (0.0, 0.02, 0.04, 0.07, 0.11, 0.16, 0.22, 0.33)
-_WIDTHS = (1.0, 0.985, 1.0, 1.08, 1.22, 1.4, 1.56, 1.6)
+_PLACES = (0.0, 0.012, 0.03, 0.05, 0.08, 0.12, 0.17, 0.22, 0.33)
+_WIDTHS = (1.0, 0.955, 0.935, 0.955, 1.04, 1.2, 1.38, 1.52, 1.58)
 # Way in which the arm leaves the hand's direction for the elbow's, m.
 _BEND = 0.075
 # Way in which the rim's own outline becomes an ellipse, m.
 _SETTLE = 0.09
-# Rows and columns of the arm's texture; about 0.3 mm of skin each.
-_TEXTURE = (1024, 768)
+# Rows and columns of the arm's texture; about 0.4 mm of skin each.
+_TEXTURE = (768, 512)
 
 
 @dataclass(frozen=True, eq=False)
@@ -205,6 +205,8 @@ def _rest(hand: SubjectHand) -> np.ndarray:
 
 def _rings(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray) -> np.ndarray:
     """(A, 3) m: a ring of the rim's length at each place of `_BACK`."""
+    from scipy.interpolate import PchipInterpolator
+
     center = rim.mean(axis=0)
     offset = rim - center
     depth = offset @ forward
@@ -216,6 +218,7 @@ def _rings(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray) -> np.ndarra
     angle = np.arctan2(b / np.abs(b).max(), a / np.abs(a).max())
     wide, high = np.sqrt(2.0) * a.std(), np.sqrt(2.0) * b.std()
     arm = unit(elbow - center)
+    widths = PchipInterpolator(_PLACES, _WIDTHS)
     rings, place, previous, heading = [], center, 0.0, -forward
     for back in _BACK:
         bend = min(back / _BEND, 1.0)
@@ -227,7 +230,7 @@ def _rings(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray) -> np.ndarra
         previous = back
         settled = min(back / _SETTLE, 1.0)
         settled = settled * settled * (3.0 - 2.0 * settled)
-        size = np.interp(back, _PLACES, _WIDTHS)
+        size = float(widths(back))
         # A forearm gets rounder towards the elbow.
         tall = high + np.interp(back, (0.05, 0.25), (0.0, 0.75)) * (wide - high)
         across = a + settled * (wide * np.cos(angle) - a)

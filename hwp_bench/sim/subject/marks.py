@@ -17,7 +17,7 @@ _STEPS, _STEP = 32, 0.0003
 
 
 def freckles(points: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
-    """Round spots of 0.4 to 1.4 mm: (N,), 0 beside and up to 1 inside a spot.
+    """Round spots of 0.4 to 1.4 mm: (N,), 0 outside and up to 1 inside a spot.
 
     Args:
         points: (N, 3) m on the rest hand.
@@ -32,6 +32,8 @@ def freckles(points: np.ndarray, amount: float, rng: np.random.Generator) -> np.
     radius = 0.0004 + 0.001 * rng.uniform(size=len(cells)) ** 3
     depth = rng.uniform(0.3, 1.0, len(cells))
     there = rng.uniform(size=len(cells)) < 0.85 * amount
+    low, high = points.min(axis=0) - _CELL, points.max(axis=0) + _CELL
+    there &= np.all((centers > low) & (centers < high), axis=1)
     if not there.any():
         return np.zeros(len(points))
     distance, nearest = cKDTree(centers[there]).query(points, distance_upper_bound=0.003)
@@ -107,4 +109,5 @@ def hair(
         # Back onto the skin, or the stroke would leave it where it curves.
         height = np.einsum("ni,ni->n", place - points[at], normals[at])
         place = place - height[:, None] * normals[at]
-    return strokes
+    # None walks on to where hair does not grow.
+    return np.where(share > 0.0, strokes, 0.0)

@@ -71,6 +71,8 @@ def sample_skin(anatomy: Anatomy, subject: Subject) -> SkinSample:
     tendons = anatomy.tendons() * back
     veins = anatomy.veins(generator(subject.seed, "veins")) * back
     nail, lunula, edge, groove = anatomy.nails()
+    if subject.looks.arm == "bare":
+        veins = veins * np.clip(7.0 * anatomy.palm_coordinates()[0] + 0.8, 0.0, 1.0)
 
     height = (
         (0.00035 + 0.0002 * old) * tendons

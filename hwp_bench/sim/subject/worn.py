@@ -26,7 +26,7 @@ _ON_FINGER = 0.66
 _BELT, _AIR = 0.003, 0.0003
 _THICKNESS = 0.0014
 # Where a wrist is worn on, m in front of the rim: with a sleeve, and on a bare arm.
-_BEFORE_SLEEVE = {"watch": 0.017, "bangle": 0.010, "beads": 0.011}
+_BEFORE_SLEEVE = {"watch": 0.0155, "bangle": 0.009, "beads": 0.010}
 _ON_ARM = {"watch": -0.020, "bangle": -0.014, "beads": -0.016}
 
 
@@ -125,15 +125,13 @@ def _wrist_mount(subject: Subject, side: str, item: WristWear, subdivisions: int
     ahead = (_ON_ARM if bare else _BEFORE_SLEEVE)[item.kind]
     skin = rest_arm(subject, side, subdivisions) if bare else rest
     local = (skin - rim) @ frame
-    half = 0.011 if item.kind == "watch" else 0.005
-    belt = np.abs(local[:, 2] - ahead) < half
-    # The thumb's root is no part of the wrist.
+    belt = np.abs(local[:, 2] - ahead) < 0.0045
     middle = 0.5 * (local[belt, :2].max(axis=0) + local[belt, :2].min(axis=0))
     outline = _outline(local[belt, :2] - middle)
     place = rim + frame @ np.array([*middle, ahead])
     color = srgb_to_linear(np.array(item.color))
     if item.kind == "watch":
-        wide, high = 0.5 * np.ptp(local[belt, :2], axis=0) + 0.0012
+        wide, high = 0.5 * np.ptp(local[belt, :2], axis=0) + 0.0008
         made = wrist_watch((float(wide), float(high)), item.color)
         # The watch lies around x with its dial to y.
         frame = np.stack([frame[:, 2], frame[:, 1], np.cross(frame[:, 2], frame[:, 1])], axis=1)
