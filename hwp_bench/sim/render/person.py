@@ -19,7 +19,6 @@ from hwp_bench.sim.subject.gloves import covered
 from hwp_bench.sim.subject.hand import FINE, anatomy_at, subject_hand
 from hwp_bench.sim.subject.painting import of_side
 from hwp_bench.sim.subject.sleeve import sleeve, sleeve_material, wrist_rim
-from hwp_bench.sim.subject.worn import ring_mounts, wrist_mounts
 
 # How far light wraps around the terminator inside skin, per linear channel.
 _WRAP = (0.28, 0.12, 0.07)
@@ -69,12 +68,23 @@ def person_parts(
             arm = sleeve(skin.vertices[wrist_rim(hand.template)], forward, elbow, cloth)
         skins.append(Part(side, skin))
         arms.append(Part("", arm))
-        for mount in ring_mounts(subject, side):
-            worn.append(Part(side, mount.carried(skin.vertices)))
-        for mount in wrist_mounts(subject, side, subdivisions):
-            carrier = arm if mount.on_arm else skin
-            worn.append(Part("", mount.carried(carrier.vertices)))
+        if subject.looks.rings or subject.looks.wrist:
+            worn += _worn(subject, side, skin, arm, subdivisions)
     return skins + arms + worn
+
+
+def _worn(
+    subject: Subject, side: str, skin: Surface, arm: Surface, subdivisions: int
+) -> list[Part]:
+    # Only a person who wears something needs the modules that build it.
+    from hwp_bench.sim.subject.worn import ring_mounts, wrist_mounts
+
+    rings = [Part(side, item.carried(skin.vertices)) for item in ring_mounts(subject, side)]
+    others = [
+        Part("", item.carried((arm if item.on_arm else skin).vertices))
+        for item in wrist_mounts(subject, side, subdivisions)
+    ]
+    return rings + others
 
 
 def person_openness(
@@ -103,7 +113,7 @@ def _hand_surface(
     skin = _skin(subject, side)
     materials: tuple[Material, ...] = (skin,)
     material = np.zeros(len(hand.faces), dtype=np.int64)
-    if of_side(subject, side).looks.gloves:
+    if hand.texture is None and of_side(subject, side).looks.gloves:
         # Light does not wrap around the terminator inside cloth.
         materials = (skin, replace(skin, wrap=(0.0, 0.0, 0.0), specular=0.02))
         material = _gloved_faces(subject, side, subdivisions)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
@@ -10,6 +10,7 @@ import numpy as np
 
 from hwp_bench.sim.geometry.mesh import normal_operator, smoothing, subdivision, surface_normals
 from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.scene.looks import PLAIN
 from hwp_bench.sim.scene.schema import Scene, Subject
 from hwp_bench.sim.subject.anatomy import Anatomy
 from hwp_bench.sim.subject.painting import of_side, painted
@@ -144,6 +145,8 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
     rest = lift @ (template.vertices + template.shape_basis @ betas)
     normals = surface_normals(rest, faces, normal_sum)
     anatomy = anatomy_at(template, betas, rest, normals, lift @ template.weights)
+    # A rig with a texture of its own keeps it, and so its bare surface.
+    paint = of_side(subject, side) if texture is None else replace(subject, looks=PLAIN)
     return SubjectHand(
         template=template,
         model=model,
@@ -155,7 +158,7 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
         faces=faces,
         corner_uv=corner_uv,
         normal_sum=normal_sum,
-        relief=painted(anatomy, of_side(subject, side), fine=False).height,
+        relief=painted(anatomy, paint, fine=False).height,
         texture=texture,
     )
 
