@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.base.errors import BadInput
+from hwp_bench.hands.footprint import Footprint, HandSurfaces
 from wildghand.prepass.assessment import FrameAssessment, enlarged, neutral_assessment
 from wildghand.prepass.borders import ShownCells, border_width, misplacement
 from wildghand.prepass.classify import classify_frames
-from wildghand.prepass.footprint import Footprint, HandSurfaces
 from wildghand.prepass.inputs import PrepassInput
 from wildghand.prepass.intensity import (
     LOWEST,

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
+from hwp_bench.hands.footprint import Footprint
 from wildghand.prepass.borders import ShownCells, interior
-from wildghand.prepass.footprint import Footprint
 from wildghand.prepass.intensity import HIGHEST, LOWEST, IntensityModel, log_light_table
 
 #: A frame with fewer readable pixels of the hand cannot be judged.

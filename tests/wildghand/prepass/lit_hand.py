@@ -9,9 +9,9 @@ import numpy as np
 from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import load_template
+from hwp_bench.hands.footprint import HandSurfaces
 from hwp_bench.hands.parameters import HandParameters
 from wildghand.prepass import PrepassInput
-from wildghand.prepass.footprint import HandSurfaces
 
 FRAMES, SIZE = 24, 96
 BACKGROUND = 0.02

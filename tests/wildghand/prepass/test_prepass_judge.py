@@ -14,6 +14,7 @@ from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.capture import CaptureInfo, CaptureWriter, HandModelId, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import load_template
+from hwp_bench.hands.footprint import HandSurfaces
 from wildghand.prepass import (
     FrameAssessment,
     PrepassInput,
@@ -21,7 +22,6 @@ from wildghand.prepass import (
     capture_input,
     judge_frames,
 )
-from wildghand.prepass.footprint import HandSurfaces
 
 Lit = tuple[np.ndarray, np.ndarray]
 #: Frames that the tests perturb.

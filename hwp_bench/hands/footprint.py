@@ -1,4 +1,4 @@
-"""The estimated hands drawn into the frames: silhouettes, surface cells and normals of pixels."""
+"""Hands drawn into frames by their parameters: silhouettes, surface cells and normals of pixels."""
 
 from __future__ import annotations
 
@@ -8,8 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
-from hwp_bench.hands import HandParameters, HandTemplate, pose_hand, project, vertex_normals
+from hwp_bench.hands.anchors import vertex_normals
+from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.hands.raster import draw_faces, mix_corners
+from hwp_bench.hands.skinning import pose_hand, project
+from hwp_bench.hands.template import HandTemplate
 
 # Frames that are posed at a time, so that memory does not grow with the clip.
 _CHUNK = 32
@@ -17,7 +20,7 @@ _CHUNK = 32
 
 @dataclass(frozen=True, eq=False)
 class Footprint:
-    """The hands in one frame, as the estimated parameters place them; P pixels show them."""
+    """The hands in one frame, as their parameters place them; P pixels show them."""
 
     #: (H, W) bool.
     silhouette: np.ndarray
@@ -34,7 +37,12 @@ class Footprint:
 
 
 class HandSurfaces:
-    """The surfaces of a capture's hands, cut into cells that each share one albedo."""
+    """The surfaces of a capture's hands, cut into cells: the places that frames have in common.
+
+    Args:
+        templates: by side.
+        patch_size: edge of a cell, m.
+    """
 
     def __init__(self, templates: Mapping[str, HandTemplate], patch_size: float) -> None:
         self._tensors = {side: template.to_torch() for side, template in templates.items()}
@@ -83,7 +91,7 @@ class HandSurfaces:
         """Draw the hands in some frames, in their order.
 
         Args:
-            hands: estimated parameters of every frame, by side.
+            hands: parameters of every frame, by side.
             Ks: (F, 3, 3) px.
             viewmats: (F, 4, 4).
             frames: (R,) which frames.
