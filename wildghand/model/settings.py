@@ -44,7 +44,7 @@ class Rates:
     """Adam's step for each group of parameters at the start of a fit."""
 
     #: The latent identity map.
-    identity: float = number(0.03)
+    identity: float = number(0.015)
     #: The matrix that adds the map to the attributes.
     direct: float = number(1e-3)
     #: The linear part of the shadow head.
@@ -114,7 +114,7 @@ class WildGHandSettings:
     #: frame, not out of three in ten: what little they took from these, the avatar lacked
     #: (docs/wildghand.md).
     prepass: PrepassSettings = field(
-        default_factory=lambda: PrepassSettings(weight_floor=0.02, omega_dropout=1.0)
+        default_factory=lambda: PrepassSettings(weight_floor=0.2, omega_dropout=1.0)
     )
     #: The network.
     network: NetworkSettings = field(default_factory=NetworkSettings)
