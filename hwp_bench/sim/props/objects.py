@@ -22,6 +22,14 @@ _MODULES: Mapping[str, str] = MappingProxyType(
         "watch": "worn",
         "phone": "held",
         "card": "paper",
+        "mug": "kitchen",
+        "ball": "kitchen",
+        "spoon": "kitchen",
+        "banana": "kitchen",
+        "remote": "household",
+        "bottle": "household",
+        "brush": "household",
+        "notebook": "household",
     }
 )
 

@@ -86,6 +86,32 @@ def turned(profile: np.ndarray, material: Material, around: int = 28) -> Surface
     return grid(vertices, len(profile), around + 1, material, flip=z[-1] < z[0])
 
 
+def tube(spine: np.ndarray, radius: np.ndarray, material: Material, *, around: int = 12) -> Surface:
+    """A tube with closed ends around a curve that runs along neither x nor y for long.
+
+    Args:
+        spine: (K, 3) m.
+        radius: (K,) m at each of its points.
+        material: its material; u runs around, v along.
+        around: number of faces around.
+    """
+    way = np.gradient(spine, axis=0)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    # The same axis everywhere, so that the tube does not twist.
+    still = np.array([1.0, 0.0, 0.0]) if abs(way[:, 0]).max() < 0.9 else np.array([0.0, 1.0, 0.0])
+    first = still - (way @ still)[:, None] * way
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(way, first)
+    angles = np.linspace(0.0, 2.0 * np.pi, around + 1)
+    rings = spine[:, None] + radius[:, None, None] * (
+        first[:, None] * np.cos(angles)[None, :, None]
+        + second[:, None] * np.sin(angles)[None, :, None]
+    )
+    first_end, last_end = (np.repeat(spine[None, None, k], around + 1, 1) for k in (0, -1))
+    closed = np.concatenate([first_end, rings, last_end])
+    return grid(closed.reshape(-1, 3), len(closed), around + 1, material)
+
+
 def grid(
     vertices: np.ndarray, rows: int, columns: int, material: Material, *, flip: bool = False
 ) -> Surface:
