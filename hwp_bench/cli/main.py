@@ -37,6 +37,7 @@ def command_tree() -> Command:
             "demo": Command("simulate a capture, fit a baseline, score it", f"{here}.demo"),
             "evaluate": Command("run a method on captures and score it", f"{here}.evaluate"),
             "ablate": Command("measure gain and cost of components", f"{here}.ablate"),
+            "budget": Command("measure what each estimate costs a method", f"{here}.budget"),
             "cost": Command("show accuracy against time", f"{here}.cost"),
             "verify": Command("recompute digests and scores of results", f"{here}.verify"),
             "compare": Command("test differences for significance", f"{here}.compare"),

@@ -1,0 +1,77 @@
+"""What an oracle gives in place of estimates. Oracle: the capture's own files."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from small_captures import CaptureMaker
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.capture import Capture
+from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.methods.material import TRUTHS, frames_with, known_truths, training_material
+
+SPLIT = contiguous_split("tiny", 20)
+
+
+@pytest.fixture
+def capture(make_capture: CaptureMaker) -> Capture:
+    """A capture whose estimates are all off by something."""
+    capture = make_capture(frames=20, truth=True)
+    capture.hands = {
+        side: replace(hand, pose=hand.pose + 0.1, betas=hand.betas + 1.0, transl=hand.transl + 0.02)
+        for side, hand in capture.hands.items()
+    }
+    return capture
+
+
+def test_poses_are_true_in_the_frames_that_are_asked_for(capture: Capture) -> None:
+    assert capture.true_hands is not None
+    truth, estimate = capture.true_hands["right"], capture.hands["right"]
+    for name, rows in (("poses", SPLIT.train), ("test-poses", [*SPLIT.validation, *SPLIT.test])):
+        hand = training_material(capture, SPLIT, frames_with([name])).hands["right"]
+        others = np.setdiff1d(np.arange(20), rows)
+        for field in ("pose", "transl"):
+            found = getattr(hand, field)
+            np.testing.assert_array_equal(found[rows], getattr(truth, field)[rows])
+            np.testing.assert_array_equal(found[others], getattr(estimate, field)[others])
+        np.testing.assert_array_equal(hand.betas, estimate.betas)
+
+
+def test_betas_alone_are_replaced(capture: Capture) -> None:
+    assert capture.true_hands is not None
+    material = training_material(capture, SPLIT, frames_with(["betas"]))
+    hand, estimate = material.hands["right"], capture.hands["right"]
+    np.testing.assert_array_equal(hand.betas, capture.true_hands["right"].betas)
+    np.testing.assert_array_equal(hand.pose, estimate.pose)
+    assert (material.frames, material.masks) == ("frames", "masks")
+    np.testing.assert_array_equal(material.train, SPLIT.train)
+
+
+@pytest.mark.parametrize(
+    ("names", "frames", "masks"),
+    [
+        (["masks"], "frames", "true_masks"),
+        (["pixels"], "clean", "clean_masks"),
+        (["masks", "pixels"], "clean", "clean_masks"),
+        ([], "frames", "masks"),
+    ],
+)
+def test_images_come_from_the_kind_that_is_asked_for(
+    capture: Capture, names: list[str], frames: str, masks: str
+) -> None:
+    material = training_material(capture, SPLIT, frames_with(names))
+    assert (material.frames, material.masks) == (frames, masks)
+
+
+def test_a_capture_says_what_it_knows(make_capture: CaptureMaker, capture: Capture) -> None:
+    assert known_truths(capture) == tuple(TRUTHS)
+    unknowing = make_capture("other", frames=20)
+    assert known_truths(unknowing) == ()
+    with pytest.raises(UsageError, match="does not know its true betas"):
+        training_material(unknowing, SPLIT, frames_with(["betas"]))
+    with pytest.raises(UsageError, match="'light' is not one of pixels, masks"):
+        training_material(capture, SPLIT, "true:light")
+    assert frames_with(reversed(TRUTHS)) == "true:" + ",".join(TRUTHS)
