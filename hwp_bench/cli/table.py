@@ -13,6 +13,7 @@ _TABLES = (
     "paper",
     "robustness",
     "severity",
+    "novelty",
     "bias",
     "seeds",
 )
@@ -22,6 +23,7 @@ _EXAMPLES = """examples:
   hwp-bench table runs/* --by overall --format tex > table.tex
   hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
   hwp-bench table runs/mine-seed* --by seeds
+  hwp-bench table runs/plain-mini runs/mine-mini --by novelty   # where training showed little
   hwp-bench table runs/mine-mini runs/plain-mini --paper 5 --published   # layout of table 5
   hwp-bench table --published                                            # the paper's numbers
 
@@ -62,7 +64,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         nargs="+",
         default=[],
         metavar="FOLDER",
-        help="capture folders, for severities (simulated ones are found in the cache)",
+        help="capture folders, for severities and novelty (simulated ones are found in the cache)",
     )
     parser.add_argument(
         "--format",

@@ -12,6 +12,7 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.base.tables import Table
 from hwp_bench.report.evaluation_tables import all_tables, same_data
+from hwp_bench.report.novelty_table import novelty_table
 from hwp_bench.report.paper_layouts import (
     DISTANCE,
     LAYOUTS,
@@ -22,7 +23,12 @@ from hwp_bench.report.paper_layouts import (
     layout_table,
     seeds_layout,
 )
-from hwp_bench.report.sources import ResultsSource, find_captures, read_sources
+from hwp_bench.report.sources import (
+    ResultsSource,
+    find_captures,
+    open_captures_of,
+    read_sources,
+)
 from hwp_bench.report.study_tables import (
     LEVEL_NOTE,
     bias_rows,
@@ -53,7 +59,7 @@ class TableRequest:
     published: bool = False
     #: Name of the method that the robustness table counts from.
     base: str | None = None
-    #: Capture folders, for the severities.
+    #: Capture folders, for severities and novelty.
     captures: Sequence[str | os.PathLike[str]] = ()
 
 
@@ -91,6 +97,9 @@ def _ours(request: TableRequest) -> Table:
     if request.by == "severity":
         same_data(results)
         return severity_table(sources, find_captures(results, request.captures))
+    if request.by == "novelty":
+        same_data(results)
+        return novelty_table(sources, open_captures_of(results, request.captures))
     if request.by == "bias":
         return bias_table(sources, find_captures(results, request.captures))
     return all_tables(results)[request.by]

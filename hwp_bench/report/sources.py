@@ -12,6 +12,7 @@ import numpy as np
 from hwp_bench.base.errors import BadResult, HwpError
 from hwp_bench.base.files import cache_root, inside, read_json, sha256_json
 from hwp_bench.base.records import parse_record
+from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.results import Results, read_results, result_files
 
@@ -109,6 +110,25 @@ def find_captures(
     Returns:
         By digest; captures that are nowhere to be found are left out.
     """
+    return {digest: info for digest, (info, _) in _located(results, folders).items()}
+
+
+def open_captures_of(
+    results: Iterable[Results], folders: Sequence[str | os.PathLike[str]] = ()
+) -> dict[str, Capture]:
+    """Open the evaluated captures that `find_captures` finds, by digest.
+
+    Raises:
+        BadCapture, BadInput: one of them is damaged.
+    """
+    found = _located(results, folders)
+    return {digest: open_capture(place) for digest, (_, place) in found.items()}
+
+
+def _located(
+    results: Iterable[Results], folders: Sequence[str | os.PathLike[str]]
+) -> dict[str, tuple[CaptureInfo, Path]]:
+    """What the captures say of themselves and where they lie, by digest."""
     digests = {c.digest: c.id for result in results for c in result.captures}
     places = [Path(folder) for folder in folders]
     rendered = cache_root() / "sim" / "captures"
@@ -123,7 +143,7 @@ def find_captures(
             continue
         digest = sha256_json(info.to_json())
         if digest in digests:
-            found[digest] = info
+            found[digest] = (info, place)
     return found
 
 
