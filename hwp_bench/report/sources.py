@@ -128,7 +128,7 @@ def open_captures_of(
 def _located(
     results: Iterable[Results], folders: Sequence[str | os.PathLike[str]]
 ) -> dict[str, tuple[CaptureInfo, Path]]:
-    """What the captures say of themselves and where they lie, by digest."""
+    """The captures' own descriptions and their places, by digest."""
     digests = {c.digest: c.id for result in results for c in result.captures}
     places = [Path(folder) for folder in folders]
     rendered = cache_root() / "sim" / "captures"

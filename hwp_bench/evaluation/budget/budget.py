@@ -94,7 +94,7 @@ def make_budget(runs: BudgetRuns) -> Budget:
 
 
 def gained(image: np.ndarray, pair: Pair) -> float:
-    """What an image (H, W, 3) in place of the prediction gains, dB; 0 where it is no better."""
+    """Gain of an image (H, W, 3) in place of the prediction, dB; 0 where it is not better."""
     return max(0.0, decibels(error_of(image, pair)) - decibels(pair.error))
 
 

@@ -170,7 +170,9 @@ def _relit(pair: Pair, basis: np.ndarray) -> np.ndarray:
 
         def step(logs: np.ndarray, truth: np.ndarray = truth) -> np.ndarray:
             now = lit(logs)
-            return _solved((_slope(now) * now)[:, None] * inner, truth - linear_to_srgb(now))
+            way = _solved((_slope(now) * now)[:, None] * inner, truth - linear_to_srgb(now))
+            # sRGB is far from linear in the logarithm: no pixel goes further than e at a time.
+            return way / max(float(np.abs(inner @ way).max()), 1.0)
 
         best = _least(error, step, np.zeros(basis.shape[-1]))
         factor = np.exp(np.clip(basis @ best, -_LARGEST, _LARGEST))

@@ -70,7 +70,7 @@ def run_budget(
     unknown = sorted(set(truths) - set(TRUTHS))
     if unknown:
         raise UsageError(
-            f"{unknown[0]!r} is no estimate",
+            f"{unknown[0]!r} is not an estimate",
             field="--truths",
             remedy=f"Known: {', '.join(TRUTHS)}.",
         )
@@ -95,7 +95,7 @@ def run_budget(
 def variants_of(
     known: Sequence[Sequence[str]], truths: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
-    """What the truth replaces in each evaluation, by its name.
+    """The estimates that the truth replaces in each evaluation, by its name.
 
     Args:
         known: the truths that each capture knows.

@@ -26,7 +26,7 @@ def _mug(variant: int) -> Surface:
 
     color = _MUGS[variant % len(_MUGS)]
     image = canvas(96, 256, color)
-    band = tuple(0.55 * channel for channel in color)
+    band = (0.55 * color[0], 0.55 * color[1], 0.55 * color[2])
     image[64:74] = ink(band)
     rng = generator(21, "mug", variant)
     for _ in range(9):
