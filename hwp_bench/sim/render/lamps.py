@@ -14,6 +14,7 @@ from hwp_bench.base.compiled import compiled
 from hwp_bench.sim.geometry.raycast import LIFT, Tracer
 from hwp_bench.sim.render.gloss import dot, gloss_lobe, grazing
 from hwp_bench.sim.render.samples import Samples
+from hwp_bench.sim.render.translucency import light_through
 from hwp_bench.sim.scene.area_lights import AreaLight, wall_irradiance
 from hwp_bench.sim.scene.optics import Lights
 
@@ -54,6 +55,8 @@ def lamp_light(
                 arrives,
                 lamp.irradiance,
             )
+        if lamp.through:
+            total += light_through(samples, lamp, tracers)
     return total * lights.exposure
 
 

@@ -35,6 +35,8 @@ class AreaLight:
     distance: float
     #: (3,) irradiance there, of a surface that faces the light.
     irradiance: np.ndarray
+    #: Share of the light that passes through skin.
+    through: float = 0.0
 
     @property
     def slope(self) -> float:
@@ -79,6 +81,7 @@ def area_light(lamp: Lamp, focus: np.ndarray) -> AreaLight:
         facing=facing,
         distance=float(np.linalg.norm(place)),
         irradiance=lamp.strength * lamp_color(lamp.kelvin) * srgb_to_linear(np.array(lamp.color)),
+        through=lamp.through,
     )
 
 

@@ -34,6 +34,8 @@ class Lamp:
     kelvin: float = number(5500.0, 1500.0, 15000.0)
     #: sRGB colour of a shade or pane in front of it.
     color: Colour = (1.0, 1.0, 1.0)
+    #: Share of the light that passes through thin parts of a hand, of what passes through skin.
+    through: float = number(0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
         if sum(way * way for way in self.place) < NEAREST**2:

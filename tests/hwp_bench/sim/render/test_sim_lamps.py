@@ -12,15 +12,16 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from tiny_scene import CLEAN, LIGHT, OBJECT
+from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects.plan import lights_at, plan
-from hwp_bench.sim.geometry.raycast import RenderCost, Tracer
+from hwp_bench.sim.geometry.raycast import LIFT, RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import Surface, plain
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.lamps import GRIDS, lamp_light, room_light
 from hwp_bench.sim.render.samples import Samples
+from hwp_bench.sim.render.translucency import SKIN_REACH
 from hwp_bench.sim.scene.area_lights import (
     BORDER_SHARE,
     FACING_SHARE,
@@ -30,6 +31,7 @@ from hwp_bench.sim.scene.area_lights import (
 )
 from hwp_bench.sim.scene.lighting import Lamp, Room
 from hwp_bench.sim.scene.optics import Lights, focus_point, steady_light
+from hwp_bench.sim.scene.recorder import AutoControl
 from hwp_bench.sim.scene.schema import Scene, Sensor
 
 SceneMaker = Callable[..., Scene]
@@ -223,3 +225,65 @@ def test_a_light_behind_the_hand_leaves_it_dark_with_a_rim_on_its_side(
     last = np.array([np.flatnonzero(hand[row])[-1] for row in rows])
     assert left[rows, first].mean() > 1.3 * right[rows, first].mean()
     assert right[rows, last].mean() > 1.3 * left[rows, last].mean()
+
+
+def test_lights_and_sensors_combine(make_scene: SceneMaker) -> None:
+    # Oracle: a frame in which no effect acts is its clean version, and repeats bit for bit.
+    scene = make_scene()
+    lamp = Lamp(place=(-0.8, 0.0, 0.0), strength=1.0, width=0.4)
+    sensor = Sensor(
+        noise=0.01,
+        jpeg_quality=70,
+        rolling_shutter=0.02,
+        sharpening=1.0,
+        auto=AutoControl(lag=2.0),
+    )
+    light = replace(scene.light, lamps=(lamp,), room=Room(left=(0.9, 0.2, 0.1)))
+    scene = replace(scene, light=light, sensor=sensor)
+    wanted = ("lamps", "room", "rolling", "auto", "sensor", "sharpening", "jpeg")
+    for frame in (CLEAN, BLUR):
+        passes = plan(scene, frame, COUNT, SIZE).passes
+        assert tuple(name for name in passes if name in wanted) == wanted
+        first, second = (render_frame(scene, frame, COUNT, SIZE) for _ in range(2))
+        np.testing.assert_array_equal(first.rgb, second.rgb)
+        assert (frame == CLEAN) == np.array_equal(first.rgb, first.clean)
+
+
+def _walls(depths: tuple[float, ...]) -> Surface:
+    """Large squares across the line of sight, some metres behind the point looked at."""
+    corners = np.array([[-1, -1, 0], [1, -1, 0], [1, 1, 0], [-1, 1, 0]], float)
+    vertices = np.concatenate([corners + focus_point() + [0, 0, depth] for depth in depths])
+    faces = np.concatenate(
+        [4 * index + np.array([[0, 1, 2], [0, 2, 3]]) for index in range(len(depths))]
+    )
+    return Surface(
+        vertices=vertices,
+        normals=np.tile([0.0, 0.0, -1.0], (len(vertices), 1)),
+        faces=faces,
+        corner_uv=np.zeros((len(faces), 3, 2)),
+        material=np.zeros(len(faces), dtype=np.int64),
+        materials=(plain((0.5, 0.5, 0.5)),),
+        hand=np.ones(len(faces), dtype=bool),
+        openness=np.ones(len(vertices)),
+    )
+
+
+@pytest.mark.parametrize("thickness", [0.002, 0.006])
+def test_light_passes_through_thin_skin_and_reddens(thickness: float) -> None:
+    # Oracle: Beer and Lambert on a slab. The ray starts twice its lift inside the skin.
+    lamp = area_light(
+        Lamp(place=(0.0, 0.0, 0.6), strength=1.0, width=0.01, through=1.0), focus_point()
+    )
+    facing = np.array([[0.0, 0.0, -1.0]])
+    samples = _samples(focus_point()[None], facing)
+    slab = _tracer(_walls((0.0, thickness)))
+    lights = _dark(lamps=(lamp,))
+    seen = lamp_light(samples, lights, [slab], FAR_TURN)[0]
+    expected = np.exp(-(thickness - 2.0 * LIFT) / np.array(SKIN_REACH)) * lamp.irradiance
+    np.testing.assert_allclose(seen, expected, rtol=0.02)
+    assert seen[0] > seen[1] > seen[2]
+    # A finger behind the slab, or a lamp that passes through nothing, leaves it dark.
+    double = _tracer(_walls((0.0, thickness, 0.1, 0.11)))
+    assert lamp_light(samples, lights, [double], FAR_TURN).max() == 0.0
+    opaque = _dark(lamps=(replace(lamp, through=0.0),))
+    assert lamp_light(samples, opaque, [slab], FAR_TURN).max() == 0.0
