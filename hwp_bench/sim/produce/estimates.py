@@ -8,6 +8,8 @@ from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.sim.effects.base import registered
 from hwp_bench.sim.effects.plan import FramePlan
 from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.produce.tracker import tracked
+from hwp_bench.sim.scene.optics import viewmat
 from hwp_bench.sim.scene.schema import Scene
 
 #: Error of a good estimator on an easy frame: rad and m.
@@ -34,7 +36,8 @@ def estimate_hands(
 
     The error grows with the effects that act. One part of it wanders in time, the other is the
     estimator's habit, which no averaging over frames removes. A gross failure keeps finite
-    parameters, far off, and is flagged by `valid`.
+    parameters, far off, and is flagged by `valid`. Where the scene names an estimator, its errors
+    come on top.
 
     Args:
         scene: the scene.
@@ -63,6 +66,11 @@ def estimate_hands(
             transl=exact.transl + shift,
             valid=~failed,
         )
+    if scene.estimator is not None:
+        times = np.array([plan.seconds for plan in plans])
+        views = np.stack([viewmat(scene, seconds) for seconds in times])
+        for side, estimate in estimates.items():
+            estimates[side] = tracked(scene, scene.estimator, side, estimate, times, views)
     return estimates
 
 

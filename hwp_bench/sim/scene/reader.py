@@ -31,6 +31,7 @@ from hwp_bench.sim.scene.schema import (
     Words,
     sides_of,
 )
+from hwp_bench.sim.scene.tracking import Estimator
 from hwp_bench.taxonomy import MAX_SEVERITY, PERTURBATIONS
 
 _SCENES = Path(__file__).with_name("scenes")
@@ -105,6 +106,7 @@ def parse_scene(text: str, *, where: str) -> Scene:
             file.track.variation,
         ),
         effects=tuple(_effect(row, f"effects[{i}]", where) for i, row in enumerate(file.effects)),
+        estimator=file.estimator,
     )
     for side in scene.sides:
         if not scene.track.keys.get(side):
@@ -144,6 +146,7 @@ class _SceneFile:
     sensor: Sensor | None = None
     noise: Annotated[float, Meta(ge=0.0, le=0.2)] | None = None
     effects: list[dict[str, Any]] = field(default_factory=list)
+    estimator: Estimator | None = None
 
 
 @dataclass(frozen=True)

@@ -22,6 +22,7 @@ from hwp_bench.sim.scene.gestures import gesture
 from hwp_bench.sim.scene.lighting import Lamp, Room
 from hwp_bench.sim.scene.looks import PLAIN, Looks
 from hwp_bench.sim.scene.recorder import AutoControl, without_defaults
+from hwp_bench.sim.scene.tracking import Estimator
 from hwp_bench.taxonomy import MAX_SEVERITY
 
 #: Version of the scene format; part of every scene digest.
@@ -221,6 +222,8 @@ class Scene:
     track: Track
     #: Perturbations.
     effects: tuple[EffectCall, ...]
+    #: Whose hand parameters a method gets, or None: those of a good estimator.
+    estimator: Estimator | None = None
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -240,6 +243,8 @@ class Scene:
         content["subject"] |= {"looks": looks}
         if not looks:
             del content["subject"]["looks"]
+        if self.estimator is None:
+            del content["estimator"]
         if self.sensor == Sensor(self.sensor.noise):
             content["noise"] = content.pop("sensor")["noise"]
         return content
