@@ -79,7 +79,8 @@ def plan(
         # In fours: each pixel then aims at every part of the lamp equally often.
         fours = np.ceil(way / SUBFRAME_STEP / 4.0)
         subframes = int(np.clip(4 * fours, 4, MAX_SUBFRAMES))
-    passes = ["hands", "shadow", "sky", "backdrop", *scene.subject.looks.passes]
+    passes = ["hands", "shadow", "sky", "backdrop"]
+    passes += [*scene.subject.looks.passes, *scene.behind.passes]
     passes += ["lamps"] if scene.light.lamps else []
     passes += ["room"] if scene.light.room is not None else []
     for kind in (*(kind for kind in ORDER if kind in acting), SENSOR):

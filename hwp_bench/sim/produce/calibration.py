@@ -164,7 +164,7 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
         turn = angle * rng.normal(size=(16, 3))
         turn[0] *= 0.6
         wrong[side] = (pose + turn, transl + length * rng.normal(size=3) * [1.0, 1.0, 2.0])
-    lens = Lens(intrinsics(scene, size), viewmat(scene, seconds), size, 1)
+    lens = Lens(intrinsics(scene, size), viewmat(scene, seconds), size, 1, seconds=seconds)
     lights = steady_light(scene.light)
     images = [
         render_instant(

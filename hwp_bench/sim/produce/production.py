@@ -35,6 +35,7 @@ from hwp_bench.sim.produce.frames import (
     render_frames,
     render_in_processes,
 )
+from hwp_bench.sim.produce.lookalikes import confused_mask
 from hwp_bench.sim.produce.video_encoding import check_encoder, through_h264
 from hwp_bench.sim.scene.motion import hand_parameters
 from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
@@ -181,7 +182,8 @@ def _assemble(
             writer.true_mask(item.frame, _eight_bits(coverage))
             clean_coverage = arrays["clean_coverage"].astype(np.float64)
             writer.clean_mask(item.frame, _eight_bits(clean_coverage))
-            writer.mask(item.frame, estimate_mask(scene, item, coverage, clean_coverage))
+            mask = estimate_mask(scene, item, coverage, clean_coverage)
+            writer.mask(item.frame, confused_mask(scene, item, mask, coverage, rgb))
             layers = exr_file(waiting, item.frame)
             if layers.exists():
                 writer.extra(f"exr/{layers.name}", layers.read_bytes())

@@ -16,6 +16,7 @@ from hwp_bench.sim.effects.base import registered
 from hwp_bench.sim.effects.plan import hands_at
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.produce.light_strips import camera_sheet, captioned, light_sheet
+from hwp_bench.sim.produce.look_strips import look_sheet
 from hwp_bench.sim.produce.video_encoding import has_encoder
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.scene.motion import hand_parameters
@@ -74,7 +75,7 @@ def write_preview(
 
 
 def write_gallery(folder: Path) -> list[Path]:
-    """Write `captureN.jpg`, `severity-KIND.jpg`, `lights.jpg` and `cameras.jpg`.
+    """Write `captureN.jpg`, `severity-KIND.jpg`, `lights.jpg`, `looks.jpg` and `cameras.jpg`.
 
     The last one is left out where nothing can encode H.264.
 
@@ -89,6 +90,7 @@ def write_gallery(folder: Path) -> list[Path]:
         image = strip(_severity_strip(load_scene(name), kind), MAX_SEVERITY + 1)
         paths.append(_write(folder / f"severity-{kind}.jpg", image))
     paths.append(_write(folder / "lights.jpg", light_sheet()))
+    paths.append(_write(folder / "looks.jpg", look_sheet()))
     if has_encoder():
         paths.append(_write(folder / "cameras.jpg", camera_sheet()))
     return paths

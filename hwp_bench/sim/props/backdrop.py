@@ -43,7 +43,9 @@ _BACKDROPS: Mapping[str, Backdrop] = MappingProxyType(
 
 def backdrop_names() -> tuple[str, ...]:
     """Names of the backdrops that a scene can name."""
-    return tuple(_BACKDROPS)
+    from hwp_bench.sim.props.planes import plane_names
+
+    return (*_BACKDROPS, *plane_names())
 
 
 def check_backdrop(name: str, where: str) -> None:
@@ -52,12 +54,12 @@ def check_backdrop(name: str, where: str) -> None:
     Raises:
         BadInput: it lists the known ones.
     """
-    if name not in _BACKDROPS:
+    if name not in _BACKDROPS and name not in backdrop_names():
         raise BadInput(
             f"is {name!r}",
             where=where,
             field="background",
-            remedy=f"Known: {', '.join(_BACKDROPS)}.",
+            remedy=f"Known: {', '.join(backdrop_names())}.",
         )
 
 
@@ -66,6 +68,10 @@ def _texture(name: str, seed: int) -> np.ndarray:
     """(T, T, 3) float32 linear, over slopes -1..1 in both directions."""
     import cv2
 
+    if name not in _BACKDROPS:
+        from hwp_bench.sim.props.planes import plane_texture
+
+        return plane_texture(name, seed)
     backdrop = _BACKDROPS[name]
     rng = generator(seed, "backdrop", name)
     ticks = np.linspace(-1.0, 1.0, _TEXTURE)
@@ -106,10 +112,11 @@ def backdrop_colors(name: str, seed: int, directions: np.ndarray) -> np.ndarray:
     slope = directions[..., :2] / np.maximum(directions[..., 2:], 1e-3)
     slope += 1.0
     slope /= 2.0
-    slope *= _TEXTURE - 1
+    texture = _texture(name, seed)
+    slope *= len(texture) - 1
     place = slope.astype(np.float32)
     return cv2.remap(
-        _texture(name, seed),
+        texture,
         np.ascontiguousarray(place[..., 0]),
         np.ascontiguousarray(place[..., 1]),
         cv2.INTER_LINEAR,

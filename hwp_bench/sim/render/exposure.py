@@ -57,7 +57,12 @@ def exposed(stage: Stage, window: Window, sky: dict[str, np.ndarray], lens: Lens
         s = (step + 0.5) / recipe.subframes - 0.5
         place = ((step + 1) * np.array(_SPREAD)) % 1.0 - 0.5
         moved = replace(
-            lens, view=window.view(s), grid=1, shift=(float(place[0]), float(place[1])), turn=step
+            lens,
+            view=window.view(s),
+            grid=1,
+            shift=(float(place[0]), float(place[1])),
+            turn=step,
+            seconds=window.seconds(s),
         )
         if rows is not None:
             moved = rows.lens(s, moved)

@@ -57,7 +57,10 @@ def carry_out(scene: Scene, recipe: FramePlan, size: int) -> SimulatedFrame:
     cost = RenderCost()
     stage = Stage(scene, cost)
     hands = hands_at(scene, recipe.seconds)
-    lens = Lens(intrinsics(scene, size), viewmat(scene, recipe.seconds), size, SUPERSAMPLING)
+    seconds = recipe.seconds
+    lens = Lens(
+        intrinsics(scene, size), viewmat(scene, seconds), size, SUPERSAMPLING, seconds=seconds
+    )
     with cost.time("hands"):
         body = stage.traced(stage.surface(hands))
     with cost.time("sky"):

@@ -8,6 +8,7 @@ import numpy as np
 
 from hwp_bench.sim.geometry.raycast import Hits, RenderCost, Tracer
 from hwp_bench.sim.props.backdrop import backdrop_colors
+from hwp_bench.sim.render.behind import draw_behind
 from hwp_bench.sim.render.lamps import lamp_light, room_light
 from hwp_bench.sim.render.samples import gather
 from hwp_bench.sim.render.shading import lit, shade
@@ -45,6 +46,8 @@ class Lens:
     shift: tuple[float, float] = (0.0, 0.0)
     #: Which part of the lamp the rays aim at first.
     turn: int = 0
+    #: Time of the capture, s: where what moves behind the hands is.
+    seconds: float = 0.0
     #: Views when the first and when the last row is read, or None where all are read at once.
     #: The backdrop follows them; what is cast stands where its row sees it (`rolling`).
     rows: tuple[np.ndarray, np.ndarray] | None = None
@@ -64,7 +67,13 @@ def render_instant(
         cost: is charged with time and rays.
     """
     with cost.time("backdrop"):
-        color = _backdrop(scene, lens, lights)
+        directions = _directions(lens)
+        color = backdrop_colors(scene.background, scene.seed, directions)
+    if scene.behind.passes:
+        with cost.time("behind"):
+            color = draw_behind(scene, directions, lens.seconds, color)
+    with cost.time("backdrop"):
+        color = color * lights.on_backdrop() * lights.exposure
         coverage = np.zeros((lens.size, lens.size))
     layers = [("hands", body)] + ([("objects", things)] if things is not None else [])
     box = _box(lens, [layer.surface.vertices for _, layer in layers])
@@ -104,15 +113,15 @@ def render_instant(
     return LinearImage(color, coverage)
 
 
-def _backdrop(scene: Scene, lens: Lens, lights: Lights) -> np.ndarray:
+def _directions(lens: Lens) -> np.ndarray:
+    """Viewing directions of all pixels: (S, S, 3), world."""
     whole = (0, lens.size, 0, lens.size)
     _, directions = pixel_rays(lens.K, lens.view, whole, 1)
     if lens.rows is not None:
         _, first = pixel_rays(lens.K, lens.rows[0], whole, 1)
         _, last = pixel_rays(lens.K, lens.rows[1], whole, 1)
         directions = first + (last - first) * np.linspace(0.0, 1.0, lens.size)[:, None, None]
-    seen = backdrop_colors(scene.background, scene.seed, directions)
-    return seen * lights.on_backdrop() * lights.exposure
+    return directions
 
 
 def _box(lens: Lens, clouds: list[np.ndarray]) -> tuple[int, int, int, int] | None:

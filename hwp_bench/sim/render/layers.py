@@ -38,7 +38,7 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
     later = seconds + scene.duration / frame_count
     hands = hands_at(scene, seconds)
     view = viewmat(scene, seconds)
-    lens = Lens(intrinsics(scene, size), view, size, 1)
+    lens = Lens(intrinsics(scene, size), view, size, 1, seconds=seconds)
     body = stage.traced(stage.surface(hands))
     things = stage.things(objects_at(scene, recipe, seconds), hands)
     image = render_instant(scene, lens, body, things, lights_at(scene, recipe), RenderCost())

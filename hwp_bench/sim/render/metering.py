@@ -113,7 +113,7 @@ def _seen(look: _Look) -> np.ndarray:
     stage = Stage(scene, cost)
     hands = {side: track_moment(scene, side, seconds) for side in scene.sides}
     body = stage.traced(stage.surface(hands, MOVING))
-    lens = Lens(intrinsics(scene, EDGE), viewmat(scene, seconds), EDGE, 1)
+    lens = Lens(intrinsics(scene, EDGE), viewmat(scene, seconds), EDGE, 1, seconds=seconds)
     image = render_instant(scene, lens, body, None, steady_light(scene.light), cost)
     mean: np.ndarray = image.color.mean(axis=(0, 1))
     return mean

@@ -13,6 +13,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import number, parse_record
 from hwp_bench.sim.props.backdrop import check_backdrop
+from hwp_bench.sim.scene.behind import NOTHING, Behind
 from hwp_bench.sim.scene.effect_settings import check_settings, keys_by_side
 from hwp_bench.sim.scene.episodes import clean_share
 from hwp_bench.sim.scene.schema import (
@@ -107,6 +108,7 @@ def parse_scene(text: str, *, where: str) -> Scene:
         ),
         effects=tuple(_effect(row, f"effects[{i}]", where) for i, row in enumerate(file.effects)),
         estimator=file.estimator,
+        behind=file.behind,
     )
     for side in scene.sides:
         if not scene.track.keys.get(side):
@@ -147,6 +149,7 @@ class _SceneFile:
     noise: Annotated[float, Meta(ge=0.0, le=0.2)] | None = None
     effects: list[dict[str, Any]] = field(default_factory=list)
     estimator: Estimator | None = None
+    behind: Behind = NOTHING
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import number
 from hwp_bench.base.text import ODD_CHARACTERS
 from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.scene.behind import NOTHING, Behind
 from hwp_bench.sim.scene.gestures import gesture
 from hwp_bench.sim.scene.lighting import Lamp, Room
 from hwp_bench.sim.scene.looks import PLAIN, Looks
@@ -224,6 +225,8 @@ class Scene:
     effects: tuple[EffectCall, ...]
     #: Whose hand parameters a method gets, or None: those of a good estimator.
     estimator: Estimator | None = None
+    #: What moves behind the hands.
+    behind: Behind = NOTHING
 
     @property
     def sides(self) -> tuple[str, ...]:
@@ -245,6 +248,8 @@ class Scene:
             del content["subject"]["looks"]
         if self.estimator is None:
             del content["estimator"]
+        if self.behind == NOTHING:
+            del content["behind"]
         if self.sensor == Sensor(self.sensor.noise):
             content["noise"] = content.pop("sensor")["noise"]
         return content

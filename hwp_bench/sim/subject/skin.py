@@ -87,7 +87,7 @@ def sample_skin(anatomy: Anatomy, subject: Subject) -> SkinSample:
         + 0.00012 * nail
         - 0.00035 * groove
     )
-    tone = np.array([np.interp(subject.tone, _TONES, _BACK[:, c]) for c in range(3)])
+    tone = skin_color(subject.tone)
     pale = np.array([np.interp(subject.tone, _TONES, _PALM[:, c]) for c in range(3)])
     albedo = srgb_to_linear(tone * back[:, None] + pale * palm[:, None])
     if subject.looks.arm == "bare":
@@ -112,6 +112,11 @@ def sample_skin(anatomy: Anatomy, subject: Subject) -> SkinSample:
         height=height,
         roughness=np.clip(roughness, 0.2, 0.9),
     )
+
+
+def skin_color(tone: float) -> np.ndarray:
+    """Colour of skin of a tone, as on the back of the hand: (3,) sRGB."""
+    return np.array([np.interp(tone, _TONES, _BACK[:, c]) for c in range(3)])
 
 
 def _palm_fades(anatomy: Anatomy) -> np.ndarray:
