@@ -17,6 +17,7 @@ from tiny_scene import BLUR, CLEAN
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.props import planes
 from hwp_bench.sim.props.backdrop import backdrop_colors
 from hwp_bench.sim.props.planes import plane_names
 from hwp_bench.sim.render.behind import draw_behind
@@ -132,14 +133,26 @@ def test_a_face_has_skin_eyes_and_a_mouth() -> None:
 
 
 @pytest.mark.parametrize("name", plane_names())
-def test_planes_have_the_colours_of_skin(make_scene: SceneMaker, name: str) -> None:
-    scene = make_scene(('background = "studio"', f'background = "{name}"'))
-    seen = backdrop_colors(name, 5, directions(scene))
+def test_planes_have_the_colours_of_skin(
+    make_scene: SceneMaker, monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    assert make_scene(('background = "studio"', f'background = "{name}"')).background == name
+    # Coarser than in a frame: colours and patterns are the same.
+    monkeypatch.setattr(planes, "PLANE_TEXTURE", 256)
+    seen, other = (planes.plane_texture(name, seed) for seed in (5, 6))
     red, green, blue = seen.mean(axis=(0, 1))
     assert red > 1.1 * green > 1.1 * 1.1 * blue
     assert seen.std(axis=(0, 1)).min() > 0.003
-    other = backdrop_colors(name, 6, directions(scene))
     assert np.abs(seen - other).mean() > 0.002
+
+
+def test_a_plane_is_the_backdrop_of_its_name(make_scene: SceneMaker) -> None:
+    rays = directions(make_scene())
+    seen = backdrop_colors("beige_wall", 5, rays)
+    middle = planes.plane_texture("beige_wall", 5)[planes.PLANE_TEXTURE // 2][:, 0]
+    assert seen.shape == rays.shape
+    assert seen[SIZE // 2, :, 0].min() >= 0.9 * middle.min()
+    assert seen[SIZE // 2, :, 0].max() <= 1.1 * middle.max()
 
 
 @pytest.mark.parametrize(
