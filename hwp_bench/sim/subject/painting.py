@@ -20,7 +20,7 @@ from hwp_bench.sim.subject.tattoos import tattoo_cover
 # Absorption of more blood and of more yellow (carotene, bilirubin), per linear channel.
 # Source: the bands of haemoglobin (540-580 nm) and of carotene (450-490 nm), as seen by sRGB.
 _BLOOD = np.array([0.02, 0.42, 0.34])
-_YELLOW = np.array([0.04, 0.10, 0.50])
+_YELLOW = np.array([0.12, 0.11, 0.34])
 _MELANIN = np.array([0.55, 0.95, 1.2])
 
 
