@@ -172,6 +172,10 @@ def _depth(
     """Depth, nearest vertex of the skin, and index of the points that lie inside: (P,) each."""
     from trimesh.triangles import closest_point
 
+    if not len(skin):
+        # With wide folds a joint may move no triangle most.
+        nothing = np.zeros(0, dtype=np.int64)
+        return np.zeros(0), nothing, nothing
     triangles = vertices[skin]
     box = triangles.reshape(-1, 3)
     near = np.flatnonzero(((points > box.min(axis=0)) & (points < box.max(axis=0))).all(axis=1))

@@ -61,6 +61,18 @@ def smoothing(faces: np.ndarray, vertex_count: int, rounds: int) -> csr_matrix:
     return matrix.tocsr()
 
 
+def smoothing_step(faces: np.ndarray, vertex_count: int, share: float) -> csr_matrix:
+    """(V, V) matrix that replaces a share of each value by the mean of its neighbours'."""
+    from scipy.sparse import diags, identity
+
+    adjacency = _adjacency(faces, vertex_count)
+    degree = np.asarray(adjacency.sum(axis=1)).reshape(-1)
+    mean = diags(1.0 / np.maximum(degree, 1.0)) @ adjacency
+    # A vertex without neighbours keeps its value.
+    keep = 1.0 - share * (degree > 0)
+    return (diags(keep) @ identity(vertex_count, format="csr") + share * mean).tocsr()
+
+
 def normal_operator(faces: np.ndarray, vertex_count: int) -> csr_matrix:
     """(V, F) matrix that adds the faces' vectors up at their corners."""
     from scipy.sparse import csr_matrix

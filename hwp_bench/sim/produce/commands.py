@@ -62,15 +62,20 @@ def print_plan(args: argparse.Namespace) -> int:
     """Print passes and predicted cost."""
     from hwp_bench.base.tables import to_markdown
     from hwp_bench.sim.produce.forecast import forecast, plan_table, share_table
+    from hwp_bench.sim.produce.subject_table import distances, subject_table
 
-    reports = [
-        forecast(scene, args.frames, args.size, probe=not args.no_probe)
-        for scene in _scenes(args.scene)
-    ]
+    scenes = _scenes(args.scene)
+    reports = [forecast(scene, args.frames, args.size, probe=not args.no_probe) for scene in scenes]
+    off = {scene.id: hands for scene in scenes if (hands := distances(scene))}
     if args.json:
-        print(json.dumps([report.to_json() for report in reports], indent=1))
+        rows = [report.to_json() for report in reports]
+        for row in rows:
+            for side, item in off.get(row["scene"], {}).items():
+                row.setdefault("subject", {})[side] = item.to_json()
+        print(json.dumps(rows, indent=1))
     else:
         tables = [plan_table(reports)] + ([] if args.no_probe else [share_table(reports)])
+        tables += [subject_table(off)] if off else []
         print("\n".join(to_markdown(table) for table in tables), end="")
     return 0
 

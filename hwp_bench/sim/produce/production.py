@@ -36,6 +36,7 @@ from hwp_bench.sim.produce.frames import (
     render_in_processes,
 )
 from hwp_bench.sim.produce.lookalikes import confused_mask
+from hwp_bench.sim.produce.subject_table import subject_json
 from hwp_bench.sim.produce.video_encoding import check_encoder, through_h264
 from hwp_bench.sim.scene.motion import hand_parameters
 from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
@@ -190,6 +191,8 @@ def _assemble(
             costs.append(json.loads(arrays["cost"].tobytes()))
         writer.true_hands(truth)
         writer.extra("scene.json", canonical_json(scene.to_json()))
+        if subject := subject_json(scene):
+            writer.extra("subject.json", canonical_json(subject))
         writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
 
 

@@ -136,7 +136,7 @@ def _gloved_faces(subject: Subject, side: str, subdivisions: int) -> np.ndarray:
     rest = hand.lift @ (template.vertices + template.shape_basis @ hand.betas)
     normals = surface_normals(rest, hand.faces, hand.normal_sum)
     weights = hand.lift @ template.weights
-    anatomy = anatomy_at(template, hand.betas, rest, normals, weights)
+    anatomy = anatomy_at(template, hand.betas, rest, normals, weights, hand.joints)
     glove = of_side(subject, side).looks.gloves[0]
     return (covered(anatomy, glove)[hand.faces].mean(axis=1) > 0.5).astype(np.int64)
 

@@ -119,6 +119,15 @@ def heading_matrix(heading: np.ndarray, side: str) -> np.ndarray:
     return rotation.as_matrix() @ base
 
 
+def palm_of(joints: np.ndarray) -> np.ndarray:
+    """The middle of the palm of a hand at rest, which keys place: (3,) m.
+
+    Args:
+        joints: (16, 3) m.
+    """
+    return 0.35 * joints[0] + 0.65 * joints[4]
+
+
 def hand_parameters(
     moment: HandMoment, side: str, joints: np.ndarray, focus: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -140,6 +149,6 @@ def hand_parameters(
     if side == "left":
         fingers = mirrored(fingers)
     turn = heading_matrix(moment.heading, side)
-    palm = 0.35 * joints[0] + 0.65 * joints[4]
+    palm = palm_of(joints)
     transl = focus + moment.place - joints[0] - turn @ (palm - joints[0])
     return np.vstack([Rotation.from_matrix(turn).as_rotvec(), fingers]), transl

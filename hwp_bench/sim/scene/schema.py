@@ -23,6 +23,7 @@ from hwp_bench.sim.scene.gestures import gesture
 from hwp_bench.sim.scene.lighting import Lamp, Room
 from hwp_bench.sim.scene.looks import PLAIN, Looks
 from hwp_bench.sim.scene.recorder import AutoControl, without_defaults
+from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy
 from hwp_bench.sim.scene.tracking import Estimator
 from hwp_bench.taxonomy import MAX_SEVERITY
 
@@ -66,6 +67,18 @@ class Subject:
     model: Words = "anny"
     #: Marks on the skin and what the person wears.
     looks: Looks = PLAIN
+    #: Geometry that no shape of the model has; None for the model as it is.
+    anatomy: SubjectAnatomy | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """Return JSON values, without later fields that change nothing."""
+        content = without_defaults(self, ("seed", "tone", "age", "sleeve", "model"))
+        content.pop("looks", None)
+        if looks := self.looks.to_json():
+            content["looks"] = looks
+        if self.anatomy is not None:
+            content["anatomy"] = without_defaults(self.anatomy, ())
+        return content
 
 
 @dataclass(frozen=True)
@@ -242,10 +255,7 @@ class Scene:
         """Return the whole content as JSON values, laid out as a scene file is."""
         content = {"schema": SCHEMA, **asdict(self)}
         content |= {"sensor": self.sensor.to_json(), "light": self.light.to_json()}
-        looks = self.subject.looks.to_json()
-        content["subject"] |= {"looks": looks}
-        if not looks:
-            del content["subject"]["looks"]
+        content["subject"] = self.subject.to_json()
         if self.estimator is None:
             del content["estimator"]
         if self.behind == NOTHING:
@@ -303,6 +313,7 @@ def with_subject(scene: Scene, seed: int) -> Scene:
         age=round(float(rng.uniform(18.0, 75.0)), 1),
         sleeve=(red, green, blue),
         model=scene.subject.model,
+        anatomy=scene.subject.anatomy,
     )
     return replace(scene, subject=person)
 

@@ -141,18 +141,8 @@ class Anatomy:
     def nails(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Nail plate, its white half-moon, its free edge, and the groove around it: (N,) each."""
         plate, moon, edge, groove = (np.zeros(len(self.points)) for _ in range(4))
-        for row, finger in enumerate(FINGERS):
-            joint = self.joints[FIRST_JOINT[finger] + 2]
-            along = unit(self.tips[row] - joint)
-            length = np.linalg.norm(self.tips[row] - joint)
-            axis = finger_back(finger)
-            axis = unit(axis - (axis @ along) * along)
-            across = np.cross(along, axis)
-            offset = (self.points - joint) / length
-            s = (offset @ along - 0.70) / 0.27
-            w = (offset @ across) / (0.27 if finger == "thumb" else 0.235)
-            top = np.clip((self.normals @ axis - 0.15) * 6.0, 0.0, 1.0)
-            owned = np.clip(3.0 * self.weights[:, FIRST_JOINT[finger] + 2] - 0.5, 0.0, 1.0)
+        for finger in FINGERS:
+            s, w, top, owned = self.nail_coordinates(finger)
             radius = (np.abs(s) ** 3 + np.abs(w) ** 3) ** (1 / 3)
             inside = _step((1.0 - radius) / 0.08 + 0.5) * top * owned
             plate = np.maximum(plate, inside)
@@ -161,6 +151,32 @@ class Anatomy:
             rim = np.exp(-(((radius - 1.04) / 0.07) ** 2)) * top * owned
             groove = np.maximum(groove, rim * _step((0.6 - s) / 0.3 + 0.5))
         return plate, moon, edge, groove
+
+    def nail_coordinates(
+        self, finger: str
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Where places lie on a finger's nail: (N,) each.
+
+        Args:
+            finger: its name.
+
+        Returns:
+            Along the plate from -1 to 1 at its free edge, across it from -1 to 1, 1 on top of the
+            finger, and 1 on its last segment.
+        """
+        joint = self.joints[FIRST_JOINT[finger] + 2]
+        tip = self._tip(finger)
+        along = unit(tip - joint)
+        length = np.linalg.norm(tip - joint)
+        axis = finger_back(finger)
+        axis = unit(axis - (axis @ along) * along)
+        across = np.cross(along, axis)
+        offset = (self.points - joint) / length
+        s = (offset @ along - 0.70) / 0.27
+        w = (offset @ across) / (0.27 if finger == "thumb" else 0.235)
+        top = np.clip((self.normals @ axis - 0.15) * 6.0, 0.0, 1.0)
+        owned = np.clip(3.0 * self.weights[:, FIRST_JOINT[finger] + 2] - 0.5, 0.0, 1.0)
+        return s, w, top, owned
 
     def _tip(self, finger: str) -> np.ndarray:
         return self.tips[FINGERS.index(finger)]

@@ -108,7 +108,9 @@ def _paint(hand: SubjectHand, subject: Subject) -> SkinAtlas:
         return np.einsum("nk,nkc->nc", hits.weights, values[corners])
 
     weights = spread(hand.lift @ template.weights)
-    anatomy = anatomy_at(template, hand.betas, spread(rest), unit(spread(normals)), weights)
+    anatomy = anatomy_at(
+        template, hand.betas, spread(rest), unit(spread(normals)), weights, hand.joints
+    )
     skin = painted(anatomy, subject, fine=True)
     layers = np.zeros((ATLAS * ATLAS, 5), dtype=np.float32)
     layers[hits.ray] = np.column_stack([skin.albedo, skin.height, skin.roughness])

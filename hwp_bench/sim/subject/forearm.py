@@ -172,7 +172,7 @@ def arm_atlas(subject: Subject) -> SkinAtlas:
         normals = unit(_spread(arm.normals, rim.around))
         weights = np.zeros((len(points), hand.template.weights.shape[1]))
         weights[:, 0] = 1.0
-        anatomy = anatomy_at(hand.template, hand.betas, points, normals, weights)
+        anatomy = anatomy_at(hand.template, hand.betas, points, normals, weights, hand.joints)
         skin = painted(anatomy, of_side(subject, "right"), fine=True)
         albedo, height, roughness = (
             np.ascontiguousarray(values.reshape(*_TEXTURE, *values.shape[1:]), dtype=np.float32)

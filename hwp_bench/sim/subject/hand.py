@@ -8,12 +8,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hwp_bench.hands.skeleton import PARENTS
 from hwp_bench.sim.geometry.mesh import normal_operator, smoothing, subdivision, surface_normals
-from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.looks import PLAIN
 from hwp_bench.sim.scene.schema import Scene, Subject
 from hwp_bench.sim.subject.anatomy import Anatomy
+from hwp_bench.sim.subject.growth import Nails, bone_relief, grown_nails
 from hwp_bench.sim.subject.painting import of_side, painted
+from hwp_bench.sim.subject.person import person, subject_anatomy
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
@@ -38,9 +40,9 @@ class SubjectHand:
     model: HandTemplate
     #: The same as tensors, float64.
     tensors: TemplateTensors
-    #: (10,) shape; zeros for a rig without a shape space.
+    #: (10,) true shape; the template of a subject off the hand model has it in its surface.
     betas: np.ndarray
-    #: (16, 3) rest joints of the surface with this shape, m.
+    #: (16, 3) rest joints of the subject's skeleton, m.
     joints: np.ndarray
     #: (16, 3) rest joints of the hand model with this shape, m.
     model_joints: np.ndarray
@@ -56,6 +58,8 @@ class SubjectHand:
     relief: np.ndarray
     #: Colour of the rig, (H, W, 3) uint8 sRGB, or None to paint skin.
     texture: np.ndarray | None
+    #: Nails that stand out, or None.
+    nails: Nails | None = None
 
     def pose(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose the fine mesh.
@@ -71,6 +75,8 @@ class SubjectHand:
         smooth = self.lift @ coarse
         normals = surface_normals(smooth, self.faces, self.normal_sum)
         vertices = smooth + self.relief[:, None] * normals
+        if self.nails is not None:
+            vertices = self.nails.pushed(vertices, joint_turns(pose))
         return vertices, surface_normals(vertices, self.faces, self.normal_sum)
 
 
@@ -93,9 +99,19 @@ def template_vertices(
     return posed.vertices[0].numpy()
 
 
-def subject_betas(subject: Subject) -> np.ndarray:
-    """Shape parameters of a subject: (10,), within 1.5 standard deviations."""
-    return np.clip(generator(subject.seed, "betas").normal(0.0, 0.7, 10), -1.5, 1.5).round(4)
+def joint_turns(pose: np.ndarray) -> np.ndarray:
+    """Rotation of each joint's segment from the rest frame to the world: (16, 3, 3).
+
+    Args:
+        pose: (16, 3) axis-angle rad.
+    """
+    from scipy.spatial.transform import Rotation
+
+    turns = Rotation.from_rotvec(pose).as_matrix()
+    for joint, parent in enumerate(PARENTS):
+        if parent >= 0:
+            turns[joint] = turns[parent] @ turns[joint]
+    return turns
 
 
 @lru_cache(maxsize=8)
@@ -113,18 +129,8 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
     """
     import torch
 
-    from hwp_bench.hands import load_template
-
-    texture = None
-    if subject.model.startswith("gltf:"):
-        from hwp_bench.sim.subject.rigs import load_rig
-
-        model = load_template("anny", side)
-        template, texture = load_rig(subject.model.removeprefix("gltf:"), side, model)
-        betas = np.zeros(10)
-    else:
-        template = model = load_template(subject.model, side)
-        betas = subject_betas(subject)
+    who = person(subject, side)
+    template, betas, model = who.template, who.betas, who.model
     faces = template.faces
     corner_uv = template.uv[template.face_uv]
     lift = None
@@ -140,26 +146,32 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
         faces, count = fine, step.shape[0]
     smooth = smoothing(faces, count, rounds=max(2 * subdivisions - 1, 0))
     lift = smooth if lift is None else (smooth @ lift).tocsr()
-    joints = template.joints + template.joint_basis @ betas
     normal_sum = normal_operator(faces, count)
     rest = lift @ (template.vertices + template.shape_basis @ betas)
     normals = surface_normals(rest, faces, normal_sum)
-    anatomy = anatomy_at(template, betas, rest, normals, lift @ template.weights)
+    places = anatomy_at(template, betas, rest, normals, lift @ template.weights, who.joints)
     # A rig with a texture of its own keeps it, and so its bare surface.
-    paint = of_side(subject, side) if texture is None else replace(subject, looks=PLAIN)
+    paint = of_side(subject, side) if who.texture is None else replace(subject, looks=PLAIN)
+    relief, nails = painted(places, paint, fine=False).height, None
+    anatomy = subject_anatomy(subject)
+    if anatomy is not None:
+        mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
+        relief = relief + bone_relief(places, anatomy)
+        nails = grown_nails(places, anatomy, mirror)
     return SubjectHand(
         template=template,
         model=model,
         tensors=template.to_torch(dtype=torch.float64),
         betas=betas,
-        joints=joints,
+        joints=who.joints,
         model_joints=model.joints + model.joint_basis @ betas,
         lift=lift,
         faces=faces,
         corner_uv=corner_uv,
         normal_sum=normal_sum,
-        relief=painted(anatomy, paint, fine=False).height,
-        texture=texture,
+        relief=relief,
+        texture=who.texture,
+        nails=nails,
     )
 
 
@@ -169,6 +181,7 @@ def anatomy_at(
     points: np.ndarray,
     normals: np.ndarray,
     weights: np.ndarray,
+    joints: np.ndarray | None = None,
 ) -> Anatomy:
     """The anatomy at places of a rest hand of either side.
 
@@ -178,14 +191,17 @@ def anatomy_at(
         points: (N, 3) m.
         normals: (N, 3) unit.
         weights: (N, 16) skinning weights.
+        joints: (16, 3) m, of the skeleton at rest; the template's if None.
     """
+    if joints is None:
+        joints = template.joints + template.joint_basis @ betas
     mirror = np.array([1.0 if template.side == "right" else -1.0, 1.0, 1.0])
     shaped = template.vertices + template.shape_basis @ betas
     return Anatomy(
         points=points * mirror,
         normals=normals * mirror,
         weights=weights,
-        joints=(template.joints + template.joint_basis @ betas) * mirror,
+        joints=joints * mirror,
         tips=shaped[template.fingertips] * mirror,
     )
 

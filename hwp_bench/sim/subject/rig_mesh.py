@@ -140,19 +140,23 @@ def outlines(faces: np.ndarray) -> list[np.ndarray]:
     loops = []
     while onward:
         path = [next(iter(onward))]
+        place = {path[0]: 0}
         while path:
             ends = onward.get(path[-1])
             if ends is None:
-                path.pop()
+                del place[path.pop()]
                 continue
             step = ends.pop()
             if not ends:
                 del onward[path[-1]]
-            if step in path:
-                first = path.index(step)
-                loops.append(np.array(path[first:], dtype=np.int64))
-                del path[first + 1 :]
+            if step in place:
+                loop = path[place[step] :]
+                loops.append(np.array(loop, dtype=np.int64))
+                for vertex in loop[1:]:
+                    del place[vertex]
+                del path[place[step] + 1 :]
             else:
+                place[step] = len(path)
                 path.append(step)
     return [loop for loop in loops if len(loop) >= 3]
 

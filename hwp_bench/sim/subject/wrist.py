@@ -46,7 +46,7 @@ def opened_at_wrist(mesh: RigMesh, joints: np.ndarray, forward: np.ndarray, wher
     Raises:
         BadHandModel: no place near the wrist's joint has skin all around it.
     """
-    mesh = _of_the_hand(mesh, joints)
+    mesh = _of_the_hand(mesh, joints, where)
     rim = _wrist_outline(mesh, joints[0], forward)
     if rim is None:
         behind = (joints[0] - mesh.vertices) @ forward
@@ -56,7 +56,7 @@ def opened_at_wrist(mesh: RigMesh, joints: np.ndarray, forward: np.ndarray, wher
                 where=where,
                 remedy="Move the joint to where the hand begins.",
             )
-        mesh = _of_the_hand(cut(mesh, _plane(mesh, behind, forward) - behind), joints)
+        mesh = _of_the_hand(cut(mesh, _plane(mesh, behind, forward) - behind), joints, where)
         rim = _wrist_outline(mesh, joints[0], forward)
     if rim is None:
         raise BadHandModel(
@@ -71,15 +71,18 @@ def opened_at_wrist(mesh: RigMesh, joints: np.ndarray, forward: np.ndarray, wher
     return closed(mesh, [loop for loop in outlines(mesh.faces) if set(loop.tolist()) != wrist])
 
 
-def _of_the_hand(mesh: RigMesh, joints: np.ndarray) -> RigMesh:
+def _of_the_hand(mesh: RigMesh, joints: np.ndarray, where: str) -> RigMesh:
     """Without pieces that are far from all joints, and without what no triangle uses."""
     from scipy.spatial import cKDTree
 
     piece = components(mesh.faces, len(mesh.vertices))
     distance, _ = cKDTree(joints).query(mesh.vertices)
-    nearest = np.full(piece.max() + 1, np.inf)
+    nearest = np.full(piece.max(initial=0) + 1, np.inf)
     np.minimum.at(nearest, piece, distance)
-    return kept(mesh, nearest[piece[mesh.faces[:, 0]]] < _FAR)
+    near = nearest[piece[mesh.faces[:, 0]]] < _FAR
+    if not near.any():
+        raise BadHandModel("has no skin near the hand's joints", where=where)
+    return kept(mesh, near)
 
 
 def _plane(mesh: RigMesh, behind: np.ndarray, forward: np.ndarray) -> float:

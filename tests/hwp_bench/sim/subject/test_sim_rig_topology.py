@@ -11,7 +11,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from rig_files import (
+
+from benchmarks.rig_files import (
     Piece,
     boxes,
     capped,
@@ -22,7 +23,6 @@ from rig_files import (
     without_nails,
     write_rig,
 )
-
 from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.sim.geometry.mesh import boundary_loop
@@ -263,6 +263,20 @@ def test_what_has_no_wrist_is_one_message(tmp_path: Path, free: HandTemplate) ->
     path = write_rig(tmp_path / "half.glb", [Piece(fine.vertices, fine.faces[below], fine.weights)])
     with pytest.raises(BadHandModel, match="outline around its wrist"):
         load_rig(str(path), "right", free)
+
+
+def test_skin_far_from_the_joints_is_one_message(tmp_path: Path, free: HandTemplate) -> None:
+    piece = split_at_seams(free)
+    far = Piece(piece.vertices + 2.0, piece.faces, piece.weights)
+    with pytest.raises(BadHandModel, match="no skin near"):
+        load_rig(str(write_rig(tmp_path / "hand.glb", [far])), "right", free)
+
+
+def test_outlines_that_touch_are_told_apart() -> None:
+    # Two squares of two triangles each that share a corner, and a triangle alone.
+    faces = np.array([[0, 1, 2], [0, 2, 3], [0, 4, 5], [0, 5, 6], [7, 8, 9]])
+    found = sorted(sorted(loop.tolist()) for loop in outlines(faces))
+    assert found == [[0, 1, 2, 3], [0, 4, 5, 6], [7, 8, 9]]
 
 
 def test_a_rest_pose_of_its_own_becomes_the_hand_models(tmp_path: Path, free: HandTemplate) -> None:

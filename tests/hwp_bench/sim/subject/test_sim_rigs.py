@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from rig_files import split_at_seams, write_rig
 
+from benchmarks.rig_files import split_at_seams, write_rig
 from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.sim.render.frame import render_frame

@@ -1,4 +1,4 @@
-"""Rigged hands as glTF files for tests: the free hand in other topologies, a hand of boxes."""
+"""Rigged hands as glTF files: the free hand in other topologies, and a hand of boxes."""
 
 from __future__ import annotations
 
