@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 from collections import Counter
 from collections.abc import Callable
@@ -69,6 +70,9 @@ def kept(
         person.append([LOOKS_VERSION, looks])
     if part:
         person.append(part)
+    if hand.template is not hand.model:
+        # A template's digest is of its shape; other subjects may lay out the same shape otherwise.
+        person.append(hashlib.sha256(np.round(hand.corner_uv, 6).tobytes()).hexdigest())
     key = sha256_json([SKIN_VERSION, ATLAS, hand.template.digest, hand.betas.tolist(), person])
     path = cache_root() / "sim" / "skin" / f"{key}.npz"
     if path.exists():

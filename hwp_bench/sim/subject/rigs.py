@@ -18,6 +18,7 @@ from hwp_bench.sim.subject.joint_names import hand_joints, is_elsewhere, side_of
 from hwp_bench.sim.subject.rest_pose import into_rest_pose
 from hwp_bench.sim.subject.rig_mesh import RigMesh, kept
 from hwp_bench.sim.subject.skinned_mesh import SkinnedMesh, read_skinned_mesh
+from hwp_bench.sim.subject.texture_sheet import paintable
 from hwp_bench.sim.subject.wrist import opened_at_wrist
 
 #: Most triangles of a hand; images here are too small to show more.
@@ -97,6 +98,9 @@ def _template(
             where=path,
             remedy="Decimate the mesh.",
         )
+    uv, face_uv = mesh.uv, mesh.face_uv
+    if file.sheet.texture is None:
+        uv, face_uv = paintable(uv, face_uv)
     tips = _fingertips(mesh, joints, path)
     vertices, joints = into_rest_pose(
         mesh.vertices, mesh.weights, joints, mesh.vertices[tips], target, target_tips
@@ -112,8 +116,8 @@ def _template(
         joint_basis=np.zeros((JOINT_COUNT, 3, SHAPE_COUNT)),
         weights=mesh.weights,
         mean_pose=np.zeros(3 * (JOINT_COUNT - 1)),
-        uv=mesh.uv,
-        face_uv=mesh.face_uv,
+        uv=uv,
+        face_uv=face_uv,
         fingertips=tips,
         where=path,
     )

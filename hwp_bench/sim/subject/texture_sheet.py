@@ -47,17 +47,13 @@ class Sheet:
 
 
 def joined_sheet(parts: list[Part]) -> Sheet:
-    """Put textures side by side, and coordinates with them.
-
-    Where no part has a texture, the coordinates are only a place to paint on: those of the file
-    if every triangle has a place of its own there, else packed ones.
-    """
+    """Put textures side by side, and coordinates with them."""
     starts = np.cumsum([0, *(len(part.vertices) for part in parts)])
     faces = np.concatenate([part.faces + start for part, start in zip(parts, starts, strict=False)])
     blank = [np.zeros((len(part.vertices), 2)) if part.uv is None else part.uv for part in parts]
     uv = np.concatenate(blank)
     if all(part.texture is None for part in parts):
-        return Sheet(*((uv, faces) if _apart(uv[faces]) else packed(len(faces))), None)
+        return Sheet(uv, faces, None)
     if len(parts) == 1:
         return Sheet(uv, faces, _tinted(parts[0]))
     corners = []
@@ -73,6 +69,16 @@ def joined_sheet(parts: list[Part]) -> Sheet:
         np.arange(3 * len(joined)).reshape(-1, 3),
         _side_by_side([_tinted(part) for part in parts]),
     )
+
+
+def paintable(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Coordinates to paint skin on: these if every triangle has its own place, else packed ones.
+
+    Args:
+        uv: (T, 2) coordinates of a whole mesh, after it was cut and closed.
+        faces: (F, 3) indices into them.
+    """
+    return (uv, faces) if _apart(uv[faces]) else packed(len(faces))
 
 
 def packed(count: int) -> tuple[np.ndarray, np.ndarray]:

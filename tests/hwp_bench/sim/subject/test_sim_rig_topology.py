@@ -115,6 +115,14 @@ def test_the_surface_is_the_one_that_was_written(
     assert (distance > 1e-4).mean() < 0.05
     assert len(np.unique(components(rig.faces, len(rig.vertices)))) == 1
     assert np.isfinite(rig.vertices).all()
+    # Skin can be painted: triangles cover the sheet without covering one another.
+    corners = rig.uv[rig.face_uv]
+    a, b = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    image = np.zeros((512, 512), dtype=np.uint8)
+    for corner in np.round(corners * 511 * 16).astype(np.int32):
+        cv2.fillConvexPoly(image, corner, 1, shift=4)
+    area = np.abs(a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum() / 2
+    assert 0.02 < area < 1.15 * image.mean()
     np.testing.assert_allclose(rig.weights.sum(axis=1), 1.0, atol=1e-9)
 
 
