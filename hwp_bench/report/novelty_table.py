@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 
 import numpy as np
 
@@ -48,7 +49,7 @@ def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     Raises:
         UsageError: no capture or no prediction is at hand, or a split is not the usual one.
     """
-    totals = [_pooled(source, captures) for source in sources]
+    totals = _pooled(sources, captures)
     if not any(pixels.any() for pixels, _ in totals):
         raise UsageError(
             "none of these captures, or none of the predictions, is at hand",
@@ -93,45 +94,63 @@ def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
 
 
 def _pooled(
-    source: ResultsSource, captures: Mapping[str, Capture]
-) -> tuple[np.ndarray, np.ndarray]:
-    """Scored pixels, and their squared error, of each of `CLASSES`."""
-    pixels, errors = np.zeros(len(CLASSES)), np.zeros(len(CLASSES))
-    found = [item for item in source.results.captures if item.digest in captures]
-    for item in track(found, source.results.method.title, len(found)):
-        capture = captures[item.digest]
-        split = split_for(item.id, len(capture))
-        if split.digest != item.split_digest:
-            raise UsageError(
-                "was not split by the 80/10/10 rule; novelty needs its training frames",
-                where=item.id,
-                field="RESULTS",
-            )
-        for index, error in _classified(source, item, capture, split):
-            np.add.at(pixels, index, 1.0)
-            np.add.at(errors, index, error)
-    return pixels, errors
+    sources: Sequence[ResultsSource], captures: Mapping[str, Capture]
+) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Scored pixels, and their squared error, of each of `CLASSES`, for each evaluation.
 
-
-def _classified(
-    source: ResultsSource, item: CaptureResult, capture: Capture, split: Split
-) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """For each predicted frame twice, by angle and by share: classes and errors of its pixels."""
-    folder = source.place(item.id, "predictions")
-    scored = [frame.frame for frame in item.frames if frame.failure is None]
-    if folder is None or not folder.is_dir():
-        return
-    for novelty in measure_novelty(capture, split, scored):
-        path = folder / frame_name(novelty.frame)
-        if not path.is_file() or path.is_symlink():
+    Novelty is the captures' own, so that each of them is measured once for all methods.
+    """
+    totals = [(np.zeros(len(CLASSES)), np.zeros(len(CLASSES))) for _ in sources]
+    for digest, capture in track(captures.items(), "Novelty", len(captures)):
+        split = split_for(capture.info.id, len(capture))
+        runs = [
+            (_scored_files(source, item, split), total)
+            for source, total in zip(sources, totals, strict=True)
+            for item in source.results.captures
+            if item.digest == digest
+        ]
+        frames = sorted({frame for files, _ in runs for frame in files})
+        if not frames:
             continue
-        prediction = read_rgb(path, capture.size) / 255.0
-        mask, exact = capture.scoring_mask(novelty.frame)
-        region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
-        error = squared_error(prediction, capture.frame(novelty.frame) / 255.0)[region]
-        angle, share = classes_of(novelty, region)
-        yield angle, error
-        yield share, error
+        for novelty in measure_novelty(capture, split, frames):
+            mask, exact = capture.scoring_mask(novelty.frame)
+            region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
+            target = capture.frame(novelty.frame) / 255.0
+            classes = classes_of(novelty, region)
+            for files, (pixels, errors) in runs:
+                if novelty.frame not in files:
+                    continue
+                prediction = read_rgb(files[novelty.frame], capture.size) / 255.0
+                error = squared_error(prediction, target)[region]
+                for index in classes:
+                    np.add.at(pixels, index, 1.0)
+                    np.add.at(errors, index, error)
+    return totals
+
+
+def _scored_files(source: ResultsSource, item: CaptureResult, split: Split) -> dict[int, Path]:
+    """The stored predictions of the frames that were scored, by frame.
+
+    Raises:
+        UsageError: the split is not the usual one.
+    """
+    if split.digest != item.split_digest:
+        raise UsageError(
+            "was not split by the 80/10/10 rule; novelty needs its training frames",
+            where=item.id,
+            field="RESULTS",
+        )
+    folder = source.place(item.id, "predictions")
+    if folder is None:
+        return {}
+    files = {
+        frame.frame: folder / frame_name(frame.frame)
+        for frame in item.frames
+        if frame.failure is None
+    }
+    return {
+        frame: path for frame, path in files.items() if path.is_file() and not path.is_symlink()
+    }
 
 
 def classes_of(novelty: Novelty, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
