@@ -13,7 +13,7 @@ from hwp_bench.sim.geometry.surface import Material, Surface
 from hwp_bench.sim.scene.motion import HandMoment, heading_matrix
 from hwp_bench.sim.scene.optics import focus_point
 from hwp_bench.sim.scene.schema import Subject
-from hwp_bench.sim.subject.atlas import skin_atlas
+from hwp_bench.sim.subject.atlas import SkinAtlas, skin_atlas
 from hwp_bench.sim.subject.forearm import arm_atlas, arm_openness, forearm, seamless, wrist_loop
 from hwp_bench.sim.subject.gloves import covered
 from hwp_bench.sim.subject.hand import FINE, anatomy_at, subject_hand
@@ -133,7 +133,7 @@ def _gloved_faces(subject: Subject, side: str, subdivisions: int) -> np.ndarray:
     """(F,) 1 where most of a face is under a glove."""
     hand = subject_hand(subject, side, subdivisions)
     template = hand.template
-    rest = hand.lift @ (template.vertices + template.shape_basis @ hand.betas)
+    rest = hand.rest
     normals = surface_normals(rest, hand.faces, hand.normal_sum)
     weights = hand.lift @ template.weights
     anatomy = anatomy_at(template, hand.betas, rest, normals, weights, hand.joints)
@@ -151,19 +151,15 @@ def _skin(subject: Subject, side: str) -> Material:
             specular=0.028,
             wrap=_WRAP,
         )
-    atlas = skin_atlas(of_side(subject, side))
-    return Material(
-        albedo=atlas.albedo,
-        roughness=atlas.roughness,
-        specular=0.028,
-        height=atlas.height,
-        wrap=_WRAP,
-    )
+    return _painted_skin(skin_atlas(of_side(subject, side)))
 
 
 @lru_cache(maxsize=4)
 def _arm_skin(subject: Subject) -> Material:
-    atlas = arm_atlas(subject)
+    return _painted_skin(arm_atlas(subject))
+
+
+def _painted_skin(atlas: SkinAtlas) -> Material:
     return Material(
         albedo=atlas.albedo,
         roughness=atlas.roughness,

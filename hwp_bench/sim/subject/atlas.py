@@ -105,7 +105,7 @@ def _paint(hand: SubjectHand, subject: Subject) -> SkinAtlas:
     corners = hand.faces[hits.face]
     template = hand.template
 
-    rest = hand.lift @ (template.vertices + template.shape_basis @ hand.betas)
+    rest = hand.rest
     normals = surface_normals(rest, hand.faces, hand.normal_sum)
 
     def spread(values: np.ndarray) -> np.ndarray:

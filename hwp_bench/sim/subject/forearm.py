@@ -11,16 +11,12 @@ from functools import lru_cache
 
 import numpy as np
 
-from hwp_bench.sim.geometry.mesh import (
-    boundary_loop,
-    normal_operator,
-    surface_normals,
-    unit,
-)
+from hwp_bench.sim.geometry.mesh import boundary_loop, unit
 from hwp_bench.sim.geometry.surface import Material, Surface
 from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.atlas import SkinAtlas, kept
-from hwp_bench.sim.subject.hand import FINE, SubjectHand, anatomy_at, subject_hand
+from hwp_bench.sim.subject.hand import FINE, anatomy_at, subject_hand
+from hwp_bench.sim.subject.limb import ringed
 from hwp_bench.sim.subject.painting import of_side, painted
 
 # Rings along the arm, m behind the rim, and how much wider than the wrist they are.
@@ -60,7 +56,7 @@ def wrist_loop(subject: Subject, side: str, subdivisions: int = FINE) -> Rim:
         subdivisions: of the hand's mesh.
     """
     hand = subject_hand(subject, side, subdivisions)
-    rest = _rest(hand)
+    rest = hand.rest
     loop = boundary_loop(hand.faces)
     mirror = 1.0 if side == "right" else -1.0
     places = (rest[loop] - rest[loop].mean(axis=0)) * np.array([mirror, 1.0, 1.0])
@@ -82,34 +78,11 @@ def forearm(
         skin: what it is covered with.
     """
     vertices = _rings(rim, forward, elbow)
-    count, spokes = len(_BACK), len(rim)
-    ring, spoke = np.meshgrid(np.arange(count - 1), np.arange(spokes), indexing="ij")
-    following = (spoke + 1) % spokes
-    a, b = (ring * spokes + spoke).ravel(), (ring * spokes + following).ravel()
-    c, d = a + spokes, b + spokes
-    faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
-    left = around[spoke.ravel()]
-    right = around[following.ravel()] + (following.ravel() == 0)
     # From the middle of the first row of texels to that of the last: textures repeat beyond.
     rows = _TEXTURE[0]
     down = (0.5 + _BACK / _BACK[-1] * (rows - 1)) / rows
-    near, far = (1.0 - down[ring.ravel() + step] for step in (0, 1))
-    uv_a, uv_b = np.stack([left, near], 1), np.stack([right, near], 1)
-    uv_c, uv_d = np.stack([left, far], 1), np.stack([right, far], 1)
-    corner_uv = np.concatenate([np.stack([uv_a, uv_c, uv_b], 1), np.stack([uv_b, uv_c, uv_d], 1)])
-    normals = surface_normals(vertices, faces, normal_operator(faces, len(vertices)))
-    outward = vertices - np.repeat(vertices.reshape(count, spokes, 3).mean(axis=1), spokes, axis=0)
-    if np.einsum("ni,ni->n", normals, outward).sum() < 0:
-        faces, corner_uv, normals = faces[:, ::-1], corner_uv[:, ::-1], -normals
-    return Surface(
-        vertices=vertices,
-        normals=normals,
-        faces=np.ascontiguousarray(faces),
-        corner_uv=np.ascontiguousarray(corner_uv),
-        material=np.zeros(len(faces), dtype=np.int64),
-        materials=(skin,),
-        hand=np.zeros(len(faces), dtype=bool),
-    )
+    following = np.append(around[1:], around[0] + 1.0)
+    return ringed(vertices, (around, following), 1.0 - down, skin)
 
 
 def seamless(hand: Surface, arm: Surface, loop: np.ndarray) -> tuple[Surface, Surface]:
@@ -144,7 +117,7 @@ def rest_arm(subject: Subject, side: str, subdivisions: int = FINE) -> np.ndarra
     """Vertices of the arm behind the rest hand, in the order of `forearm`: (A, 3) m."""
     hand = subject_hand(subject, side, subdivisions)
     loop = wrist_loop(subject, side, subdivisions).loop
-    rim = _rest(hand)[loop]
+    rim = hand.rest[loop]
     forward = unit(hand.joints[4] - hand.joints[0])
     return _rings(rim, forward, rim.mean(axis=0) - forward)
 
@@ -196,11 +169,6 @@ def _spread(values: np.ndarray, around: np.ndarray) -> np.ndarray:
     share = ((back - _BACK[step]) / (_BACK[step + 1] - _BACK[step]))[:, None, None]
     texels = wide[step] + share * (wide[step + 1] - wide[step])
     return texels.transpose(0, 2, 1).reshape(-1, 3)
-
-
-def _rest(hand: SubjectHand) -> np.ndarray:
-    """The smooth surface of the rest hand: (V, 3) m."""
-    return hand.lift @ (hand.template.vertices + hand.template.shape_basis @ hand.betas)
 
 
 def _rings(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray) -> np.ndarray:

@@ -61,6 +61,14 @@ class SubjectHand:
     #: Nails that stand out, or None.
     nails: Nails | None = None
 
+    @property
+    def rest(self) -> np.ndarray:
+        """(V, 3) m, the fine mesh at rest without its relief; computed at each call."""
+        smooth: np.ndarray = self.lift @ (
+            self.template.vertices + self.template.shape_basis @ self.betas
+        )
+        return smooth
+
     def pose(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose the fine mesh.
 

@@ -8,9 +8,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.sim.geometry.mesh import boundary_loop, normal_operator, surface_normals, unit
+from hwp_bench.sim.geometry.mesh import boundary_loop, unit
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import Material, Surface
+from hwp_bench.sim.subject.limb import ringed
 
 if TYPE_CHECKING:
     from hwp_bench.hands import HandTemplate
@@ -81,29 +82,8 @@ def sleeve(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray, material: Ma
         rings.append(
             place + size[:, None] * (np.cos(around)[:, None] * x + np.sin(around)[:, None] * y)
         )
-    vertices = np.concatenate(rings)
     count = len(rings)
-    ring, spoke = np.meshgrid(np.arange(count - 1), np.arange(_AROUND), indexing="ij")
-    a = (ring * _AROUND + spoke).ravel()
-    b = (ring * _AROUND + (spoke + 1) % _AROUND).ravel()
-    c, d = a + _AROUND, b + _AROUND
-    faces = np.concatenate([np.stack([a, c, b], axis=1), np.stack([b, c, d], axis=1)])
-    along = (np.arange(count) / (count - 1) * 2.0)[ring.ravel()]
-    next_along = (np.arange(count) / (count - 1) * 2.0)[ring.ravel() + 1]
-    left, right = spoke.ravel() / _AROUND, (spoke.ravel() + 1) / _AROUND
-    uv_a, uv_b = np.stack([left, along], 1), np.stack([right, along], 1)
-    uv_c, uv_d = np.stack([left, next_along], 1), np.stack([right, next_along], 1)
-    corner_uv = np.concatenate([np.stack([uv_a, uv_c, uv_b], 1), np.stack([uv_b, uv_c, uv_d], 1)])
-    normals = surface_normals(vertices, faces, normal_operator(faces, len(vertices)))
-    outward = vertices - np.repeat([ring.mean(axis=0) for ring in rings], _AROUND, axis=0)
-    if np.einsum("ni,ni->n", normals, outward).sum() < 0:
-        faces, corner_uv, normals = faces[:, ::-1], corner_uv[:, ::-1], -normals
-    return Surface(
-        vertices=vertices,
-        normals=normals,
-        faces=np.ascontiguousarray(faces),
-        corner_uv=np.ascontiguousarray(corner_uv),
-        material=np.zeros(len(faces), dtype=np.int64),
-        materials=(material,),
-        hand=np.zeros(len(faces), dtype=bool),
-    )
+    spokes = np.arange(_AROUND)
+    along = np.arange(count) / (count - 1) * 2.0
+    around_uv = (spokes / _AROUND, (spokes + 1) / _AROUND)
+    return ringed(np.concatenate(rings), around_uv, along, material)

@@ -148,7 +148,7 @@ def _wrist_mount(subject: Subject, side: str, item: WristWear, subdivisions: int
 
 def _rest_skin(hand: SubjectHand) -> np.ndarray:
     """The rest hand with its relief: (V, 3) m."""
-    smooth = hand.lift @ (hand.template.vertices + hand.template.shape_basis @ hand.betas)
+    smooth = hand.rest
     normals = surface_normals(smooth, hand.faces, hand.normal_sum)
     return smooth + hand.relief[:, None] * normals
 
