@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from flat_surface import facing_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
@@ -256,16 +257,7 @@ def _walls(depths: tuple[float, ...]) -> Surface:
     faces = np.concatenate(
         [4 * index + np.array([[0, 1, 2], [0, 2, 3]]) for index in range(len(depths))]
     )
-    return Surface(
-        vertices=vertices,
-        normals=np.tile([0.0, 0.0, -1.0], (len(vertices), 1)),
-        faces=faces,
-        corner_uv=np.zeros((len(faces), 3, 2)),
-        material=np.zeros(len(faces), dtype=np.int64),
-        materials=(plain((0.5, 0.5, 0.5)),),
-        hand=np.ones(len(faces), dtype=bool),
-        openness=np.ones(len(vertices)),
-    )
+    return facing_camera(vertices, faces)
 
 
 @pytest.mark.parametrize("thickness", [0.002, 0.006])

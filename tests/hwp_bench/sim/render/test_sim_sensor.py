@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pytest
+from flat_surface import facing_camera
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
@@ -18,7 +19,7 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.sim.effects.base import ORDER, SENSOR, registered
 from hwp_bench.sim.effects.plan import plan
 from hwp_bench.sim.geometry.raycast import RenderCost, Tracer
-from hwp_bench.sim.geometry.surface import Surface, plain
+from hwp_bench.sim.geometry.surface import Surface
 from hwp_bench.sim.render.exposure import knots, row_by_row
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.render.instant import Lens, render_instant
@@ -113,16 +114,7 @@ def _panel(width: float, height: float, parts: int) -> Surface:
     corner = (np.arange(parts)[:, None] * 3 + np.arange(2)).ravel()
     a, b, c, d = corner, corner + 1, corner + 3, corner + 4
     faces = np.concatenate([np.stack([a, b, c], axis=1), np.stack([b, d, c], axis=1)])
-    return Surface(
-        vertices=vertices,
-        normals=np.tile([0.0, 0.0, -1.0], (len(vertices), 1)),
-        faces=faces,
-        corner_uv=np.zeros((len(faces), 3, 2)),
-        material=np.zeros(len(faces), dtype=np.int64),
-        materials=(plain((0.5, 0.5, 0.5)),),
-        hand=np.ones(len(faces), dtype=bool),
-        openness=np.ones(len(vertices)),
-    )
+    return facing_camera(vertices, faces)
 
 
 def _moved(surface: Surface, way: np.ndarray) -> Surface:
