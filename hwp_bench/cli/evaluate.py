@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hwp_bench.run.engine.options import add_engine_arguments
+from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
     from hwp_bench.evaluation.evaluate import EvaluationSettings
@@ -55,7 +56,7 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
     what = parser.add_mutually_exclusive_group()
     what.add_argument(
         "--suite",
-        choices=("smoke", "mini", "full"),
+        choices=SUITES,
         default="mini",
         help="simulated captures, rendered on first use (default mini)",
     )

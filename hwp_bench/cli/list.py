@@ -88,9 +88,10 @@ def _perturbations() -> Table:
 def _suites() -> Table:
     from hwp_bench.base.tables import Column, Table
     from hwp_bench.sim import suite
+    from hwp_bench.taxonomy import SUITES
 
     rows = []
-    for name in ("smoke", "mini", "full"):
+    for name in SUITES:
         items = suite(name)
         rows.append(
             (

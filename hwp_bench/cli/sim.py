@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 
 from hwp_bench.run.engine.options import add_engine_arguments
+from hwp_bench.taxonomy import SUITES
 
 _EXAMPLES = """examples:
   hwp-bench sim list
@@ -12,11 +13,13 @@ _EXAMPLES = """examples:
   hwp-bench sim render --suite mini
   hwp-bench sim render capture0 -o my_capture --frames 60 --size 160 --severity 3
   hwp-bench sim render all -o captures --subject 7
+  hwp-bench sim preview wild-dev-3 -o preview
   hwp-bench sim render --suite full --engine ray://10.0.0.1:6379 --job-cpus 8
   hwp-bench sim preview capture5 -o preview
   hwp-bench sim calibrate my_scene.toml --write
 
-A scene is the name of one of the eleven captures or the path of a scene file.
+A scene is the name of one of the eleven captures, of a scene of wild-dev or wild-test such as
+wild-dev-3, or the path of a scene file. `all` are the eleven captures, wild-dev all of its own.
 """
 
 
@@ -53,7 +56,9 @@ def _add_list(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_plan(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene", metavar="SCENE", nargs="+", help="scene names, files, or all")
+    parser.add_argument(
+        "scene", metavar="SCENE", nargs="+", help="scene names, files, all, or a wild suite"
+    )
     _add_extent(parser)
     parser.add_argument(
         "--no-probe", action="store_true", help="count passes only, render no probe for the cost"
@@ -62,9 +67,11 @@ def _add_plan(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_render(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene", metavar="SCENE", nargs="?", help="scene name or file, or all")
-    parser.add_argument("-o", "--out", help="folder to make; for all and suites their parent")
-    parser.add_argument("--suite", choices=("smoke", "mini", "full"), help="render a suite")
+    parser.add_argument(
+        "scene", metavar="SCENE", nargs="?", help="scene name or file, all, or a wild suite"
+    )
+    parser.add_argument("-o", "--out", help="folder to make; for all and for suites their parent")
+    parser.add_argument("--suite", choices=SUITES, help="render a suite")
     _add_extent(parser)
     parser.add_argument("--severity", type=float, help="one severity, 1-5, for every episode")
     parser.add_argument("--subject", type=int, metavar="SEED", help="another person")
@@ -92,7 +99,9 @@ def _add_gallery(parser: argparse.ArgumentParser) -> None:
 
 
 def _add_calibrate(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene", metavar="SCENE", nargs="+", help="scene names, files, or all")
+    parser.add_argument(
+        "scene", metavar="SCENE", nargs="+", help="scene names, files, all, or a wild suite"
+    )
     parser.add_argument("--effect", metavar="KIND", help="only this effect")
     parser.add_argument("--write", action="store_true", help="write strengths into the files")
     parser.add_argument("--json", action="store_true", help="print JSON")

@@ -24,6 +24,7 @@ from hwp_bench.base.records import (
     without_schema,
 )
 from hwp_bench.methods.contents import method_digest
+from hwp_bench.taxonomy import SIZED_LIKE
 
 #: Version of the method contract.
 SCHEMA = "hwp-method/1"
@@ -160,14 +161,15 @@ class MethodManifest:
 
         Args:
             name: what was asked for; None takes the one named like the suite where the method
-                has it, else `default`.
+                has it, else that of a suite of the same size, else `default`.
             suite: name of the suite.
 
         Raises:
             BadMethod: there is no such preset.
         """
         if name is None:
-            return suite if suite in self.presets else DEFAULT_PRESET
+            fitting = (suite, SIZED_LIKE.get(suite, ""))
+            return next((name for name in fitting if name in self.presets), DEFAULT_PRESET)
         if name not in self.presets and name != DEFAULT_PRESET:
             raise BadMethod(
                 f"has no preset {name!r}",

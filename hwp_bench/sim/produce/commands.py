@@ -8,7 +8,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.sim.scene.reader import load_scene, scene_names, scene_path
+from hwp_bench.sim.scene.reader import (
+    known_scenes,
+    load_scene,
+    scene_groups,
+    scene_names,
+    scene_path,
+)
 from hwp_bench.sim.scene.schema import Scene
 
 if TYPE_CHECKING:
@@ -23,7 +29,7 @@ def list_scenes(args: argparse.Namespace) -> int:
     from hwp_bench.sim.props.objects import object_names
     from hwp_bench.sim.scene.gestures import gestures
 
-    scenes = [load_scene(name) for name in scene_names()]
+    scenes = [load_scene(name) for name in known_scenes()]
     suites = {name: [item.scene.id for item in suite(name)] for name in suite_names()}
     parts = {
         "suites": suites,
@@ -50,7 +56,7 @@ def list_scenes(args: argparse.Namespace) -> int:
         return 0
     for scene in scenes:
         effects = ", ".join(call.kind for call in scene.effects)
-        print(f"{scene.id:<10} {scene.frame_count:>5} frames  {scene.title} ({effects})")
+        print(f"{scene.id:<11} {scene.frame_count:>5} frames  {scene.title} ({effects})")
     for name, ids in suites.items():
         print(f"suite {name}: {', '.join(ids)}")
     for name in ("objects", "gestures", "backgrounds"):
@@ -115,7 +121,7 @@ def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine
     needs = needs_of(args)
     jobs = []
     for scene in scenes:
-        out = Path(args.out) / scene.id if args.scene == "all" else Path(args.out)
+        out = Path(args.out) / scene.id if len(scenes) > 1 else Path(args.out)
         if not args.overwrite and (out.is_file() or (out.is_dir() and any(out.iterdir()))):
             raise UsageError(
                 "exists already", where=out, remedy="Choose another place or --overwrite."
@@ -168,7 +174,7 @@ def calibrate_scenes(args: argparse.Namespace) -> int:
         calls = [call for call in scene.effects if args.effect in (None, call.kind)]
         results = [calibrate(scene, call) for call in calls]
         if args.write:
-            write_strengths(scene_path(name) if name in scene_names() else Path(name), results)
+            write_strengths(scene_path(name) if name in known_scenes() else Path(name), results)
         for item in results:
             rows.append(
                 {
@@ -191,7 +197,9 @@ def calibrate_scenes(args: argparse.Namespace) -> int:
 
 
 def _names(names: list[str]) -> list[str]:
-    return list(scene_names()) if names == ["all"] else names
+    """The scenes that are meant: `all` are the eleven captures, a group's name all of its own."""
+    groups = {"all": scene_names()} | {group: scene_names(group) for group in scene_groups()}
+    return [scene for name in names for scene in groups.get(name, (name,))]
 
 
 def _scenes(names: list[str]) -> list[Scene]:

@@ -45,6 +45,7 @@ from hwp_bench.sim.scene.schema import Scene
 from hwp_bench.sim.subject.atlas import skin_atlas
 from hwp_bench.sim.subject.hand import scene_hands
 from hwp_bench.sim.subject.painting import of_side
+from hwp_bench.sim.subject.rigs import rig_path
 
 #: Version of the pixels that the renderer makes; part of every render key.
 RENDERER = 9
@@ -245,7 +246,7 @@ def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters
 
 def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
     model = scene_hands(scene)[scene.sides[0]].model
-    known = "anny" if scene.subject.model.startswith("gltf:") else scene.subject.model
+    known = "anny" if rig_path(scene.subject.model) is not None else scene.subject.model
     return CaptureInfo(
         id=scene.id,
         hands=scene.hands,

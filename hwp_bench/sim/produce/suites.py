@@ -14,7 +14,7 @@ from hwp_bench.base.files import cache_root
 from hwp_bench.base.locks import exclusive
 from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
 from hwp_bench.run.engine.job import OnProgress
-from hwp_bench.sim.scene.reader import load_scene, scene_names
+from hwp_bench.sim.scene.reader import load_scene, scene_groups, scene_names
 from hwp_bench.sim.scene.schema import Scene
 
 #: Seconds between two counts of the frames that wait.
@@ -38,18 +38,20 @@ class SuiteItem:
 # One single-hand and one interacting capture for each perturbation: interaction 0 and 5,
 # complex poses 1 and 6, illumination 2 and 7, motion blur 3 and 4.
 _MINI = tuple(f"capture{number}" for number in range(8))
-# Captures, frames (None: the paper's) and size of each suite.
+# Captures (None: all of the group of scenes with the suite's name, or the eleven), frames (None:
+# the paper's) and size of each suite.
 _SUITES: Mapping[str, tuple[tuple[str, ...] | None, int | None, int]] = MappingProxyType(
     {
         "smoke": (("capture0", "capture4"), 30, 112),
         "mini": (_MINI, 60, 176),
         "full": (None, None, 256),
+        "wild-dev": (None, 60, 176),
     }
 )
 
 
 def suite_names() -> tuple[str, ...]:
-    """Names of the suites, smallest first."""
+    """Names of the suites: those of the paper's captures, smallest first, then the wild ones."""
     return tuple(_SUITES)
 
 
@@ -57,7 +59,8 @@ def suite(name: str) -> tuple[SuiteItem, ...]:
     """Return the captures of a suite.
 
     Args:
-        name: `smoke` (seconds), `mini` (minutes) or `full` (hours).
+        name: `smoke` (seconds), `mini` (minutes), `full` (hours), or of scenes that are as wide
+            as the world: `wild-dev` (for tuning).
 
     Raises:
         UsageError: there is no such suite.
@@ -65,7 +68,8 @@ def suite(name: str) -> tuple[SuiteItem, ...]:
     if name not in _SUITES:
         raise UsageError(f"there is no suite {name!r}", remedy=f"Known: {', '.join(_SUITES)}.")
     captures, frame_count, size = _SUITES[name]
-    scenes = [load_scene(capture) for capture in captures or scene_names()]
+    group = name if name in scene_groups() else ""
+    scenes = [load_scene(capture) for capture in captures or scene_names(group)]
     return tuple(
         SuiteItem(scene, frame_count or scene.frame_count, size, scene.seed) for scene in scenes
     )

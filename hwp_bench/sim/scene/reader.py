@@ -39,35 +39,52 @@ _SCENES = Path(__file__).with_name("scenes")
 
 
 @cache
-def scene_names() -> tuple[str, ...]:
-    """Names of the scenes that come with the package, in the catalogue's order."""
-    names = [path.stem for path in _SCENES.iterdir() if path.suffix == ".toml"]
+def scene_names(group: str = "") -> tuple[str, ...]:
+    """Names of scenes that come with the package.
+
+    Args:
+        group: one of `scene_groups`; the eleven captures, in the catalogue's order, if empty.
+    """
+    names = [path.stem for path in (_SCENES / group).iterdir() if path.suffix == ".toml"]
     return tuple(sorted(names, key=lambda name: (len(name), name)))
 
 
+@cache
+def scene_groups() -> tuple[str, ...]:
+    """Names of the groups of further scenes, each a folder of its own, such as `wild-dev`."""
+    return tuple(sorted(path.name for path in _SCENES.iterdir() if path.is_dir()))
+
+
 def scene_path(name: str) -> Path:
-    """Path of the file of a scene that comes with the package."""
-    return _SCENES / f"{name}.toml"
+    """Path of the file of a scene that comes with the package; of one of a group too."""
+    group = next((group for group in scene_groups() if name in scene_names(group)), "")
+    return _SCENES / group / f"{name}.toml"
+
+
+def known_scenes() -> tuple[str, ...]:
+    """Names of all scenes that come with the package: the eleven captures, then each group's."""
+    return tuple(name for group in ("", *scene_groups()) for name in scene_names(group))
 
 
 def load_scene(name_or_path: str | Path) -> Scene:
     """Read a scene that comes with the package, or a scene file.
 
     Args:
-        name_or_path: `capture0` to `capture10`, or the path of a TOML file.
+        name_or_path: `capture0` to `capture10`, a scene of a group such as `wild-dev-3`, or the
+            path of a TOML file.
 
     Raises:
         UsageError: there is no such scene.
         BadInput: the file is damaged, or a field is missing, unknown or out of range.
     """
     name = str(name_or_path)
-    if name in scene_names():
+    if name in known_scenes():
         return parse_scene(scene_path(name).read_text("utf-8"), where=f"{name}.toml")
     path = Path(name_or_path)
     if not path.is_file():
         raise UsageError(
             f"there is no scene {name!r}",
-            remedy=f"Known: {', '.join(scene_names())}; or the path of a scene file.",
+            remedy=f"Known: {', '.join(known_scenes())}; or the path of a scene file.",
         )
     try:
         text = path.read_text(encoding="utf-8")

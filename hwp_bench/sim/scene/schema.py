@@ -63,7 +63,7 @@ class Subject:
     #: sRGB colour of the sleeve, 0-1 each.
     sleeve: tuple[_Share, _Share, _Share] = (0.25, 0.3, 0.4)
     #: Surface: `anny` (the free hand), `mano:PATH` or `mano-hd:PATH` where the user has it, or
-    #: `gltf:PATH`, a rigged hand.
+    #: `gltf:PATH`, a rigged hand, or `rig:NAME`, one that comes with the package.
     model: Words = "anny"
     #: Marks on the skin and what the person wears.
     looks: Looks = PLAIN

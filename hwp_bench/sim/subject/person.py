@@ -17,11 +17,10 @@ from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy
 from hwp_bench.sim.subject.best_betas import betas_of_joints, betas_of_surface
 from hwp_bench.sim.subject.off_template import off_template
+from hwp_bench.sim.subject.rigs import load_rig, rig_path
 
 if TYPE_CHECKING:
     from hwp_bench.hands import HandTemplate
-
-_RIG = "gltf:"
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +41,7 @@ class Person:
 
 def is_off_template(subject: Subject) -> bool:
     """Whether no shape of the hand model is the subject's geometry."""
-    return subject.model.startswith(_RIG) or subject_anatomy(subject) is not None
+    return rig_path(subject.model) is not None or subject_anatomy(subject) is not None
 
 
 def subject_anatomy(subject: Subject) -> SubjectAnatomy | None:
@@ -69,12 +68,10 @@ def person(subject: Subject, side: str) -> Person:
     """
     from hwp_bench.hands import load_template
 
-    texture, rigged = None, subject.model.startswith(_RIG)
-    if rigged:
-        from hwp_bench.sim.subject.rigs import load_rig
-
+    texture, rig = None, rig_path(subject.model)
+    if rig is not None:
         model = load_template("anny", side)
-        template, texture = load_rig(subject.model.removeprefix(_RIG), side, model)
+        template, texture = load_rig(rig, side, model)
         betas = np.zeros(10)
     else:
         template = model = load_template(subject.model, side)
@@ -83,7 +80,7 @@ def person(subject: Subject, side: str) -> Person:
     anatomy = subject_anatomy(subject)
     if anatomy is not None:
         template, joints = off_template(template, betas, anatomy, subject.seed)
-    if rigged:
+    if rig is not None:
         betas = betas_of_joints(model, joints)
     elif anatomy is not None:
         betas = betas_of_surface(model, template.vertices)

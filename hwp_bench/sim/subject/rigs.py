@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import BadHandModel, MissingDependency
+from hwp_bench.base.errors import BadHandModel, UsageError
 from hwp_bench.hands import HandTemplate, mirror_template
 from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, make_template
 from hwp_bench.sim.subject.joint_names import hand_joints, is_elsewhere, side_of_name
@@ -23,11 +23,36 @@ from hwp_bench.sim.subject.wrist import opened_at_wrist
 
 #: Most triangles of a hand; images here are too small to show more.
 MAX_HAND_FACES = 250_000
+#: What a subject's `model` begins with: the path of a file follows, or the name of a rig that
+#: comes with the package.
+FROM_FILE, SHIPPED = "gltf:", "rig:"
+_FOLDER = Path(__file__).with_name("rig_files")
 # Joints of the palm, which the hand model does not have; the wrist takes their weights.
 _FOLDED = ("metacarpal", "palm")
 _FINGERS = ("thumb", "index", "middle", "ring", "little")
 # Last joints of the fingers, in that order.
 _LAST = (15, 3, 6, 12, 9)
+
+
+def rig_path(model: str) -> str | None:
+    """The file of a subject's rig, or None where `model` names no rig.
+
+    Raises:
+        UsageError: no rig of that name comes with the package.
+    """
+    if model.startswith(FROM_FILE):
+        return model.removeprefix(FROM_FILE)
+    if not model.startswith(SHIPPED):
+        return None
+    known = {path.stem: str(path) for path in sorted(_FOLDER.glob("*.glb"))}
+    name = model.removeprefix(SHIPPED)
+    if name not in known:
+        raise UsageError(
+            f"there is no rig {name!r}",
+            field="subject.model",
+            remedy=f"Known: {', '.join(known)}; or gltf: and the path of a file.",
+        )
+    return known[name]
 
 
 def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, np.ndarray | None]:
@@ -45,14 +70,7 @@ def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, n
     Raises:
         BadHandModel: the file is missing or damaged, joints are missing (it names them), or the
             mesh has no wrist.
-        MissingDependency: pygltflib is not installed.
     """
-    try:
-        import pygltflib  # noqa: F401
-    except ImportError as error:
-        raise MissingDependency(
-            "reading a glTF hand needs pygltflib", remedy="pip install 'hwp-bench[gltf]'"
-        ) from error
     file = read_skinned_mesh(Path(path))
     index, told = hand_joints(file.joint_names, side, path)
     places = file.joint_places[index]

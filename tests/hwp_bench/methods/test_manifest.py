@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -34,6 +35,11 @@ def test_a_manifest_is_read(tmp_path: Path) -> None:
     assert manifest.preset(None, "smoke") == "smoke"
     assert manifest.preset(None, "mini") == "default"
     assert manifest.preset("smoke") == "smoke"
+    # The wild suites have the size of mini: its preset fits where they have none of their own.
+    assert manifest.preset(None, "wild-dev") == "default"
+    presets = {"mini": {}, "wild-dev": {}}
+    assert replace(manifest, presets={"mini": {}}).preset(None, "wild-dev") == "mini"
+    assert replace(manifest, presets=presets).preset(None, "wild-dev") == "wild-dev"
     with pytest.raises(BadMethod, match=r"no preset 'fast'. It has: default, smoke"):
         manifest.preset("fast")
 

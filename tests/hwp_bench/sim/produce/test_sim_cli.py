@@ -13,7 +13,7 @@ from tiny_scene import SINGLE
 
 from hwp_bench.cli.main import main
 from hwp_bench.sim.produce.calibration import TARGETS, Calibration, calibrate, write_strengths
-from hwp_bench.sim.scene.reader import load_scene
+from hwp_bench.sim.scene.reader import known_scenes, load_scene, scene_groups, scene_names
 from hwp_bench.sim.scene.schema import Scene
 
 SceneMaker = Callable[..., Scene]
@@ -29,7 +29,8 @@ def scene_file(tmp_path: Path) -> Path:
 def test_list_names_scenes_and_parts(capsys: pytest.CaptureFixture[str]) -> None:
     assert main(["sim", "list", "--json"]) == 0
     content = json.loads(capsys.readouterr().out)
-    assert len(content["scenes"]) == 11
+    assert [scene["id"] for scene in content["scenes"]] == list(known_scenes())
+    assert len(content["scenes"]) == 11 + sum(len(scene_names(name)) for name in scene_groups())
     assert "phone" in content["objects"]
 
 

@@ -33,8 +33,6 @@ from hwp_bench.sim.subject.rig_mesh import components, outlines
 from hwp_bench.sim.subject.rigs import load_rig
 from hwp_bench.sim.subject.wrist import FARTHEST_BEFORE, FARTHEST_BEHIND
 
-pytest.importorskip("pygltflib")
-
 KINDS = ("remeshed", "closed", "nails", "closed nails", "forearm", "parts", "meshes", "boxes")
 
 

