@@ -136,7 +136,9 @@ _PARTS = ("pose", "betas", "transl", "valid")
 
 def _import_simulated(seed: int, errors: LandmarkErrors, keep: Path, file: Path) -> None:
     scene = parse_scene(_scene(seed), where=f"clip{seed}")
-    capture = render_capture(scene, keep / f"clip{seed}", size=SIZE, workers=1, overwrite=True)
+    capture = render_capture(
+        scene, keep / f"clip{seed}", size=SIZE, workers=1, overwrite=True, free_view=False
+    )
     truth = (capture.true_hands or {})["right"]
     posed = pose_hand(
         load_template(side="right").to_torch(torch.float64),

@@ -72,6 +72,7 @@ def check_capture(path: str | os.PathLike[str]) -> CheckReport:
         *_geometry(capture),
         *_templates(capture),
         *_numbers(capture),
+        *_free_view(capture),
     ]
     findings.sort(key=lambda finding: finding.level)
     return CheckReport(os.fspath(path), _facts(capture), tuple(findings))
@@ -106,9 +107,27 @@ def _facts(capture: Capture) -> dict[str, Any]:
             )
             if present
         ],
+        "free_view_frames": _count(capture),
         "licence": info.licence,
         "digest": capture.digest,
     }
+
+
+def _count(capture: Capture) -> int:
+    """Frames of the free-view clip; 0 where there is none that can be opened."""
+    try:
+        return 0 if capture.free_view is None else len(capture.free_view)
+    except HwpError:  # reported as a finding
+        return 0
+
+
+def _free_view(capture: Capture) -> tuple[Finding, ...]:
+    """Everything about the clip, which is a capture of its own."""
+    try:
+        clip = capture.free_view
+    except HwpError as error:
+        return (_finding(error),)
+    return () if clip is None else check_capture(clip.root).findings
 
 
 def _images(capture: Capture) -> Iterator[Finding]:

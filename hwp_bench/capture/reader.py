@@ -15,6 +15,7 @@ from hwp_bench.base.files import read_json, sha256_json
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.capture.schema import (
     CAMERAS,
+    FREE_VIEW,
     HANDS,
     IMAGE_FOLDERS,
     METADATA,
@@ -29,6 +30,9 @@ from hwp_bench.hands.template_sources import load_template
 
 if TYPE_CHECKING:
     from hwp_bench.hands.template import HandTemplate
+
+# Facts that a free-view clip shares with its capture.
+_SHARED = ("hands", "width", "height")
 
 
 class Capture:
@@ -93,6 +97,31 @@ class Capture:
         if not path.is_file():
             return None
         return read_hands(path, self.info.sides, self.info.frame_count)
+
+    @cached_property
+    def free_view(self) -> Capture | None:
+        """The free-view clip: unseen poses from cameras all around; None where there is none.
+
+        Its digest is not a part of this capture's.
+
+        Raises:
+            BadCapture, BadInput: it is damaged, or belongs to another capture.
+        """
+        folder = self.root / FREE_VIEW
+        if not (folder / METADATA).is_file():
+            return None
+        clip, model = open_capture(folder), self.info.hand_model
+        same = {name: getattr(clip.info, name) == getattr(self.info, name) for name in _SHARED}
+        same["hand_model"] = clip.info.hand_model.digest == model.digest
+        for name, equal in same.items():
+            if not equal:
+                raise BadCapture(
+                    "is not that of the capture around it",
+                    where=folder / METADATA,
+                    field=name,
+                    remedy="Remove the folder, or render the capture again.",
+                )
+        return clip
 
     def frame(self, frame: int) -> np.ndarray:
         """Read one frame: (H, W, 3) uint8 sRGB.

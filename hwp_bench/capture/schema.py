@@ -26,6 +26,8 @@ CAMERAS = "cameras.npz"
 TRUE_HANDS = "truth/hands.npz"
 #: Further files of the maker (scene, timings, overlays); withheld from methods.
 EXTRA = "extra"
+#: Folder of the free-view clip, a small capture of its own; withheld but for hands and cameras.
+FREE_VIEW = "free"
 
 #: Folder of each kind of image. All but `frames` and `masks` are truth, withheld from methods.
 IMAGE_FOLDERS = {
@@ -45,7 +47,9 @@ SIDES: Mapping[str, tuple[str, ...]] = {
     "left": ("left",),
     "both": ("right", "left"),
 }
-_ID = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
+#: Longest id of a capture.
+MAX_ID = 100
+_ID = re.compile(rf"[A-Za-z0-9][A-Za-z0-9._-]{{0,{MAX_ID - 1}}}")
 _Edge = Annotated[int, Meta(ge=1, le=MAX_EDGE)]
 
 

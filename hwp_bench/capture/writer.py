@@ -122,6 +122,11 @@ class CaptureWriter:
         self._check_hands(hands)
         self._true_hands = dict(hands)
 
+    @property
+    def folder(self) -> Path:
+        """The folder while it is filled, under its temporary name; for a clip inside of it."""
+        return self._root
+
     def extra(self, name: str, data: bytes | str) -> None:
         """Store a further file under `extra/`."""
         folder = self._root / EXTRA

@@ -78,6 +78,12 @@ def _add_render(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--seed", type=int, help="another seed of everything random")
     parser.add_argument("--workers", type=int, help="processes (default: as many as are worth it)")
     parser.add_argument("--exr", action="store_true", help="also linear EXR with extra layers")
+    parser.add_argument(
+        "--no-free-view",
+        dest="free_view",
+        action="store_false",
+        help="without the clip of unseen poses from cameras all around",
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace what exists")
     add_engine_arguments(parser)
 

@@ -99,7 +99,12 @@ def render(args: argparse.Namespace) -> int:
             raise UsageError("a suite is rendered as it is", field="--suite")
         with engine_for(args) as engine:
             folders = ensure_suite(
-                args.suite, args.out, args.workers, engine=engine, needs=needs_of(args)
+                args.suite,
+                args.out,
+                args.workers,
+                engine=engine,
+                needs=needs_of(args),
+                free_view=args.free_view,
             )
         for folder in folders:
             print(folder)
@@ -134,6 +139,7 @@ def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine
             workers=workers_each(args.workers, engine, needs),
             exr=args.exr,
             overwrite=args.overwrite,
+            free_view=args.free_view,
         )
         jobs.append(render_job(work, out, needs))
     engine.run(jobs, lambda index: None)

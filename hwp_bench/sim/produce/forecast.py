@@ -13,8 +13,12 @@ import numpy as np
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.sim.effects.base import ORDER
 from hwp_bench.sim.effects.plan import FramePlan, plan
+from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.produce.free_view import free_views, render_free
 from hwp_bench.sim.produce.video_encoding import through_h264
 from hwp_bench.sim.render.frame import carry_out
+from hwp_bench.sim.render.view import steady_gain
+from hwp_bench.sim.scene.free_view import FRAMES
 from hwp_bench.sim.scene.schema import Scene
 
 # Joins the names of effects that act in the same frame.
@@ -43,6 +47,12 @@ class Forecast:
     seconds: Mapping[str, float] | None
     #: Rays by group, or None without probing.
     rays: Mapping[str, int] | None
+    #: Frames of the free-view clip.
+    free_frames: int = FRAMES
+    #: Processor seconds of that clip, or None without probing.
+    free_seconds: float | None = None
+    #: Rays of that clip, or None without probing.
+    free_rays: int | None = None
 
     def shares(self) -> dict[str, float] | None:
         """Seconds by cause: `clean`, then the extra of each effect; they add up to all.
@@ -92,6 +102,7 @@ def forecast(
     for item in plans:
         groups.setdefault(group_name(item), []).append(item)
     seconds, rays = _probed(scene, groups, edge) if probe else (None, None)
+    free_seconds, free_rays = _probed_free(scene, edge) if probe else (None, None)
     return Forecast(
         scene=scene.id,
         frame_count=count,
@@ -101,6 +112,8 @@ def forecast(
         groups={name: len(items) for name, items in groups.items()},
         seconds=seconds,
         rays=rays,
+        free_seconds=free_seconds,
+        free_rays=free_rays,
     )
 
 
@@ -125,6 +138,16 @@ def _probed(
         seconds[name] = round(scale * sum(cost.seconds.values()) + video, 3)
         rays[name] = round(scale * sum(cost.rays.values()))
     return seconds, rays
+
+
+def _probed_free(scene: Scene, size: int) -> tuple[float, int]:
+    """Processor seconds and rays of the free-view clip, from one of its frames."""
+    once, each = RenderCost(), RenderCost()
+    gain = steady_gain(scene, once)
+    (view, *_) = free_views(scene)
+    render_free(scene, view, size, gain, each)
+    seconds = sum(once.seconds.values()) + FRAMES * sum(each.seconds.values())
+    return round(seconds, 3), sum(once.rays.values()) + FRAMES * sum(each.rays.values())
 
 
 def encoding_seconds(scene: Scene, image: np.ndarray) -> float:
@@ -165,9 +188,14 @@ def plan_table(forecasts: list[Forecast]) -> Table:
                 spent = seconds[name]
                 rows.append((item.scene, name, count, spent / count, spent, rays[name] / 1e6))
         passes = ", ".join(f"{name} {count}" for name, count in item.passes.items())
-        total = None if seconds is None else sum(seconds.values())
+        spent_free, cast = item.free_seconds, item.free_rays
+        each = None if spent_free is None else spent_free / item.free_frames
+        millions = None if cast is None else cast / 1e6
+        rows.append((item.scene, "free view", item.free_frames, each, spent_free, millions))
+        total = None if seconds is None else sum(seconds.values()) + (spent_free or 0.0)
         content = f"all ({passes}; {item.subframes} sub-frames)"
-        rows.append((item.scene, content, item.frame_count, None, total, None))
+        count = item.frame_count + item.free_frames
+        rows.append((item.scene, content, count, None, total, None))
     columns = (
         Column("scene"),
         Column("frames with"),

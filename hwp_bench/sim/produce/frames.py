@@ -45,6 +45,11 @@ def read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
         return None
 
 
+def eight_bit_coverage(coverage: np.ndarray) -> np.ndarray:
+    """Coverage 0-1 in 8 bits, rounded down: 255 means that the hand covers the pixel fully."""
+    return np.floor(255.0 * coverage + 1e-3).astype(np.uint8)
+
+
 def render_frames(
     scene: Scene,
     frames: Iterable[int],

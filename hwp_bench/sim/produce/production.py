@@ -24,17 +24,20 @@ from hwp_bench.capture import (
     HandModelId,
     open_capture,
 )
+from hwp_bench.capture.schema import FREE_VIEW
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.sim.effects.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.produce.estimates import estimate_hands, estimate_mask
 from hwp_bench.sim.produce.frames import (
     RenderFrames,
+    eight_bit_coverage,
     exr_file,
     frame_file,
     read_frame,
     render_frames,
     render_in_processes,
 )
+from hwp_bench.sim.produce.free_view import write_free_view
 from hwp_bench.sim.produce.lookalikes import confused_mask
 from hwp_bench.sim.produce.subject_table import subject_json
 from hwp_bench.sim.produce.video_encoding import check_encoder, through_h264
@@ -74,6 +77,7 @@ def render_capture(
     workers: int | None = None,
     overwrite: bool = False,
     exr: bool = False,
+    free_view: bool = True,
 ) -> Capture:
     """Render a capture.
 
@@ -90,6 +94,7 @@ def render_capture(
         overwrite: replace an existing folder.
         exr: also store linear light, depth, normals, object ids and motion of every frame as
             OpenEXR, under `extra/`.
+        free_view: also render the free-view clip, under `free/`.
 
     Raises:
         UsageError: `out` exists, or a number is out of range.
@@ -116,7 +121,8 @@ def render_capture(
             raise HwpError(f"cannot be made ({error.strerror})", where=waiting) from error
         start = time.perf_counter()
         _render_missing(scene, count, edge, waiting, workers, exr)
-        _assemble(scene, count, edge, waiting, out, overwrite, time.perf_counter() - start)
+        seconds = time.perf_counter() - start
+        _assemble(scene, count, edge, waiting, out, overwrite, seconds, free_view)
         shutil.rmtree(waiting, ignore_errors=True)
     waiting.with_name(f"{waiting.name}.lock").unlink(missing_ok=True)
     return open_capture(out)
@@ -159,7 +165,14 @@ def _render_missing(
 
 
 def _assemble(
-    scene: Scene, count: int, size: int, waiting: Path, out: Path, overwrite: bool, seconds: float
+    scene: Scene,
+    count: int,
+    size: int,
+    waiting: Path,
+    out: Path,
+    overwrite: bool,
+    seconds: float,
+    free_view: bool,
 ) -> None:
     plans = [plan(scene, frame, count, size) for frame in range(count)]
     truth = true_hands(scene, plans)
@@ -169,9 +182,8 @@ def _assemble(
     )
     info = _info(scene, plans, size)
     costs = []
-    with CaptureWriter(
-        out, info, estimate_hands(scene, truth, plans), cameras, overwrite=overwrite
-    ) as writer:
+    estimates = estimate_hands(scene, truth, plans)
+    with CaptureWriter(out, info, estimates, cameras, overwrite=overwrite) as writer:
         videos = [_video(scene, waiting, info, name) for name in ("rgb", "clean")]
         for item in plans:
             arrays = _waiting_frame(waiting, item.frame)
@@ -181,9 +193,9 @@ def _assemble(
             coverage = arrays["coverage"].astype(np.float64)
             writer.frame(item.frame, rgb)
             writer.clean(item.frame, clean)
-            writer.true_mask(item.frame, _eight_bits(coverage))
+            writer.true_mask(item.frame, eight_bit_coverage(coverage))
             clean_coverage = arrays["clean_coverage"].astype(np.float64)
-            writer.clean_mask(item.frame, _eight_bits(clean_coverage))
+            writer.clean_mask(item.frame, eight_bit_coverage(clean_coverage))
             mask = estimate_mask(scene, item, coverage, clean_coverage)
             writer.mask(item.frame, confused_mask(scene, item, mask, coverage, rgb))
             layers = exr_file(waiting, item.frame)
@@ -195,6 +207,8 @@ def _assemble(
         if subject := subject_json(scene):
             writer.extra("subject.json", canonical_json(subject))
         writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
+        if free_view:
+            write_free_view(scene, writer.folder / FREE_VIEW, info, estimates)
 
 
 def _video(scene: Scene, waiting: Path, info: CaptureInfo, name: str) -> Iterator[np.ndarray]:
@@ -217,11 +231,6 @@ def _waiting_frame(waiting: Path, frame: int) -> dict[str, np.ndarray]:
             remedy="Run the same command again; only this frame is rendered again.",
         )
     return arrays
-
-
-def _eight_bits(coverage: np.ndarray) -> np.ndarray:
-    """Coverage in 8 bits, rounded down: 255 means that the hand covers the pixel fully."""
-    return np.floor(255.0 * coverage + 1e-3).astype(np.uint8)
 
 
 def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters]:

@@ -15,10 +15,14 @@ from hwp_bench.base.progress import track
 from hwp_bench.sim.effects.base import registered
 from hwp_bench.sim.effects.plan import hands_at
 from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.produce.free_view import free_views, render_free
 from hwp_bench.sim.produce.light_strips import camera_sheet, captioned, light_sheet
 from hwp_bench.sim.produce.look_strips import look_sheet
 from hwp_bench.sim.produce.video_encoding import has_encoder
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
+from hwp_bench.sim.render.view import steady_gain
+from hwp_bench.sim.scene.free_view import FRAMES
 from hwp_bench.sim.scene.motion import hand_parameters
 from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
 from hwp_bench.sim.scene.reader import load_scene, scene_names
@@ -47,6 +51,8 @@ SHOWN_IN = (
     ("illumination", "capture2"),
     ("motion_blur", "capture3"),
 )
+#: Scenes whose free-view clips are shown.
+FREE_SHOWN = ("capture2", "capture4")
 _QUALITY = 88
 
 
@@ -75,7 +81,9 @@ def write_preview(
 
 
 def write_gallery(folder: Path) -> list[Path]:
-    """Write `captureN.jpg`, `severity-KIND.jpg`, `lights.jpg`, `looks.jpg` and `cameras.jpg`.
+    """Write `captureN.jpg`, `severity-KIND.jpg`, `free-view.jpg`, and the sheets by name.
+
+    The sheets are `lights.jpg`, `looks.jpg` and `cameras.jpg`.
 
     The last one is left out where nothing can encode H.264.
 
@@ -89,11 +97,27 @@ def write_gallery(folder: Path) -> list[Path]:
     for kind, name in track(SHOWN_IN, "Strips of the severities"):
         image = strip(_severity_strip(load_scene(name), kind), MAX_SEVERITY + 1)
         paths.append(_write(folder / f"severity-{kind}.jpg", image))
+    rows = [free_view_strip(load_scene(name)) for name in FREE_SHOWN]
+    paths.append(_write(folder / "free-view.jpg", np.concatenate(rows)))
     paths.append(_write(folder / "lights.jpg", light_sheet()))
     paths.append(_write(folder / "looks.jpg", look_sheet()))
     if has_encoder():
         paths.append(_write(folder / "cameras.jpg", camera_sheet()))
     return paths
+
+
+def free_view_strip(scene: Scene) -> np.ndarray:
+    """Two rows of frames of the free-view clip, with their numbers."""
+    cost = RenderCost()
+    gain = steady_gain(scene, cost)
+    picks = np.linspace(0, FRAMES - 1, 2 * STRIP_FRAMES).round().astype(int).tolist()
+    views = free_views(scene)
+    cells = []
+    for frame in picks:
+        _, image, _ = render_free(scene, views[frame], GALLERY_SIZE, gain, cost)
+        cells.append(captioned(image, str(frame)))
+    rows = cells[:STRIP_FRAMES], cells[STRIP_FRAMES:]
+    return np.concatenate([np.concatenate(row, axis=1) for row in rows])
 
 
 def _capture_strip(scene: Scene) -> list[SimulatedFrame]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -82,6 +82,7 @@ def ensure_suite(
     *,
     engine: Engine | None = None,
     needs: Needs | None = None,
+    free_view: bool = True,
 ) -> list[Path]:
     """Render the captures of a suite that are not in the cache yet.
 
@@ -91,6 +92,7 @@ def ensure_suite(
         workers: processes for each render.
         engine: where captures are rendered; one after another in this process if None.
         needs: what one render takes of a machine.
+        free_view: also render free-view clips, which captures in the cache may lack.
 
     Returns:
         The capture folders, in the suite's order.
@@ -99,7 +101,9 @@ def ensure_suite(
         UsageError: there is no such suite.
         HwpError: a render failed; captures that were finished stay.
     """
-    return ensure_captures(suite(name), cache, workers, engine=engine, needs=needs)
+    return ensure_captures(
+        suite(name), cache, workers, engine=engine, needs=needs, free_view=free_view
+    )
 
 
 def ensure_captures(
@@ -109,6 +113,7 @@ def ensure_captures(
     *,
     engine: Engine | None = None,
     needs: Needs | None = None,
+    free_view: bool = True,
 ) -> list[Path]:
     """Render captures that are not in the cache yet, such as some of a suite.
 
@@ -118,6 +123,7 @@ def ensure_captures(
         workers: processes for each render.
         engine: where captures are rendered; one after another in this process if None.
         needs: what one render takes of a machine.
+        free_view: also render free-view clips, which captures in the cache may lack.
 
     Returns:
         The capture folders, in the order of `items`.
@@ -135,7 +141,13 @@ def ensure_captures(
         key = render_key(item.scene, item.frame_count, item.size)
         folder = root / f"{item.scene.id}-{item.frame_count}x{item.size}-{key[:12]}"
         work = RenderCapture(
-            item.scene, item.frame_count, item.size, item.seed, workers=each, keep=True
+            item.scene,
+            item.frame_count,
+            item.size,
+            item.seed,
+            workers=each,
+            keep=True,
+            free_view=free_view,
         )
         jobs.append(render_job(work, folder, needs))
     if not all(job.finished() for job in jobs):
@@ -163,6 +175,8 @@ class RenderCapture:
     keep: bool = False
     #: Whether one that is there is replaced.
     overwrite: bool = False
+    #: Whether the free-view clip is rendered too.
+    free_view: bool = True
 
     def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
         """Render; see `hwp_bench.run.engine.job.Work`."""
@@ -178,6 +192,8 @@ class RenderCapture:
     def render(self, output: Path) -> None:
         """Render into a folder, or use the capture that exists there if `keep` says so.
 
+        The free-view clip of a capture that exists is rendered where it is missing.
+
         Raises:
             HwpError: as `render_capture`.
         """
@@ -187,6 +203,22 @@ class RenderCapture:
         with exclusive(output, wait=True):
             if not is_capture(output):
                 self._render(output)
+            elif not self.complete(output):
+                from hwp_bench.capture import open_capture
+                from hwp_bench.sim.produce.free_view import add_free_view
+
+                add_free_view(self._scene(), open_capture(output))
+
+    def complete(self, output: Path) -> bool:
+        """Whether a folder holds a capture with all that is asked for."""
+        if not is_capture(output) or not self.free_view:
+            return is_capture(output)
+        from hwp_bench.sim.produce.free_view import has_free_view
+
+        return has_free_view(output)
+
+    def _scene(self) -> Scene:
+        return self.scene if self.seed is None else replace(self.scene, seed=self.seed)
 
     def _render(self, output: Path) -> None:
         from hwp_bench.sim.produce.production import render_capture
@@ -200,6 +232,7 @@ class RenderCapture:
             workers=self.workers,
             overwrite=self.keep or self.overwrite,
             exr=self.exr,
+            free_view=self.free_view,
         )
 
     def _count(self, output: Path, on_progress: OnProgress, ended: threading.Event) -> None:
@@ -223,7 +256,7 @@ def render_job(work: RenderCapture, output: Path, needs: Needs) -> Job:
         here=lambda on_progress: work.render(output),
         work=work,
         output=output,
-        finished=lambda: work.keep and is_capture(output),
+        finished=lambda: work.keep and work.complete(output),
         needs=needs,
     )
 

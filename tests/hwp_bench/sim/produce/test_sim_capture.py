@@ -84,7 +84,9 @@ def test_the_true_hands_explain_the_masks(rendered: Path) -> None:
 
 
 def test_workers_change_nothing(rendered: Path, make_scene: SceneMaker, tmp_path: Path) -> None:
-    two = render_capture(make_scene(), tmp_path / "two", frame_count=FRAMES, size=SIZE, workers=2)
+    two = render_capture(
+        make_scene(), tmp_path / "two", frame_count=FRAMES, size=SIZE, workers=2, free_view=False
+    )
     one = open_capture(rendered)
     np.testing.assert_array_equal(_pixels(one), _pixels(two))
     assert one.info.digests == two.info.digests
@@ -106,13 +108,13 @@ def test_an_interrupted_render_goes_on(
 
     monkeypatch.setattr(production, "render_frames", broken)
     with pytest.raises(KeyboardInterrupt):
-        render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1)
+        render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     assert not out.exists()
     waiting = tmp_path / f".late.{render_key(scene, FRAMES, SIZE)[:16]}"
     assert sum(frame_file(waiting, frame).exists() for frame in range(FRAMES)) == 7
     frame_file(waiting, 3).write_bytes(b"cut short")
     monkeypatch.setattr(production, "render_frames", honest)
-    capture = render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1)
+    capture = render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     np.testing.assert_array_equal(_pixels(capture), _pixels(open_capture(rendered)))
     assert not waiting.exists()
 

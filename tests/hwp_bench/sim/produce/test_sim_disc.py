@@ -39,12 +39,15 @@ def test_a_disc_that_fills(
 
     monkeypatch.setattr(os, "replace", replace)
     with pytest.raises(HwpError, match="No space left") as caught:
-        render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1)
+        render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     assert str(caught.value).count("\n") == 0
     assert not out.exists()
     with pytest.raises(BadInput):
         open_capture(out)
     monkeypatch.setattr(os, "replace", honest)
     # With space again the same call goes on from the frames that were finished.
-    assert len(render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1)) == FRAMES
+    assert (
+        len(render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False))
+        == FRAMES
+    )
     assert [path.name for path in tmp_path.iterdir()] == ["full"]

@@ -70,7 +70,9 @@ def test_a_capture_is_one_stream_however_often_it_was_interrupted(
 ) -> None:
     scene = replace(make_scene(), sensor=Sensor(noise=0.01, h264=0.4))
     assert plan(scene, 0, FRAMES, SIZE).passes[-1] == "h264"
-    whole = render_capture(scene, tmp_path / "a", frame_count=FRAMES, size=SIZE, workers=1)
+    whole = render_capture(
+        scene, tmp_path / "a", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
+    )
     honest, done = production.render_frames, []
 
     def broken(*args: object, **settings: object) -> None:
@@ -81,12 +83,18 @@ def test_a_capture_is_one_stream_however_often_it_was_interrupted(
 
     monkeypatch.setattr(production, "render_frames", broken)
     with pytest.raises(KeyboardInterrupt):
-        render_capture(scene, tmp_path / "b", frame_count=FRAMES, size=SIZE, workers=1)
+        render_capture(
+            scene, tmp_path / "b", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
+        )
     monkeypatch.setattr(production, "render_frames", honest)
-    late = render_capture(scene, tmp_path / "b", frame_count=FRAMES, size=SIZE, workers=1)
+    late = render_capture(
+        scene, tmp_path / "b", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
+    )
     assert whole.info.digests == late.info.digests
     bare = replace(scene, sensor=Sensor(noise=0.01))
-    plain = render_capture(bare, tmp_path / "c", frame_count=FRAMES, size=SIZE, workers=1)
+    plain = render_capture(
+        bare, tmp_path / "c", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
+    )
     for frame in range(FRAMES):
         change = whole.frame(frame).astype(float) - plain.frame(frame)
         assert 0.3 < np.abs(change).mean() < 12.0

@@ -59,7 +59,9 @@ def test_the_subject_is_the_model_in_the_true_pose(
 ) -> None:
     scene = make_scene()
     scene = replace(scene, subject=replace(scene.subject, model=model))
-    capture = render_capture(scene, tmp_path / "capture", frame_count=FRAMES, size=SIZE, workers=1)
+    capture = render_capture(
+        scene, tmp_path / "capture", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
+    )
     template = load_template(model, "right")
     assert capture.info.hand_model.digest == template.digest
     assert capture.info.hand_model.source == model
@@ -85,7 +87,9 @@ def test_both_hands_are_the_model(
         ("right = [", 'left = [{ gesture = "open", place = [-0.07, 0.0, 0.0] }]\nright = ['),
     )
     scene = replace(scene, subject=replace(scene.subject, model=model), effects=())
-    capture = render_capture(scene, tmp_path / "capture", frame_count=FRAMES, size=SIZE, workers=1)
+    capture = render_capture(
+        scene, tmp_path / "capture", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
+    )
     shown = capture.true_mask(0) > 127
     for side in ("right", "left"):
         expected = _silhouette(capture, 0, side)
@@ -98,5 +102,7 @@ def test_a_missing_model_is_one_clear_error(
     scene = make_scene()
     scene = replace(scene, subject=replace(scene.subject, model=f"mano:{tmp_path / 'nowhere'}"))
     with pytest.raises(BadHandModel, match="nowhere"):
-        render_capture(scene, tmp_path / "capture", frame_count=FRAMES, size=SIZE, workers=1)
+        render_capture(
+            scene, tmp_path / "capture", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
+        )
     assert not (tmp_path / "capture").exists()

@@ -287,7 +287,9 @@ def test_a_capture_says_how_far_the_model_is(
     monkeypatch.setattr("hwp_bench.sim.subject.atlas.ATLAS", 256)
     table = "[subject.anatomy]\nbone_length = 6.0\njoint_shift = 4.0\nnail_length = 3.0\n\n[camera]"
     scene = replace(make_scene(("[camera]", table)), effects=())
-    capture = render_capture(scene, tmp_path / "off", frame_count=10, size=48, workers=1)
+    capture = render_capture(
+        scene, tmp_path / "off", frame_count=10, size=48, workers=1, free_view=False
+    )
     told = json.loads((tmp_path / "off" / "extra" / "subject.json").read_text())
     truth = capture.true_hands
     assert truth is not None
