@@ -42,7 +42,7 @@ def keep_artifacts(
         scores: the scores of the test frames.
         predictions: their predictions, in the same order.
     """
-    _keep_predictions(folder / "predictions", source, [item.frame for item in predictions])
+    keep_predictions(folder / "predictions", source, [item.frame for item in predictions])
     if (output / LOG).is_file():
         shutil.copyfile(output / LOG, folder / LOG)
     keep_diagnostics(output / DIAGNOSTICS, folder / DIAGNOSTICS)
@@ -51,7 +51,7 @@ def keep_artifacts(
         write_pictures(folder / "pictures", capture, scores, predictions)
 
 
-def _keep_predictions(folder: Path, source: Path, frames: Sequence[int]) -> None:
+def keep_predictions(folder: Path, source: Path, frames: Sequence[int]) -> None:
     """Copy the predicted frames that exist into a results folder; nothing else is copied."""
     folder.mkdir(parents=True, exist_ok=True)
     for frame in frames:

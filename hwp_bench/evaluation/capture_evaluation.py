@@ -18,6 +18,7 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import EXTRA
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.artifacts import keep_artifacts
+from hwp_bench.evaluation.free_view import keep_free_view, read_free_targets, score_free_view
 from hwp_bench.evaluation.scoring import (
     mean_scores,
     predictions_digest,
@@ -67,7 +68,7 @@ class CaptureEvaluation:
     @property
     def key(self) -> str:
         """Digest (hex) of everything that decides the scores."""
-        exposed = self.confinement.exposed
+        exposed, clip = self.confinement.exposed, self.capture.free_view
         return sha256_json(
             {
                 "recipe": RECIPE,
@@ -81,6 +82,7 @@ class CaptureEvaluation:
                 "protocols": [protocol.as_dict() for protocol in PROTOCOLS],
                 "networks": sorted(self.networks),
                 **({"exposed": exposed_digest(exposed)} if exposed else {}),
+                **({"free_view": clip.digest} if clip is not None else {}),
             }
         )
 
@@ -107,6 +109,7 @@ def evaluate_capture(
         return stored
     began = time.perf_counter()
     targets = read_targets(evaluation.capture, evaluation.split.test.tolist())
+    free_targets = read_free_targets(evaluation.capture)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     output = folder / "run"
@@ -117,6 +120,8 @@ def evaluate_capture(
     predictions = read_predictions(source, frames, evaluation.capture.size)
     scores = score_predictions(targets, predictions, evaluation.networks)
     score_seconds = time.perf_counter() - started
+    offered = record.free_view if record else output / "none"
+    free = score_free_view(evaluation.capture, free_targets, offered, evaluation.networks)
     facts = record.facts if record else RunFacts()
     result = CaptureResult(
         id=evaluation.capture.info.id,
@@ -139,7 +144,10 @@ def evaluate_capture(
         curve=_curve(evaluation, output, facts),
         curve_seconds=facts.curve_seconds,
         isolation=record.isolation if record else None,
+        free_view=free.result if free else None,
     )
+    if free is not None:
+        keep_free_view(folder, free)
     keep_artifacts(folder, output, source, evaluation.capture, scores, predictions)
     result = replace(result, job_seconds=time.perf_counter() - began)
     write_json(folder / RESULT, asdict(result))

@@ -17,6 +17,7 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation import cross_check
+from hwp_bench.evaluation.free_view import PREDICTIONS as FREE_PREDICTIONS
 from hwp_bench.evaluation.scoring import (
     Prediction,
     Target,
@@ -161,19 +162,51 @@ def _verify_capture(
         record.frames, score_predictions(targets, predictions, networks), strict=True
     ):
         found += _compare_frame(name, old, new)
-    differences, checked = _cross_check(record, targets, predictions)
+    differences, checked = _cross_check(name, record.frames, targets, predictions)
+    free, count, more = _verify_free_view(root, record, capture, networks)
+    return found + differences + free, len(numbers) + count, checked + more
+
+
+def _verify_free_view(
+    root: Path, record: CaptureResult, capture: Capture, networks: Mapping[str, Network]
+) -> tuple[list[Discrepancy], int, int]:
+    """As `_verify_capture`, of the free-view clip; nothing where the result has no scores of it."""
+    stored, name = record.free_view, f"{record.id}, free view"
+    if stored is None:
+        return [], 0, 0
+    clip = capture.free_view
+    if clip is None or clip.digest != stored.digest:
+        here = "no clip" if clip is None else clip.digest
+        return [Discrepancy(name, "capture", stored.digest, here)], 0, 0
+    numbers = [frame.frame for frame in stored.frames]
+    if numbers != list(range(len(clip))):
+        return [Discrepancy(name, "frames", str(numbers), f"0 to {len(clip) - 1}")], 0, 0
+    targets = read_targets(clip, numbers)
+    folder = inside(root, f"captures/{record.id}/{FREE_PREDICTIONS}")
+    predictions = read_predictions(folder, numbers, clip.size)
+    found, digest = [], predictions_digest(predictions)
+    if digest != stored.predictions_digest:
+        found.append(Discrepancy(name, "predictions", stored.predictions_digest, digest))
+    for old, new in zip(
+        stored.frames, score_predictions(targets, predictions, networks), strict=True
+    ):
+        found += _compare_frame(name, old, new)
+    differences, checked = _cross_check(name, stored.frames, targets, predictions)
     return found + differences, len(numbers), checked
 
 
 def _cross_check(
-    record: CaptureResult, targets: Sequence[Target], predictions: Sequence[Prediction]
+    name: str,
+    frames: Sequence[FrameResult],
+    targets: Sequence[Target],
+    predictions: Sequence[Prediction],
 ) -> tuple[list[Discrepancy], int]:
     """Compare some recorded scores with scikit-image's; returns differences and frames."""
     found = []
     valid = [place for place, item in enumerate(predictions) if item.pixels is not None]
     sample = [valid[place] for place in cross_check.sample_frames(len(valid))] if valid else []
     for place in sample:
-        target, pixels, old = targets[place], predictions[place].pixels, record.frames[place]
+        target, pixels, old = targets[place], predictions[place].pixels, frames[place]
         assert pixels is not None
         scores = cross_check.reference_scores(
             pixels, target.pixels, target.mask, coverage=target.exact
@@ -182,7 +215,7 @@ def _cross_check(
             recorded = old.scores.get(metric)
             if recorded is None or abs(recorded - value) > cross_check.TOLERANCE:
                 what = f"frame {old.frame}, {metric} by scikit-image"
-                found.append(Discrepancy(record.id, what, repr(recorded), repr(value)))
+                found.append(Discrepancy(name, what, repr(recorded), repr(value)))
     return found, len(sample)
 
 

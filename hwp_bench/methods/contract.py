@@ -14,7 +14,15 @@ from msgspec import Meta
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.records import Line
-from hwp_bench.capture.schema import CAMERAS, HANDS, SIDES, HandModelId, image_path
+from hwp_bench.capture.schema import (
+    CAMERAS,
+    FREE_VIEW,
+    HANDS,
+    MAX_FRAMES,
+    SIDES,
+    HandModelId,
+    image_path,
+)
 from hwp_bench.capture.splits import Split
 from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands
 from hwp_bench.hands.parameters import Camera, HandParameters, HandPose, hand_poses
@@ -123,6 +131,23 @@ class RunSettings:
 
 
 @dataclass(frozen=True)
+class FreeViews:
+    """The frames of the free-view clip: unseen poses from cameras all around, to be rendered."""
+
+    #: Parameters of every frame, by side: true angles, with the betas of the capture.
+    hands: Mapping[str, HandParameters]
+    #: The cameras of every frame.
+    cameras: Cameras
+
+    def __len__(self) -> int:
+        return len(self.cameras)
+
+    def hand_poses(self, frame: int) -> dict[str, HandPose]:
+        """Return the parameters of every hand in one frame, by side."""
+        return hand_poses(self.hands, frame)
+
+
+@dataclass(frozen=True)
 class RequestRecord:
     """The fields of `request.json`, but for its schema."""
 
@@ -150,6 +175,8 @@ class RequestRecord:
     frames: Line
     #: Indices of the training frames.
     train: list[Annotated[int, Meta(ge=0)]]
+    #: Frames of the free-view clip; 0 where the capture has none.
+    free_view: Annotated[int, Meta(ge=0, le=MAX_FRAMES)] = 0
 
 
 class TrainingCapture:
@@ -167,6 +194,7 @@ class TrainingCapture:
         hands: estimated parameters of every frame, by side.
         cameras: the cameras of every frame.
         run: settings, seed and budget.
+        free_views: what is rendered of the free-view clip, or None where there is none.
     """
 
     def __init__(self, root: Path, record: RequestRecord) -> None:
@@ -182,6 +210,12 @@ class TrainingCapture:
         )
         self.cameras: Cameras = read_cameras(root / CAMERAS, self.split.frame_count)
         self.run = RunSettings(record.settings, record.seed, record.budget, record.frames)
+        self.free_views: FreeViews | None = None
+        if record.free_view:
+            self.free_views = FreeViews(
+                read_hands(root / FREE_VIEW / HANDS, self.sides, record.free_view),
+                read_cameras(root / FREE_VIEW / CAMERAS, record.free_view),
+            )
         self._train = np.array(record.train, dtype=np.int64)
         if not np.isin(self._train, self.split.train).all():
             raise BadInput(

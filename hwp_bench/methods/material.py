@@ -110,6 +110,19 @@ def training_material(capture: Capture, split: Split, choice: str) -> TrainingMa
     return TrainingMaterial(split.train, "clean", "clean_masks", repaired)
 
 
+def free_view_hands(clip: Capture, choice: str) -> dict[str, HandParameters]:
+    """Return the hand parameters of a free-view clip that a method is given.
+
+    Args:
+        clip: the clip.
+        choice: as in `training_material`; angles and places are true in every case, betas are
+            those of the training frames.
+    """
+    truth = clip.true_hands
+    exact = choice.startswith(_PREFIX) and "betas" in choice.removeprefix(_PREFIX).split(",")
+    return dict(truth if exact and truth is not None else clip.hands)
+
+
 def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingMaterial:
     """The capture as it is, but for some estimates."""
     known = known_truths(capture)

@@ -2,7 +2,7 @@
 
 A request holds the training and validation frames with their masks, and for every frame,
 test frames included, the estimated hand parameters and the cameras. It holds no test pixel, no
-truth and no word about the perturbations.
+truth and no word about the perturbations. Of the free-view clip it holds parameters and cameras.
 
 The frames are those that were captured, or an oracle's choice of them
 (`hwp_bench/methods/material.py`).
@@ -19,11 +19,11 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.records import parse_record, without_schema
-from hwp_bench.capture.schema import CAMERAS, HANDS, image_path
+from hwp_bench.capture.schema import CAMERAS, FREE_VIEW, HANDS, image_path
 from hwp_bench.capture.splits import Split
 from hwp_bench.capture.tracks import write_cameras, write_hands
 from hwp_bench.methods.contract import REQUEST, RequestRecord, RunSettings, TrainingCapture
-from hwp_bench.methods.material import training_material
+from hwp_bench.methods.material import free_view_hands, training_material
 
 if TYPE_CHECKING:
     from hwp_bench.capture import Capture
@@ -57,6 +57,11 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
                 shutil.copyfile(source, target)
         write_hands(root / HANDS, material.hands)
         write_cameras(root / CAMERAS, capture.cameras)
+        clip = capture.free_view
+        if clip is not None:
+            (root / FREE_VIEW).mkdir()
+            write_hands(root / FREE_VIEW / HANDS, free_view_hands(clip, run.frames))
+            write_cameras(root / FREE_VIEW / CAMERAS, clip.cameras)
         description = {
             "schema": SCHEMA,
             "id": info.id,
@@ -71,6 +76,7 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
             "budget": {"seconds": run.budget.seconds, "steps": run.budget.steps},
             "frames": run.frames,
             "train": material.train.tolist(),
+            **({"free_view": len(clip)} if clip is not None else {}),
         }
         write_json(root / REQUEST, description)
     return path

@@ -8,7 +8,7 @@ that it was not changed after the publication.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from hwp_bench.base.files import canonical_json
@@ -31,16 +31,26 @@ def target_content(capture: Capture, split: Split) -> dict[str, Any]:
 
     Returns:
         JSON: id, split digest, and for every test frame the SHA-256 of its decoded pixels and of
-        its scoring mask, with whether the mask is exact coverage.
+        its scoring mask, with whether the mask is exact coverage. The same of the free-view clip,
+        where there is one.
 
     Raises:
         BadImage: a test frame or mask is missing or damaged.
     """
-    frames = []
-    for frame in split.test.tolist():
+    frames = _frame_digests(capture, split.test.tolist())
+    content = {"id": capture.info.id, "split": split.digest, "frames": frames}
+    clip = capture.free_view
+    if clip is not None:
+        content["free_view"] = _frame_digests(clip, range(len(clip)))
+    return content
+
+
+def _frame_digests(capture: Capture, frames: Iterable[int]) -> list[list[Any]]:
+    rows: list[list[Any]] = []
+    for frame in frames:
         mask, exact = capture.scoring_mask(frame)
-        frames.append([frame, pixel_digest(capture.frame(frame)), pixel_digest(mask), exact])
-    return {"id": capture.info.id, "split": split.digest, "frames": frames}
+        rows.append([frame, pixel_digest(capture.frame(frame)), pixel_digest(mask), exact])
+    return rows
 
 
 def commitment(content: Mapping[str, Any], salt: str) -> str:

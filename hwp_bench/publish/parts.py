@@ -14,7 +14,14 @@ from hwp_bench.base.errors import BadCapture, UsageError
 from hwp_bench.base.files import atomic_folder, write_json
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.schema import CAMERAS, HANDS, IMAGE_FOLDERS, METADATA, TRUE_HANDS
+from hwp_bench.capture.schema import (
+    CAMERAS,
+    FREE_VIEW,
+    HANDS,
+    IMAGE_FOLDERS,
+    METADATA,
+    TRUE_HANDS,
+)
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.request import write_request
@@ -53,7 +60,8 @@ def publish(
 
     The public part holds a request folder for each capture (what a method sees: training and
     validation frames and masks, and the parameters and cameras of every frame) and a manifest
-    with the splits and commitments. The sealed part holds the captures without their `extra/`.
+    with the splits and commitments. The sealed part holds the captures without their `extra/`, with
+    their free-view clips; the public part has no picture of these.
 
     Args:
         captures: capture folders.
@@ -118,3 +126,6 @@ def _copy_sealed(capture: Capture, target: Path) -> None:
     for folder in IMAGE_FOLDERS.values():
         if (capture.root / folder).is_dir():
             shutil.copytree(capture.root / folder, target / folder, copy_function=shutil.copyfile)
+    clip = capture.free_view
+    if clip is not None:
+        _copy_sealed(clip, target / FREE_VIEW)

@@ -53,6 +53,18 @@ class CurvePoint:
 
 
 @dataclass(frozen=True)
+class FreeViewResult:
+    """The scores of the free-view clip of a capture, apart from those of its test frames."""
+
+    #: Digest of the clip.
+    digest: str
+    #: Every frame of the clip, in order.
+    frames: list[FrameResult]
+    #: SHA-256 over the decoded pixels of the predictions, in frame order.
+    predictions_digest: str
+
+
+@dataclass(frozen=True)
 class CaptureResult:
     """One method on one capture."""
 
@@ -99,6 +111,8 @@ class CaptureResult:
     #: How the method's process was isolated: `namespaces`, or `processes` with the reason why
     #: not more; None for predictions that came as files, and where it was not recorded.
     isolation: str | None = None
+    #: Scores of the free-view clip; None where the capture has none, or the method drew none.
+    free_view: FreeViewResult | None = None
 
     @property
     def failed_frames(self) -> int:

@@ -13,6 +13,8 @@ from hwp_bench.base.records import parse_record
 
 #: Folder of the predicted test frames inside the output folder.
 PREDICTIONS = "predictions"
+#: Folder of the predicted frames of the free-view clip inside the output folder.
+FREE_VIEW = "free"
 #: Folder of the validation frames of each checkpoint inside the output folder.
 CHECKPOINTS = "checkpoints"
 #: Folder of files that a method writes about itself, for pictures and tables; optional.

@@ -15,7 +15,16 @@ from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.base.text import shown
 from hwp_bench.methods.manifest import MethodManifest
-from hwp_bench.run.output import FAILURE, LOG, PREDICTIONS, PROGRESS, RUN, RunFacts, read_facts
+from hwp_bench.run.output import (
+    FAILURE,
+    FREE_VIEW,
+    LOG,
+    PREDICTIONS,
+    PROGRESS,
+    RUN,
+    RunFacts,
+    read_facts,
+)
 from hwp_bench.run.sandbox.confinement import (
     Confinement,
     plain_environment,
@@ -53,6 +62,9 @@ class RunRecord:
     #: How the process was isolated: `namespaces`, or `processes` with the reason;
     #: None for submitted predictions.
     isolation: str | None = None
+    #: Folder of the predicted frames of the free-view clip; None where a submission or command
+    #: has none.
+    free_view: Path | None = None
 
 
 def run_method(
@@ -93,7 +105,8 @@ def run_method(
                 where=folder,
                 remedy=f"Put the frames into {manifest.entry}/{capture_id}/.",
             )
-        return RunRecord(folder, RunFacts(), 0.0)
+        clip = inside(manifest.root, f"{manifest.entry}/{capture_id}/{FREE_VIEW}")
+        return RunRecord(folder, RunFacts(), 0.0, free_view=clip if clip.is_dir() else None)
     confinement = confinement or Confinement()
     shutil.rmtree(output, ignore_errors=True)
     output.mkdir(parents=True)
@@ -126,7 +139,9 @@ def run_method(
     except BadInput as error:
         problem = f"{manifest.name} wrote a {RUN} that cannot be read ({error.problem})"
         raise MethodFailed(problem, where=log, field=error.field) from error
-    return RunRecord(output / PREDICTIONS, facts, wall, isolation)
+    clip = output / FREE_VIEW
+    offered = manifest.kind == "python" or clip.is_dir()
+    return RunRecord(output / PREDICTIONS, facts, wall, isolation, clip if offered else None)
 
 
 def _run(

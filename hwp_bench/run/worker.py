@@ -11,7 +11,7 @@ import resource
 import sys
 import time
 import traceback
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
@@ -22,12 +22,14 @@ from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.progress import notice
 from hwp_bench.capture.schema import frame_name
+from hwp_bench.hands.parameters import Camera, HandPose
 from hwp_bench.methods.contract import Avatar, Budget, MethodFactory, TrainingCapture
 from hwp_bench.methods.request import open_request
 from hwp_bench.run.output import (
     CHECKPOINTS,
     DIAGNOSTICS,
     FAILURE,
+    FREE_VIEW,
     PREDICTIONS,
     PROGRESS,
     RUN,
@@ -117,6 +119,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
         pixels = render(avatar, training, frame)
         render_seconds += time.perf_counter() - started
         write_image(output / PREDICTIONS / frame_name(frame), pixels)
+    render_free_views(avatar, training, output / FREE_VIEW)
     facts = RunFacts(
         fit_seconds=fit_seconds,
         ready_seconds=ready_seconds,
@@ -131,6 +134,20 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
     write_json(output / RUN, asdict(facts))
 
 
+def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path) -> None:
+    """Render the free-view clip, if there is one; a frame that fails costs itself and no more."""
+    views = training.free_views
+    for frame in range(0 if views is None else len(views)):
+        assert views is not None
+        camera = views.cameras.camera(frame, training.width, training.height)
+        try:
+            pixels = drawn(avatar, views.hand_poses(frame), camera, f"free-view frame {frame}")
+        except Exception:
+            traceback.print_exc()
+            continue
+        write_image(folder / frame_name(frame), pixels)
+
+
 def checkpoint_frames(validation: np.ndarray) -> list[int]:
     """Return at most eight validation frames, evenly spaced."""
     count = min(CHECKPOINT_FRAMES, len(validation))
@@ -139,19 +156,23 @@ def checkpoint_frames(validation: np.ndarray) -> list[int]:
 
 
 def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
-    """Render one frame and bring it to 8 bits: clipped, rounded half to even.
+    """Render one frame of the capture; see `drawn`."""
+    hands, camera = training.hand_poses(frame), training.camera(frame)
+    return drawn(avatar, hands, camera, f"frame {frame}")
+
+
+def drawn(avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: str) -> np.ndarray:
+    """Render hands and bring the image to 8 bits: clipped, rounded half to even.
 
     Raises:
-        MethodFailed: the result has another shape or is not finite.
+        MethodFailed: the result has another shape or is not finite; it says the `name`.
     """
-    rgba = np.asarray(avatar.render(training.hand_poses(frame), training.camera(frame)))
-    if rgba.shape != (training.height, training.width, 4):
-        raise MethodFailed(
-            f"render returned shape {rgba.shape}, not {(training.height, training.width, 4)}",
-            field=f"frame {frame}",
-        )
+    rgba = np.asarray(avatar.render(hands, camera))
+    size = (camera.height, camera.width, 4)
+    if rgba.shape != size:
+        raise MethodFailed(f"render returned shape {rgba.shape}, not {size}", field=name)
     if not np.isfinite(rgba).all():
-        raise MethodFailed("render returned NaN or infinity", field=f"frame {frame}")
+        raise MethodFailed("render returned NaN or infinity", field=name)
     from hwp_bench.base.images import as_uint8
 
     return as_uint8(np.asarray(rgba[:, :, :3], dtype=np.float64))

@@ -13,7 +13,7 @@ from hwp_bench.run.sandbox.confinement import Confinement
 #: A method, a capture and a split, of which only name and digests enter a key.
 PARTS: dict[str, Any] = {
     "manifest": SimpleNamespace(name="mine", digest="a" * 64),
-    "capture": SimpleNamespace(digest="b" * 64),
+    "capture": SimpleNamespace(digest="b" * 64, free_view=None),
     "split": SimpleNamespace(digest="c" * 64),
 }
 
