@@ -24,6 +24,7 @@ from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.methods.setting_files import check_settings
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.evaluation_tables import HEADLINE, all_tables
+from hwp_bench.report.free_view_table import free_view_tables
 from hwp_bench.results import Results, read_all
 from hwp_bench.run.engine import Engine, LocalEngine
 from hwp_bench.run.engine.parallel import ParallelEngine
@@ -97,7 +98,7 @@ def evaluate(
             on_capture=view.turn if engine.in_turn else None,
             engine=engine,
         )
-    write_tables(folder / "tables", all_tables([results]))
+    write_tables(folder / "tables", {**all_tables([results]), **free_view_tables([results])})
     return results
 
 

@@ -121,6 +121,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.methods.setting_files import check_settings
     from hwp_bench.report.evaluation_tables import all_tables
+    from hwp_bench.report.free_view_table import free_view_tables
     from hwp_bench.run.engine.options import engine_for, needs_of
 
     settings = evaluation_settings(args)
@@ -146,13 +147,14 @@ def run(args: argparse.Namespace) -> int:
                 engine=engine,
                 needs=needs_of(args),
             )
-    tables = all_tables([results])
+    novel = free_view_tables([results])
+    tables = {**all_tables([results]), **novel}
     write_tables(out / "tables", tables)
     if args.json:
         json.dump(asdict(results), sys.stdout, indent=1)
         print()
     else:
-        for name in ("overall", "captures"):
+        for name in ("overall", "captures", *novel):
             print_table(tables[name])
     return report_outcome(out, results)
 

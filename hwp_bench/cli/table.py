@@ -14,6 +14,7 @@ _TABLES = (
     "robustness",
     "severity",
     "novelty",
+    "free-view",
     "bias",
     "seeds",
 )
@@ -24,6 +25,7 @@ _EXAMPLES = """examples:
   hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
   hwp-bench table runs/mine-seed* --by seeds
   hwp-bench table runs/plain-mini runs/mine-mini --by novelty   # where training showed little
+  hwp-bench table runs/plain-mini runs/mine-mini --by free-view   # from all around
   hwp-bench table runs/mine-mini runs/plain-mini --paper 5 --published   # layout of table 5
   hwp-bench table --published                                            # the paper's numbers
 

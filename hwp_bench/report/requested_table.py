@@ -12,6 +12,8 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.base.tables import Table
 from hwp_bench.report.evaluation_tables import all_tables, same_data
+from hwp_bench.report.free_view_table import NAME as FREE_VIEW
+from hwp_bench.report.free_view_table import free_view_table
 from hwp_bench.report.novelty_table import novelty_table
 from hwp_bench.report.paper_layouts import (
     DISTANCE,
@@ -100,6 +102,9 @@ def _ours(request: TableRequest) -> Table:
     if request.by == "novelty":
         same_data(results)
         return novelty_table(sources, open_captures_of(results, request.captures))
+    if request.by == FREE_VIEW:
+        same_data(results)
+        return free_view_table(results)
     if request.by == "bias":
         return bias_table(sources, find_captures(results, request.captures))
     return all_tables(results)[request.by]

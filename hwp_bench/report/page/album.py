@@ -65,6 +65,11 @@ def frame_sheets(source: ResultsSource, capture: str, album: Album) -> str | Non
     return album.take_file(source.place(capture, "pictures", "comparison.png"))
 
 
+def free_view_sheet(source: ResultsSource, capture: str, album: Album) -> str | None:
+    """Return the sheet of views of the free-view clip that the evaluation drew."""
+    return album.take_file(source.place(capture, "pictures", "free_view.png"))
+
+
 def mask_sheet(source: ResultsSource, capture: str, album: Album) -> tuple[str, int] | None:
     """Return a sheet of a method's weight masks and how many there are, or None.
 

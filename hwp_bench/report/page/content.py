@@ -19,7 +19,8 @@ from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.evaluation_tables import all_tables, same_data
 from hwp_bench.report.figures import Bar, draw_bars, draw_pareto
-from hwp_bench.report.page.album import Album, frame_sheets, mask_sheet
+from hwp_bench.report.free_view_table import free_view_table
+from hwp_bench.report.page.album import Album, frame_sheets, free_view_sheet, mask_sheet
 from hwp_bench.report.page.elements import inline_svg, to_html
 from hwp_bench.report.page.strips import StripMethod, strip_plot
 from hwp_bench.report.sources import ResultsSource, find_captures, temporal_weights
@@ -47,6 +48,8 @@ class CaptureSection:
     severities: bool
     #: Sheets of worst, median and best frame: (method, data URI).
     frames: Sequence[tuple[str, str]]
+    #: Sheets of views from all around: (method, data URI).
+    views: Sequence[tuple[str, str]]
     #: Sheets of weight masks: (method, data URI, number of masks).
     masks: Sequence[tuple[str, str, int]]
 
@@ -112,6 +115,7 @@ def gather_report(
     cost = _cost(runs)
     tables = all_tables([source.results for source in chosen])
     shown = [tables[name] for name in ("overall", "perturbations", "captures")]
+    shown += _optional(lambda: free_view_table([source.results for source in chosen]))
     shown.append(replace(tables["paper"], caption="Protocol paper-wildghand"))
     shown += _optional(
         lambda: robustness_table(sources, start),
@@ -234,13 +238,15 @@ def _captures(
     sections = []
     for capture in runs[0].first.captures:
         info = infos.get(capture.digest)
-        methods, frames, masks = [], [], []
+        methods, frames, views, masks = [], [], [], []
         for index, (label, source) in enumerate(shown):
             own = next(c for c in source.results.captures if c.id == capture.id)
             weights = temporal_weights(source, capture.id)
             methods.append(StripMethod(index, label, own, weights))
             if uri := frame_sheets(source, capture.id, album):
                 frames.append((label, uri))
+            if uri := free_view_sheet(source, capture.id, album):
+                views.append((label, uri))
             if found := mask_sheet(source, capture.id, album):
                 masks.append((label, *found))
         hands = "two hands" if capture.hands == "both" else f"{capture.hands} hand"
@@ -249,7 +255,9 @@ def _captures(
         if info:
             text = f"{info.action}: {text}; {info.frame_count} frames, {info.width}x{info.height}"
         strip = strip_plot(methods, info, HEADLINE)
-        sections.append(CaptureSection(capture.id, text, strip, info is not None, frames, masks))
+        sections.append(
+            CaptureSection(capture.id, text, strip, info is not None, frames, views, masks)
+        )
     return sections
 
 
