@@ -8,7 +8,7 @@ import numpy as np
 
 from hwp_bench.analysis.statistics.bootstrap import bootstrap_mean
 from hwp_bench.analysis.statistics.pairing import MethodRuns, group_runs
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.report.evaluation_tables import score_column
 from hwp_bench.results import FreeViewResult, Results
@@ -41,6 +41,7 @@ def free_view_table(results: Sequence[Results]) -> Table:
     Raises:
         UsageError: none has such scores, no capture is common to all, two results are of the same
             method and seed, or the clips of a capture differ.
+        BadResult: a clip lists no frame, or frames without the main metric.
     """
     scored = [r for r in results if any(item.free_view for item in r.captures)]
     if not scored:
@@ -109,15 +110,28 @@ def _of_run(run: MethodRuns) -> dict[str, list[FreeViewResult]]:
 
 
 def _clips(result: Results) -> dict[str, FreeViewResult]:
-    return {item.id: item.free_view for item in result.captures if item.free_view is not None}
+    found = {}
+    for item in result.captures:
+        if item.free_view is None:
+            continue
+        metrics = {frozenset(frame.scores) for frame in item.free_view.frames}
+        if len(metrics) != 1 or MAIN not in next(iter(metrics)):
+            raise BadResult(
+                f"has frames without {MAIN}, or of different metrics, or none",
+                where=item.id,
+                field="free_view.frames",
+            )
+        found[item.id] = item.free_view
+    return found
 
 
 def _refuse_other_clips(found: Mapping[str, Mapping[str, Sequence[FreeViewResult]]]) -> None:
-    seen: dict[str, str] = {}
+    seen: dict[str, tuple[str, list[int]]] = {}
     for captures in found.values():
         for name, clips in captures.items():
             for clip in clips:
-                if seen.setdefault(name, clip.digest) != clip.digest:
+                data = clip.digest, [frame.frame for frame in clip.frames]
+                if seen.setdefault(name, data) != data:
                     raise UsageError(
                         "results on different free-view clips cannot stand in one table",
                         where=name,

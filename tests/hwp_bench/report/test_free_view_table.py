@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.images import write_image
 from hwp_bench.base.tables import Table, print_table, to_markdown
 from hwp_bench.report.free_view_table import free_view_table, free_view_tables
@@ -109,6 +109,15 @@ def test_what_cannot_be_compared_is_refused(make_results: Maker, tmp_path: Path)
         free_view_table([first, with_clips(make_results("two"), {"a": 21.0}, "other")])
     with pytest.raises(UsageError, match="no capture has a scored clip"):
         free_view_table([first, with_clips(make_results("two"), {"b": 21.0})])
+    clip = first.captures[0].free_view
+    assert clip is not None
+    for frames in ([], [replace(clip.frames[0], scores={"ssim": 0.5}), *clip.frames[1:]]):
+        odd = replace(first.captures[0], free_view=replace(clip, frames=frames))
+        with pytest.raises(BadResult, match="psnr"):
+            free_view_table([replace(first, captures=[odd])])
+    short = replace(first.captures[0], free_view=replace(clip, frames=clip.frames[1:]))
+    with pytest.raises(UsageError, match="different free-view clips"):
+        free_view_table([first, replace(first, captures=[short], seed=1)])
     path = write_results(tmp_path / "results.json", make_results("old"))
     with pytest.raises(UsageError, match="Evaluate again"):
         make_table(TableRequest([path], by="free-view"))

@@ -145,7 +145,11 @@ def test_a_capture_is_rendered_to_the_same_digest(nodes: Nodes, tmp_path: Path) 
     with RayEngine(nodes.address) as engine:
         engine.run([render_job(work, tmp_path / "ray", Needs())], lambda index: None)
     work.render(tmp_path / "turn")
-    assert open_capture(tmp_path / "ray").digest == open_capture(tmp_path / "turn").digest
+    there, here = (open_capture(tmp_path / name) for name in ("ray", "turn"))
+    assert there.digest == here.digest
+    assert there.free_view is not None
+    assert here.free_view is not None
+    assert there.free_view.digest == here.free_view.digest
 
 
 def test_a_stop_ends_the_jobs_on_the_nodes_and_leaves_no_half_result(
