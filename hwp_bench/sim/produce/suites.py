@@ -46,6 +46,7 @@ _SUITES: Mapping[str, tuple[tuple[str, ...] | None, int | None, int]] = MappingP
         "mini": (_MINI, 60, 176),
         "full": (None, None, 256),
         "wild-dev": (None, 60, 176),
+        "wild-test": (None, 60, 176),
     }
 )
 
@@ -60,7 +61,7 @@ def suite(name: str) -> tuple[SuiteItem, ...]:
 
     Args:
         name: `smoke` (seconds), `mini` (minutes), `full` (hours), or of scenes that are as wide
-            as the world: `wild-dev` (for tuning).
+            as the world: `wild-dev` (for tuning) or `wild-test` (for reports only).
 
     Raises:
         UsageError: there is no such suite.
