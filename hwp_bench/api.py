@@ -56,8 +56,8 @@ def evaluate(
 
     Args:
         method: method directory, or the name of one that ships: `plain`, `wildghand`.
-        captures: a suite (`smoke`, `mini`, `full`, `wild-dev`; rendered on first use), a capture
-            or its folder, or a list of these.
+        captures: a suite (`smoke`, `mini`, `full`, `wild-dev`, `wild-test`; rendered on first
+            use), a capture or its folder, or a list of these.
         out: results folder; `runs/METHOD-SUITE` if None, with the oracle's name behind it.
         preset: preset of the method; the suite's, else `default`, if None.
         settings: settings that override the preset, such as `{"dpd.enabled": False}`.
