@@ -132,12 +132,16 @@ def make_targets(work: Path) -> list[Target]:
 
 
 def capture_digest(out: Path) -> str:
-    """Digest of a capture, whose files are compared with what they should be."""
+    """Digests of a capture and its clip, whose files are compared with what they should be."""
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.check import check_capture
 
     wrong = [finding for finding in check_capture(out).findings if finding.level == "error"]
-    return f"damaged: {wrong[0].problem}" if wrong else open_capture(out).digest
+    if wrong:
+        return f"damaged: {wrong[0].problem}"
+    capture = open_capture(out)
+    clip = capture.free_view
+    return f"{capture.digest} {clip.digest if clip else 'without a free view'}"
 
 
 def results_digest(out: Path) -> str:
