@@ -8,13 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.sim.scene.reader import (
-    known_scenes,
-    load_scene,
-    scene_groups,
-    scene_names,
-    scene_path,
-)
+from hwp_bench.sim.scene.reader import known_scenes, load_scene, meant_scenes, scene_path
 from hwp_bench.sim.scene.schema import Scene
 
 if TYPE_CHECKING:
@@ -175,7 +169,7 @@ def calibrate_scenes(args: argparse.Namespace) -> int:
     from hwp_bench.sim.produce.calibration import calibrate, write_strengths
 
     rows: list[dict[str, Any]] = []
-    for name in _names(args.scene):
+    for name in meant_scenes(args.scene):
         scene = load_scene(name)
         calls = [call for call in scene.effects if args.effect in (None, call.kind)]
         results = [calibrate(scene, call) for call in calls]
@@ -202,14 +196,8 @@ def calibrate_scenes(args: argparse.Namespace) -> int:
     return 0
 
 
-def _names(names: list[str]) -> list[str]:
-    """The scenes that are meant: `all` are the eleven captures, a group's name all of its own."""
-    groups = {"all": scene_names()} | {group: scene_names(group) for group in scene_groups()}
-    return [scene for name in names for scene in groups.get(name, (name,))]
-
-
 def _scenes(names: list[str]) -> list[Scene]:
-    return [load_scene(name) for name in _names(names)]
+    return [load_scene(name) for name in meant_scenes(names)]
 
 
 def _changed(scene: Scene, severity: float | None, subject: int | None) -> Scene:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from functools import cache
 from pathlib import Path
@@ -64,6 +65,15 @@ def scene_path(name: str) -> Path:
 def known_scenes() -> tuple[str, ...]:
     """Names of all scenes that come with the package: the eleven captures, then each group's."""
     return tuple(name for group in ("", *scene_groups()) for name in scene_names(group))
+
+
+def meant_scenes(names: Iterable[str]) -> tuple[str, ...]:
+    """The scenes that a command means: `all` are the eleven captures, a group's name all of it.
+
+    Other names, and paths, stay as they are.
+    """
+    groups = {"all": scene_names()} | {group: scene_names(group) for group in scene_groups()}
+    return tuple(scene for name in names for scene in groups.get(name, (name,)))
 
 
 def load_scene(name_or_path: str | Path) -> Scene:

@@ -13,7 +13,13 @@ from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.sim.produce.suites import suite, suite_names
 from hwp_bench.sim.scene.episodes import clean_share, level, moments, severity
-from hwp_bench.sim.scene.reader import load_scene, parse_scene, scene_names
+from hwp_bench.sim.scene.reader import (
+    load_scene,
+    meant_scenes,
+    parse_scene,
+    scene_groups,
+    scene_names,
+)
 from hwp_bench.sim.scene.schema import (
     CLEAN_FROM,
     MIN_CLEAN_SHARE,
@@ -94,6 +100,21 @@ def test_damage_is_named(make_scene: SceneMaker, old: str, new: str, field: str)
 def test_unknown_scene_lists_the_known_ones() -> None:
     with pytest.raises(UsageError, match="capture10"):
         load_scene("capture11")
+    with pytest.raises(UsageError, match="wild-dev-7"):
+        load_scene("wild-dev-8")
+
+
+def test_groups_of_scenes_are_apart_from_the_eleven() -> None:
+    assert scene_groups() == ("wild-dev", "wild-test")
+    assert not set(scene_names()) & {name for group in scene_groups() for name in known(group)}
+    assert meant_scenes(["all"]) == scene_names()
+    assert meant_scenes(["wild-dev", "a.toml"]) == (*known("wild-dev"), "a.toml")
+    assert [item.scene.id for item in suite("wild-dev")] == list(known("wild-dev"))
+    assert [item.scene.id for item in suite("full")] == list(scene_names())
+
+
+def known(group: str) -> tuple[str, ...]:
+    return tuple(f"{group}-{number}" for number in range(8))
 
 
 @settings(max_examples=60, deadline=None)
