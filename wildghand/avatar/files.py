@@ -22,8 +22,10 @@ from hwp_bench.base.records import parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
+from wildghand.light import KnownLight
 from wildghand.model.assemble import make_model
 from wildghand.model.settings import read_stored, read_version_1
+from wildghand.subject import SubjectShape
 
 #: Version of the folder.
 SCHEMA = "wildghand-avatar/2"
@@ -135,12 +137,19 @@ def load_avatar(
     templates = _templates(value.hand_model, value.sides, hand, where)
     mean_color, frame_count = torch.tensor(value.mean_color), max(1, len(value.fit.frames))
     device = torch.device(device)
-    model = make_model(templates, settings, mean_color, frame_count, value.seed, device)
     file = root / MODEL
     if not file.is_file() or file.stat().st_size > MAX_MODEL_BYTES:
         raise BadInput(f"is missing or larger than {MAX_MODEL_BYTES} bytes", where=file)
     try:
-        model.load_state_dict(load_file(file), strict=True)
+        tensors = load_file(file)
+        subject = SubjectShape.from_tensors(tensors, next(iter(templates.values())), str(file))
+        model = make_model(
+            templates, settings, mean_color, frame_count, value.seed, device, subject
+        )
+        light = KnownLight.from_tensors(tensors, str(file))
+        if light is not None:
+            model.keep(light)
+        model.load_state_dict(tensors, strict=True)
     except (SafetensorError, RuntimeError, OSError) as error:
         problem = str(error).splitlines()[0][:300]
         raise BadInput(f"does not hold this avatar's tensors ({problem})", where=file) from error

@@ -18,14 +18,18 @@ from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fitting.hand_masks import hand_masks
+from wildghand.fitting.light_samples import light_samples
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
 from wildghand.fitting.shared_features import SharedFeatures
-from wildghand.fitting.weighting import Weighting, assess_frames
+from wildghand.fitting.skin_places import skin_places
+from wildghand.fitting.subject_shape import bent_templates, subject_of
+from wildghand.fitting.weighting import Weighting, assess_frames, weighs_by_place
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Loss, repeatable
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.training import TrainingClip, load_frames
+from wildghand.light import fit_light
 from wildghand.model.assemble import make_model
 from wildghand.model.model import RenderedFrames, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
@@ -65,16 +69,26 @@ class Fit:
         self.frames = load_frames(training)
         self.mean_color = self.frames.mean_color()
         templates = {side: training.template(side) for side in training.sides}
+        subject = subject_of(training, self.frames, templates, settings)
         self.model = make_model(
-            templates, settings, self.mean_color, len(self.frames), seed, device
+            templates, settings, self.mean_color, len(self.frames), seed, device, subject
         )
         self.source = {"capture": training.id}
         self.source |= start_from_prior(self.model, settings, training.hand_model)
         self.clip = TrainingClip(training, self.frames.indices, self.model.rigs, device)
-        assessment = assess_frames(training, self.frames, settings)
+        # Frames are compared with the person, not with a template that fits none of them.
+        bent = bent_templates(templates, subject)
+        assessment = assess_frames(training, self.frames, bent, settings)
         masks = hand_masks(training, self.frames, settings.pao.hand, device)
         self.frames = dataclasses.replace(self.frames, masks=masks)
-        self.weighting = Weighting(self.frames, len(training.sides), assessment, settings, device)
+        self.weighting = Weighting(
+            self.frames,
+            len(training.sides),
+            assessment,
+            settings,
+            device,
+            skin_places(training, self.frames, bent) if weighs_by_place(settings) else (),
+        )
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal, device)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
@@ -203,6 +217,18 @@ class Fit:
                 refine=self.settings.heads.refinement,
                 features=features,
             )
+
+    def learn_light(self) -> None:
+        """Fit the light of the clip to what the model says of it, where the settings do."""
+        settings = self.settings.light
+        if not settings.enabled:
+            return
+        weights = self.weighting.frame_weights
+        light = fit_light(
+            light_samples(self.model, self.clip, weights, settings.samples, self.seed), settings
+        )
+        if light is not None:
+            self.model.keep(light)
 
     def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
         """The avatar as it stands; it goes on changing with the fit.

@@ -95,6 +95,7 @@ def optimize(
                 break
         if not watchers.guard.sound():
             step = _go_back(fit, watchers, step)
+    fit.learn_light()
     return fit.avatar(step, report.elapsed, final=world.is_main)
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hwp_bench.hands import HandTemplate
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.dpd.pay_back import PayBack
 from wildghand.fitting.networks import choose_segmenter
@@ -19,7 +20,8 @@ from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.model import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.pao.pao import PerturbationAwareWeights, binary_weights
-from wildghand.pao.regions import ClipRegions
+from wildghand.pao.place_errors import PlaceErrors
+from wildghand.pao.regions import ClipRegions, FrameRegions
 from wildghand.pao.regions.superpixels import RegionCache
 from wildghand.pao.running_median import running_median
 from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
@@ -39,10 +41,26 @@ class FrameTarget:
     sizes: Tensor | None = None
 
 
+def weighs_by_place(settings: WildGHandSettings) -> bool:
+    """Whether PAO counts the errors of regions in those of their places."""
+    pao = settings.pao
+    return pao.enabled and pao.variant != "binary" and pao.errors == "place"
+
+
 def assess_frames(
-    training: TrainingCapture, frames: TrainingFrames, settings: WildGHandSettings
+    training: TrainingCapture,
+    frames: TrainingFrames,
+    templates: Mapping[str, HandTemplate],
+    settings: WildGHandSettings,
 ) -> FrameAssessment | None:
-    """Run the pre-pass on the frames that are fitted; None where the settings have none."""
+    """Run the pre-pass on the frames that are fitted; None where the settings have none.
+
+    Args:
+        training: their parameters and cameras.
+        frames: the frames.
+        templates: of the person's hands, by side.
+        settings: of the fit.
+    """
     if not settings.prepass.enabled:
         return None
     return judge_frames(
@@ -52,7 +70,7 @@ def assess_frames(
             masks=np.asarray(frames.masks),
             hands=training.hands,
             cameras=training.cameras,
-            templates={side: training.template(side) for side in training.sides},
+            templates=templates,
         ),
         settings.prepass,
     )
@@ -71,6 +89,8 @@ class Weighting:
         assessment: of these frames by the pre-pass; None without it.
         settings: which components are on.
         device: where the tensors live.
+        places: R times (H, W) uint16, the place of the skin at each pixel; only where regions are
+            weighed by place.
 
     Attributes:
         clean: (R,) probability that a frame is clean; ones without the pre-pass.
@@ -80,6 +100,7 @@ class Weighting:
         pao: the paper's weights, whose thresholds are learnt.
         median: running median of the regions' errors; None before the first, and where PAO does
             not count in it.
+        places: ordinary errors by place; None where PAO does not count in them.
         pay_back: what the frames' biases explain; None where nothing follows from it.
     """
 
@@ -90,6 +111,7 @@ class Weighting:
         assessment: FrameAssessment | None,
         settings: WildGHandSettings,
         device: torch.device,
+        places: Sequence[np.ndarray] = (),
     ) -> None:
         count, pao = len(frames), settings.pao
         self.frames, self.settings, self.device = frames, settings, device
@@ -114,6 +136,11 @@ class Weighting:
             segmenter = choose_segmenter(settings.pao.regions, device)
             regions = RegionCache().clip(frames.images.numpy(), segmenter)
             self._regions = ClipRegions(regions, device)
+        self.places: PlaceErrors | None = None
+        if weighs_by_place(settings):
+            labels = [FrameRegions(one) for one in places]
+            count = 1 + max(int(one.max()) for one in places)
+            self.places = PlaceErrors(ClipRegions(labels, device), self.clean.to(device), count)
         self._images, self._hands = frames.images_on(device), frames.masks_on(device)
         size = 4 * frames.masks[0].numel()
         self._fixed = FrameTable(self._fixed_weights, count, size, device)
@@ -123,6 +150,7 @@ class Weighting:
         return {
             "thresholds": self.pao.state_dict(),
             "median": None if self.median is None else float(self.median),
+            "ordinary": None if self.places is None else self.places.ordinary.clone(),
             "residuals": None if self.pay_back is None else self.pay_back.residuals.clone(),
         }
 
@@ -130,6 +158,8 @@ class Weighting:
         """Go on from a saved state."""
         self.pao.load_state_dict(state["thresholds"])
         self.median = None if state["median"] is None else float(state["median"])
+        if self.places is not None and state.get("ordinary") is not None:
+            self.places.ordinary.copy_(state["ordinary"])
         if self.pay_back is not None and state.get("residuals") is not None:
             self.pay_back.residuals.copy_(state["residuals"])
 
@@ -190,9 +220,14 @@ class Weighting:
         omega = world.gather(drawing.omega)
         if world.size > 1:  # what is gathered has no gradient
             omega = torch.cat([omega[: part.start], drawing.omega, omega[part.stop :]])
-        found = self.pao(error, regions, hands, omega, self.median)
-        if self.settings.pao.errors == "median":
+        expected = None
+        if self.places is not None and self.median is not None:
+            expected = self.places.expected(rows, self.median)
+        found = self.pao(error, regions, hands, omega, self.median, expected)
+        if self.settings.pao.errors in ("median", "place"):
             self.median = running_median(self.median, found.mean_errors, found.shares > 0.0)
+        if self.places is not None and self.median is not None:
+            self.places.watch(rows, error, hands > 0.5, self.median)
         weights = found.weights[part]
         if self.settings.pao.variant == "scaled":
             weights = weights + self.settings.terms.outside_weight * (1.0 - hands[part])

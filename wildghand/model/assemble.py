@@ -11,6 +11,7 @@ from wildghand.gaussians.rig import HandRig, rig_of
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import PredictionNetwork, mirrored_anchors, surface_points
+from wildghand.subject import SubjectShape
 
 
 def make_model(
@@ -20,6 +21,7 @@ def make_model(
     frame_count: int,
     seed: int,
     device: torch.device,
+    subject: SubjectShape | None = None,
 ) -> WildGHandModel:
     """Make the model that a fit starts from; the same arguments make the same model.
 
@@ -30,8 +32,9 @@ def make_model(
         frame_count: training frames that are fitted.
         seed: of the places of the Gaussians, and of the initial weights.
         device: where it lives.
+        subject: how the person's hand differs from the templates; None: not at all.
     """
-    rigs = make_rigs(templates, settings.gaussians, seed, device)
+    rigs = make_rigs(templates, settings.gaussians, seed, device, subject)
     surfaces = {
         side: surface_points(templates[side], rig.anchors, rig.spacing, mean_color)
         for side, rig in rigs.items()
@@ -48,19 +51,28 @@ def make_model(
             rank=dpd.rank,
             template=settings.heads.template,
         )
+    if subject is not None:
+        model.keep(subject)
     return model.to(device)
 
 
 def make_rigs(
-    templates: Mapping[str, HandTemplate], count: int, seed: int, device: torch.device
+    templates: Mapping[str, HandTemplate],
+    count: int,
+    seed: int,
+    device: torch.device,
+    subject: SubjectShape | None = None,
 ) -> dict[str, HandRig]:
     """Spread anchors over one hand or two, at the same places of the skin.
+
+    They are spread over the template, whatever the person's hand is: a prior knows these places.
 
     Args:
         templates: by side.
         count: anchors on each hand.
         seed: of their places.
         device: where the tensors live.
+        subject: how the person's hand differs from the templates.
     """
     rigs: dict[str, HandRig] = {}
     anchors = None
@@ -69,5 +81,6 @@ def make_rigs(
         anchors = (
             sample_surface(template, count, seed) if anchors is None else mirrored_anchors(anchors)
         )
-        rigs[side] = rig_of(template, anchors, device)
+        bent = template if subject is None else subject.applied(template)
+        rigs[side] = rig_of(bent, anchors, device)
     return rigs

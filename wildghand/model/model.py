@@ -14,9 +14,12 @@ from wildghand.dpd.scale_gradients import scale_refinement
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.gaussians.training import TrainingClip
+from wildghand.light import KnownLight
 from wildghand.model.dress import Gaussians, dress
+from wildghand.model.relight import relit
 from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
 from wildghand.splat import rasterize
+from wildghand.subject import SubjectShape
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,6 +98,7 @@ class WildGHandModel(nn.Module):
     ) -> None:
         super().__init__()
         self._template = template
+        self._light: KnownLight | None = None
         self.rigs = dict(rigs)
         self.network = network
         self.perturbation = nn.ModuleDict(
@@ -107,6 +111,18 @@ class WildGHandModel(nn.Module):
         self.log_gains = nn.Parameter(torch.zeros(frame_count, 3))
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
+
+    def keep(self, found: SubjectShape | KnownLight) -> None:
+        """Keep what was fitted beside the network, so that it is saved with everything else.
+
+        Args:
+            found: the person's shape, which the rigs have already, or the light, by which unknown
+                normals are drawn from now on.
+        """
+        for name, values in found.to_tensors().items():
+            self.register_buffer(name, values.to(self.log_gains.device))
+        if isinstance(found, KnownLight):
+            self._light = KnownLight.from_tensors(dict(self.named_buffers()), "light")
 
     def finite(self) -> bool:
         """Whether every fitted number is finite."""
@@ -163,7 +179,7 @@ class WildGHandModel(nn.Module):
             if move:
                 pose = pose + self.pose_steps[index, rows]
                 transl = transl + self.transl_steps[index, rows]
-            prediction = self._predict(
+            prediction = self.predict(
                 side, anchors, pose.detach(), None if features is None else features[side]
             )
             if refine:
@@ -230,12 +246,21 @@ class WildGHandModel(nn.Module):
             (B, H, W, 3) sRGB over black and (B, H, W, 1) coverage.
         """
         parts = [
-            self.gaussians(side, *hands[side], refine=refine) for side in self.rigs if side in hands
+            self.gaussians(side, *hands[side], refine=refine, viewmats=viewmats)
+            for side in self.rigs
+            if side in hands
         ]
         return _rasterize(parts, viewmats, Ks, width, height)
 
     def gaussians(
-        self, side: str, pose: Tensor, betas: Tensor, transl: Tensor, *, refine: bool = False
+        self,
+        side: str,
+        pose: Tensor,
+        betas: Tensor,
+        transl: Tensor,
+        *,
+        refine: bool = False,
+        viewmats: Tensor | None = None,
     ) -> Gaussians:
         """The Gaussians of one hand in any pose, free of perturbations.
 
@@ -245,18 +270,36 @@ class WildGHandModel(nn.Module):
             betas: (10,).
             transl: (B, 3) m.
             refine: apply the network's refinement of the parameters (head iv).
+            viewmats: (B, 4, 4) of the cameras that look at them; with these, skin that faces them
+                with a normal that no training frame has shown is drawn by the fitted light.
         """
         rig = self.rigs[side]
         anchors = rig.pose(pose, betas, transl)
-        prediction = self._predict(side, anchors, pose)
+        prediction = self.predict(side, anchors, pose)
+        if self._light is not None and viewmats is not None:
+            prediction = relit(
+                prediction,
+                self._light,
+                lambda normals: self.network(side, normals, pose),
+                anchors,
+                viewmats,
+            )
         if refine:
             step = prediction.refinement
             anchors = rig.follow(pose + step.pose, betas + step.betas, transl + step.transl)
         return dress(anchors, prediction, self.network.activation)[0]
 
-    def _predict(
+    def predict(
         self, side: str, anchors: AnchorPoses, pose: Tensor, features: HandFeatures | None = None
     ) -> NetworkOutput:
+        """What the network predicts of one hand in B frames.
+
+        Args:
+            side: which hand.
+            anchors: in the frames.
+            pose: (B, 16, 3) axis-angle, rad.
+            features: of the network, where they are at hand already.
+        """
         made = self.network(side, quat_third_axis(anchors.orientations), pose, features)
         if self._template:
             return made

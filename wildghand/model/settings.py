@@ -17,11 +17,13 @@ from hwp_bench.base.errors import BadMethod
 from hwp_bench.base.records import flattened, merged
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
+from wildghand.light import LightSettings
 from wildghand.model.former_settings import current_names
 from wildghand.model.terms import PAPER_TERMS, TermWeights
 from wildghand.network.settings import NetworkSettings, network_settings
 from wildghand.pao.pao import PAPER_PAO, PaoSettings
 from wildghand.prepass import PrepassSettings
+from wildghand.subject import SubjectSettings
 
 #: Where messages place a wrong setting.
 WHERE = "wildghand"
@@ -109,6 +111,10 @@ class WildGHandSettings:
     pao: PaoSettings = field(default_factory=PaoSettings)
     #: Component: heads iii and iv.
     heads: HeadSettings = field(default_factory=HeadSettings)
+    #: Addition: a light for normals that no frame has shown.
+    light: LightSettings = field(default_factory=LightSettings)
+    #: Addition: the template is bent to the person before the fit.
+    subject: SubjectSettings = field(default_factory=SubjectSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
     #: covered, and which poses need refining. It leaves the biases out of every clean
     #: frame, not out of three in ten: what little they took from these, the avatar lacked
@@ -142,6 +148,8 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
             "error_threshold": PAPER_PAO.error_threshold,
             "share_threshold": PAPER_PAO.share_threshold,
         },
+        "subject": {"enabled": False},
+        "light": {"enabled": False},
         "prepass": {"enabled": False},
         "schedule": {
             "batch": 4,
@@ -173,10 +181,23 @@ MODES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 _PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
     {
         "dpd": {"gains": False},
+        "subject": {"enabled": False},
+        "light": {"enabled": False},
         "prepass": {"enabled": False},
         "terms": {
             name: value for name, value in _PUBLISHED["terms"].items() if name != "dssim_weight"
         },
+    }
+)
+
+
+#: What settings that came later were before there were any.
+_BEFORE: Mapping[str, Any] = MappingProxyType(
+    {
+        "dpd": {"rank": 0},
+        "pao": {"errors": "median"},
+        "subject": {"enabled": False},
+        "light": {"enabled": False},
     }
 )
 
@@ -222,7 +243,7 @@ def read_stored(values: Mapping[str, Any]) -> WildGHandSettings:
         # Without heads iii and iv, the third acted.
         acting = heads.get("enabled", True) and heads.get("refinement", True)
         tree["heads"] = {**heads, "enabled": True, "template": True, "refinement": acting}
-    return read_settings(merged({"dpd": {"rank": 0}}, tree))
+    return read_settings(merged(_BEFORE, tree))
 
 
 def read_version_1(values: Mapping[str, Any]) -> WildGHandSettings:

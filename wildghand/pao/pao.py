@@ -12,7 +12,7 @@ from torch import Tensor, nn
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.methods.settings import check_source
 from wildghand.pao.regions.frame_regions import Regions
-from wildghand.pao.running_median import running_median
+from wildghand.pao.running_median import LEAST, running_median
 
 #: Colour channels: the paper's background error is their sum, its region error their mean.
 _CHANNELS = 3.0
@@ -39,10 +39,11 @@ class PaoSettings:
     #: learns from a frame, while the frame's biases learn from all of it. `all`: W. `regions`: the
     #: weights of regions alone, as printed. `none`: nothing, as in the authors' code.
     temporal: Literal["teaching", "all", "regions", "none"] = "teaching"
-    #: What E_u is counted in. `median`: the running median of the regions' errors. `batch`: from
-    #: the smallest to the largest of a batch on [0, 1], as the authors do. `absolute`: colours in
-    #: [0, 1], as printed.
-    errors: Literal["median", "batch", "absolute"] = "median"
+    #: What E_u is counted in. `place`: the ordinary error of the region's places on the hand
+    #: (`wildghand.pao.place_errors`). `median`: the running median of the regions' errors.
+    #: `batch`: from the smallest to the largest of a batch on [0, 1], as the authors do.
+    #: `absolute`: colours in [0, 1], as printed.
+    errors: Literal["place", "median", "batch", "absolute"] = "place"
     #: Factor of every region's weight.
     alpha: float = 1.0
     #: How strongly the temporal weight of a frame lowers its weight; 0 = not at all.
@@ -76,7 +77,7 @@ class PaoSettings:
         for name, known in (
             ("variant", ("scaled", "printed", "binary")),
             ("temporal", ("teaching", "all", "regions", "none")),
-            ("errors", ("median", "batch", "absolute")),
+            ("errors", ("place", "median", "batch", "absolute")),
             ("share_of", ("auto", "hand", "region")),
         ):
             if getattr(self, name) not in known:
@@ -154,6 +155,7 @@ class PerturbationAwareWeights(nn.Module):
         hand: Tensor,
         omega: Tensor,
         median: float | Tensor | None = None,
+        expected: Tensor | None = None,
     ) -> Weights:
         """Weigh B frames.
 
@@ -164,7 +166,9 @@ class PerturbationAwareWeights(nn.Module):
             hand: (B, H, W) y_h: bool, or coverage in [0, 1], hand where above a half.
             omega: (B,) temporal weights.
             median: running median of `Weights.mean_errors`; None: that of these frames. Only
-                `errors` "median" reads it.
+                `errors` "median" and "place" read it.
+            expected: (B, H, W) ordinary error at each pixel, positive, in which `errors` "place"
+                counts; None: `median` is.
 
         Raises:
             ShapeMismatch: the arguments do not describe the same frames.
@@ -181,6 +185,11 @@ class PerturbationAwareWeights(nn.Module):
             counted = on_hand & finite
         means, shares, present = self._measure(error, regions, counted, on_hand)
         errors = self._counted(means, present, median)
+        if expected is not None and self.settings.errors == "place":
+            ordinary, _, _ = self._measure(expected, regions, counted, on_hand)
+            errors = torch.where(
+                present, means / ordinary.clamp(min=LEAST), torch.zeros_like(means)
+            )
         live = self.temporal_factor(omega)
         temporal = live.detach()
         of_regions = temporal if self.settings.temporal in ("all", "regions") else None

@@ -1,0 +1,88 @@
+"""Outlines: where the border of a drawn hand lies against the border of a mask."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+
+from hwp_bench.hands.raster import draw_faces
+
+# Outlines nearer to the image's edge than this say nothing, px.
+_EDGE = 3
+# Standard deviation of the smoothing before an outline's direction is read, px.
+_SMOOTH = 1.5
+# Least cosine between the outward directions of drawing and mask.
+_ALIKE = 0.6
+
+
+@dataclass(frozen=True, eq=False)
+class OutlinePoints:
+    """M points of the outline of the drawn hands in one frame."""
+
+    #: (M,) face of the mesh that each point is on.
+    face: np.ndarray
+    #: (M, 3) barycentric coordinates.
+    mix: np.ndarray
+    #: (M, 2) unit vectors in the image, outward.
+    outward: np.ndarray
+    #: (M,) px that the mask's border lies farther out.
+    gap: np.ndarray
+
+
+def compare_outlines(
+    pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray, mask: np.ndarray
+) -> OutlinePoints:
+    """Compare the outline of a mesh with that of a mask.
+
+    Args:
+        pixels: (V, 2) px, the mesh in the image.
+        depth: (V,) m.
+        faces: (F, 3).
+        mask: (H, W) bool, visible hand.
+
+    Returns:
+        The points where both outlines run alike. Distances of both are read in the same way, so
+        that the rounding to pixels is the same.
+    """
+    face, mix = draw_faces(pixels, depth, faces, mask.shape)
+    drawn = face >= 0
+    mine, other = outward_distance(drawn), outward_distance(mask)
+    rim = drawn & (mine > -1.2)
+    rim[:_EDGE] = rim[-_EDGE:] = False
+    rim[:, :_EDGE] = rim[:, -_EDGE:] = False
+    rows, columns = np.nonzero(rim)
+    here, there = _direction(mine, rows, columns), _direction(other, rows, columns)
+    alike = (here * there).sum(axis=1) > _ALIKE
+    rows, columns = rows[alike], columns[alike]
+    second = mix[rows, columns]
+    return OutlinePoints(
+        face=face[rows, columns],
+        mix=np.column_stack([1.0 - second.sum(axis=1), second]),
+        outward=here[alike],
+        gap=(mine - other)[rows, columns],
+    )
+
+
+def outward_distance(area: np.ndarray) -> np.ndarray:
+    """(H, W) float32 px from the border of a bool area: positive outside, negative inside."""
+    solid = area.astype(np.uint8)
+    inside = cv2.distanceTransform(solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    outside = cv2.distanceTransform(1 - solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    result: np.ndarray = outside - inside
+    return result
+
+
+def _direction(distance: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """(M, 2) unit gradients (x, y) of a smoothed distance; zeros where it has none."""
+    smooth = cv2.GaussianBlur(distance, (0, 0), _SMOOTH)
+    slope = np.stack(
+        [
+            cv2.Sobel(smooth, cv2.CV_32F, 1, 0)[rows, columns],
+            cv2.Sobel(smooth, cv2.CV_32F, 0, 1)[rows, columns],
+        ],
+        axis=1,
+    )
+    length = np.linalg.norm(slope, axis=1, keepdims=True)
+    return np.where(length > 1e-3, slope / np.maximum(length, 1e-3), 0.0)

@@ -1,0 +1,37 @@
+"""Settings of the subject's own hand; lengths are metres on the hand or pixels of the image."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hwp_bench.methods.settings import number
+
+
+@dataclass(frozen=True)
+class SubjectSettings:
+    """How the template is bent to the person before a fit."""
+
+    #: Bend the template to the masks of the clip.
+    enabled: bool = True
+    #: Frames that are compared at most, evenly spread over the clip.
+    frames: int = number(24, 1, 1000)
+    #: Control points on the hand.
+    nodes: int = number(200, 20, 1000)
+    #: Rounds; in each the silhouettes are drawn again.
+    rounds: int = number(4, 1, 100)
+    #: Points of all outlines together that are compared in a round.
+    points: int = number(3000, 100, 100_000)
+    #: Distance at which a point of the outline counts half in the last round, px; three times as
+    #: far in the first.
+    reach: float = number(1.5, 0.1, 100.0)
+    #: Expected error of a point of the outline, px; as large as neighbouring points and frames,
+    #: which err together, make it.
+    noise: float = number(3.0, 0.01, 1000.0)
+    #: Expected displacement of a control point, m.
+    spread: float = number(4e-3, 1e-5, 0.1)
+    #: Expected difference between control points 1 cm apart, m.
+    roughness: float = number(1e-3, 1e-6, 0.1)
+    #: Expected distance of a joint from where its surroundings take it, m.
+    joint_spread: float = number(2e-3, 1e-6, 0.1)
+    #: Expected error of the given translation of a hand in a frame, m.
+    transl_spread: float = number(2e-3, 1e-6, 0.1)
