@@ -93,6 +93,7 @@ def _facts(capture: Capture) -> dict[str, Any]:
         "size": [info.width, info.height],
         "fps": info.fps,
         "hand_model": info.hand_model.name,
+        "made_by": info.made_by or "not stated",
         "perturbed_frames": {
             name: None if values is None else sum(value > 0 for value in values)
             for name, values in info.perturbations.items()

@@ -106,6 +106,19 @@ class CaptureInfo:
         """Whether two hands are in the image (the paper's `interacting`)."""
         return self.hands == "both"
 
+    @property
+    def made_by(self) -> str | None:
+        """Importer and version that made the hand parameters and masks, such as `video 1`.
+
+        It is `source.importer`, an object of `name` and `version`. None where the capture does not
+        say so: simulated ones, and imports that are older than this record.
+        """
+        maker = self.source.get("importer")
+        if not isinstance(maker, Mapping):
+            return None
+        name, version = maker.get("name"), maker.get("version")
+        return f"{name} {version}" if isinstance(name, str) and isinstance(version, int) else None
+
     def severity(self, frame: int) -> dict[str, int | None]:
         """Return the severity of every declared perturbation in one frame."""
         return {

@@ -21,6 +21,9 @@ from hwp_bench.importers.video.decode import ClipImages, VideoInfo
 from hwp_bench.importers.video.fit_clip import FittedClip, ReprojectionError
 from hwp_bench.importers.video.video_settings import VideoImport
 
+#: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
+#: because scores on captures of two versions do not compare.
+IMPORTER_VERSION = 1
 #: Frames on the overlay sheet.
 SHEET_FRAMES = 24
 
@@ -144,6 +147,7 @@ def capture_info(
         perturbations=dict.fromkeys(options.perturbations),
         source={
             "kind": "video",
+            "importer": {"name": "video", "version": IMPORTER_VERSION},
             "video": {
                 "name": video.path.name,
                 "sha256": sha256_file(video.path),

@@ -159,6 +159,25 @@ def test_damaged_metadata_is_named(
     assert not check_capture(root).ok
 
 
+@pytest.mark.parametrize(
+    ("maker", "made_by"),
+    [
+        ({"name": "video", "version": 2}, "video 2"),
+        ({"name": "video"}, None),
+        ({"name": ["video"], "version": {}}, None),
+        ("video 2", None),
+        (None, None),
+    ],
+)
+def test_the_importer_s_version_is_read_where_it_is_said(
+    make_capture: CaptureMaker, maker: object, made_by: str | None
+) -> None:
+    root = make_capture(frames=3).root
+    assert open_capture(root).info.made_by is None
+    _edit(root, source={"importer": maker})
+    assert open_capture(root).info.made_by == made_by
+
+
 def _arrays(root: Path, file: str, **changes: np.ndarray) -> None:
     with np.load(root / file) as archive:
         arrays = {**archive, **changes}

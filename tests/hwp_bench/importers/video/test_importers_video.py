@@ -20,6 +20,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import overlap
 from hwp_bench.importers.video.from_video import import_video
+from hwp_bench.importers.video.imported_clip import IMPORTER_VERSION
 from hwp_bench.importers.video.video_settings import FitSettings, FrameRange, VideoImport
 
 FRAMES = 16
@@ -69,6 +70,8 @@ def test_the_capture_is_sound(capture: Capture, clip: SyntheticClip) -> None:
     info = capture.info
     assert (info.hands, info.fps, info.frame_count, info.width) == ("right", 30.0, FRAMES, 128)
     assert info.perturbations == {}
+    assert info.made_by == f"video {IMPORTER_VERSION}"
+    assert check_capture(capture.root).facts["made_by"] == info.made_by
     assert (info.hand_model.name, info.hand_model.digest) == (
         clip.template.name,
         clip.template.digest,
