@@ -1,4 +1,4 @@
-"""What a fitted model says of the light: colours of Gaussians that turn from frame to frame."""
+"""Samples of the light from a fitted model: colours of Gaussians that turn from frame to frame."""
 
 from __future__ import annotations
 

@@ -113,7 +113,7 @@ class WildGHandModel(nn.Module):
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
 
     def keep(self, found: SubjectShape | KnownLight) -> None:
-        """Keep what was fitted beside the network, so that it is saved with everything else.
+        """Keep a shape or a light that was fitted, so that it is saved with the network.
 
         Args:
             found: the person's shape, which the rigs have already, or the light, by which unknown

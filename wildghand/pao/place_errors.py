@@ -1,4 +1,4 @@
-"""Ordinary errors by place: what every frame of a clip gets wrong is no perturbation of one."""
+"""Ordinary errors by place: an error in every frame of a clip is not a perturbation."""
 
 from __future__ import annotations
 
