@@ -139,8 +139,8 @@ class Weighting:
         self.places: PlaceErrors | None = None
         if weighs_by_place(settings):
             labels = [FrameRegions(one) for one in places]
-            count = 1 + max(int(one.max()) for one in places)
-            self.places = PlaceErrors(ClipRegions(labels, device), self.clean.to(device), count)
+            numbers = 1 + max(int(one.max()) for one in places)
+            self.places = PlaceErrors(ClipRegions(labels, device), self.clean.to(device), numbers)
         self._images, self._hands = frames.images_on(device), frames.masks_on(device)
         size = 4 * frames.masks[0].numel()
         self._fixed = FrameTable(self._fixed_weights, count, size, device)

@@ -292,7 +292,7 @@ class WildGHandModel(nn.Module):
     def predict(
         self, side: str, anchors: AnchorPoses, pose: Tensor, features: HandFeatures | None = None
     ) -> NetworkOutput:
-        """What the network predicts of one hand in B frames.
+        """Predict the attributes of one hand in B frames.
 
         Args:
             side: which hand.

@@ -111,10 +111,10 @@ class WildGHandSettings:
     pao: PaoSettings = field(default_factory=PaoSettings)
     #: Component: heads iii and iv.
     heads: HeadSettings = field(default_factory=HeadSettings)
-    #: Addition: a light for normals that no frame has shown.
-    light: LightSettings = field(default_factory=LightSettings)
     #: Addition: the template is bent to the person before the fit.
     subject: SubjectSettings = field(default_factory=SubjectSettings)
+    #: Addition: a light for normals that no frame has shown.
+    light: LightSettings = field(default_factory=LightSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
     #: covered, and which poses need refining. It leaves the biases out of every clean
     #: frame, not out of three in ten: what little they took from these, the avatar lacked

@@ -5,6 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from wildghand.gaussians.frame_table import upload
 from wildghand.pao.regions import ClipRegions
 from wildghand.pao.running_median import LEAST
 
@@ -25,6 +26,7 @@ class PlaceErrors:
         places: the place of each pixel of the R frames; frames share their numbers.
         trust: (R,) in [0, 1], how much a frame may teach what is ordinary: the probability that it
             is clean.
+        count: C, places of the clip; they are numbered from 0.
 
     Attributes:
         ordinary: (C,) mean over channels of |rendering - input|; 0 where nothing is known.
@@ -47,7 +49,8 @@ class PlaceErrors:
         places = self._places(rows)
         floor = torch.clamp(self.ordinary, min=LEAST)
         floor = torch.maximum(floor, torch.as_tensor(median, device=floor.device).to(floor))
-        return places.spread(floor.expand(len(rows), -1).contiguous())
+        # The regions of a batch may end before the last place of the clip.
+        return places.spread(floor[: places.count].expand(len(rows), -1).contiguous())
 
     @torch.no_grad()
     def watch(self, rows: Tensor, error: Tensor, hand: Tensor, median: float | Tensor) -> None:
@@ -64,8 +67,11 @@ class PlaceErrors:
         errors = places.sums(torch.where(hand, error, torch.zeros_like(error)))
         errors = errors / pixels.clamp(min=1.0)
         unit = torch.as_tensor(median, device=error.device).to(error)
-        for mine, seen, trust in zip(errors, pixels > 0.0, self._trust[rows], strict=True):
-            known = torch.where(self.ordinary > 0.0, self.ordinary, unit)
+        trusts = self._trust[upload(rows, self._trust.device)]
+        ordinary = self.ordinary[: places.count]
+        for mine, seen, trust in zip(errors, pixels > 0.0, trusts, strict=True):
+            known = torch.where(ordinary > 0.0, ordinary, unit)
             bounded = torch.minimum(mine, MOST * torch.maximum(known, unit))
             moved = known + RATE * trust * (bounded - known)
-            self.ordinary = torch.where(seen & mine.isfinite(), moved, self.ordinary)
+            ordinary = torch.where(seen & mine.isfinite(), moved, ordinary)
+        self.ordinary = torch.cat([ordinary, self.ordinary[places.count :]])

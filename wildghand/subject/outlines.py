@@ -49,7 +49,7 @@ def compare_outlines(
     face, mix = draw_faces(pixels, depth, faces, mask.shape)
     drawn = face >= 0
     mine, other = outward_distance(drawn), outward_distance(mask)
-    rim = drawn & (mine > -1.2)
+    rim = drawn & (mine > -0.7)
     rim[:_EDGE] = rim[-_EDGE:] = False
     rim[:, :_EDGE] = rim[:, -_EDGE:] = False
     rows, columns = np.nonzero(rim)
@@ -70,7 +70,8 @@ def outward_distance(area: np.ndarray) -> np.ndarray:
     solid = area.astype(np.uint8)
     inside = cv2.distanceTransform(solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     outside = cv2.distanceTransform(1 - solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
-    result: np.ndarray = outside - inside
+    # Distances are between pixel centres; the border lies halfway between two of them.
+    result: np.ndarray = np.where(area, 0.5 - inside, outside - 0.5)
     return result
 
 

@@ -21,7 +21,8 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit, make_optimizer
 from wildghand.fitting.optimize import Plateau
-from wildghand.fitting.weighting import Weighting, assess_frames
+from wildghand.fitting.skin_places import skin_places
+from wildghand.fitting.weighting import Weighting, assess_frames, weighs_by_place
 from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, ready_device
 from wildghand.model.settings import read_settings
 
@@ -36,6 +37,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "default": {},
     "two hands": {},
     "pay back": {"dpd.pay_back": 1.5},
+    "median": {"pao.errors": "median"},
     "paper": {"mode": "paper"},
     "released": {"mode": "released"},
     "binary": {"pao.variant": "binary"},
@@ -102,7 +104,8 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     """A fit that was made on the CPU and then brought to the fake device."""
     settings = read_settings({**QUICK, "device": "cpu", **changes})
     fit = Fit(training, settings, 0, torch.device("cpu"))
-    assessment = assess_frames(training, fit.frames, settings)
+    templates = {side: training.template(side) for side in training.sides}
+    assessment = assess_frames(training, fit.frames, templates, settings)
     fit.device = FAKE
     fit.model = fit.model.to(FAKE)
     fit.model.rigs = moved(fit.model.rigs)
@@ -110,7 +113,8 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     fit.clip._rigs = fit.model.rigs
     objective = fit.objective
     objective.temporal, objective._laplacians = moved((objective.temporal, objective._laplacians))
-    fit.weighting = Weighting(fit.frames, len(training.sides), assessment, settings, FAKE)
+    places = skin_places(training, fit.frames, templates) if weighs_by_place(settings) else ()
+    fit.weighting = Weighting(fit.frames, len(training.sides), assessment, settings, FAKE, places)
     fit.optimizer = make_optimizer(fit.model, fit.weighting.pao, settings)
     return fit
 

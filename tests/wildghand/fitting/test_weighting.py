@@ -11,6 +11,7 @@ import torch
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit
+from wildghand.fitting.subject_shape import bent_templates, subject_of
 from wildghand.fitting.weighting import assess_frames
 from wildghand.model.settings import read_settings
 
@@ -79,7 +80,10 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
     fit, bare = (
         fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on}) for on in (True, False)
     )
-    assessment = assess_frames(training, fit.frames, fit.settings)
+    templates = {side: training.template(side) for side in training.sides}
+    subject = subject_of(training, fit.frames, templates, fit.settings)
+    bent = bent_templates(templates, subject)
+    assessment = assess_frames(training, fit.frames, bent, fit.settings)
     assert assessment is not None
     drawing = fit.draw(ROWS)
     weights, whole = fit.weighting(ROWS, drawing).weights, bare.weighting(ROWS, drawing).weights

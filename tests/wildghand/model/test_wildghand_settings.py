@@ -87,6 +87,8 @@ def test_the_published_modes_have_no_addition(mode: str, temporal: str) -> None:
         1e-4,
     )
     assert not made.prepass.enabled
+    assert not made.subject.enabled
+    assert not made.light.enabled
     assert not made.dpd.gains
     assert not made.dpd.rank
     assert not made.prepass.frame_poses
@@ -303,7 +305,8 @@ def test_stored_settings_of_version_1_say_what_ran(
 ) -> None:
     stored = version_1()
     stored = stored | {"weights": stored["weights"] | changes.pop("weights", {}), **changes}
-    expected = read_settings({"pao.errors": "batch", **today, "dpd.rank": 0})
+    later = {"dpd.rank": 0, "subject.enabled": False, "light.enabled": False}
+    expected = read_settings({"pao.errors": "batch", **today, **later})
     assert read_version_1(stored) == expected
 
 
@@ -316,6 +319,16 @@ def test_avatars_from_before_the_field_and_the_switch_of_head_iii_draw_as_they_d
     assert (made.heads.template, made.heads.refinement) == (True, False)
     assert not made.prepass.frame_poses
     today = read_settings({"heads.enabled": False})
+    assert read_stored(dataclasses.asdict(today)) == today
+
+
+def test_avatars_from_before_the_subject_the_light_and_the_places_draw_as_they_did() -> None:
+    stored = dataclasses.asdict(read_settings({}))
+    del stored["subject"], stored["light"], stored["pao"]["errors"]
+    expected = {"subject.enabled": False, "light.enabled": False, "pao.errors": "median"}
+    assert read_stored(stored) == read_settings(expected)
+    today = read_settings({})
+    assert (today.subject.enabled, today.light.enabled, today.pao.errors) == (True, True, "place")
     assert read_stored(dataclasses.asdict(today)) == today
 
 
