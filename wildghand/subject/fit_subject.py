@@ -65,7 +65,11 @@ def fit_subject(
         if solved is None:
             break
         shape, transl = solved
-    return shape
+    # An avatar keeps float32: it is drawn with what is read again.
+    return SubjectShape(
+        shape.vertices.astype(np.float32).astype(np.float64),
+        shape.joints.astype(np.float32).astype(np.float64),
+    )
 
 
 class _Problem:
