@@ -121,6 +121,7 @@ class Weighting:
         self.pao = PerturbationAwareWeights(pao, hands).to(device)
         self.median: float | Tensor | None = None
         self._refine_pose = torch.zeros(count, dtype=torch.bool)
+        self._tolerance = 0.0
         self._weighs_regions = pao.enabled and pao.variant != "binary"
         self._pixel_weights: Tensor | None = None
         self._regions: ClipRegions | None = None
@@ -229,6 +230,8 @@ class Weighting:
         if self.places is not None and self.median is not None:
             self.places.watch(rows, error, hands > 0.5, self.median)
         weights = found.weights[part]
+        if self._tolerance:
+            weights = torch.lerp(weights, hands[part].to(weights), self._tolerance)
         if self.settings.pao.variant == "scaled":
             weights = weights + self.settings.terms.outside_weight * (1.0 - hands[part])
         if self._pixel_weights is not None:
@@ -256,6 +259,10 @@ class Weighting:
         self._refine_pose = torch.from_numpy(assessment.refine_pose)
         self.frame_weights = torch.from_numpy(assessment.frame_weights).float()
         self._pixel_weights = torch.from_numpy(assessment.pixel_weights)
+        if weighs_by_place(self.settings) and self.settings.pao.variant == "scaled":
+            floor = self.settings.prepass.misplacement_floor
+            shared = self.settings.pao.mismatch * assessment.shared_mismatch(floor)
+            self._tolerance = shared**2 / (1.0 + shared**2)
 
 
 def _mean_error(drawing: Tensor, image: Tensor) -> Tensor:

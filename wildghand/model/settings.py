@@ -195,7 +195,7 @@ _PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
 _BEFORE: Mapping[str, Any] = MappingProxyType(
     {
         "dpd": {"rank": 0},
-        "pao": {"errors": "median"},
+        "pao": {"errors": "median", "mismatch": 0.0},
         "subject": {"enabled": False},
         "light": {"enabled": False},
     }

@@ -44,6 +44,10 @@ class PaoSettings:
     #: `batch`: from the smallest to the largest of a batch on [0, 1], as the authors do.
     #: `absolute`: colours in [0, 1], as printed.
     errors: Literal["place", "median", "batch", "absolute"] = "place"
+    #: How far a mismatch that every frame of the clip shares lifts the weights of regions towards
+    #: 1 (`wildghand.prepass.FrameAssessment.shared_mismatch`); 0: not at all. Read with
+    #: `errors` "place".
+    mismatch: float = 1.0
     #: Factor of every region's weight.
     alpha: float = 1.0
     #: How strongly the temporal weight of a frame lowers its weight; 0 = not at all.

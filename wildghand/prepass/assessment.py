@@ -75,6 +75,18 @@ class FrameAssessment:
     def __len__(self) -> int:
         return len(self.indices)
 
+    def shared_mismatch(self, floor: float) -> float:
+        """The misplacement that every frame shares: that of the best tenth of the usable frames.
+
+        A hand that is not the model, or a tracker that is always a little wrong, leaves it. It is
+        no perturbation of any frame.
+
+        Args:
+            floor: misplacement that counts as 1 (`PrepassSettings.misplacement_floor`).
+        """
+        found = self.misplacement[self.usable]
+        return float(np.quantile(found, 0.1)) / floor if len(found) and floor > 0.0 else 0.0
+
 
 def neutral_assessment(
     indices: np.ndarray, usable: np.ndarray, size: tuple[int, int], omega_dropout: float
