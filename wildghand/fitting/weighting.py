@@ -181,6 +181,7 @@ class Weighting:
         if not self._teaches:
             return None
         shares = self.pao.temporal_factor(omega)
+        shares = shares + self._tolerance * (1.0 - shares)
         if self.pay_back is not None:
             shares = torch.maximum(shares, self.pay_back.shares(rows))
         return shares
