@@ -101,6 +101,8 @@ class Weighting:
         median: running median of the regions' errors; None before the first, and where PAO does
             not count in it.
         places: ordinary errors by place; None where PAO does not count in them.
+        tolerance: in [0, 1), how far a mismatch that all frames share lifts PAO's weights towards
+            1: those of regions, and how much a frame teaches.
         pay_back: what the frames' biases explain; None where nothing follows from it.
     """
 
@@ -121,7 +123,7 @@ class Weighting:
         self.pao = PerturbationAwareWeights(pao, hands).to(device)
         self.median: float | Tensor | None = None
         self._refine_pose = torch.zeros(count, dtype=torch.bool)
-        self._tolerance = 0.0
+        self.tolerance = 0.0
         self._weighs_regions = pao.enabled and pao.variant != "binary"
         self._pixel_weights: Tensor | None = None
         self._regions: ClipRegions | None = None
@@ -181,7 +183,7 @@ class Weighting:
         if not self._teaches:
             return None
         shares = self.pao.temporal_factor(omega)
-        shares = shares + self._tolerance * (1.0 - shares)
+        shares = shares + self.tolerance * (1.0 - shares)
         if self.pay_back is not None:
             shares = torch.maximum(shares, self.pay_back.shares(rows))
         return shares
@@ -231,8 +233,8 @@ class Weighting:
         if self.places is not None and self.median is not None:
             self.places.watch(rows, error, hands > 0.5, self.median)
         weights = found.weights[part]
-        if self._tolerance:
-            weights = torch.lerp(weights, hands[part].to(weights), self._tolerance)
+        if self.tolerance:
+            weights = torch.lerp(weights, hands[part].to(weights), self.tolerance)
         if self.settings.pao.variant == "scaled":
             weights = weights + self.settings.terms.outside_weight * (1.0 - hands[part])
         if self._pixel_weights is not None:
@@ -263,7 +265,7 @@ class Weighting:
         if weighs_by_place(self.settings) and self.settings.pao.variant == "scaled":
             floor = self.settings.prepass.misplacement_floor
             shared = self.settings.pao.mismatch * assessment.shared_mismatch(floor)
-            self._tolerance = shared**2 / (1.0 + shared**2)
+            self.tolerance = shared**2 / (1.0 + shared**2)
 
 
 def _mean_error(drawing: Tensor, image: Tensor) -> Tensor:

@@ -111,7 +111,7 @@ class _Problem:
         Args:
             shape: so far.
             transl: (S, F, 3) m, added to the given translations so far.
-            reach: gap at which a point counts half, px.
+            reach: gap at which a point counts a quarter, px.
 
         Returns:
             Shape and translations; None where too little can be compared.

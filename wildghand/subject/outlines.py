@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+from scipy.ndimage import gaussian_filter
 
 from hwp_bench.hands.raster import draw_faces
 
@@ -66,10 +67,12 @@ def compare_outlines(
 
 
 def outward_distance(area: np.ndarray) -> np.ndarray:
-    """(H, W) float32 px from the border of a bool area: positive outside, negative inside."""
+    """(H, W) float64 px from the border of a bool area: positive outside, negative inside."""
     solid = area.astype(np.uint8)
     inside = cv2.distanceTransform(solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
     outside = cv2.distanceTransform(1 - solid, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # Squares are integers; OpenCV's last bits depend on where an array lies in memory.
+    inside, outside = (np.sqrt(np.rint(part.astype(np.float64) ** 2)) for part in (inside, outside))
     # Distances are between pixel centres; the border lies halfway between two of them.
     result: np.ndarray = np.where(area, 0.5 - inside, outside - 0.5)
     return result
@@ -77,13 +80,14 @@ def outward_distance(area: np.ndarray) -> np.ndarray:
 
 def _direction(distance: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """(M, 2) unit gradients (x, y) of a smoothed distance; zeros where it has none."""
-    smooth = cv2.GaussianBlur(distance, (0, 0), _SMOOTH)
-    slope = np.stack(
-        [
-            cv2.Sobel(smooth, cv2.CV_32F, 1, 0)[rows, columns],
-            cv2.Sobel(smooth, cv2.CV_32F, 0, 1)[rows, columns],
-        ],
-        axis=1,
+    # SciPy's filter, too, gives the same bits wherever an array lies.
+    smooth = gaussian_filter(distance, _SMOOTH, mode="mirror", truncate=2.7)
+    across = smooth[rows, columns + 1] - smooth[rows, columns - 1]
+    down = smooth[rows + 1, columns] - smooth[rows - 1, columns]
+    length = np.sqrt(across * across + down * down)
+    known = length > 1e-3
+    length = np.where(known, length, 1.0)
+    return (
+        np.column_stack([np.where(known, across, 0.0), np.where(known, down, 0.0)])
+        / length[:, None]
     )
-    length = np.linalg.norm(slope, axis=1, keepdims=True)
-    return np.where(length > 1e-3, slope / np.maximum(length, 1e-3), 0.0)

@@ -21,8 +21,8 @@ class SubjectSettings:
     rounds: int = number(4, 1, 100)
     #: Points of all outlines together that are compared in a round.
     points: int = number(3000, 100, 100_000)
-    #: Distance at which a point of the outline counts half in the last round, px; three times as
-    #: far in the first.
+    #: Distance at which a point of the outline counts a quarter in the last round, px; three times
+    #: as far in the first.
     reach: float = number(1.5, 0.1, 100.0)
     #: Expected error of a point of the outline, px; as large as neighbouring points and frames,
     #: which err together, make it.

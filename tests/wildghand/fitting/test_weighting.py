@@ -32,10 +32,38 @@ def fit_of(training: TrainingCapture, **changes: Any) -> Fit:
 
 
 def test_frames_teach_by_their_temporal_weights(make_training: TrainingMaker) -> None:
-    fit = fit_of(make_training())
+    fit = fit_of(make_training(), **{"pao.mismatch": 0.0})
     omega = torch.tensor([0.0, -0.2])
     shares = fit.weighting.shares(ROWS, omega)
     np.testing.assert_allclose(shares, [1.0, 1.0 / (1.0 + 100.0 * 0.2)], rtol=1e-6)
+
+
+def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
+    make_training: TrainingMaker,
+) -> None:
+    # Oracle: the formula on the best tenth of the misplacements, by hand.
+    training = make_training()
+    fit = fit_of(training, **{"pao.mismatch": 0.5})
+    templates = {side: training.template(side) for side in training.sides}
+    subject = subject_of(training, fit.frames, templates, fit.settings)
+    bent = bent_templates(templates, subject)
+    assessment = assess_frames(training, fit.frames, bent, fit.settings)
+    assert assessment is not None
+    found = np.quantile(assessment.misplacement[assessment.usable], 0.1)
+    shared = 0.5 * found / fit.settings.prepass.misplacement_floor
+    tolerance = shared**2 / (1.0 + shared**2)
+    assert 0.0 < tolerance < 1.0
+    shares = fit.weighting.shares(ROWS, torch.tensor([0.0, -0.2]))
+    alone = 1.0 / (1.0 + 100.0 * 0.2)
+    np.testing.assert_allclose(shares, [1.0, alone + tolerance * (1.0 - alone)], rtol=1e-6)
+    # Regions that are rejected keep that share of the hand's weight.
+    drawing = fit.draw(ROWS)
+    lifted = fit.weighting(ROWS, drawing).weights
+    strict = fit_of(training, **{"pao.mismatch": 0.0}).weighting(ROWS, drawing).weights
+    assert (lifted >= strict - 1e-6).all()
+    assert lifted.sum() > strict.sum()
+    # Without the pre-pass nothing is known of it.
+    assert fit_of(training, **{"prepass.enabled": False}).weighting.tolerance == 0.0
 
 
 @pytest.mark.parametrize(
@@ -56,7 +84,7 @@ def test_all_frames_teach_alike_where_a_part_of_it_is_missing(
 
 
 def test_what_is_explained_teaches(make_training: TrainingMaker) -> None:
-    fit = fit_of(make_training(), **{"dpd.pay_back": 2.0})
+    fit = fit_of(make_training(), **{"dpd.pay_back": 2.0, "pao.mismatch": 0.0})
     weighting, omega = fit.weighting, torch.tensor([0.4, 0.4])
     assert weighting.pay_back is not None
     before = weighting.shares(ROWS, omega)
@@ -78,7 +106,8 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
 ) -> None:
     training = make_training()
     fit, bare = (
-        fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on}) for on in (True, False)
+        fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on, "pao.mismatch": 0.0})
+        for on in (True, False)
     )
     templates = {side: training.template(side) for side in training.sides}
     subject = subject_of(training, fit.frames, templates, fit.settings)
