@@ -26,3 +26,4 @@ from .template import mirror_template as mirror_template
 from .template_sources import load_template as load_template
 from .topology import boundary_vertices as boundary_vertices
 from .topology import subdivide as subdivide
+from .topology import unique_edges as unique_edges

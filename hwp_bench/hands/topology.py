@@ -66,7 +66,7 @@ def mano_hd(template: HandTemplate) -> HandTemplate:
         template: MANO at 778 vertices.
     """
     fine = subdivide(template, MANO_HD_TIMES)
-    edges = _unique_edges(fine.faces)[0]
+    edges = unique_edges(fine.faces)[0]
     smooth = {
         field: None if values is None else _neighbour_mean(values, edges)
         for field, values in ((field, getattr(fine, field)) for field in _VERTEX_FIELDS)
@@ -83,21 +83,28 @@ def boundary_vertices(faces: np.ndarray) -> np.ndarray:
     Returns:
         (N,) int64, the vertices of the edges that belong to one face only.
     """
-    edges, edge_of = _unique_edges(faces)
+    edges, edge_of = unique_edges(faces)
     return np.unique(edges[np.bincount(edge_of.ravel(), minlength=len(edges)) == 1])
 
 
 def _split(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The four faces of each face, and the end points of the new vertices (from `count` on)."""
-    edges, edge_of = _unique_edges(faces)
+    edges, edge_of = unique_edges(faces)
     a, b, c = faces.T
     ab, bc, ca = count + edge_of
     quarters = [(a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca)]
     return np.stack([np.stack(face, axis=1) for face in quarters], axis=1).reshape(-1, 3), edges
 
 
-def _unique_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(E, 2) edges in sorted order, and for each face the edges ab, bc, ca as (3, F)."""
+def unique_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the edges of a mesh, each once.
+
+    Args:
+        faces: (F, 3) int.
+
+    Returns:
+        (E, 2) edges in sorted order, and for each face the edges ab, bc, ca as (3, F).
+    """
     directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
     edges, inverse = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
     return edges, inverse.reshape(3, -1)

@@ -188,12 +188,13 @@ class PerturbationAwareWeights(nn.Module):
             error = torch.where(finite, error, torch.zeros_like(error))
             counted = on_hand & finite
         means, shares, present = self._measure(error, regions, counted, on_hand)
-        errors = self._counted(means, present, median)
         if expected is not None and self.settings.errors == "place":
-            ordinary, _, _ = self._measure(expected, regions, counted, on_hand)
+            ordinary, _ = _region_means(expected, regions, counted)
             errors = torch.where(
                 present, means / ordinary.clamp(min=LEAST), torch.zeros_like(means)
             )
+        else:
+            errors = self._counted(means, present, median)
         live = self.temporal_factor(omega)
         temporal = live.detach()
         of_regions = temporal if self.settings.temporal in ("all", "regions") else None
@@ -248,9 +249,7 @@ class PerturbationAwareWeights(nn.Module):
         self, error: Tensor, regions: Regions, counted: Tensor, on_hand: Tensor
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The regions' mean errors, mu_u, and which have any hand, (B, U) each."""
-        ones = counted.to(error)
-        pixels = regions.sums(ones)
-        errors = regions.sums(error * ones) / pixels.clamp(min=1.0)
+        errors, pixels = _region_means(error, regions, counted)
         share_of = self.settings.share_of
         if share_of == "auto":
             share_of = "region" if regions.membership is None else "hand"
@@ -259,6 +258,13 @@ class PerturbationAwareWeights(nn.Module):
         else:
             whole = regions.sizes().to(error)
         return errors, pixels / whole.clamp(min=1.0), pixels > 0.0
+
+
+def _region_means(values: Tensor, regions: Regions, counted: Tensor) -> tuple[Tensor, Tensor]:
+    """Means of (B, H, W) values over the counted pixels of each region, and how many they are."""
+    ones = counted.to(values)
+    pixels = regions.sums(ones)
+    return regions.sums(values * ones) / pixels.clamp(min=1.0), pixels
 
 
 def binary_weights(hand: Tensor, outside: float = 0.0) -> Tensor:

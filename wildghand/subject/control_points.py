@@ -8,7 +8,7 @@ import numpy as np
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from hwp_bench.hands import HandTemplate
+from hwp_bench.hands import HandTemplate, unique_edges
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,10 +32,7 @@ def place_control_points(template: HandTemplate, count: int) -> ControlPoints:
         template: the hand.
         count: K; every vertex is one where the template has fewer.
     """
-    vertices, faces = template.vertices, template.faces
-    edges = np.unique(
-        np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])), axis=0
-    )
+    vertices, edges = template.vertices, unique_edges(template.faces)[0]
     lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
     graph = coo_matrix((lengths, edges.T), shape=(len(vertices),) * 2).tocsr()
     count = min(count, len(vertices))

@@ -15,7 +15,14 @@ import torch
 from scipy.linalg import solve
 
 from hwp_bench.capture import Cameras
-from hwp_bench.hands import HandParameters, HandTemplate, pose_hand, project
+from hwp_bench.hands import (
+    HandParameters,
+    HandTemplate,
+    TemplateTensors,
+    boundary_vertices,
+    pose_hand,
+    project,
+)
 from hwp_bench.hands.skeleton import PARENTS
 from hwp_bench.hands.template import JOINT_COUNT
 from wildghand.subject.control_points import ControlPoints, place_control_points
@@ -94,6 +101,9 @@ class _Problem:
         self.points: ControlPoints = place_control_points(first, settings.nodes)
         self.near_wrist = _near_open_end(first)
         self.count = len(first.vertices)
+        self.faces = np.concatenate(
+            [one.faces + index * self.count for index, one in enumerate(templates.values())]
+        )
         self.ring = _joint_surroundings(first)
         self.expected = self._expected()
         self.values = np.zeros(self._size())
@@ -117,7 +127,10 @@ class _Problem:
             Shape and translations; None where too little can be compared.
         """
         rows, gaps = [], []
-        bent = {side: shape.applied(template) for side, template in self.templates.items()}
+        bent = {
+            side: shape.applied(template).to_torch(torch.float64)
+            for side, template in self.templates.items()
+        }
         quota = max(20, self.settings.points // len(self.masks))
         for frame in range(len(self.masks)):
             made = self._frame(bent, transl, frame, quota)
@@ -145,10 +158,10 @@ class _Problem:
         return nodes, joints.reshape(-1, 3), moves
 
     def _frame(
-        self, bent: Mapping[str, HandTemplate], transl: np.ndarray, frame: int, quota: int
+        self, bent: Mapping[str, TemplateTensors], transl: np.ndarray, frame: int, quota: int
     ) -> tuple[np.ndarray, np.ndarray] | None:
         """Rows of the linear problem of one frame, and its gaps in px."""
-        vertices, faces, turns = [], [], []
+        vertices, turns = [], []
         for index, (side, template) in enumerate(bent.items()):
             pose, betas, given = (
                 torch.as_tensor(part, dtype=torch.float64)
@@ -158,14 +171,13 @@ class _Problem:
                     self.parameters[side][2][frame : frame + 1] + transl[index, frame],
                 )
             )
-            posed = pose_hand(template.to_torch(torch.float64), pose, betas, given)
+            posed = pose_hand(template, pose, betas, given)
             vertices.append(posed.vertices[0])
-            faces.append(template.faces + index * self.count)
             turns.append(posed.transforms[0, :, :3, :3].numpy())
         viewmat, K = self.viewmats[frame], self.Ks[frame]
         mesh = torch.cat(vertices)[None]
         pixels, depth = project(mesh, torch.as_tensor(viewmat)[None], torch.as_tensor(K)[None])
-        corners = np.concatenate(faces)
+        corners = self.faces
         seen = compare_outlines(pixels[0].numpy(), depth[0].numpy(), corners, self.masks[frame])
         seen = self._chosen(seen, corners, quota)
         if not len(seen.gap):
@@ -258,10 +270,7 @@ class _Problem:
 
 def _near_open_end(template: HandTemplate) -> np.ndarray:
     """(V,) bool: near the border of the mesh, or of a closed mesh near the wrist joint."""
-    faces = template.faces
-    edges = np.sort(np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
-    unique, counts = np.unique(edges, axis=0, return_counts=True)
-    border = np.unique(unique[counts == 1])
+    border = boundary_vertices(template.faces)
     places = template.vertices[border] if len(border) else template.joints[:1]
     distance = np.linalg.norm(template.vertices[:, None] - places[None], axis=-1).min(axis=1)
     near: np.ndarray = distance < _WRIST
