@@ -14,8 +14,8 @@ from hwp_bench.importers.video.rigid_start import RigidStart
 
 # The joint whose frame a landmark is fixed in: joints in their own, tips in the last joint's.
 _FRAME_OF = (0, 13, 14, 15, 15, 1, 2, 3, 3, 4, 5, 6, 6, 10, 11, 12, 12, 7, 8, 9, 9)
-# Adam's step is about its learning rate: pixels are counted in units that make it a sane one.
-_ANCHOR_UNIT = 100.0
+#: Pixels in a unit of the anchor: Adam's step is about its learning rate, which this makes sane.
+ANCHOR_UNIT = 100.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,7 +93,7 @@ class ClipModel:
         self.world = torch.as_tensor(start.world, dtype=torch.float32)
         self.centre = torch.as_tensor(centre, dtype=torch.float32)
         self._tips = only_fingertips(self.tensors)
-        anchor = start.wrist[:, :2] / start.wrist[:, 2:] * focal / _ANCHOR_UNIT
+        anchor = start.wrist[:, :2] / start.wrist[:, 2:] * focal / ANCHOR_UNIT
         frames = len(start.wrist)
 
         def leaf(value: object) -> torch.Tensor:
@@ -123,7 +123,7 @@ class ClipModel:
         rest = pose_hand(self._tips, pose, free.betas, pose.new_zeros(frames, 3))
         rotation = self.start_rotation @ axis_angle_to_matrix(free.turn)
         depth = free.log_depth.exp()
-        wrist = torch.cat([free.anchor * (_ANCHOR_UNIT / self.focal) * depth, depth], dim=1)
+        wrist = torch.cat([free.anchor * (ANCHOR_UNIT / self.focal) * depth, depth], dim=1)
         place = wrist - (rotation @ rest.joints[:, 0, :, None])[..., 0]
         turned = rest.transforms[:, list(_FRAME_OF), :3, :3] @ free.offsets[..., None]
         return PosedClip(

@@ -17,6 +17,7 @@ from hwp_bench.importers.video.clip_model import ClipModel, PosedClip
 from hwp_bench.importers.video.contour import ContourEnergy
 from hwp_bench.importers.video.fit_terms import LandmarkEnergy
 from hwp_bench.importers.video.rigid_start import rigid_start
+from hwp_bench.importers.video.texture_energy import TextureEnergy
 from hwp_bench.importers.video.video_settings import FitSettings
 
 #: Likely focal length where none is given, as a share of the image's longer
@@ -143,16 +144,25 @@ def fit_landmarks(
 
 
 def fit_outline(
-    fitted: FittedClip, contour: ContourEnergy, update: Callable[[int], None] | None = None
+    fitted: FittedClip,
+    contour: ContourEnergy,
+    update: Callable[[int], None] | None = None,
+    texture: TextureEnergy | None = None,
 ) -> None:
-    """Refine a fit, in place, so that the mesh's outline meets the masks' outline."""
+    """Refine a fit, in place, so that the mesh's outline meets the masks' outline.
+
+    With a texture, what lies inside the outline meets the mean of all frames, too.
+    """
     settings = fitted.settings
 
     def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        return fitted.energy(model, posed) + contour(model, posed)
+        value = fitted.energy(model, posed) + contour(model, posed)
+        return value if texture is None else value + texture(model, posed)
 
     for done in range(settings.contour_rounds):
         contour.rematch(fitted.model)
+        if texture is not None:
+            texture.rematch(fitted.model)
         descend(
             fitted.model,
             energy,

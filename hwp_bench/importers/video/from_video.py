@@ -26,6 +26,7 @@ from hwp_bench.importers.video.fit_clip import (
 from hwp_bench.importers.video.fit_terms import hand_size
 from hwp_bench.importers.video.imported_clip import ImportedClip, VideoSource, store_clip
 from hwp_bench.importers.video.segmentation import NARROW, WIDE
+from hwp_bench.importers.video.texture_energy import TextureEnergy
 from hwp_bench.importers.video.video_settings import VideoImport
 from hwp_bench.taxonomy import perturbation
 
@@ -90,7 +91,10 @@ def read_source(
 
 
 def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
-    """Fit the hand and cut the masks: landmarks, masks, outline, masks, outline, masks."""
+    """Fit the hand and cut the masks in turns.
+
+    Landmarks, masks, outline, masks, outline and texture, masks.
+    """
     landmarks, windows, settings = source.landmarks, source.windows, options.fit
     video = source.video
     footage = Footage(video.width, video.height, video.fps / options.frames.stride, options.focal)
@@ -105,14 +109,25 @@ def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
     overlaps = []
     frames = len(source.indices)
     steps = settings.contour_rounds * settings.contour_steps
-    for turn, trust in ((1, WIDE), (2, NARROW)):
+    for turn, trust, reduction in ((1, WIDE, 2), (2, NARROW, 1)):
         with progress(f"cutting masks ({turn} of 3)", frames) as update:
             projected = project_clip(fitted.model, windows)
-            masks = masking.masks(projected, trust, reduction=2, update=update)
+            masks = masking.masks(projected, trust, reduction=reduction, update=update)
         overlaps.append(float(masks.overlap[landmarks.detected].mean()))
         with progress(f"fitting outlines ({turn} of 2)", steps) as update:
             contour = ContourEnergy(masks.fields, landmarks.detected, windows, settings, size)
-            fit_outline(fitted, contour, update)
+            texture = None
+            if settings.texture_weight > 0 and turn == 2:
+                texture = TextureEnergy(
+                    source.images.frames,
+                    masks.coverage,
+                    landmarks.detected,
+                    windows,
+                    settings,
+                    size,
+                    fitted.model,
+                )
+            fit_outline(fitted, contour, update, texture)
     projected = project_clip(fitted.model, windows)
     with progress("cutting masks (3 of 3)", frames) as update:
         masks = masking.masks(projected, NARROW, update=update)

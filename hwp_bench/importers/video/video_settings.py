@@ -54,7 +54,7 @@ class FitSettings:
     landmark_steps: int = 450
     #: Steps of Adam in each round against the masks.
     contour_steps: int = 120
-    #: Rounds of: find the mesh's outline, pull it to the mask's outline.
+    #: Rounds after each cutting of masks: find the mesh's outline, pull it to the mask's outline.
     contour_rounds: int = 3
     #: Factor on the learning rates in those rounds: only corrections are left.
     contour_rate: float = 0.3
@@ -95,6 +95,13 @@ class FitSettings:
     contour_reach: float = 0.06
     #: Weight of one outline vertex; neighbours agree, so each counts little.
     contour_weight: float = 0.2
+    #: Weight of the texture, shared among as many pixels as the hand's size squared; 0 leaves it
+    #: out. It joins when the outline fits.
+    texture_weight: float = 770.0
+    #: Difference of a pixel from the clip's mean texture, log grey.
+    texture_scale: float = 0.06
+    #: Changes wider than this count as light, not as texture, as a share of the hand's size.
+    light_breadth: float = 0.05
 
 
 @dataclass(frozen=True)

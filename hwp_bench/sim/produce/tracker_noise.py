@@ -2,7 +2,8 @@
 
 All numbers are printed by `python -m benchmarks.tracker_errors --video VIDEO --landmarks NPZ` on a
 video of 621 frames with MediaPipe's landmarks. There is no truth in it: what counts as an error of
-a landmark is its distance from the whole clip's fit, less the mean of the clip.
+a landmark is its distance from the whole clip's fit, less the mean of the clip. The fit was that of
+version 1 of the importer; later versions give other numbers, and scenes keep these.
 """
 
 from __future__ import annotations

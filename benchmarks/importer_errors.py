@@ -1,0 +1,121 @@
+"""Errors of the video importer against the truth of simulated clips, with and without its terms.
+
+Run from the repository: `python -m benchmarks.importer_errors FOLDER` imports the clips that
+`python -m benchmarks.tracker_errors --video VIDEO --landmarks NPZ --keep FOLDER` left there and
+prints how far the hands are from the true ones. `--set NAME=VALUE` changes a number of
+`hwp_bench.importers.video.FitSettings`, for example `--set texture_weight=0`. About two minutes
+of one core for each clip.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import time
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from hwp_bench.capture import open_capture
+from hwp_bench.hands import HandTemplate, load_template, pose_hand
+from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import FINGERS, finger_joints
+from hwp_bench.importers.video import FitSettings, VideoImport
+from hwp_bench.importers.video.from_video import fit_video, read_source
+
+
+@dataclass(frozen=True)
+class HandErrors:
+    """Mean distances from the true hand; nothing is aligned in the image."""
+
+    #: Joints in space, mm.
+    joints: float
+    #: Vertices in space with both wrists laid on each other, mm.
+    shape: float
+    #: Joints in the image, px.
+    image_joints: float
+    #: Vertices in the image, px.
+    image: float
+    #: Vertices in the image, px: palm, then the five fingers.
+    parts: tuple[float, ...]
+    #: Rotation of the wrist, degrees.
+    wrist: float
+
+
+def hand_errors(
+    estimate: HandParameters, truth: HandParameters, focal: float, template: HandTemplate
+) -> HandErrors:
+    """Compare two hands that a camera at the origin with a focal length in px sees."""
+    from scipy.spatial.transform import Rotation
+
+    tensors = template.to_torch(torch.float64)
+    found, true = (
+        pose_hand(tensors, *(torch.from_numpy(part) for part in (h.pose, h.betas, h.transl)))
+        for h in (estimate, truth)
+    )
+
+    def apart(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
+        return np.asarray(torch.linalg.vector_norm(first - second, dim=-1).numpy())
+
+    def seen(points: torch.Tensor) -> torch.Tensor:
+        return points[..., :2] / points[..., 2:] * focal
+
+    image = apart(seen(found.vertices), seen(true.vertices))
+    owner = template.weights.argmax(axis=1)
+    groups = [(0,), *(finger_joints(name) for name in FINGERS)]
+    shapes = [hand.vertices - hand.joints[:, :1] for hand in (found, true)]
+    roots = [Rotation.from_rotvec(hand.pose[:, 0]) for hand in (truth, estimate)]
+    return HandErrors(
+        joints=1e3 * float(apart(found.joints, true.joints).mean()),
+        shape=1e3 * float(apart(*shapes).mean()),
+        image_joints=float(apart(seen(found.joints), seen(true.joints)).mean()),
+        image=float(image.mean()),
+        parts=tuple(float(image[:, np.isin(owner, group)].mean()) for group in groups),
+        wrist=float(np.degrees((roots[0].inv() * roots[1]).magnitude().mean())),
+    )
+
+
+def import_errors(folder: Path, clip: str, settings: FitSettings) -> tuple[HandErrors, float]:
+    """Import a kept clip: its errors, and the processor seconds that it took."""
+    capture = open_capture(folder / clip)
+    focal = float(capture.cameras.Ks[0][0, 0])
+    options = VideoImport(focal=focal, size=capture.info.width, fit=settings)
+    number = clip.removeprefix("clip")
+    source = read_source(folder / f"{clip}.avi", folder / f"landmarks{number}.npz", options)
+    start = time.process_time()
+    hand = fit_video(source, options).hand
+    taken = time.process_time() - start
+    truth = (capture.true_hands or {})["right"]
+    return hand_errors(hand, truth, focal, load_template("anny", "right")), taken
+
+
+def changed(settings: FitSettings, changes: list[str]) -> FitSettings:
+    """Set fields given as NAME=VALUE."""
+    kinds = {field.name: type(getattr(settings, field.name)) for field in fields(settings)}
+    pairs = (text.split("=", 1) for text in changes)
+    return replace(settings, **{name: kinds[name](value) for name, value in pairs})
+
+
+def main(arguments: list[str]) -> int:
+    """Print the table."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("folder", type=Path)
+    parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes")
+    options = parser.parse_args(arguments)
+    settings = changed(FitSettings(), options.changes)
+    parts = " ".join(f"{name:>7}" for name in ("palm", *FINGERS))
+    print(f"clip   joints mm  shape mm  joints px  surface px  wrist deg {parts}  cpu s")
+    for path in sorted(options.folder.glob("clip*.avi")):
+        found, taken = import_errors(options.folder, path.stem, settings)
+        row = " ".join(f"{value:7.2f}" for value in found.parts)
+        print(
+            f"{path.stem:6} {found.joints:9.2f} {found.shape:9.2f} {found.image_joints:10.3f}"
+            f" {found.image:11.3f} {found.wrist:10.2f} {row} {taken:6.0f}"
+        )
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

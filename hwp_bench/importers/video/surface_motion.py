@@ -1,0 +1,129 @@
+"""How the vertices of a posed clip move in the image when the variables of their frame change."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from hwp_bench.hands.skeleton import PARENTS
+from hwp_bench.importers.video.clip_model import ANCHOR_UNIT, ClipModel, ClipVariables
+
+#: Variables of one frame: turn 3, fingers 45, anchor 2, log depth 1.
+FRAME_VARIABLES = 51
+
+
+def frame_variables(variables: ClipVariables) -> torch.Tensor:
+    """Join what differs from frame to frame: (F, 51), differentiable."""
+    parts = (variables.turn, variables.fingers.flatten(1), variables.anchor, variables.log_depth)
+    return torch.cat(parts, dim=1)
+
+
+class SurfaceMotion:
+    """Derivatives of the vertices' pixels by the variables of their frame, in closed form.
+
+    Automatic differentiation would need one pass for each of thousands of pixels. Correctives
+    count as they are and not in how they change, as in `ClipModel.choose`.
+
+    Args:
+        model: the clip; read once, as it is now.
+    """
+
+    def __init__(self, model: ClipModel) -> None:
+        free, tensors = model.variables, model.tensors
+
+        def array(tensor: torch.Tensor) -> np.ndarray:
+            return np.asarray(tensor.detach().double().numpy())
+
+        with torch.no_grad():
+            posed = model.posed()
+            shaped = array(tensors.vertices + tensors.shape_basis @ free.betas)
+            self._joints = array(tensors.joints + tensors.joint_basis @ free.betas)
+        self._shaped = shaped
+        self._correctives = None if tensors.pose_basis is None else array(tensors.pose_basis)
+        self._transforms = array(posed.transforms)
+        self._rotation, self._place = array(posed.rotation), array(posed.place)
+        self._focal = float(model.focal.detach())
+        self._depth = np.exp(array(free.log_depth))[:, 0]
+        self._fingers = array(free.fingers)
+        self._turn_rates = right_jacobian(array(free.turn))
+        self._finger_rates = right_jacobian(self._fingers)
+        self._weights = array(tensors.weights)
+        self._below = _descendants()
+
+    def by_variables(self, frame: int, vertices: np.ndarray) -> np.ndarray:
+        """Differentiate vertices' pixels of the whole frame.
+
+        Args:
+            frame: which frame.
+            vertices: (P,) which vertices.
+
+        Returns:
+            (P, 2, 51) px per unit of each of the `frame_variables`.
+        """
+        rotation, wrist = self._rotation[frame], self._joints[0]
+        motion = self._transforms[frame, :, :3]
+        weights = self._weights[vertices]
+        rest = np.append(self._rest(frame, vertices), np.ones((len(vertices), 1)), axis=1)
+        # (P, 16, 3): each joint's share of the vertex, then the share of all joints below each.
+        shares = weights[:, :, None] * np.einsum("kab,vb->vka", motion, rest)
+        below = np.einsum("jk,vka->vja", self._below, shares)
+        centres = np.einsum("kab,kb->ka", motion[:, :, :3], self._joints) + motion[:, :, 3]
+        arms = below - (weights @ self._below.T)[:, :, None] * centres
+        own = below[:, 0]
+        moved = np.zeros((len(vertices), 3, FRAME_VARIABLES))
+        moved[:, :, :3] = -rotation @ cross_matrix(own - wrist) @ self._turn_rates[frame]
+        axes = motion[1:, :, :3] @ self._finger_rates[frame]
+        fingers = -np.einsum(
+            "ab,njbc,jcd->najd", rotation, cross_matrix(arms[:, 1:]), axes, optimize=True
+        )
+        moved[:, :, 3:48] = fingers.reshape(len(vertices), 3, 45)
+        moved[:, 0, 48] = moved[:, 1, 49] = ANCHOR_UNIT / self._focal * self._depth[frame]
+        moved[:, :, 50] = self._place[frame] + rotation @ wrist
+        place = own @ rotation.T + self._place[frame]
+        depth = np.maximum(place[:, 2:], 1e-3)
+        slope = place[:, :2] / depth
+        return np.asarray(
+            (moved[:, :2] - slope[..., None] * moved[:, 2:]) * (self._focal / depth[..., None])
+        )
+
+    def _rest(self, frame: int, vertices: np.ndarray) -> np.ndarray:
+        rest = self._shaped[vertices]
+        if self._correctives is not None:
+            from scipy.spatial.transform import Rotation
+
+            turns = Rotation.from_rotvec(self._fingers[frame]).as_matrix() - np.eye(3)
+            rest = rest + self._correctives[vertices] @ turns.ravel()
+        return np.asarray(rest)
+
+
+def right_jacobian(vectors: np.ndarray) -> np.ndarray:
+    """Rate J of R(v + d) = R(v) exp(J d), for axis-angle vectors (..., 3): (..., 3, 3).
+
+    Source: Sola, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics",
+    2018, equation 143.
+    """
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    cross = cross_matrix(vectors)
+    return np.asarray(np.eye(3) - first * cross + second * (cross @ cross))
+
+
+def cross_matrix(vectors: np.ndarray) -> np.ndarray:
+    """Matrices (..., 3, 3) whose product with w is the cross product of `vectors` with w."""
+    result = np.zeros((*vectors.shape, 3))
+    x, y, z = np.moveaxis(vectors, -1, 0)
+    result[..., 0, 1], result[..., 0, 2] = -z, y
+    result[..., 1, 0], result[..., 1, 2] = z, -x
+    result[..., 2, 0], result[..., 2, 1] = -y, x
+    return result
+
+
+def _descendants() -> np.ndarray:
+    """(16, 16): 1 where the second joint moves with the first."""
+    below = np.eye(len(PARENTS))
+    for joint in range(len(PARENTS) - 1, 0, -1):
+        below[PARENTS[joint]] = np.maximum(below[PARENTS[joint]], below[joint])
+    return below
