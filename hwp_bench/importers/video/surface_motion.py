@@ -72,10 +72,10 @@ class SurfaceMotion:
         own = below[:, 0]
         moved = np.zeros((len(vertices), 3, FRAME_VARIABLES))
         moved[:, :, :3] = -rotation @ cross_matrix(own - wrist) @ self._turn_rates[frame]
-        axes = motion[1:, :, :3] @ self._finger_rates[frame]
-        fingers = -np.einsum(
-            "ab,njbc,jcd->najd", rotation, cross_matrix(arms[:, 1:]), axes, optimize=True
-        )
+        # The cross product of each of a joint's three axes with the arm from the joint.
+        x, y, z = np.moveaxis(rotation @ motion[1:, :, :3] @ self._finger_rates[frame], 1, 0)
+        u, v, w = np.einsum("ab,njb->anj", rotation, arms[:, 1:])[..., None]
+        fingers = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
         moved[:, :, 3:48] = fingers.reshape(len(vertices), 3, 45)
         moved[:, 0, 48] = moved[:, 1, 49] = ANCHOR_UNIT / self._focal * self._depth[frame]
         moved[:, :, 50] = self._place[frame] + rotation @ wrist

@@ -19,6 +19,8 @@ from hwp_bench.importers.video.video_settings import FitSettings
 
 #: Pixels of a frame below which its texture says nothing.
 LEAST_PIXELS = 50
+# Rows in a product of matrices.
+_BLOCK = 24
 
 
 class TextureEnergy:
@@ -130,5 +132,17 @@ class TextureEnergy:
         x, y = rates[:, 0], rates[:, 1]
         weighed = np.stack([xx * x + xy * y, xy * x + yy * y], axis=1)
         pull = np.stack([collected(across * error)[used], collected(down * error)[used]], axis=1)
-        flat = rates.reshape(-1, FRAME_VARIABLES)
-        return flat.T @ weighed.reshape(-1, FRAME_VARIABLES), flat.T @ pull.ravel()
+        return _summed(rates, weighed), np.einsum("pak,pa->k", rates, pull)
+
+
+def _summed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Sum over P and 2 of the products of (P, 2, K) and (P, 2, K): (K, K).
+
+    In blocks that are too small for BLAS to start threads of its own next to those that frames
+    are worked on in; so the result does not depend on their number either.
+    """
+    rows = np.zeros((2, -(-2 * len(first) // _BLOCK) * _BLOCK, first.shape[2]))
+    for row, part in zip(rows, (first, second), strict=True):
+        row[: 2 * len(part)] = part.reshape(-1, part.shape[2])
+    left, right = rows.reshape(2, -1, _BLOCK, first.shape[2])
+    return np.asarray((left.transpose(0, 2, 1) @ right).sum(axis=0))
