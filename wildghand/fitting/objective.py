@@ -12,6 +12,7 @@ from wildghand.fitting.networks import choose_perceptual
 from wildghand.fitting.weighting import FrameTarget
 from wildghand.gaussians.attribute_roughness import attribute_roughness
 from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.closed_surface import off_surface
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.laplacian import surface_laplacian
 from wildghand.gaussians.rig import HandRig
@@ -56,6 +57,7 @@ class Objective:
         self._laplacians = (
             {side: surface_laplacian(rig) for side, rig in rigs.items()} if any(smooth) else {}
         )
+        self._spacing = {side: rig.spacing for side, rig in rigs.items()}
         self._perceptual = choose_perceptual(settings, device)
 
     def __call__(
@@ -94,6 +96,10 @@ class Objective:
                 total = total + weights.shadow * terms.distance_to_one(hand.prediction.shadow)
             if weights.opacity:
                 total = total + weights.opacity * terms.distance_to_one(hand.opacities)
+            if weights.surface:
+                activation = model.network.activation
+                off = off_surface(hand.prediction.raw, activation, self._spacing[side])
+                total = total + weights.surface * off
             rough = self._roughness(side, hand.prediction.raw)
             total = total if rough is None else total + rough
         if self.temporal is not None and settings.dpd.omega_weight:

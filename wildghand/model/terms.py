@@ -45,6 +45,8 @@ class TermWeights:
     silhouette: float = 0.0
     #: `weight_reward`: keeps PAO from weighing everything with 0.
     weight_reward: float = 5e-3
+    #: `off_surface`: what keeps Gaussians from being opaque discs that lie on the skin.
+    surface: float = 5e-4
     #: `cross_hand`: texture features of the two hands, where there are two.
     cross_hand: float = 1e-3
     #: A perceptual distance (`wildghand.gaussians.perceptual`).
@@ -72,6 +74,7 @@ PAPER_TERMS = TermWeights(
     laplacian_colors=0.1,
     silhouette=1.0,
     weight_reward=0.5,
+    surface=0.0,
     cross_hand=0.1,
     perceptual=0.1,
 )
