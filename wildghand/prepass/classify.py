@@ -10,7 +10,6 @@ from wildghand.prepass.assessment import FrameAssessment
 from wildghand.prepass.measurements import FrameMeasurements
 from wildghand.prepass.robust_location import densest, excess, normal_value
 from wildghand.prepass.settings import PrepassSettings
-from wildghand.prepass.weights import weigh_pixels
 
 # Deviation at which a cue starts to count; it grows like a logarithm beyond.
 _ONSET = 3.0
@@ -20,18 +19,16 @@ _EXPONENT = 3
 
 def classify_frames(
     indices: np.ndarray,
-    masks: np.ndarray,
+    size: tuple[int, int],
     measured: Mapping[int, FrameMeasurements],
-    cell_count: int,
     settings: PrepassSettings,
 ) -> FrameAssessment:
-    """Compare the frames with each other and assess them.
+    """Compare the frames with each other and assess them; every pixel has full weight.
 
     Args:
         indices: (R,) ascending frame numbers.
-        masks: (R, H, W) uint8.
+        size: height and width of the frames.
         measured: by row; rows that are missing cannot be used. Not empty.
-        cell_count: number of cells of the surface.
         settings: floors and thresholds.
     """
     count, share = len(indices), settings.clean_share
@@ -88,7 +85,7 @@ def classify_frames(
         hidden=spread(hidden),
         hidden_deviation=spread(off_hidden),
         motion=spread(gathered([one.motion for one in found])),
-        pixel_weights=weigh_pixels(masks, measured, clean, cell_count, settings),
+        pixel_weights=np.full((count, *size), 255, dtype=np.uint8),
     )
 
 

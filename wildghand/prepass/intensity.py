@@ -9,6 +9,7 @@ import torch
 
 from hwp_bench.base.colors import log_light
 from wildghand.gaussians.shading import sh_basis
+from wildghand.prepass.assessment import CLEAN_FROM
 from wildghand.prepass.robust_location import densest
 from wildghand.prepass.settings import PrepassSettings
 
@@ -21,6 +22,11 @@ _DEGREE = 2
 _RIDGE = 20.0
 # Gain deviation at which a frame counts half in albedo and shading.
 _FRAME_SCALE = 0.25
+# Part of a clip's frames over which clean views of a cell must be spread. An object that stays for
+# one episode is no part of the hand, even if nothing else is wrong with its frames.
+_SPREAD = 1.0 / 3.0
+# Samples that the skin colour is worth in such a cell.
+_KNOWN_PRIOR = 1.0
 # Distance from the skin colour at which a cell counts half in it.
 _SKIN_SCALE = 0.3
 
@@ -50,6 +56,16 @@ class LightSamples:
 
 
 @dataclass(frozen=True, eq=False)
+class Verdict:
+    """What a first judgement says of R frames."""
+
+    #: (R,) probability that nothing perturbs the frame.
+    clean: np.ndarray
+    #: (R, 3) log gain, linear light.
+    gains: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
 class IntensityModel:
     """Log light of the hands at every place; gains are relative to the mode of the gains."""
 
@@ -71,14 +87,22 @@ class IntensityModel:
 
 
 def fit_intensity(
-    samples: LightSamples, cell_normals: np.ndarray, settings: PrepassSettings
+    samples: LightSamples,
+    cell_normals: np.ndarray,
+    settings: PrepassSettings,
+    verdict: Verdict | None = None,
 ) -> IntensityModel:
     """Fit albedo, shading and gains by turns, with weights that leave outliers out.
+
+    Without a verdict a place that looks like no other one is an outlier, because an object may
+    cover it in every frame that shows it. With one, what clean frames show of a place is how it
+    looks: a bare finger of a glove, a palm of another colour.
 
     Args:
         samples: at least one.
         cell_normals: (C, 3) normal of every cell on the rest surface; zeros where unknown.
         settings: share of clean frames, prior and passes.
+        verdict: on the frames of the samples.
     """
     counts = np.diff(samples.starts)
     rows = np.repeat(np.arange(len(counts)), counts)
@@ -92,13 +116,21 @@ def fit_intensity(
     basis = samples.basis.astype(np.float64)
     weights = np.ones(len(light))
     shading = np.zeros((basis.shape[1], 3))
-    gains = np.zeros((len(counts), 3))
+    gains = np.zeros((len(counts), 3)) if verdict is None else verdict.gains
+    sure = np.ones(len(rows))
+    known = np.zeros(len(used), dtype=bool)
+    if verdict is not None:
+        known = _known_cells(verdict.clean, cells, rows, len(used))
+        # Squared: doubtful frames count little, because they may all show the same object.
+        sure = np.where(known[cells], verdict.clean[rows] ** 2, 1.0)
+    prior = np.where(known, _KNOWN_PRIOR, settings.albedo_prior)
     shade = np.zeros_like(light)
     scale = 1.0
     for _ in range(settings.iterations):
-        trust = weights / (1.0 + (np.linalg.norm(gains, axis=1) / _FRAME_SCALE)[rows] ** 2)
+        near = 1.0 / (1.0 + (np.linalg.norm(gains, axis=1) / _FRAME_SCALE) ** 2)
+        trust = weights * sure * near[rows]
         rest = light - shade - gains[rows]
-        albedo, skin = _albedo(cells, rest, trust, sides, settings.albedo_prior)
+        albedo, skin = _albedo(cells, rest, trust, sides, prior)
         rest = light - albedo[cells] - gains[rows]
         weighted = basis * trust[:, None]
         normal = weighted.T @ basis + _RIDGE * np.eye(basis.shape[1])
@@ -110,7 +142,8 @@ def fit_intensity(
         gains = gains - centre
         residual = np.abs(rest - centre - gains[rows]) @ np.full(3, 1.0 / 3.0)
         scale = max(float(np.median(residual[part[rows]])), 0.01)
-        weights = 1.0 / (1.0 + (residual / (2.5 * scale)) ** 4)
+        ordinary = _cell_scales(cells, residual, sure * known[cells], np.full(len(used), scale))
+        weights = 1.0 / (1.0 + (residual / (2.5 * ordinary[cells])) ** 4)
     everywhere = np.column_stack([np.ones(cell_count), shading_basis(cell_normals)])
     smooth = (everywhere @ skin + centre).astype(np.float32)
     full = smooth.copy()
@@ -119,7 +152,7 @@ def fit_intensity(
 
 
 def _albedo(
-    cells: np.ndarray, rest: np.ndarray, weights: np.ndarray, sides: np.ndarray, prior: float
+    cells: np.ndarray, rest: np.ndarray, weights: np.ndarray, sides: np.ndarray, prior: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Weighted means of the cells, drawn towards the skin colour of their side of the hand.
 
@@ -140,7 +173,32 @@ def _albedo(
         off = np.linalg.norm(own - sides @ skin, axis=1)
         weighted = sides * (trust / (1.0 + (off / _SKIN_SCALE) ** 2))[:, None]
         skin = np.linalg.solve(weighted.T @ sides + ridge, weighted.T @ own)
-    return (sums + prior * (sides @ skin)) / (mass + prior)[:, None], skin
+    return (sums + prior[:, None] * (sides @ skin)) / (mass + prior)[:, None], skin
+
+
+def _known_cells(clean: np.ndarray, cells: np.ndarray, rows: np.ndarray, count: int) -> np.ndarray:
+    """(count,) bool: clean frames from different parts of the clip show the cell."""
+    good = clean[rows] >= CLEAN_FROM
+    first = np.full(count, len(clean))
+    last = np.full(count, -1)
+    np.minimum.at(first, cells[good], rows[good])
+    np.maximum.at(last, cells[good], rows[good])
+    return np.asarray(last - first >= _SPREAD * len(clean))
+
+
+def _cell_scales(
+    cells: np.ndarray, residual: np.ndarray, trust: np.ndarray, least: np.ndarray
+) -> np.ndarray:
+    """(U,) residual that is ordinary in each cell, from `least` (U,) on.
+
+    The mean is geometric, so that some outliers hardly raise it. Where all samples of a cell are
+    far off, its albedo is wrong and not the samples, and they must not be left out.
+    """
+    count = len(least)
+    above = np.log(np.maximum(residual / least[cells], 1.0))
+    mass = np.bincount(cells, trust, minlength=count)
+    sums = np.bincount(cells, trust * above, minlength=count)
+    return np.asarray(least * np.exp(sums / np.maximum(mass, 1e-9)))
 
 
 def _frame_medians(values: np.ndarray, starts: np.ndarray) -> np.ndarray:

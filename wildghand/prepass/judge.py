@@ -2,14 +2,15 @@
 
 The pipeline in order: `inputs` -> `footprint` (where the hands are) -> `borders` and `intensity`
 (a model of all frames) -> `measurements` (each frame against it) -> `classify` (the frames against
-each other, with `robust_location`) and `weights` (their pixels) -> `assessment` (the result).
+each other, with `robust_location`) -> `intensity` and `measurements` again, with the verdict ->
+`weights` (pixels) -> `assessment` (the result).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -21,13 +22,21 @@ from wildghand.prepass.classify import classify_frames
 from wildghand.prepass.inputs import PrepassInput
 from wildghand.prepass.intensity import (
     LOWEST,
+    IntensityModel,
     LightSamples,
+    Verdict,
     fit_intensity,
     log_light_table,
     shading_basis,
 )
-from wildghand.prepass.measurements import LEAST_PIXELS, inner_pixels, measure_frame
+from wildghand.prepass.measurements import (
+    LEAST_PIXELS,
+    FrameMeasurements,
+    inner_pixels,
+    measure_frame,
+)
 from wildghand.prepass.settings import PrepassSettings
+from wildghand.prepass.weights import weigh_pixels
 
 
 def judge_frames(given: PrepassInput, settings: PrepassSettings | None = None) -> FrameAssessment:
@@ -60,23 +69,18 @@ def _judge(given: PrepassInput, settings: PrepassSettings) -> FrameAssessment:
         )
     if usable.sum() < settings.least_frames:
         return neutral_assessment(given.indices, usable, given.size, settings.omega_dropout)
-    model = fit_intensity(survey.samples, surfaces.cell_normals, settings)
-    measured = {
-        row: measure_frame(
-            model,
-            footprint,
-            given.images[row],
-            given.masks[row],
-            shown=survey.shown,
-            misplacement=float(survey.misplacement[row]),
-            border=float(survey.border[row]),
-            motion=float(survey.motion[row]),
-        )
-        for row, footprint in _footprints(given, surfaces, usable)
-    }
-    return classify_frames(
-        given.indices, given.masks, measured, len(surfaces.cell_normals), settings
+    drawn = list(_footprints(given, surfaces, usable))
+    cell_normals = surfaces.cell_normals
+    model = fit_intensity(survey.samples, cell_normals, settings)
+    judged = classify_frames(
+        given.indices, given.size, _measured(given, survey, model, drawn), settings
     )
+    # Pixels are compared with what clean frames show, which is known only now.
+    verdict = Verdict(judged.clean[usable], model.gains)
+    model = fit_intensity(survey.samples, cell_normals, settings, verdict)
+    measured = _measured(given, survey, model, drawn)
+    weights = weigh_pixels(given.masks, measured, judged.clean, len(cell_normals), settings)
+    return replace(judged, pixel_weights=weights)
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +96,28 @@ class _Survey:
     border: np.ndarray
     #: (R,) px.
     motion: np.ndarray
+
+
+def _measured(
+    given: PrepassInput,
+    survey: _Survey,
+    model: IntensityModel,
+    drawn: Sequence[tuple[int, Footprint]],
+) -> dict[int, FrameMeasurements]:
+    """Compare each of the drawn frames, by row, with the model."""
+    return {
+        row: measure_frame(
+            model,
+            footprint,
+            given.images[row],
+            given.masks[row],
+            shown=survey.shown,
+            misplacement=float(survey.misplacement[row]),
+            border=float(survey.border[row]),
+            motion=float(survey.motion[row]),
+        )
+        for row, footprint in drawn
+    }
 
 
 def _measurable(given: PrepassInput) -> np.ndarray:

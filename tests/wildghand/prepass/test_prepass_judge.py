@@ -22,6 +22,7 @@ from wildghand.prepass import (
     capture_input,
     judge_frames,
 )
+from wildghand.prepass.borders import interior
 
 Lit = tuple[np.ndarray, np.ndarray]
 #: Frames that the tests perturb.
@@ -308,3 +309,20 @@ def test_frames_read_from_a_capture_are_judged_the_same(lit_frames: Lit, tmp_pat
     assert judgement.indices.tolist() == split.train.tolist()
     # hands.npz may hold the parameters in single precision.
     np.testing.assert_allclose(judgement.clean, expected.clean, atol=1e-3)
+
+
+def test_a_part_of_another_colour_in_every_frame_keeps_its_weight(lit_frames: Lit) -> None:
+    """Cloth over the fingers, bare skin below, and a light that changes in some frames."""
+    linear, masks = lit_frames[0].copy(), lit_frames[1]
+    bare = np.zeros_like(masks)
+    for frame in range(FRAMES):
+        start = int(np.quantile(np.nonzero(masks[frame])[0], 0.7))
+        bare[frame, start:] = masks[frame, start:]
+        linear[frame][masks[frame] & ~bare[frame]] *= [0.12, 0.25, 0.12]
+    linear[HIT] *= 0.3
+    given = as_input(developed(linear), masks)
+    weights = judge_frames(given).pixel_weights
+    # The borders of hand and cloth move over the surface with the pose, and are left out.
+    inner = np.stack([interior(part, 4) for part in bare])
+    assert weights[SPARED][inner[SPARED]].mean() > 0.7 * 255
+    assert weights[SPARED][(masks & ~bare)[SPARED]].mean() > 0.7 * 255
