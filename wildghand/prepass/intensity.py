@@ -27,6 +27,9 @@ _FRAME_SCALE = 0.25
 _SPREAD = 1.0 / 3.0
 # Samples that the skin colour is worth in such a cell.
 _KNOWN_PRIOR = 1.0
+# Distance from the skin colour beyond which a cell has another one, and the share of the cells that
+# must have it.
+_SECOND_OFF, _SECOND_SHARE = 0.7, 0.03
 # Distance from the skin colour at which a cell counts half in it.
 _SKIN_SCALE = 0.3
 
@@ -80,6 +83,11 @@ class IntensityModel:
     gains: np.ndarray
     #: Median absolute residual of a channel in the frames around the mode.
     scale: float
+    #: (C,) bool: clean frames from different parts of the clip show the cell.
+    known: np.ndarray
+    #: (3,) log colour of known cells that are far from the skin colour, such as the bare fingers of
+    #: a glove; None where these are few.
+    second: np.ndarray | None = None
 
     def predict(self, cells: np.ndarray, normals: np.ndarray) -> np.ndarray:
         """(P, 3) log light at gain 0."""
@@ -148,7 +156,12 @@ def fit_intensity(
     smooth = (everywhere @ skin + centre).astype(np.float32)
     full = smooth.copy()
     full[used] = albedo + centre
-    return IntensityModel(full, smooth, shading.astype(np.float32), gains, scale)
+    shown = np.zeros(cell_count, dtype=bool)
+    shown[used] = known
+    second = _second_colour(full[shown], smooth[shown])
+    return IntensityModel(
+        full, smooth, shading.astype(np.float32), gains, scale, known=shown, second=second
+    )
 
 
 def _albedo(
@@ -199,6 +212,14 @@ def _cell_scales(
     mass = np.bincount(cells, trust, minlength=count)
     sums = np.bincount(cells, trust * above, minlength=count)
     return np.asarray(least * np.exp(sums / np.maximum(mass, 1e-9)))
+
+
+def _second_colour(albedo: np.ndarray, skin: np.ndarray) -> np.ndarray | None:
+    """(3,) median log albedo of the cells that are far from the skin colour; None if few are."""
+    off = np.linalg.norm(albedo - skin, axis=1) > _SECOND_OFF
+    if not len(albedo) or off.mean() < _SECOND_SHARE:
+        return None
+    return np.asarray(np.median(albedo[off], axis=0))
 
 
 def _frame_medians(values: np.ndarray, starts: np.ndarray) -> np.ndarray:

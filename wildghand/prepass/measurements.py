@@ -91,13 +91,24 @@ def measure_frame(
     gain = _agreed_gain(rest[inner], 2.5 * model.scale)
     residual = channel_mean(np.abs(rest - gain.astype(np.float32)))
     skin = model.skin[footprint.cells]
+    tint = _tint(light - skin - gain)
+    colours = table[image.reshape(-1, 3)[beyond]] - gain
+    tint_beyond = _tint(colours - np.median(skin, axis=0))
+    if model.second is not None:
+        # A place that no clean frame shows has one of the hand's colours, and nobody knows which.
+        tint = np.minimum(tint, _tint(light - model.second - gain))
+        tint_beyond = np.minimum(tint_beyond, _tint(colours - model.second))
+        shade = expected - model.albedo[footprint.cells]
+        other = channel_mean(np.abs(light - shade - model.second - gain)).astype(np.float32)
+        known = model.known[footprint.cells]
+        residual = np.where(known, residual, np.minimum(residual, other))
     return FrameMeasurements(
         pixels=footprint.pixels,
         cells=footprint.cells,
         residual=residual,
-        tint=_tint(light - skin - gain),
+        tint=tint,
         beyond=beyond.astype(np.int32),
-        tint_beyond=_tint(table[image.reshape(-1, 3)[beyond]] - np.median(skin, axis=0) - gain),
+        tint_beyond=tint_beyond,
         gain=gain,
         level=float(np.median(residual[inner])),
         texture=_texture(

@@ -55,8 +55,12 @@ def weigh_pixels(
         for values in (levels, tint_levels)
     )
     prior = settings.residual_prior
-    normal = normal_residuals(residuals, cells, trusts, cell_count, level, prior)
-    normal_tint = normal_tints(tints, cells, trusts, cell_count, tint_level, prior)
+    # Where clean frames all fit badly, the larger of both means is what is normal.
+    normal = np.maximum(
+        normal_residuals(residuals, cells, trusts, cell_count, level, prior),
+        geometric_normals(residuals, cells, trusts, cell_count, level, prior),
+    )
+    normal_tint = geometric_normals(tints, cells, trusts, cell_count, tint_level, prior)
     weights = np.full(masks.shape, 255, dtype=np.uint8)
     for row, one in measured.items():
         seen = masks[row].reshape(-1) / 255.0
@@ -105,21 +109,21 @@ def normal_residuals(
     return np.maximum((sums + prior * level) / (mass + prior), level).astype(np.float32)
 
 
-def normal_tints(
-    tints: Sequence[np.ndarray],
+def geometric_normals(
+    distances: Sequence[np.ndarray],
     cells: Sequence[np.ndarray],
     trusts: Sequence[float],
     cell_count: int,
     level: float,
     prior: float,
 ) -> np.ndarray:
-    """How far from the skin's tint each cell of the surface is in clean frames.
+    """Distance of each cell of the surface from what is expected of it, in clean frames.
 
-    Nails and tattoos are far from it in every frame, a place under an object in some. The mean
-    is geometric: the first it follows all the way, the second hardly moves it.
+    Nails and tattoos are far from the skin's tint in every frame, a place under an object in some.
+    The mean is geometric: the first it follows all the way, the second hardly moves it.
 
     Args:
-        tints: for each frame (P,) distances.
+        distances: for each frame (P,) distances, of tint or residuals.
         cells: for each frame (P,) cells.
         trusts: for each frame how much it counts, in [0, 1].
         cell_count: number of cells.
@@ -130,8 +134,8 @@ def normal_tints(
         (C,) float32, at least the level.
     """
     sums, mass = np.zeros(cell_count), np.full(cell_count, prior)
-    for tint, cell, trust in zip(tints, cells, trusts, strict=True):
-        above = np.log(np.maximum(tint, level) / level)
+    for distance, cell, trust in zip(distances, cells, trusts, strict=True):
+        above = np.log(np.maximum(distance, level) / level)
         sums += trust * np.bincount(cell, above, minlength=cell_count)
         mass += trust * np.bincount(cell, minlength=cell_count)
     return (level * np.exp(sums / mass)).astype(np.float32)

@@ -326,3 +326,27 @@ def test_a_part_of_another_colour_in_every_frame_keeps_its_weight(lit_frames: Li
     inner = np.stack([interior(part, 4) for part in bare])
     assert weights[SPARED][inner[SPARED]].mean() > 0.7 * 255
     assert weights[SPARED][(masks & ~bare)[SPARED]].mean() > 0.7 * 255
+
+
+@pytest.mark.parametrize(("colour", "least", "most"), [(None, 0.5, 1.0), ((0.1, 0.1, 0.6), 0, 0.1)])
+def test_a_place_that_no_clean_frame_shows_may_have_a_second_colour_of_the_hand(
+    lit_frames: Lit, colour: tuple[float, ...] | None, least: float, most: float
+) -> None:
+    """Dark frames alone show a strip of the bare part: as bare as the rest of it, or painted."""
+    linear, masks = lit_frames[0].copy(), lit_frames[1].copy()
+    strip = np.zeros_like(masks)
+    for frame in range(FRAMES):
+        rows = np.nonzero(masks[frame])[0]
+        below = np.zeros_like(masks[frame])
+        below[int(np.quantile(rows, 0.6)) :] = True
+        linear[frame][masks[frame] & ~below] *= [0.12, 0.25, 0.12]
+        below[: int(np.quantile(rows, 0.8))] = False
+        strip[frame] = masks[frame] & below
+        if frame not in HIT:
+            masks[frame] &= ~strip[frame]
+        elif colour is not None:
+            linear[frame][strip[frame]] = colour
+    linear[HIT] *= 0.3
+    weights = judge_frames(as_input(developed(linear), masks)).pixel_weights
+    inner = np.stack([interior(part, 3) & part for part in strip])
+    assert least * 255 <= weights[HIT][inner[HIT]].mean() <= most * 255
