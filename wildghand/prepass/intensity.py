@@ -23,7 +23,7 @@ _RIDGE = 20.0
 # Gain deviation at which a frame counts half in albedo and shading.
 _FRAME_SCALE = 0.25
 # Part of a clip's frames over which clean views of a cell must be spread. An object that stays for
-# one episode is no part of the hand, even if nothing else is wrong with its frames.
+# one episode does not belong to the hand, even if nothing else is wrong with its frames.
 _SPREAD = 1.0 / 3.0
 # Samples that the skin colour is worth in such a cell.
 _KNOWN_PRIOR = 1.0
@@ -60,7 +60,7 @@ class LightSamples:
 
 @dataclass(frozen=True, eq=False)
 class Verdict:
-    """What a first judgement says of R frames."""
+    """A first judgement of R frames."""
 
     #: (R,) probability that nothing perturbs the frame.
     clean: np.ndarray
