@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.nearest import kd_tree
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.hands.skeleton import PARENTS
 from hwp_bench.sim.geometry.mesh import boundary_loop
@@ -43,14 +44,13 @@ def split_at_seams(template: HandTemplate) -> Piece:
 
 def remeshed(template: HandTemplate, longest: float = 0.006) -> Piece:
     """The free hand with other triangles: no edge longer than `longest`, m."""
-    from scipy.spatial import cKDTree
     from trimesh.remesh import subdivide_to_size
 
     vertices, faces = subdivide_to_size(template.vertices, template.faces, longest, max_iter=6)
     _, first, welded = np.unique(
         np.round(vertices, 7), axis=0, return_index=True, return_inverse=True
     )
-    distance, near = cKDTree(template.vertices).query(vertices[first], k=3)
+    distance, near = kd_tree(template.vertices).query(vertices[first], k=3)
     share = 1.0 / np.maximum(distance, 1e-6)
     share /= share.sum(axis=1, keepdims=True)
     weights = np.einsum("vk,vkj->vj", share, template.weights[near])

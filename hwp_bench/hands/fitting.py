@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadInput, DidNotConverge
+from hwp_bench.base.nearest import kd_tree
 from hwp_bench.hands.anchors import vertex_normals
 from hwp_bench.hands.articulation import anatomical_limits, joint_limit_penalty
 from hwp_bench.hands.parameters import HandParameters
@@ -193,14 +194,12 @@ class _Fit:
 
     def _match(self, posed: PosedHand) -> tuple[torch.Tensor, ...]:
         """For every skin point the nearest vertex, its normal, and whether it may be used."""
-        from scipy.spatial import cKDTree
-
         assert self.skin is not None
         vertices = posed.vertices.detach()
         normals = vertex_normals(vertices, self.faces)
         index, usable = [], []
         for points, own in zip(self.skin.numpy(), vertices.numpy(), strict=True):
-            distance, nearest = cKDTree(own).query(points)
+            distance, nearest = kd_tree(own).query(points)
             index.append(nearest)
             usable.append((distance < REACH) & ~np.isin(nearest, self.border))
         found = torch.from_numpy(np.stack(index))

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import ShapeMismatch
+from hwp_bench.base.nearest import kd_tree
 from hwp_bench.hands.anchors import anchor_frames, anchor_positions
 from wildghand.gaussians.bags import sum_bags
 from wildghand.gaussians.rig import HandRig
@@ -119,12 +120,10 @@ def nearest_on_surface(positions: np.ndarray, normals: np.ndarray, count: int) -
     Returns:
         (N, K) int64, K = count or N - 1 if that is less; -1 where fewer agree.
     """
-    from scipy.spatial import cKDTree
-
     total = len(positions)
     found = min(count, total - 1)
     candidates = min(_CANDIDATES * count + 1, total)
-    _, near = cKDTree(positions).query(positions, k=candidates)
+    _, near = kd_tree(positions).query(positions, k=candidates)
     near = near.reshape(total, candidates)
     agree = np.einsum("nc,nkc->nk", normals, normals[near]) > 0.0
     agree &= near != np.arange(total)[:, None]

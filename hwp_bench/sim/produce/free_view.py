@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.errors import HwpError
+from hwp_bench.base.nearest import kd_tree
 from hwp_bench.base.progress import progress
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, open_capture
 from hwp_bench.capture.schema import FREE_VIEW, MAX_ID
@@ -105,13 +106,11 @@ def _apart(scene: Scene, hands: dict[str, HandMoment]) -> dict[str, HandMoment]:
     """The hands, pushed apart along the line between them until `GAP` is between them."""
     if len(hands) < 2:
         return hands
-    from scipy.spatial import cKDTree
-
     (first, one), (second, other) = hands.items()
     surfaces = _surfaces(scene, hands)
     line = one.place - other.place
     line = unit(line) if np.linalg.norm(line) > 1e-3 else np.array([1.0, 0.0, 0.0])
-    tree, push = cKDTree(surfaces[second]), 0.0
+    tree, push = kd_tree(surfaces[second]), 0.0
     # Surfaces that cross have no distance either: what is between them must open along the line.
     while tree.query(surfaces[first] + push * line)[0].min() < GAP:
         push += GAP / 2.0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from hwp_bench.base.nearest import kd_tree
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import fractal_noise
 
@@ -24,8 +25,6 @@ def freckles(points: np.ndarray, amount: float, rng: np.random.Generator) -> np.
         amount: 0 to 1, share of the places that carry one.
         rng: decides which, where and how dark.
     """
-    from scipy.spatial import cKDTree
-
     ticks = [np.arange(low, high, _CELL) for low, high in _BOX]
     cells = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
     centers = cells + rng.uniform(0.0, _CELL, cells.shape)
@@ -36,7 +35,7 @@ def freckles(points: np.ndarray, amount: float, rng: np.random.Generator) -> np.
     there &= np.all((centers > low) & (centers < high), axis=1)
     if not there.any():
         return np.zeros(len(points))
-    distance, nearest = cKDTree(centers[there]).query(points, distance_upper_bound=0.003)
+    distance, nearest = kd_tree(centers[there]).query(points, distance_upper_bound=0.003)
     near = np.isfinite(distance)
     spots = np.zeros(len(points))
     own = nearest[near]
@@ -79,13 +78,11 @@ def hair(
     Returns:
         (N,) 0 (none) to 1 (covered by hair).
     """
-    from scipy.spatial import cKDTree
-
     strokes = np.zeros(len(points))
     total = float(share.sum())
     if total <= 0.0:
         return strokes
-    tree = cKDTree(points)
+    tree = kd_tree(points)
     probe = rng.integers(0, len(points), 400)
     spacing = float(np.median(tree.query(points[probe], k=2)[0][:, 1]))
     count = int(amount * _HAIRS * 1e4 * total * spacing**2)

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hwp_bench.base.nearest import kd_tree
 from hwp_bench.sim.scene.motion import palm_of
 
 if TYPE_CHECKING:
@@ -48,7 +49,6 @@ def template_distance(hand: SubjectHand) -> TemplateDistance:
     Args:
         hand: the subject's hand.
     """
-    from scipy.spatial import cKDTree
     from trimesh.triangles import closest_point
 
     model = hand.model
@@ -59,7 +59,7 @@ def template_distance(hand: SubjectHand) -> TemplateDistance:
     aside = palm_of(hand.model_joints) - palm_of(hand.joints)
     places = places[(places[:, 0] - hand.joints[0, 0]) * forward > _BEFORE] + aside
     triangles = shaped[model.faces]
-    _, near = cKDTree(triangles.mean(axis=1)).query(places, k=_TRIED)
+    _, near = kd_tree(triangles.mean(axis=1)).query(places, k=_TRIED)
     nearest = closest_point(triangles[near.reshape(-1)], np.repeat(places, _TRIED, axis=0))
     way = np.linalg.norm(nearest.reshape(len(places), _TRIED, 3) - places[:, None], axis=2)
     distance = 1000.0 * way.min(axis=1)

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.base.errors import BadHandModel
+from hwp_bench.base.nearest import kd_tree
 from hwp_bench.sim.subject.rig_mesh import RigMesh, closed, components, cut, kept, outlines
 
 #: How far behind the wrist's joint a mesh is cut, m; the free hand's own rim lies there.
@@ -73,10 +74,8 @@ def opened_at_wrist(mesh: RigMesh, joints: np.ndarray, forward: np.ndarray, wher
 
 def _of_the_hand(mesh: RigMesh, joints: np.ndarray, where: str) -> RigMesh:
     """Without pieces that are far from all joints, and without what no triangle uses."""
-    from scipy.spatial import cKDTree
-
     piece = components(mesh.faces, len(mesh.vertices))
-    distance, _ = cKDTree(joints).query(mesh.vertices)
+    distance, _ = kd_tree(joints).query(mesh.vertices)
     nearest = np.full(piece.max(initial=0) + 1, np.inf)
     np.minimum.at(nearest, piece, distance)
     near = nearest[piece[mesh.faces[:, 0]]] < _FAR
