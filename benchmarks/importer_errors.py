@@ -12,18 +12,20 @@ from __future__ import annotations
 import argparse
 import sys
 import time
-from dataclasses import dataclass, fields, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 import torch
 
 from hwp_bench.capture import open_capture
+from hwp_bench.cli.overrides import overrides
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.hands.skeleton import FINGERS, finger_joints
 from hwp_bench.importers.video import FitSettings, VideoImport
 from hwp_bench.importers.video.from_video import fit_video, read_source
+from hwp_bench.methods.settings import settings_from
 
 
 @dataclass(frozen=True)
@@ -92,10 +94,9 @@ def import_errors(folder: Path, clip: str, settings: FitSettings) -> tuple[HandE
 
 
 def changed(settings: FitSettings, changes: list[str]) -> FitSettings:
-    """Set fields given as NAME=VALUE."""
-    kinds = {field.name: type(getattr(settings, field.name)) for field in fields(settings)}
-    pairs = (text.split("=", 1) for text in changes)
-    return replace(settings, **{name: kinds[name](value) for name, value in pairs})
+    """Set fields given as NAME=VALUE; refuses names and values that are wrong."""
+    values = {**asdict(settings), **overrides(changes)}
+    return settings_from(FitSettings, values, "--set")
 
 
 def main(arguments: list[str]) -> int:

@@ -31,7 +31,7 @@ def axis_angle_to_matrix(axis_angle: torch.Tensor) -> torch.Tensor:
     cosine_ratio = torch.where(
         small, _cosine_series(series_of), 2.0 * half_sine * half_sine / closed_of
     )
-    cross = _cross_matrix(axis_angle)
+    cross = cross_matrix(axis_angle)
     identity = torch.eye(3, dtype=axis_angle.dtype, device=axis_angle.device)
     outer = axis_angle.unsqueeze(-1) * axis_angle.unsqueeze(-2)
     # K^2 = v v^T - |v|^2 I: one outer product, no matrix product.
@@ -57,7 +57,8 @@ def _cosine_series(squared: torch.Tensor) -> torch.Tensor:
     return 0.5 * term
 
 
-def _cross_matrix(vector: torch.Tensor) -> torch.Tensor:
+def cross_matrix(vector: torch.Tensor) -> torch.Tensor:
+    """Matrices (..., 3, 3) whose product with w is the cross product of (..., 3) with w."""
     x, y, z = vector.unbind(dim=-1)
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(

@@ -150,8 +150,10 @@ def fit_intensity(
         gains = gains - centre
         residual = np.abs(rest - centre - gains[rows]) @ np.full(3, 1.0 / 3.0)
         scale = max(float(np.median(residual[part[rows]])), 0.01)
-        ordinary = _cell_scales(cells, residual, sure * known[cells], np.full(len(used), scale))
-        weights = 1.0 / (1.0 + (residual / (2.5 * ordinary[cells])) ** 4)
+        ordinary: float | np.ndarray = scale
+        if verdict is not None:
+            ordinary = _cell_scales(cells, residual, sure * known[cells], len(used), scale)[cells]
+        weights = 1.0 / (1.0 + (residual / (2.5 * ordinary)) ** 4)
     everywhere = np.column_stack([np.ones(cell_count), shading_basis(cell_normals)])
     smooth = (everywhere @ skin + centre).astype(np.float32)
     full = smooth.copy()
@@ -200,15 +202,14 @@ def _known_cells(clean: np.ndarray, cells: np.ndarray, rows: np.ndarray, count: 
 
 
 def _cell_scales(
-    cells: np.ndarray, residual: np.ndarray, trust: np.ndarray, least: np.ndarray
+    cells: np.ndarray, residual: np.ndarray, trust: np.ndarray, count: int, least: float
 ) -> np.ndarray:
-    """(U,) residual that is ordinary in each cell, from `least` (U,) on.
+    """(count,) residual that is ordinary in each cell, from `least` on.
 
     The mean is geometric, so that some outliers hardly raise it. Where all samples of a cell are
     far off, its albedo is wrong and not the samples, and they must not be left out.
     """
-    count = len(least)
-    above = np.log(np.maximum(residual / least[cells], 1.0))
+    above = np.log(np.maximum(residual / least, 1.0))
     mass = np.bincount(cells, trust, minlength=count)
     sums = np.bincount(cells, trust * above, minlength=count)
     return np.asarray(least * np.exp(sums / np.maximum(mass, 1e-9)))

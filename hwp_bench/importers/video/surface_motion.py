@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from hwp_bench.hands.rotations import cross_matrix
 from hwp_bench.hands.skeleton import PARENTS
 from hwp_bench.importers.video.clip_model import ANCHOR_UNIT, ClipModel, ClipVariables
 
@@ -71,7 +72,7 @@ class SurfaceMotion:
         arms = below - (weights @ self._below.T)[:, :, None] * centres
         own = below[:, 0]
         moved = np.zeros((len(vertices), 3, FRAME_VARIABLES))
-        moved[:, :, :3] = -rotation @ cross_matrix(own - wrist) @ self._turn_rates[frame]
+        moved[:, :, :3] = -rotation @ _cross(own - wrist) @ self._turn_rates[frame]
         # The cross product of each of a joint's three axes with the arm from the joint.
         x, y, z = np.moveaxis(rotation @ motion[1:, :, :3] @ self._finger_rates[frame], 1, 0)
         u, v, w = np.einsum("ab,njb->anj", rotation, arms[:, 1:])[..., None]
@@ -107,18 +108,12 @@ def right_jacobian(vectors: np.ndarray) -> np.ndarray:
     safe = np.where(small, 1.0, angle)
     first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
     second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    cross = cross_matrix(vectors)
+    cross = _cross(vectors)
     return np.asarray(np.eye(3) - first * cross + second * (cross @ cross))
 
 
-def cross_matrix(vectors: np.ndarray) -> np.ndarray:
-    """Matrices (..., 3, 3) whose product with w is the cross product of `vectors` with w."""
-    result = np.zeros((*vectors.shape, 3))
-    x, y, z = np.moveaxis(vectors, -1, 0)
-    result[..., 0, 1], result[..., 0, 2] = -z, y
-    result[..., 1, 0], result[..., 1, 2] = z, -x
-    result[..., 2, 0], result[..., 2, 1] = -y, x
-    return result
+def _cross(vectors: np.ndarray) -> np.ndarray:
+    return np.asarray(cross_matrix(torch.from_numpy(vectors)).numpy())
 
 
 def _descendants() -> np.ndarray:
