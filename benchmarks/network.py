@@ -12,7 +12,6 @@ test frames and on every fifth training frame.
 from __future__ import annotations
 
 import argparse
-import sys
 import tempfile
 import time
 from collections.abc import Callable, Mapping
@@ -27,7 +26,6 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import split_for
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import RunSettings, TrainingCapture
-from hwp_bench.methods.manifest import find_method
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.gaussians.fit_loop import batches
 from wildghand.gaussians.frame_table import soft_weights
@@ -41,6 +39,9 @@ from wildghand.network import (
     parameter_groups,
     surface_points,
 )
+from wildghand.plain.model import make_model
+from wildghand.plain.recipe import learning_rates
+from wildghand.plain.settings import FitSettings
 from wildghand.splat import rasterize
 
 #: Gaussians of the stated cost.
@@ -128,12 +129,7 @@ def measure(size: str = "compact", count: int = 5_000, rounds: int = 12) -> Mapp
 
 def plain(training: TrainingCapture, frames: TrainingFrames, count: int) -> Contender:
     """Free attributes of every Gaussian, as the plain baseline fits them."""
-    sys.path.insert(0, str(find_method("plain")))
-    from plain_fit.model import make_model
-    from plain_fit.optimize import learning_rates
-    from plain_fit.settings import PlainSettings
-
-    settings = PlainSettings()
+    settings = FitSettings()
     model = make_model(
         {side: training.template(side) for side in training.sides},
         frames.mean_color(),

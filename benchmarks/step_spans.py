@@ -45,15 +45,15 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
         "wildghand.model.model:dress",
         "wildghand.gaussians.anchored:AnchoredGaussians.place",
     ),
-    "shading": ("plain_fit.model:sh_basis",),
+    "shading": ("wildghand.plain.model:sh_basis",),
     "rasterizer": (
         "wildghand.model.model:_rasterize",
         "wildghand.model.model:rasterize",
-        "plain_fit.model:rasterize",
+        "wildghand.plain.model:rasterize",
     ),
     "photometric loss": (
         "wildghand.model.terms:reconstruction",
-        "plain_fit.optimize:photometric_loss",
+        "wildghand.plain.recipe:photometric_loss",
     ),
     "regularisers": ("wildghand.fitting.objective:Objective.__call__",),
     "targets and weights": (

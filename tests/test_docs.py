@@ -114,19 +114,29 @@ def is_defined(name: str) -> bool:
     return False
 
 
-def test_the_example_of_the_method_contract_runs(
-    make_capture: CaptureMaker, tmp_path: Path
+@pytest.mark.parametrize(
+    ("example", "entry", "settings"),
+    [
+        (0, "MyMethod", None),
+        (1, "CappedMethod", "[presets.default]\ngaussians = 200\nsteps = 2\ncap = 0.2\n"),
+    ],
+    ids=["of the contract", "on the plain fit"],
+)
+def test_the_examples_of_the_method_contract_run(
+    make_capture: CaptureMaker, tmp_path: Path, example: int, entry: str, settings: str | None
 ) -> None:
     from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
 
-    blocks = re.findall(
-        r"```(toml|python)\n(.*?)```", (ROOT / "docs" / "methods.md").read_text(), re.DOTALL
-    )
-    code = dict(blocks)
+    page = (ROOT / "docs" / "methods.md").read_text()
+    manifest = re.findall(r"```toml\n(.*?)```", page, re.DOTALL)[0]
+    code = re.findall(r"```python\n(.*?)```", page, re.DOTALL)[example]
+    if settings is not None:
+        head = 'schema = "hwp-method/1"\nname = "capped"\ntitle = "Capped"\n'
+        manifest = f'{head}[entry]\npython = "my_package.my_module:{entry}"\n{settings}'
     method = tmp_path / "method"
     (method / "my_package").mkdir(parents=True)
-    (method / "method.toml").write_text(code["toml"])
-    (method / "my_package" / "my_module.py").write_text(code["python"])
+    (method / "method.toml").write_text(manifest)
+    (method / "my_package" / "my_module.py").write_text(code)
     capture = make_capture(frames=20, size=48)
     results = evaluate(str(method), [capture.root], tmp_path / "out", EvaluationSettings())
     assert results.captures[0].failure is None

@@ -63,7 +63,7 @@ def test_a_wheel_has_the_two_packages_and_their_data(wheel: Path) -> None:
         "hwp_bench/py.typed",
         "wildghand/py.typed",
         "wildghand/method.toml",
-        f"{data}/baselines/interaction-gaussian/method.toml",
+        f"{data}/baselines/network-scratch/method.toml",
         f"{data}/baselines/plain/method.toml",
         f"{data}/baselines/plain/plain_fit/method.py",
         f"{data}/leaderboard/published.json",
@@ -90,7 +90,7 @@ def test_its_programs_run_outside_of_the_checkout(programs: Path, tmp_path: Path
     assert "evaluate" in run(programs / "hwp-bench", "--help", cwd=tmp_path)
     assert "fit" in run(programs / "wildghand", "--help", cwd=tmp_path)
     methods = run(programs / "hwp-bench", "list", "methods", cwd=tmp_path)
-    for name in ("plain", "interaction-gaussian", "wildghand"):
+    for name in ("plain", "network-scratch", "wildghand"):
         assert name in methods
     where = "import hwp_bench, wildghand; print(hwp_bench.__file__, wildghand.__file__)"
     for place in run(programs / "python", "-c", where, cwd=tmp_path).split():
@@ -101,7 +101,7 @@ def test_the_shipped_baseline_can_be_loaded_from_it(programs: Path, tmp_path: Pa
     code = (
         "from hwp_bench.methods import find_method, read_manifest\n"
         "from hwp_bench.run.worker import load_entry\n"
-        "for name in ('plain', 'baselines/plain', 'interaction-gaussian', 'wildghand'):\n"
+        "for name in ('plain', 'baselines/plain', 'network-scratch', 'wildghand'):\n"
         "    manifest = read_manifest(find_method(name))\n"
         "    print(load_entry(manifest.root, manifest.entry).__name__)\n"
     )

@@ -5,8 +5,8 @@ an entry that is not needed any more.
 """
 
 PlainMethod  # the entry of baselines/plain/method.toml
-WildGHandMethod  # the entry of wildghand/method.toml and of baselines/interaction-gaussian
-check_networks  # `check_files` of wildghand/method.toml and of baselines/interaction-gaussian
+WildGHandMethod  # the entry of wildghand/method.toml and of baselines/network-scratch
+check_networks  # `check_files` of wildghand/method.toml and of baselines/network-scratch
 modified  # part of the cache's key: a changed file is read again
 _.maxlong  # reprlib reads it
 _.maxother  # reprlib reads it

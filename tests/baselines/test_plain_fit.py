@@ -15,7 +15,7 @@ from hwp_bench.base.errors import DidNotConverge, MissingDependency, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, Camera, HandPose, TrainingCapture
 from plain_fit.method import PlainMethod
-from plain_fit.model import PlainAvatar
+from wildghand.plain.avatar import PlainAvatar
 
 
 def masked_psnr(avatar: PlainAvatar, training: TrainingCapture, capture: Capture) -> float:

@@ -125,7 +125,7 @@ def test_shipped_methods_are_found_by_name_and_by_path() -> None:
     assert find_method("plain").resolve() == find_method("baselines/plain").resolve()
 
 
-@pytest.mark.parametrize("name", ["plain", "interaction-gaussian", "wildghand"])
+@pytest.mark.parametrize("name", ["plain", "network-scratch", "wildghand"])
 def test_shipped_methods_are_found_from_any_folder(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -81,7 +81,7 @@ def test_a_rule_for_a_setting_that_is_not_there_is_refused(tmp_path: Path) -> No
         read_manifest(tmp_path)
 
 
-@pytest.mark.parametrize("method", ["wildghand", "interaction-gaussian"])
+@pytest.mark.parametrize("method", ["wildghand", "network-scratch"])
 def test_the_shipped_rules_are_those_of_the_settings(method: str) -> None:
     files = read_manifest(find_method(method)).files
     kinds = {"pao.regions": ("sam",), "pao.hand": ("sam",), "perceptual": ("vgg19",)}

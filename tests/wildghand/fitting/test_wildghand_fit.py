@@ -271,13 +271,13 @@ def test_posed_gaussians_are_what_is_drawn(hands: str, make_training: TrainingMa
 
 
 def test_settings_of_presets_and_switches() -> None:
-    for name in ("wildghand", "interaction-gaussian"):
+    for name in ("wildghand", "network-scratch"):
         manifest = read_manifest(find_method(name))
         for preset in manifest.presets.values():
             read_settings(preset)
         for switch in manifest.switches.values():
             read_settings(switch.settings)
-    base = read_manifest(find_method("interaction-gaussian")).presets["mini"]
+    base = read_manifest(find_method("network-scratch")).presets["mini"]
     assert not read_settings(base).dpd.enabled
     assert not read_settings(base).pao.enabled
     assert FRAMES > 0

@@ -9,8 +9,8 @@ import torch
 from painted import painted_avatar
 
 from hwp_bench.base.errors import DidNotConverge
-from plain_fit.model import PlainModel
 from wildghand.gaussians.fit_loop import MAX_RISE, WINDOW, Guard, repeatable
+from wildghand.plain.model import PlainModel
 
 
 @pytest.fixture(scope="module")

@@ -332,7 +332,7 @@ def test_avatars_from_before_the_subject_the_light_and_the_places_draw_as_they_d
     assert read_stored(dataclasses.asdict(today)) == today
 
 
-@pytest.mark.parametrize("name", ["wildghand", "interaction-gaussian"])
+@pytest.mark.parametrize("name", ["wildghand", "network-scratch"])
 def test_the_manifest_lists_every_setting_and_every_former_name(name: str) -> None:
     listed = read_manifest(find_method(name)).settings
     assert list(listed) == ["mode", *EVERY, *NAMES, *GONE, "binary_mask", *TABLES]

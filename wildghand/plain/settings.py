@@ -1,18 +1,19 @@
-"""Settings of the plain baseline, checked when read."""
+"""Settings that every fit of the plain model has."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
-from hwp_bench.methods.settings import choice, number, settings_from
+from hwp_bench.methods.settings import choice, number
 from wildghand.gaussians.shading import MAX_DEGREE
 
 
 @dataclass(frozen=True)
-class PlainSettings:
-    """How the plain baseline fits; the defaults are those of the preset `default`."""
+class FitSettings:
+    """How the plain model is fitted; the defaults are those of the preset `default`.
+
+    A method with more settings extends this class.
+    """
 
     #: Gaussians on each hand.
     gaussians: int = number(12_000, 1, 1_000_000)
@@ -45,16 +46,3 @@ class PlainSettings:
     final_rate: float = number(0.05, 1e-6, 1.0)
     #: `auto` (CUDA where both a GPU and gsplat are there), `cpu` or `cuda`.
     device: str = choice("auto", "cpu", "cuda")
-
-
-def read_settings(values: Mapping[str, Any]) -> PlainSettings:
-    """Check a preset's table with its overrides.
-
-    Args:
-        values: any of the fields of `PlainSettings`.
-
-    Raises:
-        BadMethod: an unknown name (the message says which one is close), a wrong type, or a
-            value outside its range.
-    """
-    return settings_from(PlainSettings, values, "baselines/plain")

@@ -1,0 +1,134 @@
+"""The hooks of the plain fit. Oracles: a recipe that changes nothing, and one by construction."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import pytest
+import torch
+from painted import QUICK, SilentReport, TrainingMaker
+
+from hwp_bench.base.errors import DidNotConverge
+from hwp_bench.methods.contract import Budget
+from wildghand.gaussians.training import load_frames
+from wildghand.plain.avatar import PlainAvatar
+from wildghand.plain.loop import run_fit
+from wildghand.plain.method import RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
+from wildghand.plain.settings import FitSettings
+
+
+class FrameGain(PlainRecipe[FitSettings]):
+    """One factor for each frame, and a record of the order of the hooks."""
+
+    def __init__(self, material: Material, settings: FitSettings) -> None:
+        super().__init__(material, settings)
+        self.log_gains = torch.zeros(len(material.frames))
+        self.calls: list[str] = []
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        return {**super().parameters(), "log_gains": self.log_gains}
+
+    def rates(self) -> dict[str, float]:
+        return {**super().rates(), "log_gains": 0.05}
+
+    def draw(self, batch: Batch) -> Drawing:
+        self.calls.append("draw")
+        drawn = super().draw(batch)
+        return Drawing(
+            drawn.image * self.log_gains[batch.rows].exp()[:, None, None, None], drawn.coverage
+        )
+
+    def weights(self, batch: Batch, drawing: Drawing) -> torch.Tensor:
+        self.calls.append("weights")
+        return super().weights(batch, drawing)
+
+    def loss(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
+        self.calls.append("loss")
+        return super().loss(batch, drawing, weights)
+
+    def after_step(self, batch: Batch) -> None:
+        self.calls.append("after_step")
+        super().after_step(batch)
+
+
+class GainMethod(RecipeMethod):
+    name: ClassVar[str] = "gain"
+    recipe_type: ClassVar[type[PlainRecipe[Any]]] = FrameGain
+
+
+def gain_recipe(make_training: TrainingMaker, **settings: Any) -> FrameGain:
+    training = make_training()
+    method = GainMethod({**QUICK, **settings})
+    material = Material(training, load_frames(training), 0, method.device)
+    return FrameGain(material, method.settings)
+
+
+def test_the_loop_calls_the_hooks_in_order(make_training: TrainingMaker) -> None:
+    recipe = gain_recipe(make_training)
+    run_fit(recipe, Budget(steps=3), SilentReport())
+    assert recipe.calls == ["draw", "weights", "loss", "after_step"] * 3
+
+
+def test_a_recipe_s_own_tensors_are_fitted(make_training: TrainingMaker) -> None:
+    """Frames that are made darker ask for a gain below the others'."""
+    recipe = gain_recipe(make_training)
+    dark = 5
+    recipe.material.frames.images[:dark] //= 2
+    run_fit(recipe, Budget(steps=150), SilentReport())
+    gains = recipe.log_gains.exp()
+    assert gains[:dark].max() < 0.8 * gains[dark:].median()
+    assert not any(value.requires_grad for value in recipe.parameters().values())
+
+
+def test_without_changes_a_recipe_is_the_plain_fit_bit_for_bit(
+    make_training: TrainingMaker,
+) -> None:
+    """A hook that draws the same must not change a bit of the other tensors."""
+    training = make_training()
+
+    class Same(PlainRecipe[FitSettings]):
+        def draw(self, batch: Batch) -> Drawing:
+            return super().draw(batch)
+
+    class SameMethod(RecipeMethod):
+        name = "same"
+        recipe_type = Same
+
+    class Plain(RecipeMethod):
+        name = "plain"
+
+    fits = [
+        method(QUICK, 2).fit(training, Budget(steps=10), SilentReport())
+        for method in (SameMethod, Plain)
+    ]
+    assert all(isinstance(fit, PlainAvatar) for fit in fits)
+    for name, value in fits[0].model.parameters().items():
+        assert torch.equal(value, fits[1].model.parameters()[name]), name
+
+
+def test_a_fit_that_diverges_later_goes_back_to_its_best_state(
+    make_training: TrainingMaker,
+) -> None:
+    """After 100 steps the drawing is no number; the state of a window's end must come back."""
+
+    class Breaking(FrameGain):
+        def draw(self, batch: Batch) -> Drawing:
+            drawn = super().draw(batch)
+            if batch.step < 100:
+                return drawn
+            return Drawing(drawn.image * float("nan"), drawn.coverage)
+
+    training = make_training()
+    method = GainMethod(QUICK)
+    recipe = Breaking(Material(training, load_frames(training), 0, method.device), method.settings)
+    avatar = run_fit(recipe, Budget(steps=200), SilentReport())
+    assert isinstance(avatar, PlainAvatar)
+    assert avatar.steps in (49, 99)
+    assert recipe.finite()
+
+
+def test_a_fit_that_diverges_at_once_says_so(make_training: TrainingMaker) -> None:
+    recipe = gain_recipe(make_training, light_rate=1e30, offset_rate=1e30)
+    with pytest.raises(DidNotConverge, match="diverged"):
+        run_fit(recipe, Budget(), SilentReport())
