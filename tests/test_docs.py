@@ -123,7 +123,7 @@ def is_defined(name: str) -> bool:
     ids=["of the contract", "on the plain fit"],
 )
 def test_the_examples_of_the_method_contract_run(
-    make_capture: CaptureMaker, tmp_path: Path, example: int, entry: str, settings: str | None
+    make_painted: Callable[[str], Capture], tmp_path: Path, example: int, entry: str, settings: str | None
 ) -> None:
     from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
 
@@ -137,7 +137,7 @@ def test_the_examples_of_the_method_contract_run(
     (method / "my_package").mkdir(parents=True)
     (method / "method.toml").write_text(manifest)
     (method / "my_package" / "my_module.py").write_text(code)
-    capture = make_capture(frames=20, size=48)
+    capture = make_painted("right")
     results = evaluate(str(method), [capture.root], tmp_path / "out", EvaluationSettings())
     assert results.captures[0].failure is None
     assert 5 < results.captures[0].frames[0].scores["psnr"] < 40
