@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -40,6 +41,17 @@ class SilentReport:
 
     def progress(self, done: int, total: int) -> None:
         self.done.append((done, total))
+
+
+def masked_psnr(avatar: Avatar, training: TrainingCapture, capture: Capture) -> float:
+    """PSNR over the pixels of the hand in all test frames, dB; these frames are as painted."""
+    errors = []
+    for frame in training.targets.tolist():
+        rgba = avatar.render(training.hand_poses(frame), training.camera(frame))
+        inside = capture.mask(frame) == 255
+        error = rgba[..., :3] - capture.frame(frame) / 255.0
+        errors.append(np.square(error[inside]).mean())
+    return -10.0 * math.log10(np.mean(errors))
 
 
 def hand_parameters(side: str, seed: int) -> HandParameters:

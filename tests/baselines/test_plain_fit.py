@@ -2,30 +2,19 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
-from painted import QUICK, SilentReport, TrainingMaker, painted_avatar
+from painted import QUICK, SilentReport, TrainingMaker, masked_psnr, painted_avatar
 
 from hwp_bench.base.errors import DidNotConverge, MissingDependency, UsageError
 from hwp_bench.capture import Capture
-from hwp_bench.methods.contract import Budget, Camera, HandPose, TrainingCapture
+from hwp_bench.methods.contract import Budget, Camera, HandPose
 from plain_fit.method import PlainMethod
 from wildghand.plain.avatar import PlainAvatar
-
-
-def masked_psnr(avatar: PlainAvatar, training: TrainingCapture, capture: Capture) -> float:
-    errors = []
-    for frame in training.targets.tolist():
-        rgba = avatar.render(training.hand_poses(frame), training.camera(frame))
-        inside = capture.mask(frame) == 255
-        error = rgba[..., :3] - capture.frame(frame) / 255.0
-        errors.append(np.square(error[inside]).mean())
-    return -10.0 * math.log10(np.mean(errors))
 
 
 def upright(side: str) -> HandPose:

@@ -69,22 +69,55 @@ class PlainModel:
         Returns:
             (B, H, W, 3) sRGB colour, premultiplied, and (B, H, W, 1) coverage in [0, 1].
         """
-        placed = self.gaussians.place(poses.positions, poses.orientations)
+        colors = self.lit(self.gaussians.logit_colors.sigmoid(), poses)
+        return self.rasterized(colors, poses, viewmats, Ks, width, height)
+
+    def lit(self, colors: torch.Tensor, poses: AnchorPoses) -> torch.Tensor:
+        """Multiply the light on; differentiable in the colours and the light.
+
+        Args:
+            colors: (N, 3) or (B, N, 3) sRGB without light.
+            poses: the anchors of all Gaussians in B frames.
+
+        Returns:
+            (B, N, 3) sRGB.
+        """
         # The light is multiplied on in sRGB: the encoding is close to a power, and a power of a
         # product is the product of the powers.
-        colors = self.gaussians.logit_colors.sigmoid()
         if self.degree:
             normals = quat_third_axis(poses.orientations)
             log_light = sh_basis(normals, self.degree)[..., 1:] @ self.light
-            colors = colors * log_light.exp()
-        else:
-            colors = colors.expand(len(viewmats), -1, -1)
+            return colors * log_light.exp()
+        return colors.expand(len(poses.positions), -1, -1)
+
+    def rasterized(
+        self,
+        channels: torch.Tensor,
+        poses: AnchorPoses,
+        viewmats: torch.Tensor,
+        Ks: torch.Tensor,
+        width: int,
+        height: int,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw any channels of the Gaussians in B frames over zero; differentiable.
+
+        Args:
+            channels: (B, N, D), any number D; colours are three of them.
+            poses: the anchors of all Gaussians in B frames.
+            viewmats: (B, 4, 4) world to camera.
+            Ks: (B, 3, 3) px.
+            width, height: px.
+
+        Returns:
+            (B, H, W, D), premultiplied, and (B, H, W, 1) coverage in [0, 1].
+        """
+        placed = self.gaussians.place(poses.positions, poses.orientations)
         image, coverage, _ = rasterize(
             placed.means,
             placed.quats,
             placed.scales,
             placed.opacities,
-            colors,
+            channels,
             viewmats,
             Ks,
             width,
