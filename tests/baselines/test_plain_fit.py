@@ -12,7 +12,7 @@ from painted import QUICK, SilentReport, TrainingMaker, masked_psnr, painted_ava
 
 from hwp_bench.base.errors import DidNotConverge, MissingDependency, UsageError
 from hwp_bench.capture import Capture
-from hwp_bench.methods.contract import Budget, Camera, HandPose
+from hwp_bench.methods.contract import Budget, Camera, HandPose, TrainingCapture
 from plain_fit.method import PlainMethod
 from wildghand.plain.avatar import PlainAvatar
 
