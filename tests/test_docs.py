@@ -6,11 +6,12 @@ import argparse
 import importlib
 import re
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from small_captures import CaptureMaker
 
+from hwp_bench.capture import Capture
 from hwp_bench.cli.main import command_tree
 from wildghand.cli.main import command_tree as wildghand_tree
 
@@ -101,7 +102,7 @@ def is_defined(name: str) -> bool:
     """Whether a dotted name is a module, or is defined or given out by one."""
     parts = name.split(".")
     for count in range(len(parts), 0, -1):
-        for folder in (ROOT, ROOT / "baselines" / "plain"):
+        for folder in (ROOT, *(ROOT / "baselines").iterdir()):
             base = folder.joinpath(*parts[:count])
             file = next(
                 (f for f in (base.with_suffix(".py"), base / "__init__.py") if f.is_file()), base
@@ -123,7 +124,11 @@ def is_defined(name: str) -> bool:
     ids=["of the contract", "on the plain fit"],
 )
 def test_the_examples_of_the_method_contract_run(
-    make_painted: Callable[[str], Capture], tmp_path: Path, example: int, entry: str, settings: str | None
+    make_painted: Callable[[str], Capture],
+    tmp_path: Path,
+    example: int,
+    entry: str,
+    settings: str | None,
 ) -> None:
     from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
 

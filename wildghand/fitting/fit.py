@@ -24,7 +24,7 @@ from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients,
 from wildghand.fitting.shared_features import SharedFeatures
 from wildghand.fitting.skin_places import skin_places
 from wildghand.fitting.subject_shape import bent_templates, subject_of
-from wildghand.fitting.weighting import Weighting, assess_frames, weighs_by_place
+from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Loss, repeatable
 from wildghand.gaussians.frame_table import upload
@@ -87,7 +87,7 @@ class Fit:
             assessment,
             settings,
             device,
-            skin_places(training, self.frames, bent) if weighs_by_place(settings) else (),
+            skin_places(training, self.frames, bent) if needs_places(settings) else (),
         )
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal, device)

@@ -13,9 +13,10 @@ from torch import Tensor
 from hwp_bench.hands import HandTemplate
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.dpd.pay_back import PayBack
+from wildghand.fitting.hidden_skin import hidden_skin
 from wildghand.fitting.networks import choose_segmenter
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
-from wildghand.gaussians.frame_table import FrameTable, shares_of_255, soft_weights
+from wildghand.gaussians.frame_table import FrameTable, shares_of_255, soft_weights, upload
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.model import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
@@ -45,6 +46,11 @@ def weighs_by_place(settings: WildGHandSettings) -> bool:
     """Whether PAO counts the errors of regions in those of their places."""
     pao = settings.pao
     return pao.enabled and pao.variant != "binary" and pao.errors == "place"
+
+
+def needs_places(settings: WildGHandSettings) -> bool:
+    """Whether anything asks for the place of the skin at each pixel."""
+    return weighs_by_place(settings) or settings.terms.leave_hidden
 
 
 def assess_frames(
@@ -89,8 +95,8 @@ class Weighting:
         assessment: of these frames by the pre-pass; None without it.
         settings: which components are on.
         device: where the tensors live.
-        places: R times (H, W) uint16, the place of the skin at each pixel; only where regions are
-            weighed by place.
+        places: R times (H, W) uint16, the place of the skin at each pixel; only where
+            `needs_places` says so.
 
     Attributes:
         clean: (R,) probability that a frame is clean; ones without the pre-pass.
@@ -147,6 +153,12 @@ class Weighting:
         self._images, self._hands = frames.images_on(device), frames.masks_on(device)
         size = 4 * frames.masks[0].numel()
         self._fixed = FrameTable(self._fixed_weights, count, size, device)
+        self._hidden: FrameTable | None = None
+        if settings.terms.leave_hidden:
+            hidden = torch.from_numpy(hidden_skin(places, frames.masks.numpy()))
+            self._hidden = FrameTable(
+                lambda rows: upload(hidden[rows], device), count, size // 4, device
+            )
 
     def state_dict(self) -> dict[str, Any]:
         """What steps change, for `load_state_dict`; it may wait for the device."""
@@ -202,6 +214,9 @@ class Weighting:
         """
         mine = rows[world.shard(len(rows))]
         hand, image = self._hands(mine), self._images(mine)
+        if self._hidden is not None:
+            # Compared with itself, a pixel asks for nothing, in the windows of SSIM neither.
+            image = torch.where(self._hidden(mine)[..., None], drawing.image.detach(), image)
         if not self._weighs_regions:
             return FrameTarget(image, hand, self._fixed(mine))
         error = world.gather(_mean_error(drawing.image, image))

@@ -198,7 +198,7 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
         "pao": {"errors": "median", "mismatch": 0.0},
         "subject": {"enabled": False},
         "light": {"enabled": False},
-        "terms": {"surface": 0.0},
+        "terms": {"surface": 0.0, "leave_hidden": False},
     }
 )
 

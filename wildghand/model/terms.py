@@ -29,6 +29,9 @@ class TermWeights:
     dssim_weight: float = number(0.2, 0.0, 1.0)
     #: Weight in the reconstruction of a pixel outside the visible-hand mask; inside it is 1.
     outside_weight: float = number(0.03, 0.0, 1.0)
+    #: Leave out of the reconstruction what the mask leaves out though the posed hand covers it:
+    #: there something is in front of the hand (`wildghand.fitting.hidden_skin`).
+    leave_hidden: bool = True
     #: `bias_size`: biases of the perturbation module.
     bias: float = 1e-3
     #: `distance_to_one` of the shadow coefficients.
@@ -66,6 +69,7 @@ class TermWeights:
 PAPER_TERMS = TermWeights(
     dssim_weight=0.0,
     reconstruction=100.0,
+    leave_hidden=False,
     bias=0.1,
     shadow=0.001,
     opacity=0.1,

@@ -22,7 +22,7 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit, make_optimizer
 from wildghand.fitting.optimize import Plateau
 from wildghand.fitting.skin_places import skin_places
-from wildghand.fitting.weighting import Weighting, assess_frames, weighs_by_place
+from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
 from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, ready_device
 from wildghand.model.settings import read_settings
 
@@ -113,7 +113,7 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     fit.clip._rigs = fit.model.rigs
     objective = fit.objective
     objective.temporal, objective._laplacians = moved((objective.temporal, objective._laplacians))
-    places = skin_places(training, fit.frames, templates) if weighs_by_place(settings) else ()
+    places = skin_places(training, fit.frames, templates) if needs_places(settings) else ()
     fit.weighting = Weighting(fit.frames, len(training.sides), assessment, settings, FAKE, places)
     fit.optimizer = make_optimizer(fit.model, fit.weighting.pao, settings)
     return fit

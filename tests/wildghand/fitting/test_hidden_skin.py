@@ -1,0 +1,90 @@
+"""Pixels behind something. Oracles: drawn squares, the images by hand, gradients of the loss."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.hidden_skin import MARGIN, hidden_skin
+from wildghand.fitting.skin_places import skin_places
+from wildghand.fitting.weighting import Weighting
+from wildghand.model.settings import read_settings
+
+CPU = torch.device("cpu")
+QUICK: dict[str, Any] = {
+    "gaussians": 300,
+    "prior": "",
+    "network.identity_resolution": 24,
+    "network.plane_resolution": 12,
+    "prepass.enabled": False,
+    "subject.enabled": False,
+    "device": "cpu",
+}
+TrainingMaker = Callable[..., TrainingCapture]
+
+
+@pytest.mark.parametrize("size", [60, 240])
+def test_only_what_is_well_inside_the_outline_and_left_out_is_hidden(size: int) -> None:
+    place = np.zeros((size, size), dtype=np.uint16)
+    place[10:50, 10:50] = 7
+    mask = np.zeros((size, size), dtype=np.uint8)
+    mask[10:50, 30:50] = 255
+    margin = max(1, round(MARGIN * size))
+    expected = np.zeros((size, size), dtype=bool)
+    expected[10 + margin : 50 - margin, 10 + margin : 30] = True
+    np.testing.assert_array_equal(hidden_skin([place], mask[None])[0], expected)
+
+
+def test_without_a_hand_nothing_is_hidden() -> None:
+    nothing = np.zeros((8, 8), dtype=np.uint16)
+    assert not hidden_skin([nothing], np.zeros((1, 8, 8), np.uint8)).any()
+
+
+def covered(training: TrainingCapture, **changes: Any) -> tuple[Fit, torch.Tensor]:
+    """A fit whose first frame's mask has lost its upper half, and what is hidden in it then."""
+    fit = Fit(training, read_settings({**QUICK, **changes}), 0, CPU)
+    masks = fit.frames.masks.clone()
+    rows = torch.nonzero((masks[0] > 127).any(dim=1))[:, 0]
+    masks[0, : int(rows.float().mean())] = 0
+    fit.frames = dataclasses.replace(fit.frames, masks=masks)
+    templates = {side: training.template(side) for side in training.sides}
+    places = skin_places(training, fit.frames, templates)
+    fit.weighting = Weighting(fit.frames, len(training.sides), None, fit.settings, CPU, places)
+    return fit, torch.from_numpy(hidden_skin(places, masks.numpy()))[0]
+
+
+@pytest.mark.parametrize("pao", [True, False])
+def test_hidden_pixels_are_compared_with_what_is_drawn(
+    make_training: TrainingMaker, pao: bool
+) -> None:
+    fit, hidden = covered(make_training(), **{"pao.enabled": pao})
+    assert hidden.sum() > 20
+    drawing = fit.draw(torch.tensor([0]))
+    target = fit.weighting(torch.tensor([0]), drawing)
+    assert torch.equal(target.image[0][hidden], drawing.image.detach()[0][hidden])
+    masked = fit.frames.images[0].float() / 255.0 * (fit.frames.masks[0] / 255.0)[..., None]
+    torch.testing.assert_close(target.image[0][~hidden], masked[~hidden])
+
+
+@pytest.mark.parametrize("leave", [True, False])
+def test_hidden_pixels_ask_for_nothing_where_they_are_left_out(
+    make_training: TrainingMaker, leave: bool
+) -> None:
+    """The gradient of the image is 0 in them without SSIM, whose windows reach the others."""
+    changes = {"terms.leave_hidden": leave, "terms.dssim_weight": 0.0, "pao.enabled": False}
+    fit, hidden = covered(make_training(), **changes)
+    drawing = fit.draw(torch.tensor([0]))
+    drawing.image.retain_grad()
+    target = fit.weighting(torch.tensor([0]), drawing)
+    loss = fit.objective(fit.model, drawing, target, torch.tensor([0]), fit.weighting.clean[:1])
+    loss.backward()
+    asked = drawing.image.grad[0].abs().sum(dim=-1)
+    assert asked[~hidden].max() > 0.0
+    assert bool((asked[hidden] == 0.0).all()) is leave
