@@ -44,7 +44,8 @@ def run(args: argparse.Namespace) -> int:
 
     from hwp_bench.base.packages import data_folder
     from hwp_bench.base.progress import notice
-    from hwp_bench.leaderboard.entries import add_entry, check_entries, read_entries
+    from hwp_bench.leaderboard.entries import read_entries
+    from hwp_bench.leaderboard.rules import add_entry, check_complete, check_entries
 
     folder = Path(args.entries) if args.entries else data_folder("leaderboard") / "entries"
     if args.action == "add":
@@ -53,8 +54,10 @@ def run(args: argparse.Namespace) -> int:
         for results in read_all(args.results):
             notice(f"entry: {add_entry(folder, results)}")
     elif args.action == "check":
-        count = len(check_entries(read_entries(folder)))
-        print(f"{count} entries, all sound")
+        entries = check_entries(read_entries(folder))
+        for entry in entries:
+            check_complete(entry)
+        print(f"{len(entries)} entries, all sound")
     else:
         from hwp_bench.leaderboard.site import build_site
         from hwp_bench.report.sources import read_sources

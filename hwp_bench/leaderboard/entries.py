@@ -4,25 +4,29 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import atomic_write, read_json, sha256_json
+from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import parse_record, without_schema
-from hwp_bench.metrics import PROTOCOLS
-from hwp_bench.metrics.aggregate import aggregate
+from hwp_bench.leaderboard.records import (
+    CHECK_SCHEMA,
+    ENTRY_SCHEMA,
+    Check,
+    Submission,
+    badge,
+    level,
+)
 from hwp_bench.results import Results
-from hwp_bench.results.schema import score_rows
 
-#: Version of the entry files.
-SCHEMA = "hwp-leaderboard-entry/1"
 #: Largest entry that is read, bytes: the full suite takes about 1 MB.
 MAX_ENTRY_BYTES = 16 * 1024 * 1024
-#: Suites whose captures are the same everywhere.
-SUITES = ("smoke", "mini", "full")
+#: Folder of checks, inside that of the entries.
+CHECKS = "checks"
 
 
 @dataclass(frozen=True)
@@ -33,6 +37,33 @@ class Entry:
     name: str
     #: The results, every frame's scores included.
     results: Results
+    #: What the submitter added; nothing in the oldest entries.
+    submission: Submission = field(default_factory=Submission)
+    #: Digest of the file's content; empty for one that is in no file yet.
+    digest: str = ""
+    #: Its checks.
+    checks: tuple[Check, ...] = ()
+
+    @property
+    def level(self) -> str:
+        """How far it was checked, one of `records.LEVELS`."""
+        return level(self.checks)
+
+    @property
+    def badge(self) -> str:
+        """Its reproducibility badge, one of `records.BADGES`."""
+        return badge(self.checks)
+
+    @property
+    def protocol(self) -> str:
+        """Name of the protocol of its headline scores, such as `hwp-v1`; empty without one."""
+        named = [name for name in self.results.protocols if name.startswith("hwp-")]
+        return max(named, default="")
+
+    @property
+    def table(self) -> tuple[str, str]:
+        """Suite and protocol: rows are ranked within one table and never over two."""
+        return self.results.suite, self.protocol
 
 
 @dataclass(frozen=True)
@@ -41,6 +72,15 @@ class _File:
 
     digest: str
     results: Results
+    submission: Submission | None = None
+
+
+@dataclass(frozen=True)
+class _CheckFile:
+    """The content of a check's file, next to its `schema`."""
+
+    digest: str
+    check: Check
 
 
 def entry_name(results: Results, content: str | None = None) -> str:
@@ -48,7 +88,7 @@ def entry_name(results: Results, content: str | None = None) -> str:
 
     Args:
         results: the results.
-        content: their digest; None computes it.
+        content: the digest of the entry; None takes that of the results.
     """
     parts = [results.method.name, results.suite]
     if results.budget.get("seconds"):
@@ -64,18 +104,32 @@ def digest(results: Results) -> str:
     return sha256_json(asdict(results))
 
 
-def add_entry(folder: Path, results: Results) -> Path:
-    """Write an entry; returns its file.
+def make_entry(results: Results, submission: Submission | None = None) -> Entry:
+    """Return the entry of some results; nothing is checked or written."""
+    added = submission or Submission()
+    content = _content(asdict(results), asdict(added) if added != Submission() else None)
+    return Entry(entry_name(results, content), results, added, content)
+
+
+def write_entry(folder: Path, entry: Entry) -> Path:
+    """Write an entry that `make_entry` made; returns its file.
 
     Raises:
-        BadResult, UsageError: the results are not fit for the leaderboard, or do not go together
-            with the entries that are there.
+        UsageError: the folder belongs to an installed package.
     """
-    entry = Entry(entry_name(results), results)
-    check_entries([*read_entries(folder), entry])
-    value = {"schema": SCHEMA, "digest": digest(results), "results": asdict(results)}
+    refuse_installed(folder)
+    value: dict[str, Any] = {"schema": ENTRY_SCHEMA, "digest": entry.digest}
+    if entry.submission != Submission():
+        value["submission"] = asdict(entry.submission)
+    value["results"] = asdict(entry.results)
     # One line a capture keeps the file small and its changes readable.
     return atomic_write(folder / f"{entry.name}.json", _file_text(value))
+
+
+def _content(results: dict[str, Any], submission: dict[str, Any] | None) -> str:
+    """Return the digest of an entry: of its results alone where nothing was added to them."""
+    added = {"results": results, "submission": submission}
+    return sha256_json(results if submission is None else added)
 
 
 def _file_text(value: dict[str, Any]) -> str:
@@ -86,95 +140,88 @@ def _file_text(value: dict[str, Any]) -> str:
     return f'{head[:-2]}, "captures": [\n{lines}\n]}}}}\n'
 
 
+def refuse_installed(folder: Path) -> None:
+    """Refuse to write into a package that is installed.
+
+    Raises:
+        UsageError: the folder lies in one.
+    """
+    place = folder.resolve()
+    packages = {"site-packages", "dist-packages"} & set(place.parts)
+    if packages or place.is_relative_to(PACKAGES / "hwp_bench"):
+        raise UsageError(
+            "belongs to an installed package, which is never changed",
+            where=folder,
+            remedy="Make a submission: `hwp-bench leaderboard submit RESULTS -o FOLDER`.",
+        )
+
+
 def read_entries(folder: Path) -> list[Entry]:
-    """Read every entry of a folder, by name.
+    """Read every entry of a folder with its checks, by name.
 
     Raises:
         BadInput: a file is damaged.
-        BadResult: a file breaks the schema, or its digest is not that of its content.
+        BadResult: a file breaks the schema, its digest is not that of its content, or a check is
+            of no entry that is there.
     """
     files = sorted(folder.glob("*.json")) if folder.is_dir() else []
-    return [_read(file) for file in files]
+    checks = [_read_check(file) for file in sorted((folder / CHECKS).glob("*.json"))]
+    entries = [_read(file, checks) for file in files]
+    known = {(entry.name, entry.digest) for entry in entries}
+    for check in checks:
+        if (check.entry, check.entry_digest) not in known:
+            raise BadResult(
+                f"is of {check.entry} with digest {check.entry_digest[:8]}, which is not there",
+                where=folder / CHECKS / f"{check_name(check)}.json",
+                field="entry",
+            )
+    return entries
 
 
-def _read(file: Path) -> Entry:
-    value = without_schema(read_json(file, max_bytes=MAX_ENTRY_BYTES), SCHEMA, where=file)
+def _read(file: Path, checks: Sequence[Check]) -> Entry:
+    value = without_schema(read_json(file, max_bytes=MAX_ENTRY_BYTES), ENTRY_SCHEMA, where=file)
     entry = parse_record(_File, value, where=file)
     results = entry.results
     # The digest is of the file's own fields: an old file lacks those that were added later.
-    content = sha256_json(value["results"])
+    content = _content(value["results"], value.get("submission"))
     if entry.digest != content:
         raise BadResult(
             "is not the digest of the content: the entry was changed by hand",
             where=file,
             field="digest",
-            remedy="Make it again with `hwp-bench leaderboard add RESULTS`.",
+            remedy="Submit a revision: `hwp-bench leaderboard submit RESULTS --revises ENTRY`.",
         )
     if file.stem != entry_name(results, content):
         raise BadResult(f"must be called {entry_name(results, content)}.json", where=file)
-    return Entry(file.stem, results)
+    own = tuple(check for check in checks if check.entry == file.stem)
+    return Entry(file.stem, results, entry.submission or Submission(), content, own)
 
 
-def check_entries(entries: Iterable[Entry]) -> list[Entry]:
-    """Check that entries are fit to be ranked against each other; returns them.
+def check_name(check: Check) -> str:
+    """Return the name of a check's file: its entry, its kind, and part of its digest."""
+    return f"{check.entry}.{check.kind}-{sha256_json(asdict(check))[:8]}"
+
+
+def write_check(folder: Path, check: Check) -> Path:
+    """Write a check below a folder of entries; returns its file.
 
     Raises:
-        UsageError: an entry is of no suite, of clean frames, or of other data, splits, test
-            frames or protocols than the entries of the same suite.
-        BadResult: scores are missing or impossible.
+        UsageError: the folder belongs to an installed package.
     """
-    listed = list(entries)
-    for entry in listed:
-        _check_one(entry)
-    for suite in SUITES:
-        _check_same([entry for entry in listed if entry.results.suite == suite])
-    return listed
+    refuse_installed(folder)
+    value = {"digest": sha256_json(asdict(check)), "check": asdict(check)}
+    text = json.dumps({"schema": CHECK_SCHEMA, **value}, indent=1, allow_nan=False)
+    return atomic_write(folder / CHECKS / f"{check_name(check)}.json", text + "\n")
 
 
-def _check_one(entry: Entry) -> None:
-    results = entry.results
-    if results.suite not in SUITES:
-        raise UsageError(
-            f"was made on {results.suite!r}, no suite that everybody has",
-            where=entry.name,
-            field="suite",
-            remedy=f"The leaderboard takes results of --suite {', '.join(SUITES)}.",
+def _read_check(file: Path) -> Check:
+    value = without_schema(read_json(file), CHECK_SCHEMA, where=file)
+    content = parse_record(_CheckFile, value, where=file)
+    if content.digest != sha256_json(value["check"]):
+        raise BadResult(
+            "is not the digest of the content: the check was changed by hand",
+            where=file,
+            field="digest",
+            remedy="Check again with `hwp-bench leaderboard confirm`.",
         )
-    if results.frames != "perturbed":
-        raise UsageError(
-            f"was given {results.frames} frames; the leaderboard is of perturbed ones",
-            where=entry.name,
-            field="frames",
-        )
-    current = {protocol.name: protocol.as_dict() for protocol in PROTOCOLS}
-    # Written and read again, so that tuples and lists do not look different.
-    if json.loads(json.dumps(current)) != json.loads(json.dumps(results.protocols)):
-        raise UsageError(
-            "was scored by other protocols than this version's",
-            where=entry.name,
-            field="protocols",
-            remedy="Evaluate again with this version of the toolkit.",
-        )
-    for capture in results.captures:
-        for frame in capture.frames:
-            if not {"psnr", "ssim", "oriented_distance"} <= frame.scores.keys():
-                raise BadResult("lacks a headline metric", where=entry.name, field=capture.id)
-    aggregate(score_rows(results))
-
-
-def _check_same(entries: Sequence[Entry]) -> None:
-    for entry in entries[1:]:
-        if _data(entry.results) != _data(entries[0].results):
-            raise UsageError(
-                f"is on other captures, splits or test frames than {entries[0].name}",
-                where=entry.name,
-                field="captures",
-                remedy="Evaluate both with the same version of the suite.",
-            )
-
-
-def _data(results: Results) -> list[tuple[Any, ...]]:
-    return sorted(
-        (c.id, c.digest, c.split_digest, tuple(frame.frame for frame in c.frames))
-        for c in results.captures
-    )
+    return content.check

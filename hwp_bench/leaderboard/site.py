@@ -12,7 +12,10 @@ from markupsafe import Markup
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, canonical_json
-from hwp_bench.leaderboard.entries import SUITES, Entry, check_entries, digest
+from hwp_bench.leaderboard.entries import Entry, digest
+from hwp_bench.leaderboard.records import BADGES, LEVEL_TEXTS, Submission
+from hwp_bench.leaderboard.rules import SUITES, check_entries, current, history
+from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import aggregate
 from hwp_bench.report.page.render import render_template, style_sheet, write_report
@@ -58,10 +61,25 @@ class Row:
     fit: float | None
     #: Frames that failed.
     failed: int
+    #: Name of the protocol of the scores; rows of two protocols are never in one table.
+    protocol: str
+    #: How far it was checked, one of `records.LEVELS`.
+    level: str
+    #: Its reproducibility badge, one of `records.BADGES`.
+    badge: str
+    #: What the submitter added: links, digests of avatars, what is revised and why.
+    submission: Submission
+    #: 1 for a first entry, one more for each correction.
+    revision: int
 
 
-def make_row(entry: Entry) -> Row:
-    """Return the row of an entry."""
+def make_row(entry: Entry, entries: Sequence[Entry] = ()) -> Row:
+    """Return the row of an entry.
+
+    Args:
+        entry: the entry.
+        entries: those among which the ones that it revises are found.
+    """
     results = entry.results
     mean = aggregate(score_rows(results))
     found: dict[str, Mapping[str, float]] = {
@@ -84,6 +102,11 @@ def make_row(entry: Entry) -> Row:
         },
         fit=sum(fits) / len(fits) if fits else None,
         failed=sum(capture.failed_frames for capture in results.captures),
+        protocol=entry.protocol,
+        level=entry.level,
+        badge=entry.badge,
+        submission=entry.submission,
+        revision=1 + len(history(entry, entries)),
     )
 
 
@@ -123,7 +146,7 @@ def build_site(
 def board_page(entries: Sequence[Entry]) -> str:
     """Return the page of the board."""
     rows = sorted(
-        (make_row(entry) for entry in entries),
+        (make_row(entry, entries) for entry in current(entries) if entry.protocol == HWP_V1.name),
         key=lambda row: (SUITES.index(row.suite), -(row.scores["macro"]["psnr"] or 0.0), row.name),
     )
     return render_template(
@@ -139,6 +162,8 @@ def board_page(entries: Sequence[Entry]) -> str:
         published=_published(),
         note=NOTE,
         scores_json=_scores_json,
+        levels=LEVEL_TEXTS,
+        badges=BADGES,
     )
 
 

@@ -10,7 +10,8 @@ from typing import Any
 import pytest
 from browser import PHONE, least_contrast, open_page, overflow, show
 
-from hwp_bench.leaderboard.entries import Entry, entry_name
+from hwp_bench.leaderboard.entries import Entry, entry_name, make_entry
+from hwp_bench.leaderboard.records import Submission
 from hwp_bench.leaderboard.site import board_page, budget_text, build_site, make_row, script
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult
@@ -200,3 +201,18 @@ def test_it_is_legible_on_a_phone_in_the_dark_and_on_paper(browser) -> None:
             assert overflow(browser) <= 0
     # On paper nothing is there to be pressed.
     assert not browser.find_element("id", "controls").is_displayed()
+
+
+def test_the_board_shows_the_current_revision_of_one_protocol(entries) -> None:
+    first = entries[1]
+    again = Submission(revises=first.name, reason="the device was wrong")
+    second = make_entry(first.results, again)
+    old = replace(entries[2].results, protocols={"hwp-v0": {}})
+    rows = [*entries, second, make_entry(replace(old, method=replace(old.method, title="Omega")))]
+    page = board_page(rows)
+    assert second.name in page
+    assert f"reports/{first.name}/" not in page
+    assert "Omega" not in page
+    assert page.count('data-key="level"') == 3
+    row = make_row(second, rows)
+    assert (row.revision, row.level, row.badge) == (2, "self-reported", "not tried")

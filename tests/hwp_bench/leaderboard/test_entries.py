@@ -7,11 +7,19 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from made_entries import complete_results
 
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.packages import data_folder
 from hwp_bench.cli.main import main
-from hwp_bench.leaderboard.entries import add_entry, check_entries, entry_name, read_entries
+from hwp_bench.leaderboard.entries import entry_name, read_entries
+from hwp_bench.leaderboard.entries import make_entry as entry_of
+from hwp_bench.leaderboard.rules import (
+    add_entry,
+    check_complete,
+    check_entries,
+    missing,
+)
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult, Results, write_results
 
@@ -104,11 +112,31 @@ def test_a_result_without_the_headline_metrics_is_refused(
 
 
 def test_the_entries_that_ship_are_sound() -> None:
-    check_entries(read_entries(data_folder("leaderboard") / "entries"))
+    for entry in check_entries(read_entries(data_folder("leaderboard") / "entries")):
+        check_complete(entry)
 
 
-def test_the_command(make_entry, tmp_path, capsys) -> None:
-    write_results(tmp_path / "run" / "results.json", make_entry())
+def test_an_incomplete_row_is_found() -> None:
+    """Oracle: what was taken away."""
+    whole = complete_results()
+    assert missing(whole) == []
+    first, second = whole.captures
+    few = replace(first, frames=first.frames[1:])
+    alien = replace(second, id="capture99")
+    split = replace(second, split_digest="other")
+    for captures, problem in (
+        ([first], "lacks 1 of 2 captures: capture4"),
+        ([few, second], "capture0: lacks test frames"),
+        ([first, second, alien], "not of the suite: capture99"),
+        ([first, first, second], "a capture twice"),
+        ([first, split], "capture4: is split otherwise"),
+    ):
+        with pytest.raises(BadResult, match=problem):
+            check_complete(entry_of(replace(whole, captures=captures)))
+
+
+def test_the_command(tmp_path, capsys) -> None:
+    write_results(tmp_path / "run" / "results.json", complete_results())
     entries = ["--entries", str(tmp_path / "entries")]
     assert main(["leaderboard", "add", str(tmp_path / "run"), *entries]) == 0
     assert main(["leaderboard", "check", *entries]) == 0

@@ -1,0 +1,122 @@
+"""What stands with the results of an entry: who submitted it, and who checked it how far."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from typing import Annotated, Literal
+
+from msgspec import Meta
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.records import Line, number
+
+#: Version of the entry files. `submission` was added within it and may be missing.
+ENTRY_SCHEMA = "hwp-leaderboard-entry/1"
+#: Version of the check files.
+CHECK_SCHEMA = "hwp-leaderboard-check/1"
+#: How far a row was checked, the least first.
+LEVELS = ("self-reported", "rescored", "re-run")
+#: What the levels mean, in words for people.
+LEVEL_TEXTS = {
+    "self-reported": "the submitter's own numbers; form and digests are sound",
+    "rescored": "every score was computed again from the stored predictions",
+    "re-run": "the method was run again, and its score came out the same",
+}
+#: What a reproducibility badge can say, and what it means.
+BADGES = {
+    "not tried": "nobody has checked this row yet",
+    "scores hold": "the predictions have these scores; the method was not run again",
+    "reproduces": "a second run of the method had the same score within the tolerance",
+    "differs": "the latest check found other numbers than the row has",
+}
+#: What a link of a submission can lead to.
+LINKS = ("code", "paper", "predictions", "avatars")
+
+#: A SHA-256 in hexadecimal digits.
+Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", description="64 hexadecimal digits")]
+
+
+@dataclass(frozen=True)
+class Submission:
+    """What a submitter adds to results."""
+
+    #: Who stands for the row.
+    by: Line = ""
+    #: Name of the entry that this one corrects; None for a first entry.
+    revises: Line | None = None
+    #: Why it was corrected; empty for a first entry.
+    reason: Line = ""
+    #: Addresses by what they lead to (`LINKS`); each begins with `https://`.
+    links: dict[str, Line] = field(default_factory=dict)
+    #: SHA-256 of the fitted avatar of each capture, by capture id.
+    avatars: dict[str, Digest] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        if (self.revises is None) != (not self.reason):
+            raise UsageError("a revision needs a reason, and a reason a revision", field="reason")
+        for name, address in self.links.items():
+            if name not in LINKS:
+                known = f"Known: {', '.join(LINKS)}."
+                raise UsageError(f"{name!r} is no kind of link", field="links", remedy=known)
+            if not address.startswith("https://") or any(c in address for c in " \"'<>\\"):
+                raise UsageError("is no https:// address", field=f"links.{name}")
+
+
+@dataclass(frozen=True)
+class Check:
+    """One check of an entry, made by `hwp-bench leaderboard confirm`."""
+
+    #: Name of the entry.
+    entry: Line
+    #: Digest in the entry's file: a check is of one content only.
+    entry_digest: Digest
+    #: `rescored`: its predictions were scored again. `re-run`: the method was run again.
+    kind: Literal["rescored", "re-run"]
+    #: Whether the numbers of the entry were found again.
+    verdict: Literal["reproduces", "differs"]
+    #: When, ISO 8601, UTC.
+    date: Line
+    #: Who checked.
+    by: Line
+    #: Version of the toolkit that checked.
+    toolkit: Line
+    #: Digest of its modules.
+    code: Line
+    #: Processor, cores and system that it ran on.
+    machine: Line
+    #: Frames whose scores were computed again from predictions.
+    frames: int
+    #: Of them, frames whose PSNR and SSIM scikit-image computed too.
+    cross_checked: int
+    #: Parts of the checked result that were not as it says.
+    differences: int
+    #: Digest of the second run's results; None for `rescored`.
+    rerun: Digest | None = None
+    #: Macro means that the second run had, by metric.
+    scores: dict[str, float] = field(default_factory=dict)
+    #: Captures of the second run whose predictions are those of the entry, pixel by pixel.
+    same_predictions: int = 0
+    #: Largest difference of the macro mean of PSNR that still reproduces, dB.
+    tolerance: float = number(0.0, 0.0, 100.0)
+
+
+def latest(checks: Iterable[Check]) -> dict[str, Check]:
+    """Return the last check of each kind; a later check overrules an earlier one."""
+    return {check.kind: check for check in sorted(checks, key=lambda item: item.date)}
+
+
+def level(checks: Iterable[Check]) -> str:
+    """Return how far a row was checked: the highest of `LEVELS` whose last check found it again."""
+    found = [check.kind for check in latest(checks).values() if check.verdict == "reproduces"]
+    return max(["self-reported", *found], key=LEVELS.index)
+
+
+def badge(checks: Iterable[Check]) -> str:
+    """Return the reproducibility badge of a row, one of `BADGES`."""
+    last = latest(checks)
+    if any(check.verdict == "differs" for check in last.values()):
+        return "differs"
+    return {"self-reported": "not tried", "rescored": "scores hold", "re-run": "reproduces"}[
+        level(last.values())
+    ]
