@@ -22,7 +22,6 @@ _._repr_markdown_  # notebooks call it
 _.formatter_class  # argparse reads it
 _.channelnames  # OpenImageIO reads it
 _.camera_position  # pyvista reads it
-_.date  # read by the leaderboard's template
 _.pareto  # read by the report's template
 _.provenance  # read by the report's template
 _.exact_masks  # a field of result files

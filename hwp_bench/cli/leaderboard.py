@@ -3,15 +3,66 @@
 from __future__ import annotations
 
 import argparse
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from hwp_bench.leaderboard.entries import Entry
+    from hwp_bench.leaderboard.records import Submission
 
 _EXAMPLES = """examples:
-  hwp-bench leaderboard add runs/mine-mini runs/plain-mini
+  hwp-bench leaderboard submit runs/mine-mini -o submission --by "A. Person"
+  hwp-bench leaderboard submit runs/mine-mini -o submission --link code=https://example.org/mine
   hwp-bench leaderboard check
+  hwp-bench leaderboard confirm runs/mine-mini --by maintainers   # score again, or a second run
   hwp-bench leaderboard build -o site
-  hwp-bench leaderboard build -o site --with runs/mine-mini    # reports with images
+  hwp-bench leaderboard build -o site --with runs/mine-mini       # reports with images
 
-An entry is a whole result file with its digest. Only results of a suite, on perturbed frames and
-in this version's protocols are taken. The site is static: copy the folder anywhere.
+An entry is a whole result file with its digest. Only results of a whole suite, on perturbed frames
+and in this version's protocols are taken. The site is static: copy the folder anywhere.
+docs/submissions.md says how a row gets on the board and what its level and badge mean.
+"""
+_ADD = """examples:
+  hwp-bench leaderboard add runs/mine-mini
+  hwp-bench leaderboard add runs/* --entries board/entries
+
+For the maintainers of a board: writes into its folder. Others make a submission.
+"""
+_BUILD = """examples:
+  hwp-bench leaderboard build -o site
+  hwp-bench leaderboard build -o site --entries submission/leaderboard/entries --with runs/mine-mini
+"""
+_SUBMIT = """examples:
+  hwp-bench leaderboard submit runs/mine-mini -o submission --by "A. Person"
+  hwp-bench leaderboard submit runs/mine-* -o submission --link code=https://example.org/mine
+  hwp-bench leaderboard submit runs/mine-mini -o submission --avatars avatars/mine-mini
+  hwp-bench leaderboard submit runs/new -o submission --revises mine-mini-seed0-0123abcd \\
+      --reason "a frame was rendered with the wrong camera"
+
+Writes FOLDER/leaderboard/entries/NAME.json and FOLDER/PULL_REQUEST.md. Copy the first into a clone
+of the repository, open a pull request, and paste the second into it. Nothing else is written.
+"""
+_CHECK = """examples:
+  hwp-bench leaderboard check
+  hwp-bench leaderboard check --entries submission/leaderboard/entries
+  hwp-bench leaderboard check --against ../base/leaderboard/entries   # nothing was changed
+  hwp-bench leaderboard check --json
+
+Checks schema, digests, protocol version, completeness, revisions, and that the rows of a table are
+of the same data. Exit status 0: all is sound; 1: a file is damaged, changed or incomplete;
+2: an entry cannot stand with the others.
+"""
+_CONFIRM = """examples:
+  hwp-bench leaderboard confirm runs/mine-mini --by maintainers
+  hwp-bench leaderboard confirm runs/second-run --by maintainers --tolerance 0.05
+  hwp-bench leaderboard confirm runs/second-run --by maintainers --entry mine-mini-seed0-0123abcd
+
+Verifies the results as `hwp-bench verify` does and writes a check next to the entry. Results of the
+entry itself make its level `rescored`; another run of the same method, settings, seed and budget
+makes it `re-run` where the macro mean of PSNR is the same within the tolerance. Exit status 0: it
+reproduces; 1: it differs (the check says so too); 2: no entry fits.
 """
 
 
@@ -19,10 +70,62 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
     actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    add = actions.add_parser("add", help="make entries of results")
-    add.add_argument("results", nargs="+", metavar="RESULTS", help="results folder or results.json")
-    check = actions.add_parser("check", help="check schema, digests and comparability of entries")
-    build = actions.add_parser("build", help="write the static site")
+
+    def action(name: str, text: str, epilog: str = "") -> argparse.ArgumentParser:
+        added = actions.add_parser(
+            name, help=text, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
+        )
+        added.add_argument(
+            "--entries", metavar="DIR", help="folder of the entries (default leaderboard/entries)"
+        )
+        return added
+
+    add = action("add", "write entries of results into the folder of entries", _ADD)
+    submit = action("submit", "make the folder of a pull request", _SUBMIT)
+    for taking in (add, submit):
+        taking.add_argument(
+            "results", nargs="+", metavar="RESULTS", help="results folder or results.json"
+        )
+    submit.add_argument(
+        "-o", "--out", required=True, metavar="FOLDER", help="new folder of the submission"
+    )
+    submit.add_argument("--by", default="", metavar="NAME", help="who stands for the rows")
+    submit.add_argument(
+        "--link",
+        action="append",
+        default=[],
+        metavar="KIND=URL",
+        help="https address of code, paper, predictions or avatars; may be repeated",
+    )
+    submit.add_argument(
+        "--avatars",
+        metavar="DIR",
+        help="fitted avatars, one file or folder for each capture id; only digests are noted",
+    )
+    submit.add_argument("--revises", metavar="ENTRY", help="name of the entry that is corrected")
+    submit.add_argument("--reason", default="", metavar="TEXT", help="why it is corrected")
+    submit.add_argument("--json", action="store_true", help="print the entries as JSON")
+    check = action("check", "check digests, protocol version, completeness of entries", _CHECK)
+    check.add_argument(
+        "--against", metavar="DIR", help="entries before: none may be changed or removed"
+    )
+    check.add_argument("--json", action="store_true", help="print the entries as JSON")
+    confirm = action("confirm", "score an entry again, or compare a second run", _CONFIRM)
+    confirm.add_argument("results", metavar="RESULTS", help="results folder with predictions")
+    confirm.add_argument("--by", required=True, metavar="NAME", help="who checks")
+    confirm.add_argument("--entry", metavar="NAME", help="entry, where several fit")
+    confirm.add_argument(
+        "--tolerance",
+        type=float,
+        default=0.1,
+        metavar="DB",
+        help="largest difference of the macro mean of PSNR of a second run (default 0.1)",
+    )
+    confirm.add_argument(
+        "--captures", nargs="+", metavar="DIR", help="captures (default: the result's suite)"
+    )
+    confirm.add_argument("--json", action="store_true", help="print the check as JSON")
+    build = action("build", "write the static site", _BUILD)
     build.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the site")
     build.add_argument(
         "--with",
@@ -32,36 +135,146 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RESULTS",
         help="results folders of entries, for the images of their reports",
     )
-    for action in (add, check, build):
-        action.add_argument(
-            "--entries", metavar="DIR", help="folder of the entries (default leaderboard/entries)"
-        )
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from pathlib import Path
-
     from hwp_bench.base.packages import data_folder
-    from hwp_bench.base.progress import notice
-    from hwp_bench.leaderboard.entries import read_entries
-    from hwp_bench.leaderboard.rules import add_entry, check_complete, check_entries
 
     folder = Path(args.entries) if args.entries else data_folder("leaderboard") / "entries"
-    if args.action == "add":
-        from hwp_bench.results import read_all
+    work = {
+        "add": _add,
+        "submit": _submit,
+        "check": _check,
+        "confirm": _confirm,
+        "build": _build,
+    }
+    return work[args.action](args, folder)
 
-        for results in read_all(args.results):
-            notice(f"entry: {add_entry(folder, results)}")
-    elif args.action == "check":
-        entries = check_entries(read_entries(folder))
-        for entry in entries:
-            check_complete(entry)
-        print(f"{len(entries)} entries, all sound")
-    else:
-        from hwp_bench.leaderboard.site import build_site
-        from hwp_bench.report.sources import read_sources
 
-        page = build_site(Path(args.out), read_entries(folder), read_sources(args.folders))
-        notice(f"site: {page}")
+def _add(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.progress import notice
+    from hwp_bench.leaderboard.rules import add_entry
+    from hwp_bench.results import read_all
+
+    for results in read_all(args.results):
+        notice(f"entry: {add_entry(folder, results)}")
     return 0
+
+
+def _submit(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.progress import notice
+    from hwp_bench.leaderboard.entries import read_entries
+    from hwp_bench.leaderboard.submit import TEXT, submit
+    from hwp_bench.report.sources import read_sources
+
+    done = submit(
+        Path(args.out),
+        read_sources(args.results),
+        read_entries(folder),
+        _submission(args),
+        Path(args.avatars) if args.avatars else None,
+    )
+    for entry in done.entries:
+        there, count = done.predictions[entry.name]
+        if there < count:
+            notice(f"{entry.name}: predictions of {count - there} of {count} captures not at hand")
+    notice(f"submission: {done.folder}; text of the pull request: {done.folder / TEXT}")
+    _print_entries(done.entries, args.json)
+    return 0
+
+
+def _submission(args: argparse.Namespace) -> Submission:
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.leaderboard.records import Submission
+
+    links = {}
+    for text in args.link:
+        kind, equals, address = text.partition("=")
+        if not equals:
+            raise UsageError(f"{text!r} is not KIND=URL", field="--link")
+        links[kind] = address
+    return Submission(args.by, args.revises, args.reason, links)
+
+
+def _check(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.leaderboard.entries import read_entries
+    from hwp_bench.leaderboard.rules import check_complete, check_entries, check_unchanged
+
+    entries = check_entries(read_entries(folder))
+    for entry in entries:
+        check_complete(entry)
+    new = check_unchanged(folder, Path(args.against)) if args.against else None
+    _print_entries(entries, args.json)
+    if not args.json:
+        print(f"{len(entries)} entries, all sound" + ("" if new is None else f", {new} new files"))
+    return 0
+
+
+def _confirm(args: argparse.Namespace, folder: Path) -> int:
+    from dataclasses import asdict
+
+    from hwp_bench.base.progress import notice
+    from hwp_bench.cli.verify import captures_of
+    from hwp_bench.leaderboard.confirm import confirm
+    from hwp_bench.leaderboard.entries import read_entries, refuse_installed, write_check
+    from hwp_bench.results import result_files
+
+    refuse_installed(folder)
+    (file,) = result_files(args.results)
+    check = confirm(
+        read_entries(folder),
+        file,
+        captures_of(args.captures, file),
+        by=args.by,
+        name=args.entry,
+        tolerance=args.tolerance,
+    )
+    notice(f"check: {write_check(folder, check)}")
+    if args.json:
+        print(json.dumps(asdict(check), indent=1))
+    else:
+        print(f"{check.entry}: {check.kind}, {check.verdict} ({check.frames} frames)")
+        if check.rerun:
+            print(f"  second run {check.rerun[:8]}: PSNR {check.scores['psnr']:.2f} dB (macro mean)")
+            print(f"  captures with the same predictions: {check.same_predictions}")
+    return 0 if check.verdict == "reproduces" else 1
+
+
+def _build(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.progress import notice
+    from hwp_bench.leaderboard.entries import read_entries
+    from hwp_bench.leaderboard.site import build_site
+    from hwp_bench.report.sources import read_sources
+
+    page = build_site(Path(args.out), read_entries(folder), read_sources(args.folders))
+    notice(f"site: {page}")
+    return 0
+
+
+def _print_entries(entries: Sequence[Entry], as_json: bool) -> None:
+    if as_json:
+        print(json.dumps([_facts(entry) for entry in entries], indent=1))
+
+
+def _facts(entry: Entry) -> dict[str, Any]:
+    return {
+        "entry": entry.name,
+        "digest": entry.digest,
+        "suite": entry.results.suite,
+        "protocol": entry.protocol,
+        "level": entry.level,
+        "badge": entry.badge,
+        "revises": entry.submission.revises,
+        "by": entry.submission.by,
+        "links": entry.submission.links,
+        "captures": [
+            {
+                "id": capture.id,
+                "data": capture.digest,
+                "predictions": capture.predictions_digest,
+                "avatar": entry.submission.avatars.get(capture.id),
+            }
+            for capture in entry.results.captures
+        ],
+    }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -56,7 +57,7 @@ def run(args: argparse.Namespace) -> int:
     files = [file for path in args.results for file in result_files(path)]
     outcomes = []
     for file in track(files, "verify"):
-        outcomes.append(verify_results(file, _captures(args, file), splits))
+        outcomes.append(verify_results(file, captures_of(args.captures, file), splits))
     if args.json:
         json.dump([asdict(outcome) for outcome in outcomes], sys.stdout, indent=1)
         print()
@@ -66,15 +67,25 @@ def run(args: argparse.Namespace) -> int:
     return 1 if any(outcome.discrepancies for outcome in outcomes) else 0
 
 
-def _captures(args: argparse.Namespace, file: Path) -> list[Path]:
+def captures_of(places: Sequence[str] | None, file: Path) -> list[Path]:
+    """Return the capture folders that a result is verified with.
+
+    Args:
+        places: captures or folders of captures; None takes the result's suite, rendered where
+            it is not in the cache.
+        file: the result file.
+
+    Raises:
+        UsageError: the places hold no capture, or the result is of no suite.
+    """
     from hwp_bench.base.errors import UsageError
     from hwp_bench.evaluation.verify import capture_folders
     from hwp_bench.results import read_results
     from hwp_bench.sim import ensure_suite
     from hwp_bench.sim.produce.suites import suite_names
 
-    if args.captures:
-        folders = capture_folders([Path(place) for place in args.captures])
+    if places:
+        folders = capture_folders([Path(place) for place in places])
         if not folders:
             raise UsageError("there is no capture", field="--captures")
         return folders

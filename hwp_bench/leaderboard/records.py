@@ -1,4 +1,4 @@
-"""What stands with the results of an entry: who submitted it, and who checked it how far."""
+"""Records that stand with the results of an entry: its submission and its checks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", description="64 hexade
 
 @dataclass(frozen=True)
 class Submission:
-    """What a submitter adds to results."""
+    """A submitter and what was added to the results: corrections, links, digests of avatars."""
 
     #: Who stands for the row.
     by: Line = ""
@@ -58,9 +58,9 @@ class Submission:
         for name, address in self.links.items():
             if name not in LINKS:
                 known = f"Known: {', '.join(LINKS)}."
-                raise UsageError(f"{name!r} is no kind of link", field="links", remedy=known)
+                raise UsageError(f"{name!r} is not a kind of link", field="links", remedy=known)
             if not address.startswith("https://") or any(c in address for c in " \"'<>\\"):
-                raise UsageError("is no https:// address", field=f"links.{name}")
+                raise UsageError("is not an https:// address", field=f"links.{name}")
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What an entry must be to stand on the leaderboard, and which entries stand in one table."""
+"""The rules of the leaderboard: what makes an entry fit, and which entries share a table."""
 
 from __future__ import annotations
 
@@ -211,3 +211,33 @@ def _check_revisions(entries: Sequence[Entry]) -> None:
                 remedy="Name the latest entry of the method with --revises.",
             )
         revised[name] = entry.name
+
+
+def check_unchanged(folder: Path, base: Path) -> int:
+    """Check that every entry and check of an earlier state is still there, byte by byte.
+
+    Args:
+        folder: the entries.
+        base: the entries before, such as those of the branch that a pull request goes to.
+
+    Returns:
+        How many files are new.
+
+    Raises:
+        UsageError: the earlier folder does not exist.
+        BadResult: a file was changed or removed: entries never change, a correction is a revision.
+    """
+    if not base.is_dir():
+        raise UsageError("does not exist", where=base, field="--against")
+    before, after = (
+        {path.relative_to(root): path.read_bytes() for path in root.rglob("*.json")}
+        for root in (base, folder)
+    )
+    for name, content in sorted(before.items()):
+        if after.get(name) != content:
+            raise BadResult(
+                "was changed" if name in after else "was removed",
+                where=folder / name,
+                remedy="Entries never change. Submit a revision: `leaderboard submit --revises`.",
+            )
+    return len(after.keys() - before.keys())

@@ -97,9 +97,9 @@ def test_a_submission_that_is_changed_by_hand_is_found(make_results, tmp_path: P
     [
         ({"reason": "because"}, "a revision needs a reason"),
         ({"revises": "other"}, "a revision needs a reason"),
-        ({"links": {"video": "https://a.b"}}, "no kind of link"),
-        ({"links": {"code": "javascript:alert(1)"}}, "no https:// address"),
-        ({"links": {"code": 'https://a.b/"onclick='}}, "no https:// address"),
+        ({"links": {"video": "https://a.b"}}, "not a kind of link"),
+        ({"links": {"code": "javascript:alert(1)"}}, "not an https:// address"),
+        ({"links": {"code": 'https://a.b/"onclick='}}, "not an https:// address"),
     ],
 )
 def test_what_a_submission_cannot_say(changes, problem) -> None:

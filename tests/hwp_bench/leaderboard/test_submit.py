@@ -1,0 +1,154 @@
+"""Submissions. Oracles: hashlib, the files that are written, and what was changed on purpose."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from made_entries import complete_results
+
+from hwp_bench.base.images import write_image
+from hwp_bench.base.packages import data_folder
+from hwp_bench.capture.schema import frame_name
+from hwp_bench.cli.main import main
+from hwp_bench.evaluation.scoring import predictions_digest, read_predictions
+from hwp_bench.leaderboard.entries import read_entries
+from hwp_bench.results import write_results
+from hwp_bench.sim.produce.suites import suite
+
+
+@pytest.fixture
+def run(tmp_path: Path) -> Path:
+    """A results folder of the suite smoke with predictions and avatars."""
+    results, place = complete_results("mine"), tmp_path / "run"
+    size = suite("smoke")[0].size
+    captures = []
+    for number, capture in enumerate(results.captures):
+        folder = place / "captures" / capture.id / "predictions"
+        frames = [frame.frame for frame in capture.frames]
+        folder.mkdir(parents=True)
+        for frame in frames:
+            pixels = np.full((size, size, 3), 10 * number + frame, np.uint8)
+            write_image(folder / frame_name(frame), pixels)
+        digest = predictions_digest(read_predictions(folder, frames, (size, size)))
+        captures.append(replace(capture, predictions_digest=digest))
+    write_results(place / "results.json", replace(results, captures=captures))
+    avatars = tmp_path / "avatars"
+    (avatars / "capture4").mkdir(parents=True)
+    (avatars / "capture4" / "a.npz").write_bytes(b"left")
+    (avatars / "capture0.npz").write_bytes(b"right")
+    return place
+
+
+def submit(run: Path, out: Path, *options: str, entries: Path | None = None) -> int:
+    place = entries or out.parent / "no-entries"
+    words = ["leaderboard", "submit", str(run), "-o", str(out), "--entries", str(place)]
+    return main([*words, *options])
+
+
+def test_a_submission_is_what_a_pull_request_needs(run: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    before = sorted(data_folder("leaderboard").rglob("*"))
+    options = ["--by", "A | Person", "--link", "code=https://a.b/c", "--json"]
+    assert submit(run, out, *options, "--avatars", str(tmp_path / "avatars")) == 0
+    (facts,) = json.loads(capsys.readouterr().out)
+    assert sorted(data_folder("leaderboard").rglob("*")) == before
+    entries = out / "leaderboard" / "entries"
+    (entry,) = read_entries(entries)
+    assert sorted(p.name for p in out.rglob("*") if p.is_file()) == [
+        "PULL_REQUEST.md",
+        f"{entry.name}.json",
+    ]
+    assert (facts["entry"], facts["level"], facts["badge"]) == (
+        entry.name,
+        "self-reported",
+        "not tried",
+    )
+    right, left = (hashlib.sha256(content) for content in (b"right", b"left"))
+    folder = hashlib.sha256(b"a.npz\0" + left.digest()).hexdigest()
+    assert entry.submission.avatars == {"capture0": right.hexdigest(), "capture4": folder}
+    text = (out / "PULL_REQUEST.md").read_text("utf-8")
+    assert "submitted by A  Person" in text
+    assert "predictions at hand of 2 of 2 captures" in text
+    for capture in entry.results.captures:
+        assert f"| {capture.id} | `{capture.predictions_digest}` | `" in text
+    # What was made is sound where it is copied to.
+    assert main(["leaderboard", "check", "--entries", str(entries)]) == 0
+
+
+def test_predictions_that_are_not_the_result_s_are_refused(run: Path, tmp_path, capsys) -> None:
+    place = next((run / "captures" / "capture4" / "predictions").glob("*.png"))
+    write_image(place, np.zeros((112, 112, 3), np.uint8))
+    assert submit(run, tmp_path / "out") == 1
+    assert "not the predictions that the result was scored from" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    # Without any predictions the row can be submitted, and says so.
+    for file in (run / "captures").rglob("*.png"):
+        file.unlink()
+    for name in ("capture0", "capture4"):
+        (run / "captures" / name / "predictions").rmdir()
+    assert submit(run, tmp_path / "out") == 0
+    assert "predictions of 2 of 2 captures not at hand" in capsys.readouterr().err
+
+
+def test_a_correction_is_a_revision(run: Path, tmp_path: Path, capsys) -> None:
+    entries, out = tmp_path / "entries", tmp_path / "out"
+    assert main(["leaderboard", "add", str(run), "--entries", str(entries)]) == 0
+    (first,) = read_entries(entries)
+    assert submit(run, out, entries=entries) == 2
+    assert "is on the leaderboard already" in capsys.readouterr().err
+    options = ["--revises", first.name, "--reason", "the link was missing"]
+    assert submit(run, out, *options, entries=entries) == 0
+    assert submit(run, tmp_path / "more", *options, "--by", "B", entries=tmp_path) == 2
+    assert "which is not there" in capsys.readouterr().err
+    (made,) = (out / "leaderboard" / "entries").glob("*.json")
+    made.rename(entries / made.name)
+    check = ["leaderboard", "check", "--entries", str(entries), "--against"]
+    base = tmp_path / "base"
+    base.mkdir()
+    kept = base / f"{first.name}.json"
+    kept.write_bytes((entries / kept.name).read_bytes())
+    capsys.readouterr()
+    assert main([*check, str(base)]) == 0
+    assert capsys.readouterr().out == "2 entries, all sound, 1 new files\n"
+    kept.write_text("{}")
+    assert main([*check, str(base)]) == 1
+    assert "was changed" in capsys.readouterr().err
+    kept.rename(base / "gone.json")
+    assert main([*check, str(base)]) == 1
+    assert "was removed" in capsys.readouterr().err
+    assert main([*check, str(tmp_path / "nowhere")]) == 2
+
+
+@pytest.mark.parametrize(
+    ("options", "status", "problem"),
+    [
+        (["--link", "code"], 2, "KIND=URL"),
+        (["--link", "code=http://a.b"], 2, "https://"),
+        (["--reason", "because"], 2, "a reason a revision"),
+        (["--avatars", "{tmp}/run/captures"], 0, ""),
+        (["--avatars", "{tmp}/run"], 1, "holds no avatar of the capture"),
+        (["-o", "{tmp}/run"], 2, "exists already"),
+        (["-o", "{tmp}/lib/site-packages/x"], 2, "installed package"),
+    ],
+)
+def test_mistakes_are_named(run, tmp_path, capsys, options, status, problem) -> None:
+    told = [text.replace("{tmp}", str(tmp_path)) for text in options]
+    assert submit(run, tmp_path / "out", *told) == status
+    assert problem in capsys.readouterr().err
+
+
+def test_results_that_cannot_be_ranked_are_not_submitted(run: Path, tmp_path, capsys) -> None:
+    whole = complete_results("mine")
+    for changes, status, problem in (
+        ({"captures": whole.captures[:1]}, 1, "lacks 1 of 2 captures"),
+        ({"protocols": {"hwp-v0": {}}}, 2, "other protocols"),
+        ({"suite": "captures"}, 2, "no suite that everybody has"),
+    ):
+        write_results(run / "results.json", replace(whole, **changes))
+        assert submit(run, tmp_path / "out") == status
+        assert problem in capsys.readouterr().err
