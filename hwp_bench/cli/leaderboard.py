@@ -236,7 +236,9 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     else:
         print(f"{check.entry}: {check.kind}, {check.verdict} ({check.frames} frames)")
         if check.rerun:
-            print(f"  second run {check.rerun[:8]}: PSNR {check.scores['psnr']:.2f} dB (macro mean)")
+            print(
+                f"  second run {check.rerun[:8]}: PSNR {check.scores['psnr']:.2f} dB (macro mean)"
+            )
             print(f"  captures with the same predictions: {check.same_predictions}")
     return 0 if check.verdict == "reproduces" else 1
 
