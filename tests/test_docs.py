@@ -124,7 +124,7 @@ def is_defined(name: str) -> bool:
     ids=["of the contract", "on the plain fit"],
 )
 def test_the_examples_of_the_method_contract_run(
-    make_painted: CaptureMaker,
+    make_painted: Callable[[str], Capture],
     tmp_path: Path,
     example: int,
     entry: str,
