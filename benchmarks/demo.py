@@ -3,7 +3,7 @@
 Run from the repository: `python -m benchmarks.demo`. The demo runs twice in processes of its own:
 with an empty cache, then with the machine code of the first run but without its captures, as after
 the installation of a new version. The reference is a process that imports torch and numba and
-multiplies two matrices of 4,096 rows. The budget is 90 s of two cores with warm machine code.
+multiplies two matrices of 4,096 rows. The budget is five minutes of two cores, from an empty cache.
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-#: Seconds until the first table, with machine code in the cache.
-BUDGET = 90.0
+#: Seconds until the tables, with nothing in the cache.
+BUDGET = 300.0
 _REFERENCE = "import torch, numba; x = torch.ones(4096, 4096); print((x @ x)[0, 0])"
 _DEMO = ("-m", "hwp_bench.cli.main", "demo", "--out")
 
@@ -63,8 +63,8 @@ def main() -> int:
         print(
             f"{name}: {seconds:.1f} s, processor {processor:.1f} s, {processor / reference:.1f} x"
         )
-    print(f"budget with warm machine code: {BUDGET:g} s")
-    return 0 if found["warm"][0] <= BUDGET else 1
+    print(f"budget from an empty cache: {BUDGET:g} s")
+    return 0 if found["cold"][0] <= BUDGET else 1
 
 
 if __name__ == "__main__":

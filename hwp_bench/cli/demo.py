@@ -9,10 +9,12 @@ from pathlib import Path
 _EXAMPLES = """examples:
   hwp-bench demo
   hwp-bench demo --out my-demo
+  hwp-bench demo --methods plain my_method/
 
-Renders the two captures of the smoke suite, fits the plain baseline to their training frames,
-scores it on their test frames, prints the table and the seconds of each step, and writes a
-sheet of images. Needs no data and no network.
+Renders the two captures of the smoke suite, fits the plain baseline and WildGHand to their
+training frames, scores both on the test frames, prints the tables and the seconds of each step,
+and draws truth and methods side by side. Needs no data and no network. Started again it takes
+finished fits as they are.
 """
 
 
@@ -20,34 +22,52 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
     parser.add_argument("--out", default="hwp-demo", help="folder to write (default hwp-demo)")
-    parser.add_argument("--method", default="plain", help="method to run (default plain)")
+    parser.add_argument(
+        "--methods",
+        nargs="+",
+        default=["plain", "wildghand"],
+        metavar="METHOD",
+        help="methods to run: directories or shipped names (default plain wildghand)",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.progress import JobsView
+    from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.base.tables import Column, Table, print_table, write_tables
+    from hwp_bench.capture import open_capture
     from hwp_bench.cli.evaluate import report_outcome
     from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
+    from hwp_bench.methods import find_method, read_manifest
     from hwp_bench.report.evaluation_tables import all_tables
+    from hwp_bench.report.side_by_side import write_side_by_side
+    from hwp_bench.report.sources import ResultsSource
     from hwp_bench.sim import ensure_suite
 
     out = Path(args.out)
+    names = [read_manifest(find_method(method)).name for method in args.methods]
     clock = _Clock()
     captures = ensure_suite("smoke")
     clock.lap("simulated captures (rendered once, then cached)")
-    with JobsView() as jobs:
-        results = evaluate(
-            args.method, captures, out, EvaluationSettings("smoke"), on_capture=jobs.turn
-        )
-    clock.lap(f"{results.method.title}: fit, render, score, pictures")
-    tables = all_tables([results])
+    sources, status = [], 0
+    for method, name in zip(args.methods, names, strict=True):
+        with JobsView() as jobs:
+            results = evaluate(
+                method, captures, out / name, EvaluationSettings("smoke"), on_capture=jobs.turn
+            )
+        clock.lap(f"{results.method.title}: fit, render, score, pictures")
+        sources.append(ResultsSource(results, out / name))
+        status = max(status, report_outcome(out / name, results))
+    tables = all_tables([source.results for source in sources])
     write_tables(out / "tables", tables)
     print_table(tables["overall"])
     print_table(tables["captures"])
     columns = (Column("step"), Column("seconds", 1))
     print_table(Table("Time of this demo", columns, tuple(clock.laps)))
-    return report_outcome(out, results)
+    picture = out / "side-by-side.png"
+    write_side_by_side(picture, sources, [open_capture(capture) for capture in captures])
+    notice(f"truth and methods side by side: {picture}; tables: {out / 'tables'}")
+    return status
 
 
 class _Clock:
