@@ -9,8 +9,9 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.tables import Column, Table
-from hwp_bench.evaluation.budget.corrections import CORRECTIONS, Pair, error_of
+from hwp_bench.evaluation.budget.corrections import CORRECTIONS
 from hwp_bench.evaluation.budget.frames import pairs_of
+from hwp_bench.evaluation.budget.pair import Pair, error_of
 from hwp_bench.evaluation.budget.runs import ALL, GIVEN, BudgetRuns
 from hwp_bench.methods.material import TRUTHS
 from hwp_bench.metrics.protocol import PSNR_CAP

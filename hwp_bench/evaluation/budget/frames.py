@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.capture import Capture
-from hwp_bench.evaluation.budget.corrections import Pair
+from hwp_bench.evaluation.budget.pair import Pair
+from hwp_bench.evaluation.budget.surface import MovingSurface
 from hwp_bench.evaluation.scoring import read_prediction
 from hwp_bench.hands.footprint import HandSurfaces
 from hwp_bench.metrics.pixels import scored_pixels
@@ -24,14 +25,16 @@ def pairs_of(
     """Read the predictions of some test frames next to their truth.
 
     Args:
-        capture: with true hands where it knows them; else the estimates give the normals.
+        capture: with true hands where it knows them; else the estimates give the normals. The
+            surface that moves is always that of the estimates, which the method was given.
         predictions: folder of the predicted frames.
         frames: indices, ascending.
 
     Yields:
         The frame's index and the pair; None where the prediction cannot be scored.
     """
-    surfaces = HandSurfaces({side: capture.template(side) for side in capture.info.sides}, _PATCH)
+    templates = {side: capture.template(side) for side in capture.info.sides}
+    surfaces = HandSurfaces(templates, _PATCH)
     drawn = surfaces.footprints(
         capture.true_hands or capture.hands,
         capture.cameras.Ks,
@@ -47,6 +50,10 @@ def pairs_of(
         mask, exact = capture.scoring_mask(frame)
         normals = np.zeros((*capture.size, 3))
         normals.reshape(-1, 3)[footprint.pixels] = footprint.normals
+        shown = {
+            side: hand.at(frame, side) for side, hand in capture.hands.items() if hand.valid[frame]
+        }
+        camera = capture.cameras.camera(frame, capture.info.width, capture.info.height)
         yield (
             frame,
             Pair(
@@ -54,5 +61,6 @@ def pairs_of(
                 target=capture.frame(frame) / 255.0,
                 region=scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact),
                 normals=normals,
+                surface=MovingSurface(templates, shown, camera) if shown else None,
             ),
         )

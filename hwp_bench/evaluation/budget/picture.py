@@ -9,8 +9,9 @@ import numpy as np
 from hwp_bench.base.drawing import PAPER, error_map, fitted, labelled, sheet
 from hwp_bench.base.images import as_uint8
 from hwp_bench.evaluation.budget.budget import Budget
-from hwp_bench.evaluation.budget.corrections import CORRECTIONS, Pair, error_of
+from hwp_bench.evaluation.budget.corrections import CORRECTIONS
 from hwp_bench.evaluation.budget.frames import pairs_of
+from hwp_bench.evaluation.budget.pair import Pair, error_of
 from hwp_bench.evaluation.budget.runs import GIVEN, BudgetRuns
 from hwp_bench.metrics.psnr_ssim import decibels
 

@@ -96,7 +96,7 @@ def test_each_truth_gains_what_its_error_costs(
     assert main([*command, "--isolation", "none", "--json"]) == 0
     record = json.loads(capsys.readouterr().out)
     rows = {row["name"]: row["gain"]["dark"] for row in record["rows"]}
-    assert set(rows) >= {*TRUTHS, "all of them", "gain", "light", "motion"}
+    assert set(rows) >= {*TRUTHS, "all of them", "gain", "light", "motion", "pose"}
     # Masks and poses do not enter the answer; light and shape do, and both at once most.
     for name in ("masks", "poses", "test-poses"):
         assert rows[name] == pytest.approx(0.0, abs=1e-9)

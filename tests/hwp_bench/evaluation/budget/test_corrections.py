@@ -10,7 +10,9 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
 from hwp_bench.evaluation.budget.budget import gained
-from hwp_bench.evaluation.budget.corrections import CORRECTIONS, Pair, harmonics
+from hwp_bench.evaluation.budget.corrections import CORRECTIONS
+from hwp_bench.evaluation.budget.light import harmonics
+from hwp_bench.evaluation.budget.pair import Pair
 
 SIZE = 48
 ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE] / SIZE - 0.5
