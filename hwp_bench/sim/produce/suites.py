@@ -38,15 +38,30 @@ class SuiteItem:
 # One single-hand and one interacting capture for each perturbation: interaction 0 and 5,
 # complex poses 1 and 6, illumination 2 and 7, motion blur 3 and 4.
 _MINI = tuple(f"capture{number}" for number in range(8))
-# Captures (None: all of the group of scenes with the suite's name, or the eleven), frames (None:
-# the paper's) and size of each suite.
-_SUITES: Mapping[str, tuple[tuple[str, ...] | None, int | None, int]] = MappingProxyType(
+
+
+@dataclass(frozen=True)
+class _Rule:
+    """How a suite is made of scenes."""
+
+    #: Edge of the image, px.
+    size: int
+    #: Frames of each capture, over the same motions; None: by the paper's number and `every`.
+    frames: int | None = None
+    #: The captures; None: all of the group of scenes with the suite's name, or the eleven.
+    captures: tuple[str, ...] | None = None
+    #: Without `frames`: how many of the paper's frames stand for one of the suite's.
+    every: int = 1
+
+
+_SUITES: Mapping[str, _Rule] = MappingProxyType(
     {
-        "smoke": (("capture0", "capture4"), 30, 112),
-        "mini": (_MINI, 60, 176),
-        "full": (None, None, 256),
-        "wild-dev": (None, 60, 176),
-        "wild-test": (None, 60, 176),
+        "smoke": _Rule(112, 30, ("capture0", "capture4")),
+        "mini": _Rule(176, 60, _MINI),
+        "full-lite": _Rule(256, every=12),
+        "full": _Rule(256),
+        "wild-dev": _Rule(176, 60),
+        "wild-test": _Rule(176, 60),
     }
 )
 
@@ -60,19 +75,21 @@ def suite(name: str) -> tuple[SuiteItem, ...]:
     """Return the captures of a suite.
 
     Args:
-        name: `smoke` (seconds), `mini` (minutes), `full` (hours), or of scenes that are as wide
-            as the world: `wild-dev` (for tuning) or `wild-test` (for reports only).
+        name: `smoke` (seconds), `mini` (minutes), `full` (hours), `full-lite` (a twelfth
+            of its frames), or of scenes that are as wide as the world: `wild-dev` (for tuning)
+            or `wild-test` (for reports only).
 
     Raises:
         UsageError: there is no such suite.
     """
     if name not in _SUITES:
         raise UsageError(f"there is no suite {name!r}", remedy=f"Known: {', '.join(_SUITES)}.")
-    captures, frame_count, size = _SUITES[name]
+    rule = _SUITES[name]
     group = name if name in scene_groups() else ""
-    scenes = [load_scene(capture) for capture in captures or scene_names(group)]
+    scenes = [load_scene(capture) for capture in rule.captures or scene_names(group)]
     return tuple(
-        SuiteItem(scene, frame_count or scene.frame_count, size, scene.seed) for scene in scenes
+        SuiteItem(scene, rule.frames or -(-scene.frame_count // rule.every), rule.size, scene.seed)
+        for scene in scenes
     )
 
 

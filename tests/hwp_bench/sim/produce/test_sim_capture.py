@@ -178,6 +178,9 @@ def test_suites_name_existing_scenes() -> None:
     full = suite("full")
     assert sum(item.frame_count for item in full) == 13821
     assert {item.size for item in full} == {256}
+    for whole, lite in zip(full, suite("full-lite"), strict=True):
+        assert (lite.scene, lite.size, lite.seed) == (whole.scene, whole.size, whole.seed)
+        assert 0 <= 12 * lite.frame_count - whole.frame_count < 12
 
 
 def test_a_suite_in_the_cache_is_not_rendered_again(
