@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.files import atomic_write
+from hwp_bench.base.terminal_tables import WIDTH, table_lines
 
 #: Formats of a table by file ending.
 FORMATS = ("md", "tex", "csv", "json")
@@ -250,36 +251,24 @@ def to_object(table: Table) -> dict[str, Any]:
     }
 
 
-def print_table(table: Table) -> None:
-    """Print a table on standard output: colours and lines on a terminal, plain text elsewhere."""
+def print_table(table: Table, width: int | None = None) -> None:
+    """Print a table on standard output: styled on a terminal, plain text elsewhere.
+
+    Args:
+        table: the table.
+        width: in characters; None takes that of the terminal, `COLUMNS`, or 80.
+    """
     import shutil
-    import sys
 
     from rich.console import Console
-    from rich.table import Table as RichTable
     from rich.text import Text
 
-    # Without a terminal rich assumes 80 columns and would fold the numbers.
-    width = shutil.get_terminal_size().columns if sys.stdout.isatty() else 400
+    width = width or shutil.get_terminal_size((WIDTH, 24)).columns
     console = Console(width=width)
-    grid = RichTable(title=Text(table.caption), title_justify="left", expand=False)
-    for index, column in enumerate(table.columns):
-        numeric = any(isinstance(cells[index], int | float) for cells in table.rows)
-        head = "\n".join(part for part in (column.group, column.heading) if part)
-        grid.add_column(Text(head), justify="right" if numeric else "left")
-    styles = {0: "bold", 1: "underline", None: ""}
-    for row in range(len(table.rows)):
-        if row in table.breaks:
-            grid.add_section()
-        grid.add_row(
-            *(
-                Text(table.text(row, column), style=styles[table.rank(row, column)])
-                for column in range(len(table.columns))
-            )
-        )
-    console.print(grid)
-    for note in table.notes:
-        console.print(Text(note, style="dim"))
+    for line in table_lines(table, width, marks=not console.is_terminal):
+        whole = Text.assemble(*line.pieces)
+        whole.rstrip()
+        console.print(whole, no_wrap=True, overflow="ignore", crop=False)
 
 
 def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
