@@ -97,7 +97,8 @@ def table_lines(table: Table, width: int, *, marks: bool = False) -> list[Line]:
         widths = _narrowed(table, widths, keys, width)
     for number, block in enumerate(_blocks(table, widths, keys, width)):
         lines += [Line((("", ""),))] if number else []
-        lines += _block_lines(table, [*range(keys), *block], widths, marks)
+        columns = [*range(keys), *block]
+        lines += _block_lines(table, columns, _spread(table, columns, widths, width), marks)
     notes = list(table.notes)
     if marks and any(
         table.rank(row, column) == 0
@@ -109,7 +110,11 @@ def table_lines(table: Table, width: int, *, marks: bool = False) -> list[Line]:
 
 
 def _folded(text: str, width: int, style: str) -> list[Line]:
-    return [Line(((part, style),)) for part in textwrap.wrap(text, width)]
+    return [Line(((part, style),)) for part in _wrapped(text, width)]
+
+
+def _wrapped(text: str, width: int) -> list[str]:
+    return textwrap.wrap(text, width, break_on_hyphens=False) or [""]
 
 
 def _is_number(table: Table, column: int) -> bool:
@@ -177,13 +182,27 @@ def _blocks(table: Table, widths: Sequence[int], keys: int, width: int) -> list[
     return blocks
 
 
+def _spread(
+    table: Table, columns: Sequence[int], widths: Sequence[int], width: int
+) -> Sequence[int]:
+    """Widen the last column of each group whose name has a longer word, where there is room."""
+    found = list(widths)
+    for group, run in groupby(columns, key=lambda i: table.columns[i].group):
+        members = list(run)
+        word = max((len(part) for part in group.split()), default=0)
+        lacks = word - _total([found[i] for i in members])
+        if 0 < lacks <= width - _total([found[i] for i in columns]):
+            found[members[-1]] += lacks
+    return found
+
+
 def _block_lines(
     table: Table, columns: Sequence[int], widths: Sequence[int], marks: bool
 ) -> list[Line]:
     """Return heading, rule and rows of one block."""
     rule = Line((("─" * _total([widths[i] for i in columns]), "dim"),))
     lines = _group_line(table, columns, widths)
-    heads = [textwrap.wrap(table.columns[i].heading, widths[i]) or [""] for i in columns]
+    heads = [_wrapped(table.columns[i].heading, widths[i]) for i in columns]
     deepest = max(map(len, heads))
     heads = [[""] * (deepest - len(head)) + head for head in heads]
     for depth in range(deepest):
@@ -204,7 +223,7 @@ def _parts(text: str, width: int) -> list[str]:
     """Return a cell's lines; spaces at its end stay, which keep numbers in line."""
     if len(text) <= width:
         return [text]
-    return textwrap.wrap(text, width) or [""]
+    return _wrapped(text, width)
 
 
 def _joined(
@@ -233,7 +252,7 @@ def _group_line(table: Table, columns: Sequence[int], widths: Sequence[int]) -> 
     depths: list[tuple[int, list[str], bool]] = []
     for group, members in groupby(columns, key=lambda i: table.columns[i].group):
         span = _total([widths[i] for i in members])
-        depths.append((span, textwrap.wrap(group, span) or [""], bool(group)))
+        depths.append((span, _wrapped(group, span), bool(group)))
     deepest = max(len(texts) for _, texts, _ in depths)
     lines = []
     for depth in range(deepest):

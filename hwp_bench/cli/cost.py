@@ -14,7 +14,8 @@ _EXAMPLES = """examples:
 
 Prints scores after fixed times, times to given scores, where the time goes, and which method has
 the best score when; writes the tables and the figure of score against seconds (PNG and SVG) to the
-output folder.
+output folder. Results on different data are analysed apart: their tables say `Data A`, `Data B`,
+... and their figures go to folders of these names.
 """
 
 
@@ -49,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from dataclasses import replace
     from pathlib import Path
 
     from hwp_bench.analysis.cost.analysis import analyse_cost
@@ -57,7 +59,9 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table
     from hwp_bench.metrics import metric
+    from hwp_bench.report.data_groups import data_groups, data_key
     from hwp_bench.report.figures import write_cost
+    from hwp_bench.report.sources import read_sources
     from hwp_bench.results import read_all
 
     metric(args.metric)
@@ -70,18 +74,30 @@ def run(args: argparse.Namespace) -> int:
         if len(named) != 1:
             raise UsageError("names more than one method", field="--reference")
         reference = named[0]
-    analysis = analyse_cost(
-        group_runs(read_all(args.results)),
-        args.metric,
-        budgets=sorted(set(args.budgets)),
-        reference=reference,
-    )
+    found = []
+    groups = data_groups(read_sources(args.results))
+    for group in groups:
+        results = [source.results for source in group.sources]
+        # With several groups a reference is only of the one that it shares its data with.
+        fits = reference is None or data_key(reference.first) == data_key(results[0])
+        analysis = analyse_cost(
+            group_runs(results),
+            args.metric,
+            budgets=sorted(set(args.budgets)),
+            reference=reference if fits or len(groups) == 1 else None,
+        )
+        found.append((group, analysis))
+        if not args.json:
+            if group.label:
+                print(f"Data {group.label}: {group.text}")
+            for table in analysis.tables.values():
+                head = f"Data {group.label}: " if group.label else ""
+                print_table(replace(table, caption=head + table.caption))
+        for figure in write_cost(Path(args.out) / group.label, analysis):
+            notice(f"figure: {figure}")
     if args.json:
-        json.dump(analysis.as_object(), sys.stdout, indent=1, allow_nan=False)
+        several = {"groups": [{"data": g.label, "text": g.text, **a.as_object()} for g, a in found]}
+        whole = several if len(found) > 1 else found[0][1].as_object()
+        json.dump(whole, sys.stdout, indent=1, allow_nan=False)
         print()
-    else:
-        for table in analysis.tables.values():
-            print_table(table)
-    for figure in write_cost(Path(args.out), analysis):
-        notice(f"figure: {figure}")
     return 0

@@ -10,6 +10,9 @@ _EXAMPLES = """examples:
   hwp-bench report runs/mine-mini runs/mine-mini-clean runs/plain-mini --base plain -o reports/mine
   hwp-bench report runs/mine-captures --captures my_captures/* -o reports/mine
 
+Results on different data get a page each, A/index.html, B/index.html, ..., and index.html leads to
+them.
+
 Writes one HTML page, index.html, that needs no network: tables, score against seconds, scores by
 perturbation with intervals, a strip for every capture, images, environment and digests.
 """
@@ -43,15 +46,16 @@ def run(args: argparse.Namespace) -> int:
     from pathlib import Path
 
     from hwp_bench.base.progress import notice
-    from hwp_bench.report.page.render import write_report
+    from hwp_bench.report.page.mixed import write_reports
     from hwp_bench.report.sources import read_sources
 
-    page = write_report(
+    pages = write_reports(
         Path(args.out),
         read_sources(args.results),
         args.captures,
         base=args.base,
         title=args.title,
     )
-    notice(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")
+    for page in pages:
+        notice(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")
     return 0

@@ -6,6 +6,8 @@ import argparse
 
 _TABLES = (
     "overall",
+    "rank",
+    "cost",
     "captures",
     "perturbations",
     "details",
@@ -21,6 +23,8 @@ _TABLES = (
 _EXAMPLES = """examples:
   hwp-bench table runs/plain-mini
   hwp-bench table runs/plain-mini runs/mine-mini --by perturbations
+  hwp-bench table runs/* --by rank       # ranks with intervals; who is tied with whom
+  hwp-bench table runs/* --by cost       # score, seconds, memory, seconds on one core
   hwp-bench table runs/* --by overall --format tex > table.tex
   hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
   hwp-bench table runs/mine-seed* --by seeds
@@ -29,6 +33,8 @@ _EXAMPLES = """examples:
   hwp-bench table runs/mine-mini runs/plain-mini --paper 5 --published   # layout of table 5
   hwp-bench table --published                                            # the paper's numbers
 
+Results on different data stand in blocks of their own and are never ranked together. The output is
+as wide as the terminal, 80 columns in a pipe; COLUMNS=200 asks for more.
 docs/tables.md says what each table shows and which command makes each table of the paper.
 """
 

@@ -143,6 +143,7 @@ def evaluate_capture(
         device=facts.device[:100] if facts.device else None,
         curve=_curve(evaluation, output, facts),
         curve_seconds=facts.curve_seconds,
+        cpu_seconds=facts.cpu_seconds,
         isolation=record.isolation if record else None,
         free_view=free.result if free else None,
     )

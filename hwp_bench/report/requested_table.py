@@ -11,8 +11,8 @@ from hwp_bench.analysis.statistics.pairing import group_runs
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.base.tables import Table
+from hwp_bench.report.data_groups import DataGroup, data_groups, stacked
 from hwp_bench.report.evaluation_tables import all_tables, same_data
-from hwp_bench.report.free_view_table import NAME as FREE_VIEW
 from hwp_bench.report.free_view_table import free_view_table
 from hwp_bench.report.novelty_table import novelty_table
 from hwp_bench.report.paper_layouts import (
@@ -25,6 +25,7 @@ from hwp_bench.report.paper_layouts import (
     layout_table,
     seeds_layout,
 )
+from hwp_bench.report.ranking_tables import cost_table, rank_table, winner_note
 from hwp_bench.report.sources import (
     ResultsSource,
     find_captures,
@@ -45,6 +46,8 @@ from hwp_bench.results.schema import ABLATION
 
 #: The paper's table with the same content, by name of our table.
 PAPER_OF = {"overall": 3, "paper": 3, "perturbations": 5, "bias": 9, "seeds": 10}
+#: Tables under which a sentence says who wins.
+VERDICTS = ("overall", "captures", "perturbations", "cost", "seeds")
 
 
 @dataclass(frozen=True)
@@ -90,24 +93,49 @@ def make_table(request: TableRequest) -> Table:
 
 def _ours(request: TableRequest) -> Table:
     sources = read_sources(request.paths)
+    shown: list[DataGroup] = []
+    tables: list[Table] = []
+    refused: list[UsageError] = []
+    for group in data_groups(sources, oracles=request.by == "robustness"):
+        try:
+            tables.append(_group_table(group.sources, request))
+            shown.append(group)
+        except UsageError as error:
+            # Such as captures of unknown severity; other data may have what the table needs.
+            refused.append(error)
+    if not tables:
+        raise refused[0]
+    table = stacked(shown, tables)
+    left = [str(error) for error in refused]
+    return replace(table, notes=(*table.notes, *(f"Left out: {text}" for text in left)))
+
+
+def _group_table(sources: Sequence[ResultsSource], request: TableRequest) -> Table:
+    """Return the table of results on the same data."""
     results = [source.results for source in sources]
-    if request.by == "robustness":
-        same_data(results)
-        return robustness_table(sources, request.base)
-    if request.by == "seeds":
-        return seeds_table(sources)
-    if request.by == "severity":
-        same_data(results)
-        return severity_table(sources, find_captures(results, request.captures))
-    if request.by == "novelty":
-        same_data(results)
-        return novelty_table(sources, open_captures_of(results, request.captures))
-    if request.by == FREE_VIEW:
-        same_data(results)
-        return free_view_table(results)
-    if request.by == "bias":
-        return bias_table(sources, find_captures(results, request.captures))
-    return all_tables(results)[request.by]
+    match request.by:
+        case "robustness":
+            return robustness_table(sources, request.base)
+        case "seeds":
+            table = seeds_table(sources)
+        case "rank":
+            return rank_table(group_runs(results))
+        case "cost":
+            table = cost_table(group_runs(results))
+        case "severity":
+            return severity_table(sources, find_captures(results, request.captures))
+        case "novelty":
+            return novelty_table(sources, open_captures_of(results, request.captures))
+        case "free-view":
+            return free_view_table(results)
+        case "bias":
+            return bias_table(sources, find_captures(results, request.captures))
+        case _:
+            table = all_tables(results)[request.by]
+    if request.by not in VERDICTS:
+        return table
+    sentence = winner_note(results)
+    return replace(table, notes=(sentence, *table.notes)) if sentence else table
 
 
 def _paper(number: int, request: TableRequest) -> Table:

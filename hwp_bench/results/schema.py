@@ -108,6 +108,9 @@ class CaptureResult:
     curve_seconds: float | None = None
     #: Seconds of everything: reading, copying, the method's process, scoring, images.
     job_seconds: float | None = None
+    #: CPU seconds of the method's process on its clock, all threads added up: the seconds that
+    #: the fit would take on one core. None where it was not recorded.
+    cpu_seconds: float | None = None
     #: How the method's process was isolated: `namespaces`, or `processes` with the reason why
     #: not more; None for predictions that came as files, and where it was not recorded.
     isolation: str | None = None

@@ -49,6 +49,8 @@ class RunFacts:
 
     #: Seconds on the method's clock.
     fit_seconds: float | None = None
+    #: CPU seconds of the process and its children on that clock, all threads added up.
+    cpu_seconds: float | None = None
     #: Seconds before that clock started, in which the method was made: what it compiles or loads.
     ready_seconds: float | None = None
     #: Seconds to render the test frames.

@@ -106,7 +106,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
     notice(f"Made ready in {ready_seconds:.1f} s, which the seconds of the fit leave out.")
     report = ReportClock(training.run.budget, record, output / PROGRESS)
     avatar = method.fit(training, training.run.budget, report)
-    fit_seconds = report.elapsed
+    fit_seconds, cpu = report.elapsed, report.cpu_seconds
     steps = max((checkpoint.step for checkpoint in report.checkpoints), default=0)
     final_step = int(getattr(avatar, "steps", steps))
     explain = getattr(avatar, "write_diagnostics", None)
@@ -122,6 +122,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
     render_free_views(avatar, training, output / FREE_VIEW)
     facts = RunFacts(
         fit_seconds=fit_seconds,
+        cpu_seconds=cpu,
         ready_seconds=ready_seconds,
         render_seconds=render_seconds,
         curve_seconds=report.paused,
@@ -216,12 +217,19 @@ class ReportClock:
         self._last_progress = 0.0
         self._paused = 0.0
         self._start = time.perf_counter()
+        self._paused_cpu = 0.0
+        self._start_cpu = cpu_seconds()
         self.checkpoints: list[Checkpoint] = []
 
     @property
     def elapsed(self) -> float:
         """Seconds on the method's clock."""
         return time.perf_counter() - self._start - self._paused
+
+    @property
+    def cpu_seconds(self) -> float:
+        """CPU seconds of this process and of children that have ended, on the method's clock."""
+        return cpu_seconds() - self._start_cpu - self._paused_cpu
 
     @property
     def paused(self) -> float:
@@ -244,12 +252,13 @@ class ReportClock:
             seconds: what the clock said when the avatar was made; what it says now if None.
         """
         seconds = self.elapsed if seconds is None else seconds
-        entered = time.perf_counter()
+        entered, entered_cpu = time.perf_counter(), cpu_seconds()
         self._due = [moment for moment in self._due if moment > seconds]
         self._due_steps = [due for due in self._due_steps if due > step]
         self._record(len(self.checkpoints), avatar)
         self.checkpoints.append(Checkpoint(step, seconds, peak_memory()))
         self._paused += time.perf_counter() - entered
+        self._paused_cpu += cpu_seconds() - entered_cpu
 
     def progress(self, done: int, total: int) -> None:
         """Tell the runner how far the fit is."""
@@ -258,6 +267,12 @@ class ReportClock:
             self._last_progress = now
             write_json(self._progress_file, {"done": int(done), "total": int(total)})
             self._paused += time.perf_counter() - now
+
+
+def cpu_seconds() -> float:
+    """Return the CPU seconds of this process, all threads, and of its children that have ended."""
+    spent = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(usage.ru_utime + usage.ru_stime for usage in spent)
 
 
 def peak_memory() -> int:

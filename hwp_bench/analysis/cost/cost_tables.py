@@ -102,6 +102,7 @@ def _times_table(costs: Sequence[MethodCost]) -> Table:
     columns = (
         Column("Method"),
         Column("Fit [s]", 1),
+        Column("On one core [s]", 1),
         Column("Steps", 0),
         Column("Step [ms]", 1),
         Column("Render [ms/frame]", 1),
@@ -115,6 +116,7 @@ def _times_table(costs: Sequence[MethodCost]) -> Table:
         (
             cost.label,
             cost.fit_seconds,
+            cost.cpu_seconds,
             cost.steps,
             1000 * cost.fit_seconds / cost.steps if cost.fit_seconds and cost.steps else None,
             1000 * cost.render_seconds if cost.render_seconds else None,
@@ -128,7 +130,7 @@ def _times_table(costs: Sequence[MethodCost]) -> Table:
     )
     note = (
         "Means over captures and seeds; peak memory is the largest. Whole process: start-up, "
-        "checkpoints and rendering included."
+        "checkpoints and rendering included. On one core: CPU seconds of the fit, all threads."
     )
     return Table("Times and memory", columns, rows, (note,))
 

@@ -51,6 +51,8 @@ class MethodCost:
     area: float | None
     #: Seconds of fitting.
     fit_seconds: float | None
+    #: CPU seconds of fitting, all threads added up; None where a result does not record it.
+    cpu_seconds: float | None
     #: Optimizer steps.
     steps: float | None
     #: Seconds to render one frame.
@@ -165,6 +167,7 @@ def _method_cost(
         },
         area=_mean([curve.log_area(*stretch) for curve in every]) if stretch else None,
         fit_seconds=_mean([c.fit_seconds for c in captures if c.fit_seconds is not None]),
+        cpu_seconds=_mean([c.cpu_seconds for c in captures if c.cpu_seconds is not None]),
         steps=_mean([float(c.steps) for c in captures if c.steps is not None]),
         render_seconds=_render_seconds(captures),
         score_seconds=sum(capture.score_seconds for capture in captures) / max(frames, 1),

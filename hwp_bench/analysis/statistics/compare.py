@@ -55,7 +55,12 @@ class Standing:
 
 
 def compare(
-    runs: Sequence[MethodRuns], metric: str, *, resamples: int = RESAMPLES, seed: int = 0
+    runs: Sequence[MethodRuns],
+    metric: str,
+    *,
+    resamples: int = RESAMPLES,
+    seed: int = 0,
+    scope: str | None = None,
 ) -> list[Difference]:
     """Return the difference of every pair of methods in every scope.
 
@@ -66,24 +71,32 @@ def compare(
         metric: a metric that all have.
         resamples: of each interval.
         seed: of the resampling.
+        scope: the only scope that is wanted; None takes all.
 
     Raises:
         UsageError: two methods have no seed in common.
     """
     differences: list[Difference] = []
     for first, second in combinations(runs, 2):
-        differences += _holm_perturbations(_pair(first, second, metric, resamples, seed))
+        differences += _holm_perturbations(_pair(first, second, metric, resamples, seed, scope))
     places = [index for index, item in enumerate(differences) if item.scope == MACRO]
     _adjust(differences, places)
     return differences
 
 
 def _pair(
-    first: MethodRuns, second: MethodRuns, metric: str, resamples: int, seed: int
+    first: MethodRuns,
+    second: MethodRuns,
+    metric: str,
+    resamples: int,
+    seed: int,
+    only: str | None,
 ) -> list[Difference]:
     seeds = common_seeds(first, second)
     found = []
     for scope, weights in scopes(first.first).items():
+        if only not in (None, scope):
+            continue
         samples = [
             first.values(capture, metric, seeds) - second.values(capture, metric, seeds)
             for capture in weights

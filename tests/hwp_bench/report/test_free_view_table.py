@@ -77,7 +77,8 @@ def test_means_are_over_captures_and_failures_are_counted(make_results: Maker) -
 
 def test_the_table_fits_a_terminal(make_results: Maker, capsys) -> None:
     print_table(free_view_table([with_clips(make_results(), {"capture1": 21.0, "capture2": 27.0})]))
-    assert max(map(len, capsys.readouterr().out.splitlines())) <= 80
+    lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
     assert any("capture2" in line and "27.00" in line for line in lines)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -17,7 +18,7 @@ from hwp_bench.methods.manifest import MethodManifest, read_manifest
 from hwp_bench.methods.request import write_request
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, run_method
 from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
-from hwp_bench.run.worker import ReportClock, schedule
+from hwp_bench.run.worker import ReportClock, cpu_seconds, schedule
 
 PYTHON = """
 import numpy as np
@@ -184,6 +185,28 @@ def test_the_clock_stands_still_while_a_checkpoint_is_taken(
     assert clock.checkpoints[0].seconds == 0.5
     clock(6, None)  # type: ignore[arg-type]
     assert taken == [0]
+
+
+def test_cpu_seconds_are_of_the_fit_and_leave_checkpoints_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    spent = [7.0]
+    monkeypatch.setattr("hwp_bench.run.worker.cpu_seconds", lambda: spent[0])
+
+    def record(index: int, avatar: object) -> None:
+        spent[0] += 0.25
+
+    clock = ReportClock(Budget(), record, tmp_path / "p.json")
+    spent[0] += 3.0
+    clock.take(5, None)  # type: ignore[arg-type]
+    spent[0] += 1.0
+    assert clock.cpu_seconds == 4.0
+    monkeypatch.undo()
+    # What the system counts grows by about what a busy loop takes, in this thread or another.
+    before, began = cpu_seconds(), time.thread_time()
+    while time.thread_time() - began < 0.05:
+        pass
+    assert cpu_seconds() - before >= 0.04
 
 
 def test_a_budget_in_steps_is_checkpointed_every_tenth(tmp_path: Path) -> None:
