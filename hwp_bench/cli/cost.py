@@ -53,13 +53,13 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import replace
     from pathlib import Path
 
-    from hwp_bench.analysis.cost.analysis import analyse_cost
+    from hwp_bench.analysis.cost.analysis import CostAnalysis, analyse_cost
     from hwp_bench.analysis.statistics.pairing import group_runs
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table
     from hwp_bench.metrics import metric
-    from hwp_bench.report.data_groups import data_groups, data_key
+    from hwp_bench.report.data_groups import DataGroup, data_groups, data_key
     from hwp_bench.report.figures import write_cost
     from hwp_bench.report.sources import read_sources
     from hwp_bench.results import read_all
@@ -74,18 +74,24 @@ def run(args: argparse.Namespace) -> int:
         if len(named) != 1:
             raise UsageError("names more than one method", field="--reference")
         reference = named[0]
-    found = []
+    found: list[tuple[DataGroup, CostAnalysis]] = []
     groups = data_groups(read_sources(args.results))
     for group in groups:
         results = [source.results for source in group.sources]
         # With several groups a reference is only of the one that it shares its data with.
         fits = reference is None or data_key(reference.first) == data_key(results[0])
-        analysis = analyse_cost(
-            group_runs(results),
-            args.metric,
-            budgets=sorted(set(args.budgets)),
-            reference=reference if fits or len(groups) == 1 else None,
-        )
+        try:
+            analysis = analyse_cost(
+                group_runs(results),
+                args.metric,
+                budgets=sorted(set(args.budgets)),
+                reference=reference if fits or len(groups) == 1 else None,
+            )
+        except UsageError as error:
+            if len(groups) == 1 or (group is groups[-1] and not found):
+                raise
+            notice(f"left out, data {group.label}: {error}")
+            continue
         found.append((group, analysis))
         if not args.json:
             if group.label:

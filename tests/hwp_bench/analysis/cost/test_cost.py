@@ -188,7 +188,24 @@ def test_the_command_prints_writes_and_refuses(tmp_path: Path, capsys) -> None:
     assert main(["cost", mine, "--metric", "ssim", "-o", out]) == 2
     assert "no result has a curve of ssim" in capsys.readouterr().err
     write_results(tmp_path / "few" / "results.json", doubling("few", captures=2))
-    assert main(["cost", mine, str(tmp_path / "few"), "-o", out]) == 2
+    # Other data are analysed apart, and are no reference.
+    few, bare = str(tmp_path / "few"), str(tmp_path / "bare")
+    assert main(["cost", mine, few, "-o", out]) == 0
+    shown = capsys.readouterr().out
+    assert "Data A: Accuracy against time" in shown
+    assert "Data B: Accuracy against time" in shown
+    assert {path.name for path in Path(out, "B").iterdir()} >= {"pareto.svg", "pareto.png"}
+    assert main(["cost", mine, "--reference", few, "-o", out]) == 2
+    assert "not evaluated on the same captures" in capsys.readouterr().err
+    # Data without a curve are named and left out.
+    write_results(
+        tmp_path / "bare" / "results.json", made_results("bare", flat, captures=3, curve=[])
+    )
+    assert main(["cost", mine, bare, "-o", out]) == 0
+    assert "data B: metric: no result has a curve of psnr" in " ".join(
+        capsys.readouterr().err.split()
+    )
+    assert main(["cost", bare, "-o", out]) == 2
 
 
 def test_a_fit_of_one_checkpoint_is_a_point() -> None:
