@@ -146,6 +146,7 @@ def evaluate_capture(
         cpu_seconds=facts.cpu_seconds,
         isolation=record.isolation if record else None,
         free_view=free.result if free else None,
+        made_by=evaluation.capture.info.made_by,
     )
     if free is not None:
         keep_free_view(folder, free)

@@ -9,8 +9,8 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
 from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
-from hwp_bench.results import Results
-from hwp_bench.results.schema import differing_settings, score_rows
+from hwp_bench.results import CaptureResult, Results
+from hwp_bench.results.schema import differing_makers, differing_settings, score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: Metrics of the headline tables, where an evaluation has them.
@@ -86,7 +86,7 @@ def mean_table(
     scope = f"Every mean is over captures of means over test frames; {_scope(results)}."
     if MACRO in groups:
         scope += " Macro: the mean over perturbations, each over the captures with it."
-    notes = (note, scope) if note else (scope,)
+    notes = tuple(text for text in (note, scope, makers_note(results)) if text)
     return Table("All captures", tuple(columns), tuple(rows), notes)
 
 
@@ -108,6 +108,8 @@ def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Tab
     columns = [Column("Capture"), Column("Hands"), Column("Method")]
     columns += [score_column(name) for name in names]
     columns += [Column("Fit [s]", 1), Column("Failed frames", 0)]
+    imported = any(capture.made_by for result in results for capture in result.captures)
+    columns += [Column("Made by")] if imported else []
     rows: list[tuple[Cell, ...]] = []
     breaks = []
     for identifier in dict.fromkeys(c.id for result in results for c in result.captures):
@@ -118,7 +120,8 @@ def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Tab
                     scores = [mean.overall.captures[identifier].get(name) for name in names]
                     hands = "interacting" if capture.hands == "both" else "single"
                     tail = (capture.fit_seconds, capture.failed_frames)
-                    rows.append((identifier, hands, label, *scores, *tail))
+                    maker = (capture.made_by,) if imported else ()
+                    rows.append((identifier, hands, label, *scores, *tail, *maker))
     # Captures are of unequal difficulty: only methods on one capture are ranked. Lines between
     # captures are drawn where there are several methods.
     separate = tuple(breaks[1:])
@@ -151,13 +154,15 @@ def same_data(results: Sequence[Results]) -> None:
     Raises:
         UsageError: naming the capture.
     """
-    seen: dict[str, tuple[str, str]] = {}
+    seen: dict[str, CaptureResult] = {}
     for result in results:
         for capture in result.captures:
+            first = seen.setdefault(capture.id, capture)
             data = (capture.digest, capture.split_digest)
-            if seen.setdefault(capture.id, data) != data:
+            if (first.digest, first.split_digest) != data:
                 raise UsageError(
-                    "results on different data cannot stand in one table",
+                    "results on different data cannot stand in one table"
+                    + differing_makers(first, capture),
                     where=capture.id,
                     remedy="Evaluate the methods on the same captures with the same splits.",
                 )
@@ -168,6 +173,18 @@ def score_column(name: str, group: str = "") -> Column:
     facts = metric(name)
     title = f"{facts.label} [{facts.unit}]" if facts.unit else facts.label
     return Column(title, facts.digits, facts.higher_is_better, group)
+
+
+def makers_note(results: Sequence[Results]) -> str:
+    """Return which importer made which captures, for a line under a table; empty if none."""
+    makers: dict[str, list[str]] = {}
+    for identifier, maker in dict.fromkeys(
+        (capture.id, capture.made_by) for result in results for capture in result.captures
+    ):
+        if maker:
+            makers.setdefault(maker, []).append(identifier)
+    parts = [f"{', '.join(found)} by {maker}" for maker, found in makers.items()]
+    return f"Hands and masks were made by an importer: {'; '.join(parts)}." if parts else ""
 
 
 def _present(results: Sequence[Results], metrics: Sequence[str]) -> list[str]:

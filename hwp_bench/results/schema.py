@@ -116,6 +116,9 @@ class CaptureResult:
     isolation: str | None = None
     #: Scores of the free-view clip; None where the capture has none, or the method drew none.
     free_view: FreeViewResult | None = None
+    #: Importer and version that made the hand parameters and masks, such as `video 2`; None where
+    #: the capture does not say so (simulated ones do not), and where it was not recorded.
+    made_by: str | None = None
 
     @property
     def failed_frames(self) -> int:
@@ -256,6 +259,14 @@ def score_rows(results: Results) -> list[CaptureScores]:
         )
         for capture in results.captures
     ]
+
+
+def differing_makers(first: CaptureResult, second: CaptureResult) -> str:
+    """Return who made two captures of one name, for the end of a message; empty if the same."""
+    if first.made_by == second.made_by:
+        return ""
+    makers = [item.made_by or "an importer that is not stated" for item in (first, second)]
+    return f": made by {makers[0]}, and by {makers[1]}"
 
 
 def differing_settings(results: Sequence[Results]) -> list[str]:

@@ -22,15 +22,21 @@ from hwp_bench.results import (
 
 HERE = Path(__file__).parent
 #: Fields that were added within version 1, and what a file without them means.
-ADDED = {"frames": "perturbed", "curve_seconds": None, "job_seconds": None, "isolation": None}
+ADDED = {
+    "frames": "perturbed",
+    "curve_seconds": None,
+    "job_seconds": None,
+    "isolation": None,
+    "made_by": None,
+}
 
 
 @pytest.mark.parametrize(
     ("name", "captures", "lacks"),
     [
         ("results_version_1_oldest", ["capture0"], set(ADDED)),
-        ("results_version_1_before_isolation", ["capture0"], {"isolation"}),
-        ("results_version_1", ["capture0", "capture4"], set()),
+        ("results_version_1_before_isolation", ["capture0"], {"isolation", "made_by"}),
+        ("results_version_1", ["capture0", "capture4"], {"made_by"}),
     ],
 )
 def test_results_of_every_version_are_read(name: str, captures: list[str], lacks: set) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.results import CaptureResult, Results
-from hwp_bench.results.schema import differing_settings
+from hwp_bench.results.schema import differing_makers, differing_settings
 from hwp_bench.taxonomy import PERTURBATIONS
 
 #: Scope of the headline: every perturbation counts the same, as the macro mean of the tables.
@@ -158,7 +158,8 @@ def _same_captures(between: str, reference: Results, other: Results) -> None:
         else:
             continue
         raise UsageError(
-            f"{between} were evaluated on {problem} under the name {identifier}",
+            f"{between} were evaluated on {problem} under the name {identifier}"
+            + differing_makers(capture, twin),
             where=identifier,
             field=field,
             remedy="Evaluate both on the same captures with the same splits.",

@@ -288,6 +288,7 @@ def _digests(result: Results) -> list[dict[str, str]]:
         {
             "method": f"{result.method.title}, seed {result.seed}",
             "capture": capture.id,
+            "made_by": capture.made_by or "",
             "data": capture.digest,
             "split": capture.split_digest,
             "predictions": capture.predictions_digest,

@@ -76,6 +76,34 @@ def test_results_on_different_data_are_not_compared(two) -> None:
         all_tables([two[0], other])
 
 
+def _made_by(results: Results, digest: str, **makers: str) -> Results:
+    found = [
+        replace(item, made_by=makers[item.id], digest=digest) if item.id in makers else item
+        for item in results.captures
+    ]
+    return replace(results, captures=found)
+
+
+def test_tables_say_which_importer_made_a_capture(two) -> None:
+    assert not any("importer" in note for note in all_tables(two)["overall"].notes)
+    assert all_tables(two)["captures"].columns[-1].title == "Failed frames"
+    imported = [_made_by(item, "e", a="video 2", b="video 2", c="video 1") for item in two]
+    tables = all_tables(imported)
+    note = "Hands and masks were made by an importer: a, b by video 2; c by video 1."
+    assert note in tables["overall"].notes
+    assert tables["captures"].columns[-1].title == "Made by"
+    makers = [row[-1] for row in tables["captures"].rows]
+    assert makers == ["video 2"] * 4 + ["video 1"] * 2
+
+
+def test_a_capture_of_another_version_of_the_importer_is_named(two) -> None:
+    old, new = _made_by(two[0], "e", a="video 1"), _made_by(two[1], "f", a="video 2")
+    with pytest.raises(UsageError, match="one table: made by video 1, and by video 2"):
+        all_tables([old, new])
+    with pytest.raises(UsageError, match="made by an importer that is not stated, and by video 2"):
+        all_tables([two[0], new])
+
+
 def test_titles_that_repeat_are_told_apart(two) -> None:
     rows = all_tables([two[0], replace(two[0], seed=3)])["overall"].rows
     assert [row[0] for row in rows] == [

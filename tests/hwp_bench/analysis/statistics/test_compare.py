@@ -109,12 +109,13 @@ def changed(**fields: object) -> Results:
     [
         (made_results("other", noise, captures=3), r"not evaluated on the same captures \(cap"),
         (changed(digest="e"), "on different data under the name capture0"),
+        (changed(digest="e", made_by="video 2"), "not stated, and by video 2"),
         (changed(split_digest="e"), "on different splits under the name capture0"),
         (made_results("other", noise, frames=5), "on different test frames under"),
         (made_results("other", noise, protocols={"hwp-v1": {}}), r"different protocols \(hwp-v1"),
         (replace(changed(), frames="clean"), r"training frames \(perturbed and clean\)"),
     ],
-    ids=["captures", "data", "split", "frames", "protocol", "choice"],
+    ids=["captures", "data", "importer", "split", "frames", "protocol", "choice"],
 )
 def test_what_differs_in_more_than_the_method_is_refused(other: Results, reason: str) -> None:
     with pytest.raises(UsageError, match=reason):

@@ -72,6 +72,7 @@ def dark_capture(make_painted: Callable[..., Capture], tmp_path: Path) -> Captur
     info = replace(
         painted.info,
         id="dark",
+        source={"kind": "test", "importer": {"name": "video", "version": 2}},
         perturbations={"illumination": (3,) * (count * 4 // 5) + (0,) * (count - count * 4 // 5)},
     )
     truth = painted.hands
@@ -112,6 +113,8 @@ def test_each_truth_gains_what_its_error_costs(
     # The truth, the method as it is, five truths and all of them; below the corrections.
     assert picture.shape[1] > 176 * (len(TRUTHS) + 3)
     assert picture.shape[0] > 2 * 176
+    given = json.loads((out / "runs" / "as-given" / "results.json").read_text())
+    assert [capture["made_by"] for capture in given["captures"]] == ["video 2"]
     # Started again it takes what is there.
     stored = sorted(path.stat().st_mtime_ns for path in out.rglob("result.json"))
     assert main([*command, "--isolation", "none"]) == 0
