@@ -152,14 +152,19 @@ def _narrowed(table: Table, widths: Sequence[int], keys: int, width: int) -> lis
     """Return widths with texts folded: those that name rows leave half of the line to numbers."""
     least, most = _FOLDED
     found = list(widths)
-    for index in range(len(found)):
+    for index in range(keys):
         if not _is_number(table, index):
-            found[index] = min(found[index], most if index < keys else max(most, width // 2))
+            found[index] = min(found[index], most)
     while _total(found[:keys]) > max(width // 2, least):
         wide = [i for i in range(keys) if not _is_number(table, i) and found[i] > least]
         if not wide:
             break
         found[max(wide, key=lambda i: found[i])] -= 1
+    room = max(width - _total(found[:keys]) - _GAP, most)
+    for index in range(keys, len(found)):
+        # A name that fits a line stays whole, so that it can be copied; prose is folded.
+        if not _is_number(table, index) and found[index] > min(room, 2 * most):
+            found[index] = min(room, max(most, width // 2))
     return found
 
 

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 _EXAMPLES = """examples:
   hwp-bench leaderboard submit runs/mine-mini -o submission --by "A. Person"
   hwp-bench leaderboard submit runs/mine-mini -o submission --link code=https://example.org/mine
+  hwp-bench leaderboard show                                      # the board on the terminal
   hwp-bench leaderboard check
   hwp-bench leaderboard confirm runs/mine-mini --by maintainers   # score again, or a second run
   hwp-bench leaderboard build -o site
@@ -33,6 +34,15 @@ For the maintainers of a board: writes into its folder. Others make a submission
 _BUILD = """examples:
   hwp-bench leaderboard build -o site
   hwp-bench leaderboard build -o site --entries submission/leaderboard/entries --with runs/mine-mini
+"""
+_SHOW = """examples:
+  hwp-bench leaderboard show
+  hwp-bench leaderboard show --suite mini --json
+  hwp-bench leaderboard show --entries submission/leaderboard/entries
+
+One table for each suite and version of the protocol, best row first: rank with 95 % interval,
+scores, level and badge, and a sentence that says who wins and how surely. Rows that another entry
+revises are left out; rows that lack captures have no rank.
 """
 _SUBMIT = """examples:
   hwp-bench leaderboard submit runs/mine-mini -o submission --by "A. Person"
@@ -110,6 +120,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--against", metavar="DIR", help="entries before: none may be changed or removed"
     )
     check.add_argument("--json", action="store_true", help="print the entries as JSON")
+    show = action("show", "print the board: ranks with intervals, levels, badges", _SHOW)
+    show.add_argument("--suite", metavar="NAME", help="only the tables of this suite")
+    show.add_argument("--json", action="store_true", help="print the tables as JSON")
     confirm = action("confirm", "score an entry again, or compare a second run", _CONFIRM)
     confirm.add_argument("results", metavar="RESULTS", help="results folder with predictions")
     confirm.add_argument("--by", required=True, metavar="NAME", help="who checks")
@@ -145,6 +158,7 @@ def run(args: argparse.Namespace) -> int:
     work = {
         "add": _add,
         "submit": _submit,
+        "show": _show,
         "check": _check,
         "confirm": _confirm,
         "build": _build,
@@ -208,6 +222,25 @@ def _check(args: argparse.Namespace, folder: Path) -> int:
     _print_entries(entries, args.json)
     if not args.json:
         print(f"{len(entries)} entries, all sound" + ("" if new is None else f", {new} new files"))
+    return 0
+
+
+def _show(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.tables import print_table, to_object
+    from hwp_bench.leaderboard.entries import read_entries
+    from hwp_bench.leaderboard.rules import check_entries
+    from hwp_bench.leaderboard.standings import board_tables
+
+    entries = check_entries(read_entries(folder))
+    chosen = [entry for entry in entries if args.suite in (None, entry.results.suite)]
+    if args.suite and not chosen:
+        raise UsageError(f"no entry is of the suite {args.suite!r}", field="--suite")
+    tables = board_tables(chosen)
+    if args.json:
+        print(json.dumps([to_object(table) for table in tables], indent=1))
+    for table in () if args.json else tables:
+        print_table(table)
     return 0
 
 

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from hwp_bench.analysis.cost.method_cost import BUDGETS, MethodCost, method_costs
 from hwp_bench.analysis.statistics.compare import macro_by_seed
 from hwp_bench.analysis.statistics.pairing import MethodRuns, common_metrics, group_runs
-from hwp_bench.analysis.statistics.ranks import Ranking, rank_methods, verdict
+from hwp_bench.analysis.statistics.ranks import rank_methods, verdict
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import metric as metric_facts
@@ -74,19 +74,14 @@ def winner_note(results: Sequence[Results]) -> str | None:
     Args:
         results: on the same data.
     """
-    ranking = _ranking(results)
-    return verdict(ranking) if ranking else None
-
-
-def _ranking(results: Sequence[Results]) -> Ranking | None:
     try:
         runs = group_runs(results)
         if len(runs) < 2 or not common_metrics(runs, [METRIC]):
             return None
-        return rank_methods(runs, METRIC)
-    except UsageError:
+        return verdict(rank_methods(runs, METRIC))
+    except UsageError as error:
         # The same run twice, or no seed in common: the tables can be shown all the same.
-        return None
+        return f"Nobody is named as the winner: {error.problem}."
 
 
 def cost_table(runs: Sequence[MethodRuns]) -> Table:

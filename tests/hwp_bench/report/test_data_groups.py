@@ -79,6 +79,11 @@ def test_a_best_is_marked_within_the_same_data(mixed) -> None:
     assert "+2.00 dB against Mine" in notes
 
 
+def test_a_run_that_is_given_twice_stops_no_table(mixed) -> None:
+    notes = make_table(TableRequest([mixed[0], mixed[0], mixed[2]])).notes
+    assert notes[0].startswith("Nobody is named as the winner: two results are of Plain")
+
+
 def test_tables_with_other_columns_are_put_under_one_another() -> None:
     first = Table("T", (Column("M"), Column("x", 1, True, "G")), (("a", 1.0), ("b", 2.0)), ("n",))
     second = Table(

@@ -1,0 +1,92 @@
+"""The board on the terminal. Oracle: constructed scores."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from made_entries import complete_results
+
+from hwp_bench.cli.main import main
+from hwp_bench.leaderboard.entries import make_entry, write_check, write_entry
+from hwp_bench.leaderboard.records import Check, Submission
+from hwp_bench.leaderboard.standings import board_tables
+
+
+def scorer(level: float):
+    """Captures differ by a tenth of a decibel, and methods by their level."""
+    return lambda capture, frame: level + 0.1 * capture + 0.01 * (frame % 2)
+
+
+@pytest.fixture
+def entries():
+    """Three methods on mini, one of them revised; one row lacks a capture, one is of hwp-v0."""
+    first = make_entry(complete_results("mine", scorer(24.0), suite_name="mini"))
+    again = Submission(revises=first.name, reason="one camera was wrong")
+    second = make_entry(complete_results("mine", scorer(26.0), suite_name="mini"), again)
+    plain = make_entry(complete_results("plain", scorer(25.0), suite_name="mini"))
+    short = complete_results("short", scorer(30.0), suite_name="mini")
+    short_entry = make_entry(replace(short, captures=short.captures[1:]))
+    old = complete_results("old", scorer(40.0), suite_name="mini")
+    protocols = dict(old.protocols)
+    protocols["hwp-v0"] = {**protocols.pop("hwp-v1"), "name": "hwp-v0"}
+    return [plain, first, second, short_entry, make_entry(replace(old, protocols=protocols))]
+
+
+def test_each_protocol_has_a_table_and_incomplete_rows_no_rank(entries) -> None:
+    now, old = board_tables(entries)
+    assert now.caption == "Suite mini, protocol hwp-v1"
+    assert [row[:3] for row in now.rows] == [
+        ("Mine", 1, "1"),
+        ("Plain", 2, "2"),
+        ("Short", None, None),
+    ]
+    assert [now.rank(row, 3) for row in range(3)] == [0, 1, None]
+    assert now.notes[0].startswith("Mine wins with PSNR ")
+    assert "+1.00 dB against Plain" in now.notes[0]
+    assert "have no rank" in now.notes[1]
+    assert old.caption == "Suite mini, protocol hwp-v0"
+    assert [row[0] for row in old.rows] == ["Old"]
+    assert "rows of hwp-v1 stand in another table" in old.notes[-1]
+
+
+def test_a_run_that_was_submitted_twice_has_no_rank(entries) -> None:
+    twin = make_entry(entries[0].results, Submission(by="B"))
+    (table,) = board_tables([entries[0], twin])
+    assert [row[1] for row in table.rows] == [None, None]
+    assert table.notes[0].startswith("No ranks: two results are of Plain")
+
+
+def test_the_command_shows_levels_and_badges_in_80_columns(
+    entries, tmp_path: Path, capsys, monkeypatch
+) -> None:
+    monkeypatch.delenv("COLUMNS", raising=False)
+    for entry in entries[:3]:
+        write_entry(tmp_path, entry)
+    check = Check(
+        entry=entries[0].name,
+        entry_digest=entries[0].digest,
+        kind="rescored",
+        verdict="reproduces",
+        date="2026-01-01T00:00:00+00:00",
+        by="us",
+        toolkit="0.1.0",
+        code="c",
+        machine="m",
+        frames=1,
+        cross_checked=1,
+        differences=0,
+    )
+    write_check(tmp_path, check)
+    words = ["leaderboard", "show", "--entries", str(tmp_path)]
+    assert main(words) == 0
+    out = capsys.readouterr().out
+    assert max(map(len, out.splitlines())) <= 80
+    for text in ("self-reported", "not tried", "rescored", "scores hold", "Mine wins with PSNR"):
+        assert text in out
+    assert main([*words, "--suite", "mini", "--json"]) == 0
+    (table,) = json.loads(capsys.readouterr().out)
+    assert [row["Level"] for row in table["rows"]] == ["self-reported", "rescored"]
+    assert main([*words, "--suite", "full"]) == 2
