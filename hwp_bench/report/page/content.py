@@ -23,6 +23,7 @@ from hwp_bench.report.free_view_table import free_view_table
 from hwp_bench.report.page.album import Album, frame_sheets, free_view_sheet, mask_sheet
 from hwp_bench.report.page.elements import inline_svg, to_html
 from hwp_bench.report.page.strips import StripMethod, strip_plot
+from hwp_bench.report.ranking_tables import rank_table
 from hwp_bench.report.sources import ResultsSource, find_captures, temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
 from hwp_bench.results import Results
@@ -114,7 +115,9 @@ def gather_report(
     start = base or next((r.first.method.name for r in runs if r.first.method.name == PLAIN), None)
     cost = _cost(runs)
     tables = all_tables([source.results for source in chosen])
-    shown = [tables[name] for name in ("overall", "perturbations", "captures")]
+    shown = [tables["overall"]]
+    shown += _optional(lambda: rank_table(runs) if len(runs) > 1 else None)
+    shown += [tables[name] for name in ("perturbations", "captures")]
     shown += _optional(lambda: free_view_table([source.results for source in chosen]))
     shown.append(replace(tables["paper"], caption="Protocol paper-wildghand"))
     shown += _optional(

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import subprocess
+import tarfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -18,6 +21,7 @@ from hwp_bench.leaderboard.rules import (
     add_entry,
     check_complete,
     check_entries,
+    check_unchanged,
     missing,
 )
 from hwp_bench.metrics import PROTOCOLS
@@ -114,6 +118,20 @@ def test_a_result_without_the_headline_metrics_is_refused(
 def test_the_entries_that_ship_are_sound() -> None:
     for entry in check_entries(read_entries(data_folder("leaderboard") / "entries")):
         check_complete(entry)
+
+
+def test_no_entry_differs_from_the_branch_that_a_pull_request_goes_to(tmp_path: Path) -> None:
+    """CI names the branch; `tests/.../test_submit.py` shows that a change is found."""
+    base = os.environ.get("HWP_LEADERBOARD_BASE")
+    if not base:
+        pytest.skip("HWP_LEADERBOARD_BASE names no branch")
+    place = "leaderboard/entries"
+    root = Path(__file__).parents[3]
+    archive = ["git", "-C", str(root), "archive", "--output", str(tmp_path / "b.tar")]
+    subprocess.run([*archive, base, place], check=True)
+    with tarfile.open(tmp_path / "b.tar") as tar:
+        tar.extractall(tmp_path, filter="data")
+    assert check_unchanged(root / place, tmp_path / place) >= 0
 
 
 def test_an_incomplete_row_is_found() -> None:

@@ -117,6 +117,7 @@ def test_everything_that_was_asked_for_is_there(page: str) -> None:
     text = " ".join(parsed.words)
     for words in (
         "All captures",
+        "Ranks by PSNR",
         "Per perturbation",
         "By severity",
         "Bias strength",
