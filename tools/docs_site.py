@@ -1,8 +1,8 @@
 """Builds the documentation site: `mkdocs build --strict` reads `mkdocs.yml`, which loads this.
 
 It adds pages that are not files below `docs/` (the README as home, the files at the root that
-contributors read, one page of API reference for each public package), and gives the reference the
-`#:` comments that document fields and constants.
+contributors read, the page of each baseline, one page of API reference for each public package),
+and gives the reference the `#:` comments that document fields and constants.
 """
 
 from __future__ import annotations
@@ -45,6 +45,9 @@ def on_files(files: Files, *, config: MkDocsConfig) -> Files:
     for name, page in ROOT_PAGES.items():
         text = (ROOT / name).read_text(encoding="utf-8")
         files.append(File.generated(config, page, content=_from_root(text)))
+    for name, page in _baseline_pages().items():
+        text = (ROOT / name).read_text(encoding="utf-8").replace("](../../docs/", "](../")
+        files.append(File.generated(config, page, content=text))
     for package in API:
         names = getattr(importlib.import_module(package), "__all__", ())
         public = sorted(set(names) - {"__version__"})
@@ -62,13 +65,22 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
     return _LINK.sub(lambda link: _moved(link, "../"), markdown)
 
 
+def _baseline_pages() -> dict[str, str]:
+    """Page of the site by the README of each baseline, from the root of the repository."""
+    pages = sorted((ROOT / "baselines").glob("*/README.md"))
+    return {
+        page.relative_to(ROOT).as_posix(): f"baselines/{page.parent.name}.md" for page in pages
+    }
+
+
 def _from_root(text: str) -> str:
     text = _LINK.sub(lambda link: _moved(link, ""), text)
     return re.sub(r"\]\(docs/", "](", text)
 
 
 def _moved(link: re.Match[str], prefix: str) -> str:
-    page = ROOT_PAGES.get(link[1].removeprefix(prefix)) if link[1].startswith(prefix) else None
+    pages = ROOT_PAGES | _baseline_pages()
+    page = pages.get(link[1].removeprefix(prefix)) if link[1].startswith(prefix) else None
     return f"]({page}{link[2]})" if page else link[0]
 
 

@@ -5,6 +5,9 @@ an entry that is not needed any more.
 """
 
 PlainMethod  # the entry of baselines/plain/method.toml
+TrimmedMethod  # the entry of baselines/trimmed/method.toml
+WildMethod  # the entry of baselines/wild/method.toml
+JointPoseMethod  # the entry of baselines/joint-pose/method.toml
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/network-scratch
 check_networks  # `check_files` of wildghand/method.toml and of baselines/network-scratch
 modified  # part of the cache's key: a changed file is read again

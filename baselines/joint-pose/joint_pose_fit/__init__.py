@@ -1,0 +1,1 @@
+"""The plain fit with a correction of the given pose in each training frame."""
