@@ -68,9 +68,7 @@ def on_page_markdown(markdown: str, *, page: Page, config: MkDocsConfig, files: 
 def _baseline_pages() -> dict[str, str]:
     """Page of the site by the README of each baseline, from the root of the repository."""
     pages = sorted((ROOT / "baselines").glob("*/README.md"))
-    return {
-        page.relative_to(ROOT).as_posix(): f"baselines/{page.parent.name}.md" for page in pages
-    }
+    return {page.relative_to(ROOT).as_posix(): f"baselines/{page.parent.name}.md" for page in pages}
 
 
 def _from_root(text: str) -> str:

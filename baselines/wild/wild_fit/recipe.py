@@ -54,7 +54,7 @@ class WildRecipe(PlainRecipe[WildSettings]):
         for rig in self.model.rigs.values():
             template, anchors = rig.template, rig.anchors
             corners = template.vertices[template.faces[anchors.face_index]]
-            places.append(places_at_rest(corners, anchors.barycentric))
+            places.append(places_at_rest(corners, torch.as_tensor(anchors.barycentric)))
         self.tensors = start_appearance(
             torch.cat(places),
             len(material.frames),

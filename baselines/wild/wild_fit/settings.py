@@ -30,7 +30,7 @@ class WildSettings(FitSettings):
     #: a transient colour that is left out of tests; `none` fits the appearance alone.
     uncertainty: str = choice("mask", "nerf-w", "none")
     #: The error that an uncertainty of 1 stands for, sRGB in a frame of mean brightness.
-    error_unit: float = number(0.3, 1e-6, 1.0)
+    error_unit: float = number(1.0, 1e-6, 1.0)
     #: Least uncertainty.
     least_uncertainty: float = number(0.1, 1e-6, 1e6)
     #: `mask`: share of the fit before pixels are left out.
