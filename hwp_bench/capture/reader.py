@@ -20,10 +20,12 @@ from hwp_bench.capture.schema import (
     IMAGE_FOLDERS,
     METADATA,
     TRUE_HANDS,
+    TRUE_TEMPLATE,
     CaptureInfo,
     HandModelId,
     image_path,
 )
+from hwp_bench.capture.subject_mesh import read_subject_mesh
 from hwp_bench.capture.tracks import Cameras, read_cameras, read_hands
 from hwp_bench.hands.parameters import Camera, HandParameters, HandPose, hand_poses
 from hwp_bench.hands.template_sources import load_template
@@ -176,6 +178,20 @@ class Capture:
         if side not in self.info.sides:
             raise UsageError(f"this capture has no {side} hand", where=self.root)
         return load_matching_template(self.info.hand_model, self.info.sides, side, where=self.root)
+
+    @property
+    def has_true_template(self) -> bool:
+        """Whether the subject's own hands at rest are known."""
+        return (self.root / TRUE_TEMPLATE).is_file()
+
+    def true_template(self, side: str) -> HandTemplate:
+        """Read the subject's own hand at rest, which no shape parameter changes.
+
+        Raises:
+            UsageError: the capture has no such hand.
+            BadInput: it is missing or damaged, or does not belong to the hand model.
+        """
+        return read_subject_mesh(self.root / TRUE_TEMPLATE, self.template(side))
 
     def scoring_mask(self, frame: int) -> tuple[np.ndarray, bool]:
         """Read the mask that scores are taken over.

@@ -24,6 +24,9 @@ HANDS = "hands.npz"
 CAMERAS = "cameras.npz"
 #: True hand parameters, where they are known; withheld from methods.
 TRUE_HANDS = "truth/hands.npz"
+#: The subject's own hands at rest, where they are known and have the hand model's triangles;
+#: withheld from methods, and in no digest, since it follows from the scene.
+TRUE_TEMPLATE = "truth/template.npz"
 #: Further files of the maker (scene, timings, overlays); withheld from methods.
 EXTRA = "extra"
 #: Folder of the free-view clip, a small capture of its own; withheld but for hands and cameras.

@@ -21,8 +21,8 @@ _EXAMPLES = """examples:
   hwp-bench budget my_method --capture capture4 --truths poses test-poses --json
 
 Each truth that a simulated capture knows replaces one estimate (pixels, masks, poses, test-poses,
-betas), then all of them do; the method is fitted each time. What a capture does not know is left
-out: of a real one the corrections of the rendered test frames remain. Started again with the
+betas, mesh), then all of them do; the method is fitted each time. What a capture does not know is
+left out: of a real one the corrections of the rendered test frames remain. Started again with the
 same arguments, it takes finished captures as they are.
 Exit status 1: the method failed on a capture or left out frames.
 """

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 
 #: Name of the file that describes a request folder.
 REQUEST = "request.json"
+#: The subject's own hands at rest, in the request of an error budget that replaces the template.
+TEMPLATE = "template.npz"
 #: Training frames as they were captured; their clean versions; only those without perturbation.
 FRAME_CHOICES = ("perturbed", "clean", "unperturbed-only")
 
@@ -177,6 +179,8 @@ class RequestRecord:
     train: list[Annotated[int, Meta(ge=0)]]
     #: Frames of the free-view clip; 0 where the capture has none.
     free_view: Annotated[int, Meta(ge=0, le=MAX_FRAMES)] = 0
+    #: Whether `template.npz` holds the subject's own mesh, in place of the hand model's template.
+    own_template: bool = False
 
 
 class TrainingCapture:
@@ -216,6 +220,7 @@ class TrainingCapture:
                 read_hands(root / FREE_VIEW / HANDS, self.sides, record.free_view),
                 read_cameras(root / FREE_VIEW / CAMERAS, record.free_view),
             )
+        self._own_template = record.own_template
         self._train = np.array(record.train, dtype=np.int64)
         if not np.isin(self._train, self.split.train).all():
             raise BadInput(
@@ -256,11 +261,19 @@ class TrainingCapture:
     def template(self, side: str) -> HandTemplate:
         """Load the hand template of one side.
 
+        It is that of the hand model; in an error budget with the truth `mesh` it is the subject's
+        own, which no shape parameter changes.
+
         Raises:
-            BadInput: the template that is installed here is not the capture's.
+            BadInput: the template that is installed here is not the capture's, or the subject's
+                own is damaged.
         """
         from hwp_bench.capture.reader import load_matching_template
+        from hwp_bench.capture.subject_mesh import read_subject_mesh
 
         if side not in self.sides:
             raise UsageError(f"this capture has no {side} hand", where=self.root)
-        return load_matching_template(self.hand_model, self.sides, side, where=self.root)
+        model = load_matching_template(self.hand_model, self.sides, side, where=self.root)
+        if not self._own_template:
+            return model
+        return read_subject_mesh(self.root / TEMPLATE, model)

@@ -31,6 +31,7 @@ TRUTHS: Mapping[str, str] = MappingProxyType(
         "poses": "pose and translation in the training frames",
         "test-poses": "pose and translation in the frames that are rendered",
         "betas": "shape parameters",
+        "mesh": "the subject's own rest mesh and joints, in place of the hand model's template",
     }
 )
 _PREFIX = "true:"
@@ -67,6 +68,8 @@ def known_truths(capture: Capture) -> tuple[str, ...]:
         known |= {"poses", "test-poses", "betas"}
     if capture.has_true_masks:
         known.add("masks")
+    if capture.has_true_template:
+        known.add("mesh")
     if all((capture.root / IMAGE_FOLDERS[kind]).is_dir() for kind in ("clean", "clean_masks")):
         known.add("pixels")
     return tuple(name for name in TRUTHS if name in known)
@@ -87,7 +90,7 @@ def training_material(capture: Capture, split: Split, choice: str) -> TrainingMa
             severities, or another truth that is asked for, or every training frame is perturbed.
     """
     if choice.startswith(_PREFIX):
-        return _with_truths(capture, split, choice.removeprefix(_PREFIX).split(","))
+        return _with_truths(capture, split, _replaced_by(choice))
     if choice not in FRAME_CHOICES:
         raise UsageError(f"{choice!r} is not one of {', '.join(FRAME_CHOICES)}", field="frames")
     hands = dict(capture.hands)
@@ -119,8 +122,19 @@ def free_view_hands(clip: Capture, choice: str) -> dict[str, HandParameters]:
             those of the training frames.
     """
     truth = clip.true_hands
-    exact = choice.startswith(_PREFIX) and "betas" in choice.removeprefix(_PREFIX).split(",")
+    # The subject's mesh has the true shape in it, and so belongs in the places of that shape.
+    exact = bool({"betas", "mesh"} & set(_replaced_by(choice)))
     return dict(truth if exact and truth is not None else clip.hands)
+
+
+def gives_mesh(choice: str) -> bool:
+    """Whether a choice of frames replaces the template by the subject's own mesh."""
+    return "mesh" in _replaced_by(choice)
+
+
+def _replaced_by(choice: str) -> list[str]:
+    """The estimates that a choice of frames replaces by the truth."""
+    return choice.removeprefix(_PREFIX).split(",") if choice.startswith(_PREFIX) else []
 
 
 def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingMaterial:

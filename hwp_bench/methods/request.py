@@ -21,9 +21,16 @@ from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.records import parse_record, without_schema
 from hwp_bench.capture.schema import CAMERAS, FREE_VIEW, HANDS, image_path
 from hwp_bench.capture.splits import Split
+from hwp_bench.capture.subject_mesh import write_subject_mesh
 from hwp_bench.capture.tracks import write_cameras, write_hands
-from hwp_bench.methods.contract import REQUEST, RequestRecord, RunSettings, TrainingCapture
-from hwp_bench.methods.material import free_view_hands, training_material
+from hwp_bench.methods.contract import (
+    REQUEST,
+    TEMPLATE,
+    RequestRecord,
+    RunSettings,
+    TrainingCapture,
+)
+from hwp_bench.methods.material import free_view_hands, gives_mesh, training_material
 
 if TYPE_CHECKING:
     from hwp_bench.capture import Capture
@@ -57,6 +64,10 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
                 shutil.copyfile(source, target)
         write_hands(root / HANDS, material.hands)
         write_cameras(root / CAMERAS, capture.cameras)
+        mesh = gives_mesh(run.frames)
+        if mesh:
+            own = {side: capture.true_template(side) for side in info.sides}
+            write_subject_mesh(root / TEMPLATE, own)
         clip = capture.free_view
         if clip is not None:
             (root / FREE_VIEW).mkdir()
@@ -77,6 +88,7 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
             "frames": run.frames,
             "train": material.train.tolist(),
             **({"free_view": len(clip)} if clip is not None else {}),
+            **({"own_template": True} if mesh else {}),
         }
         write_json(root / REQUEST, description)
     return path

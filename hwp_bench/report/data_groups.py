@@ -106,6 +106,7 @@ def stacked(groups: Sequence[DataGroup], tables: Sequence[Table]) -> Table:
         ]
     notes = ["Results are on different data: only rows of the same data are ranked together."]
     notes += [f"{HEADING} {group.label}: {group.text}." for group in groups]
+    notes += _importer_notes(groups)
     seen = [
         (group.label, note)
         for group, table in zip(groups, tables, strict=True)
@@ -123,6 +124,21 @@ def stacked(groups: Sequence[DataGroup], tables: Sequence[Table]) -> Table:
         breaks=tuple(breaks[1:]),
         unranked=frozenset(unranked),
     )
+
+
+def _importer_notes(groups: Sequence[DataGroup]) -> list[str]:
+    """Return a warning for captures of one name that different importers made."""
+    makers: dict[str, dict[str, None]] = {}
+    for group in groups:
+        for source in group.sources:
+            for capture in source.results.captures:
+                made_by = capture.made_by or "not stated"
+                makers.setdefault(capture.id, {})[made_by] = None
+    return [
+        f"{name} was made by different importers ({', '.join(found)}): its scores do not compare."
+        for name, found in makers.items()
+        if len(found) > 1
+    ]
 
 
 def _joined(every: Sequence[Sequence[Column]]) -> list[Column]:

@@ -14,6 +14,7 @@ from hwp_bench.methods.contract import FRAME_CHOICES
 from hwp_bench.methods.material import TRUTHS, frames_with, known_truths
 from hwp_bench.results import Results
 from hwp_bench.run.engine import Engine, Needs
+from hwp_bench.sim.produce.subject_mesh import add_subject_mesh
 
 #: Name of the evaluation in which nothing is replaced, and of that in which everything is.
 GIVEN, ALL = "as given", "all of them"
@@ -75,6 +76,10 @@ def run_budget(
             remedy=f"Known: {', '.join(TRUTHS)}.",
         )
     opened = tuple(open_capture(path) for path in captures)
+    if "mesh" in truths:
+        # Captures that were rendered before it was stored get it from their scene.
+        for capture in opened:
+            add_subject_mesh(capture)
     variants = variants_of([known_truths(capture) for capture in opened], truths)
     results, folders = {}, {}
     for index, (name, replaced) in enumerate(variants.items()):

@@ -39,6 +39,7 @@ from hwp_bench.sim.produce.frames import (
 )
 from hwp_bench.sim.produce.free_view import write_free_view
 from hwp_bench.sim.produce.lookalikes import confused_mask
+from hwp_bench.sim.produce.subject_mesh import write_truth
 from hwp_bench.sim.produce.subject_table import subject_json
 from hwp_bench.sim.produce.video_encoding import check_encoder, through_h264
 from hwp_bench.sim.scene.motion import hand_parameters
@@ -203,6 +204,7 @@ def _assemble(
                 writer.extra(f"exr/{layers.name}", layers.read_bytes())
             costs.append(json.loads(arrays["cost"].tobytes()))
         writer.true_hands(truth)
+        write_truth(writer.folder, scene.subject, scene.sides)
         writer.extra("scene.json", canonical_json(scene.to_json()))
         if subject := subject_json(scene):
             writer.extra("subject.json", canonical_json(subject))

@@ -10,7 +10,10 @@ from small_captures import CaptureMaker
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture
+from hwp_bench.capture.schema import TRUE_TEMPLATE
 from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.capture.subject_mesh import write_subject_mesh
+from hwp_bench.hands import load_template
 from hwp_bench.methods.material import TRUTHS, frames_with, known_truths, training_material
 
 SPLIT = contiguous_split("tiny", 20)
@@ -67,7 +70,14 @@ def test_images_come_from_the_kind_that_is_asked_for(
 
 
 def test_a_capture_says_what_it_knows(make_capture: CaptureMaker, capture: Capture) -> None:
+    assert known_truths(capture) == tuple(name for name in TRUTHS if name != "mesh")
+    with pytest.raises(UsageError, match="does not know its true mesh"):
+        training_material(capture, SPLIT, frames_with(["mesh"]))
+    write_subject_mesh(capture.root / TRUE_TEMPLATE, {"right": load_template("anny", "right")})
     assert known_truths(capture) == tuple(TRUTHS)
+    given = training_material(capture, SPLIT, frames_with(["mesh"])).hands["right"]
+    np.testing.assert_array_equal(given.betas, capture.hands["right"].betas)
+    np.testing.assert_array_equal(given.pose, capture.hands["right"].pose)
     unknowing = make_capture("other", frames=20)
     assert known_truths(unknowing) == ()
     with pytest.raises(UsageError, match="does not know its true betas"):

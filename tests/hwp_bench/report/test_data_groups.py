@@ -84,6 +84,20 @@ def test_a_run_that_is_given_twice_stops_no_table(mixed) -> None:
     assert notes[0].startswith("Nobody is named as the winner: two results are of Plain")
 
 
+def test_captures_of_two_versions_of_an_importer_are_named(tmp_path: Path, capsys) -> None:
+    paths = []
+    for number, maker in enumerate(("video 1", "video 2", "video 2")):
+        base = made_results(f"m{number}", level(20.0), captures=1)
+        capture = replace(base.captures[0], made_by=maker, digest=maker)
+        row = replace(base, captures=[capture])
+        paths.append(str(write_results(tmp_path / f"v{number}" / "results.json", row).parent))
+    assert main(["table", *paths, "--format", "md"]) == 0
+    warning = "capture0 was made by different importers (video 1, video 2)"
+    assert warning in capsys.readouterr().out
+    assert main(["table", *paths[1:], "--format", "md"]) == 0
+    assert "different importers" not in capsys.readouterr().out
+
+
 def test_tables_with_other_columns_are_put_under_one_another() -> None:
     first = Table("T", (Column("M"), Column("x", 1, True, "G")), (("a", 1.0), ("b", 2.0)), ("n",))
     second = Table(

@@ -14,6 +14,8 @@ import pytest
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import Capture, CaptureWriter, open_capture
+from hwp_bench.capture.schema import TRUE_TEMPLATE
+from hwp_bench.capture.subject_mesh import write_subject_mesh
 from hwp_bench.cli.main import main
 from hwp_bench.evaluation.budget.runs import run_budget, variants_of
 from hwp_bench.evaluation.evaluate import EvaluationSettings
@@ -86,6 +88,8 @@ def dark_capture(make_painted: Callable[..., Capture], tmp_path: Path) -> Captur
             writer.clean_mask(frame, mask)
             writer.true_mask(frame, mask)
         writer.true_hands(truth)
+    own = {side: painted.template(side) for side in info.sides}
+    write_subject_mesh(tmp_path / "dark" / TRUE_TEMPLATE, own)
     return open_capture(tmp_path / "dark")
 
 
@@ -98,8 +102,8 @@ def test_each_truth_gains_what_its_error_costs(
     record = json.loads(capsys.readouterr().out)
     rows = {row["name"]: row["gain"]["dark"] for row in record["rows"]}
     assert set(rows) >= {*TRUTHS, "all of them", "gain", "light", "motion", "pose"}
-    # Masks and poses do not enter the answer; light and shape do, and both at once most.
-    for name in ("masks", "poses", "test-poses"):
+    # Masks, poses and the mesh do not enter the answer; light and shape do, and both at once most.
+    for name in ("masks", "poses", "test-poses", "mesh"):
         assert rows[name] == pytest.approx(0.0, abs=1e-9)
     assert rows["pixels"] > 1.0
     assert rows["betas"] > 1.0
@@ -110,7 +114,7 @@ def test_each_truth_gains_what_its_error_costs(
     assert json.loads((out / "budget.json").read_text()) == record
     assert (out / "tables" / "budget.md").is_file()
     picture = read_rgb(out / "budget.png")
-    # The truth, the method as it is, five truths and all of them; below the corrections.
+    # The truth, the method as it is, six truths and all of them; below the corrections.
     assert picture.shape[1] > 176 * (len(TRUTHS) + 3)
     assert picture.shape[0] > 2 * 176
     given = json.loads((out / "runs" / "as-given" / "results.json").read_text())
