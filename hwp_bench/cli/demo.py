@@ -38,9 +38,9 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.cli.evaluate import report_outcome
     from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
+    from hwp_bench.evaluation.side_by_side import write_side_by_side
     from hwp_bench.methods import find_method, read_manifest
     from hwp_bench.report.evaluation_tables import all_tables
-    from hwp_bench.report.side_by_side import write_side_by_side
     from hwp_bench.report.sources import ResultsSource
     from hwp_bench.sim import ensure_suite
 

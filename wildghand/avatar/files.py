@@ -22,6 +22,7 @@ from hwp_bench.base.records import parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
+from wildghand.evidence import Evidence
 from wildghand.light import KnownLight
 from wildghand.model.assemble import make_model
 from wildghand.model.settings import read_stored, read_version_1
@@ -149,6 +150,10 @@ def load_avatar(
         light = KnownLight.from_tensors(tensors, str(file))
         if light is not None:
             model.keep(light)
+        counts = {side: len(rig) for side, rig in model.rigs.items()}
+        evidence = Evidence.from_tensors(tensors, counts, str(file))
+        if evidence is not None:
+            model.keep(evidence)
         model.load_state_dict(tensors, strict=True)
     except (SafetensorError, RuntimeError, OSError) as error:
         problem = str(error).splitlines()[0][:300]

@@ -17,6 +17,7 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.evidence import shown_frames, weigh_evidence
 from wildghand.fitting.hand_masks import hand_masks
 from wildghand.fitting.light_samples import light_samples
 from wildghand.fitting.objective import Objective
@@ -89,6 +90,11 @@ class Fit:
             device,
             skin_places(training, self.frames, bent) if needs_places(settings) else (),
         )
+        if settings.evidence.enabled:
+            shown = shown_frames(
+                self.model.rigs, self.clip, self.weighting.visible, len(self.frames)
+            )
+            self.model.keep(weigh_evidence(shown, len(self.frames), settings.evidence))
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal, device)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)

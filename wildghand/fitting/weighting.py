@@ -178,6 +178,17 @@ class Weighting:
         if self.pay_back is not None and state.get("residuals") is not None:
             self.pay_back.residuals.copy_(state["residuals"])
 
+    def visible(self, rows: Tensor) -> Tensor:
+        """How much each pixel of some frames says of the hand, (B, H, W) in [0, 1].
+
+        Args:
+            rows: (B,) int64, which of the R frames; on the CPU.
+        """
+        hand = self._hands(rows)
+        if self._pixel_weights is not None:
+            hand = hand * self._uncovered(rows)
+        return hand * self.frame_weights[rows].to(hand)[:, None, None]
+
     def moves(self, rows: Tensor) -> bool:
         """Whether the pose of any frame of a batch is refined."""
         return self.settings.prepass.frame_poses and bool(self._refine_pose[rows].any())

@@ -11,6 +11,7 @@ from torch import Tensor, nn
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal
 from wildghand.dpd.field import bone_features
 from wildghand.dpd.scale_gradients import scale_refinement
+from wildghand.evidence import Evidence
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.gaussians.training import TrainingClip
@@ -99,6 +100,7 @@ class WildGHandModel(nn.Module):
         super().__init__()
         self._template = template
         self._light: KnownLight | None = None
+        self._evidence: Evidence | None = None
         self.rigs = dict(rigs)
         self.network = network
         self.perturbation = nn.ModuleDict(
@@ -112,17 +114,20 @@ class WildGHandModel(nn.Module):
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
 
-    def keep(self, found: SubjectShape | KnownLight) -> None:
-        """Keep a shape or a light that was fitted, so that it is saved with the network.
+    def keep(self, found: SubjectShape | KnownLight | Evidence) -> None:
+        """Keep what was fitted next to the network, so that it is saved with it.
 
         Args:
             found: the person's shape, which the rigs have already, or the light, by which unknown
-                normals are drawn from now on.
+                normals are drawn from now on, or the evidence, by which free poses are.
         """
         for name, values in found.to_tensors().items():
             self.register_buffer(name, values.to(self.log_gains.device))
         if isinstance(found, KnownLight):
             self._light = KnownLight.from_tensors(dict(self.named_buffers()), "light")
+        if isinstance(found, Evidence):
+            counts = {side: len(rig) for side, rig in self.rigs.items()}
+            self._evidence = Evidence.from_tensors(dict(self.named_buffers()), counts, "evidence")
 
     def finite(self) -> bool:
         """Whether every fitted number is finite."""
@@ -284,6 +289,10 @@ class WildGHandModel(nn.Module):
                 anchors,
                 viewmats,
             )
+        if self._evidence is not None:
+            bias = self.network.activation.log_scale_bias
+            settled = self._evidence.settle(side, prediction.raw, rig.spacing, bias)
+            prediction = replace(prediction, raw=settled)
         if refine:
             step = prediction.refinement
             anchors = rig.follow(pose + step.pose, betas + step.betas, transl + step.transl)

@@ -17,6 +17,7 @@ from hwp_bench.base.errors import BadMethod
 from hwp_bench.base.records import flattened, merged
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
+from wildghand.evidence import EvidenceSettings
 from wildghand.light import LightSettings
 from wildghand.model.former_settings import current_names
 from wildghand.model.terms import PAPER_TERMS, TermWeights
@@ -115,6 +116,8 @@ class WildGHandSettings:
     subject: SubjectSettings = field(default_factory=SubjectSettings)
     #: Addition: a light for normals that no frame has shown.
     light: LightSettings = field(default_factory=LightSettings)
+    #: Addition: Gaussians that few frames show are discs on the skin.
+    evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
     #: covered, and which poses need refining. It leaves the biases out of every clean
     #: frame, not out of three in ten: what little they took from these, the avatar lacked
@@ -150,6 +153,7 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
         },
         "subject": {"enabled": False},
         "light": {"enabled": False},
+        "evidence": {"enabled": False},
         "prepass": {"enabled": False},
         "schedule": {
             "batch": 4,
@@ -183,6 +187,7 @@ _PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
         "dpd": {"gains": False},
         "subject": {"enabled": False},
         "light": {"enabled": False},
+        "evidence": {"enabled": False},
         "prepass": {"enabled": False},
         "terms": {
             name: value for name, value in _PUBLISHED["terms"].items() if name != "dssim_weight"
@@ -198,6 +203,7 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
         "pao": {"errors": "median", "mismatch": 0.0},
         "subject": {"enabled": False},
         "light": {"enabled": False},
+        "evidence": {"enabled": False},
         "terms": {"surface": 0.0, "leave_hidden": False},
     }
 )

@@ -1,0 +1,154 @@
+"""How far Gaussians are trusted. Oracles: the formula, discs by hand, a sphere's two halves."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hwp_bench.base.errors import BadInput
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.avatar.files import load_avatar, save_avatar
+from wildghand.evidence import Evidence, EvidenceSettings, shown_frames, weigh_evidence
+from wildghand.evidence.count import _FAR, _depth_image
+from wildghand.fitting.fit import Fit
+from wildghand.gaussians.attributes import Activation, RawAttributes
+from wildghand.model.settings import read_settings
+
+QUICK = {
+    "gaussians": 300,
+    "prior": "",
+    "network.identity_resolution": 24,
+    "network.plane_resolution": 12,
+    "prepass.enabled": False,
+    "subject.enabled": False,
+    "device": "cpu",
+}
+SPACING = 2e-3
+TrainingMaker = Callable[..., TrainingCapture]
+
+
+def raw_attributes(count: int = 40, seed: int = 0) -> RawAttributes:
+    generator = torch.Generator().manual_seed(seed)
+    return RawAttributes.split(torch.randn(2, count, 14, generator=generator))
+
+
+def evidence(offsets: float, shapes: float, count: int = 40) -> Evidence:
+    return Evidence(
+        {"right": torch.full((count,), offsets)}, {"right": torch.full((count,), shapes)}
+    )
+
+
+def test_with_all_the_evidence_gaussians_are_drawn_as_they_were() -> None:
+    raw, activation = raw_attributes(), Activation()
+    settled = evidence(1.0, 1.0).settle("right", raw, SPACING, activation.log_scale_bias)
+    before, after = activation(raw), activation(settled)
+    for name in ("offsets", "scales", "opacities", "colors"):
+        torch.testing.assert_close(getattr(after, name), getattr(before, name))
+    turns = (before.quats * after.quats).sum(dim=-1).abs()
+    torch.testing.assert_close(turns, torch.ones_like(turns))
+
+
+def test_without_evidence_gaussians_are_opaque_discs_on_the_skin_in_their_colours() -> None:
+    raw, activation = raw_attributes(), Activation()
+    settled = evidence(0.0, 0.0).settle("right", raw, SPACING, activation.log_scale_bias)
+    drawn = activation(settled)
+    assert not drawn.offsets.any()
+    disc = torch.tensor([0.6, 0.6, 0.2]) * SPACING
+    torch.testing.assert_close(drawn.scales, disc.expand_as(drawn.scales))
+    torch.testing.assert_close(drawn.quats[..., 0], torch.ones(2, 40))
+    assert drawn.opacities.min() > 0.98
+    torch.testing.assert_close(drawn.colors, activation(raw).colors)
+
+
+def amounts(most: float) -> st.SearchStrategy[float]:
+    """Nothing, or what float32 can tell from nothing."""
+    return st.just(0.0) | st.floats(1e-6, most)
+
+
+@given(
+    shown=amounts(200.0),
+    count=st.integers(1, 200),
+    offset=amounts(10.0),
+    shape=amounts(10.0),
+)
+def test_shares_are_those_of_the_formula(
+    shown: float, count: int, offset: float, shape: float
+) -> None:
+    settings = EvidenceSettings(offset_share=offset, shape_share=shape)
+    found = weigh_evidence({"left": torch.tensor([shown])}, count, settings)
+    for share, half in ((found.offsets, offset), (found.shapes, shape)):
+        expected = np.float64(shown) / (shown + half * count) if half else 1.0
+        expected = 0.0 if np.isnan(expected) else expected
+        got = float(share["left"])
+        assert 0.0 <= got <= 1.0
+        np.testing.assert_allclose(got, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_the_depth_image_has_the_nearest_of_all_hands_around_a_cell() -> None:
+    one = (torch.tensor([[[10.0, 10.0]]]), torch.tensor([[0.5]]))
+    other = (torch.tensor([[[11.0, 10.0], [-5.0, 3.0]]]), torch.tensor([[0.4, 0.1]]))
+    image = _depth_image({"right": one, "left": other}, torch.Size((40, 60)))[0]
+    assert float(image[10, 10]) == pytest.approx(0.4)
+    assert float(image[10, 9]) == pytest.approx(0.5)
+    assert float(image[20, 20]) == _FAR
+    assert float(image.min()) == pytest.approx(0.4)
+
+
+def test_frames_show_what_faces_them_and_lies_in_the_mask(make_training: TrainingMaker) -> None:
+    """All of a frame counts as visible: about half of a hand faces a camera, and never all."""
+    fit = Fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
+    rows, size = len(fit.frames), fit.frames.masks.shape[1:]
+    everything = shown_frames(
+        fit.model.rigs, fit.clip, lambda part: torch.ones(len(part), *size), rows
+    )
+    nothing = shown_frames(
+        fit.model.rigs, fit.clip, lambda part: torch.zeros(len(part), *size), rows
+    )
+    half = shown_frames(
+        fit.model.rigs, fit.clip, lambda part: torch.full((len(part), *size), 0.5), rows
+    )
+    for side, found in everything.items():
+        assert 0.2 < float(found.mean()) / rows < 0.6
+        assert float(found.max()) <= rows
+        assert not nothing[side].any()
+        torch.testing.assert_close(half[side], 0.5 * found)
+
+
+def test_an_avatar_keeps_its_evidence(make_training: TrainingMaker, tmp_path: Path) -> None:
+    training = make_training()
+    fit = Fit(training, read_settings(QUICK), 0, torch.device("cpu"))
+    bare = Fit(
+        training, read_settings({**QUICK, "evidence.enabled": False}), 0, torch.device("cpu")
+    )
+    frame = int(training.validation[0])
+    where = training.hand_poses(frame), training.camera(frame)
+    drawn = fit.avatar(0).render(*where)
+    assert not np.array_equal(drawn, bare.avatar(0).render(*where))
+    again = load_avatar(save_avatar(fit.avatar(0), tmp_path / "avatar"))
+    np.testing.assert_array_equal(again.render(*where), drawn)
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"evidence_offsets_right": torch.zeros(3)}, "shape"),
+        ({"evidence_shapes_right": None}, "shape"),
+        ({"evidence_shapes_right": torch.full((4,), 1.5)}, "0 to 1"),
+        ({"evidence_offsets_right": torch.full((4,), float("nan"))}, "0 to 1"),
+    ],
+)
+def test_damaged_evidence_is_refused(change: dict[str, torch.Tensor | None], message: str) -> None:
+    tensors = {**evidence(0.5, 0.5, 4).to_tensors(), **change}
+    kept = {name: tensor for name, tensor in tensors.items() if tensor is not None}
+    with pytest.raises(BadInput, match=message):
+        Evidence.from_tensors(kept, {"right": 4}, "avatar")
+
+
+def test_an_avatar_of_before_has_none() -> None:
+    assert Evidence.from_tensors({}, {"right": 4}, "avatar") is None

@@ -1,0 +1,124 @@
+"""Gaussians that are the more opaque discs on the skin, the less the frames say of them.
+
+An offset from the skin moves a Gaussian along the line of sight too, where a single direction shows
+nothing of it; from elsewhere it is at the wrong place. Its shape is as uncertain. The maximum of a
+Gaussian likelihood of n frames and a prior that weighs as much as k of them keeps n / (n + k) of
+what the frames say, and the rest of the prior: no offset, and a disc that closes the skin.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+from torch.nn.functional import normalize
+
+from hwp_bench.base.errors import BadInput
+from wildghand.evidence.settings import EvidenceSettings
+from wildghand.gaussians.attributes import RawAttributes
+
+_OFFSETS, _SHAPES = "evidence_offsets_", "evidence_shapes_"
+# The disc: standard deviations along the skin and across it, in spacings of the anchors, and its
+# opacity before the sigmoid.
+_WIDE, _THIN, _OPAQUE = 0.6, 0.2, 4.0
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """The share of what a fit has found that is kept of each Gaussian, in [0, 1]."""
+
+    #: (N,) by side, of the offset.
+    offsets: Mapping[str, Tensor]
+    #: (N,) by side, of scales, orientation and transparency.
+    shapes: Mapping[str, Tensor]
+
+    def settle(
+        self, side: str, raw: RawAttributes, spacing: float, log_scale_bias: float
+    ) -> RawAttributes:
+        """Bring Gaussians nearer to discs on the skin, by what is missing of the evidence.
+
+        Args:
+            side: which hand.
+            raw: (..., N, k) attributes.
+            spacing: mean distance between neighbouring anchors, m.
+            log_scale_bias: see `Activation`.
+
+        Returns:
+            The same shapes; colours are as they were.
+        """
+        kept, shape = self.offsets[side][:, None], self.shapes[side][:, None]
+        disc = raw.log_scales.new_tensor([_WIDE, _WIDE, _THIN]).mul(spacing).log() - log_scale_bias
+        # A quaternion and its negative turn alike: the one near the identity is the shorter way.
+        quats = normalize(raw.quats, dim=-1)
+        quats = torch.where(quats[..., :1] < 0.0, -quats, quats)
+        upright = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+        opaque = raw.logit_opacities.clamp(min=_OPAQUE)
+        return RawAttributes(
+            offsets=kept * raw.offsets,
+            log_scales=disc + shape * (raw.log_scales - disc),
+            quats=upright + shape * (quats - upright),
+            logit_opacities=opaque + shape * (raw.logit_opacities - opaque),
+            logit_colors=raw.logit_colors,
+        )
+
+    def to_tensors(self) -> dict[str, Tensor]:
+        """The shares by the names under which an avatar keeps them."""
+        return {
+            **{f"{_OFFSETS}{side}": shares for side, shares in self.offsets.items()},
+            **{f"{_SHAPES}{side}": shares for side, shares in self.shapes.items()},
+        }
+
+    @classmethod
+    def from_tensors(
+        cls, tensors: Mapping[str, Tensor], counts: Mapping[str, int], where: str
+    ) -> Evidence | None:
+        """Read what `to_tensors` made.
+
+        Args:
+            tensors: of an avatar.
+            counts: N by side.
+            where: the file, for messages.
+
+        Returns:
+            The evidence; None where the avatar keeps none.
+
+        Raises:
+            BadInput: a part is missing, of another shape, or no share.
+        """
+        if not any(f"{_OFFSETS}{side}" in tensors for side in counts):
+            return None
+        for side, count in counts.items():
+            for name in (f"{_OFFSETS}{side}", f"{_SHAPES}{side}"):
+                tensor = tensors.get(name)
+                if tensor is None or tuple(tensor.shape) != (count,):
+                    raise BadInput(f"has not the shape {(count,)}", where=where, field=name)
+                if not bool(((tensor >= 0.0) & (tensor <= 1.0)).all()):
+                    raise BadInput("lies outside 0 to 1", where=where, field=name)
+        return cls(
+            {side: tensors[f"{_OFFSETS}{side}"].float() for side in counts},
+            {side: tensors[f"{_SHAPES}{side}"].float() for side in counts},
+        )
+
+
+def weigh_evidence(shown: Mapping[str, Tensor], count: int, settings: EvidenceSettings) -> Evidence:
+    """The shares that follow from how many frames show each Gaussian.
+
+    Frames of a clip that follow one another show the same, so that what counts is their share.
+
+    Args:
+        shown: (N,) frames by side.
+        count: of all training frames, at least 1.
+        settings: which share outweighs the prior.
+    """
+
+    def shares(frames: Tensor, half: float) -> Tensor:
+        if half <= 0.0:
+            return torch.ones_like(frames)
+        return frames / (frames + half * count).clamp(min=1e-12)
+
+    return Evidence(
+        {side: shares(frames, settings.offset_share) for side, frames in shown.items()},
+        {side: shares(frames, settings.shape_share) for side, frames in shown.items()},
+    )

@@ -1,0 +1,22 @@
+"""Settings of how far a Gaussian is trusted that few frames have shown."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from hwp_bench.methods.settings import number
+
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """How much evidence outweighs that a Gaussian is an opaque disc on the skin."""
+
+    #: Draw free poses with Gaussians that are the more discs on the skin, the fewer frames have
+    #: shown them.
+    enabled: bool = True
+    #: Share of the training frames that must show a Gaussian until half of its offset from the skin
+    #: is kept.
+    offset_share: float = number(0.08, 0.0, 100.0)
+    #: Share of the training frames that must show a Gaussian until half of its shape and
+    #: transparency is kept.
+    shape_share: float = number(0.002, 0.0, 100.0)
