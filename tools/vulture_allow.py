@@ -8,6 +8,9 @@ PlainMethod  # the entry of baselines/plain/method.toml
 TrimmedMethod  # the entry of baselines/trimmed/method.toml
 WildMethod  # the entry of baselines/wild/method.toml
 JointPoseMethod  # the entry of baselines/joint-pose/method.toml
+ExposureMethod  # the entry of baselines/exposure/method.toml
+OccluderMethod  # the entry of baselines/occluder-splats/method.toml
+ShadowMethod  # the entry of baselines/shadow-albedo/method.toml
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/network-scratch
 check_networks  # `check_files` of wildghand/method.toml and of baselines/network-scratch
 modified  # part of the cache's key: a changed file is read again
