@@ -40,7 +40,7 @@ def write_side_by_side(
         target = capture.frame(frame)
         mask, exact = capture.scoring_mask(frame)
         region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
-        box = _square_around(region)
+        box = square_around(region)
 
         def tile(
             pixels: np.ndarray | None,
@@ -68,7 +68,7 @@ def _typical_frame(found: Sequence[CaptureResult]) -> int:
     return found[0].frames[int(order[len(order) // 2])].frame
 
 
-def _square_around(region: np.ndarray) -> tuple[slice, slice]:
+def square_around(region: np.ndarray) -> tuple[slice, slice]:
     """The smallest square window around some pixels, or as much of it as the image has."""
     rows, columns = (np.nonzero(region.any(axis=axis))[0] for axis in (1, 0))
     if not len(rows):

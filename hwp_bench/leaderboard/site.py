@@ -13,13 +13,14 @@ from markupsafe import Markup
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, canonical_json
 from hwp_bench.leaderboard.entries import Entry, digest
+from hwp_bench.leaderboard.gallery import write_gallery
 from hwp_bench.leaderboard.records import BADGES, LEVEL_TEXTS, Submission
 from hwp_bench.leaderboard.rules import SUITES, check_entries, current, history
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import aggregate
 from hwp_bench.report.page.render import render_template, style_sheet, write_report
-from hwp_bench.report.sources import ResultsSource
+from hwp_bench.report.sources import ResultsSource, open_captures_of
 from hwp_bench.results.published import NOTE, read_published
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
@@ -134,17 +135,45 @@ def build_site(
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "board.js").is_file():
         raise UsageError("holds something else than a leaderboard", where=folder, field="-o")
     folders = {digest(source.results): source.folder for source in results_folders}
+    captures = open_captures_of([source.results for source in results_folders])
     with atomic_folder(folder, overwrite=True) as temporary:
-        (temporary / "index.html").write_text(board_page(entries), encoding="utf-8")
+        shown = [
+            (entry, ResultsSource(entry.results, folders[digest(entry.results)]))
+            for entry in current(entries)
+            if digest(entry.results) in folders
+        ]
+        scenes = write_gallery(temporary, shown, captures, _titles(entries))
+        page = board_page(entries, pictures=bool(scenes))
+        (temporary / "index.html").write_text(page, encoding="utf-8")
         (temporary / "board.js").write_text(script(), encoding="utf-8")
+        if scenes:
+            data = f"var GALLERY = {canonical_json(scenes)};\n"
+            (temporary / "gallery.js").write_text(data, encoding="utf-8")
+            (temporary / "viewer.js").write_text(script("viewer.js"), encoding="utf-8")
         for entry in entries:
             source = ResultsSource(entry.results, folders.get(digest(entry.results)))
             write_report(temporary / "reports" / entry.name, [source])
     return folder / "index.html"
 
 
-def board_page(entries: Sequence[Entry]) -> str:
-    """Return the page of the board."""
+def _titles(entries: Sequence[Entry]) -> dict[str, str]:
+    """How entries are called in lists: by method, with what tells two of one title apart."""
+    kinds = [(entry.results.method.title, entry.results.suite) for entry in entries]
+    return {
+        entry.name: f"{kind[0]} ({budget_text(entry.results.budget)}, seed {entry.results.seed})"
+        if kinds.count(kind) > 1
+        else kind[0]
+        for entry, kind in zip(entries, kinds, strict=True)
+    }
+
+
+def board_page(entries: Sequence[Entry], *, pictures: bool = False) -> str:
+    """Return the page of the board.
+
+    Args:
+        entries: the measured rows.
+        pictures: whether the viewer's pictures lie next to the page.
+    """
     rows = sorted(
         (make_row(entry, entries) for entry in current(entries) if entry.protocol == HWP_V1.name),
         key=lambda row: (SUITES.index(row.suite), -(row.scores["macro"]["psnr"] or 0.0), row.name),
@@ -162,6 +191,7 @@ def board_page(entries: Sequence[Entry]) -> str:
         published=_published(),
         note=NOTE,
         scores_json=_scores_json,
+        pictures=pictures,
         levels=LEVEL_TEXTS,
         badges=BADGES,
     )
@@ -190,7 +220,7 @@ def _published() -> list[dict[str, Any]]:
     ]
 
 
-def script() -> Markup:
-    """Return the page's script."""
+def script(name: str = "board.js") -> Markup:
+    """Return a script of the page."""
     folder = resources.files("hwp_bench.leaderboard").joinpath("templates")
-    return Markup(folder.joinpath("board.js").read_text("utf-8"))
+    return Markup(folder.joinpath(name).read_text("utf-8"))
