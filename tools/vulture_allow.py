@@ -11,6 +11,7 @@ JointPoseMethod  # the entry of baselines/joint-pose/method.toml
 ExposureMethod  # the entry of baselines/exposure/method.toml
 OccluderMethod  # the entry of baselines/occluder-splats/method.toml
 ShadowMethod  # the entry of baselines/shadow-albedo/method.toml
+OneShotMethod  # the entry of baselines/one-shot-prior/method.toml
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/network-scratch
 check_networks  # `check_files` of wildghand/method.toml and of baselines/network-scratch
 modified  # part of the cache's key: a changed file is read again

@@ -9,14 +9,14 @@ import torch
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Avatar, Budget, Report
 from wildghand.gaussians.fit_loop import Guard, batches, repeatable, spent
-from wildghand.plain.recipe import Batch, PlainRecipe
+from wildghand.plain.hooks import Batch, Recipe
 
 # Adam's epsilon: gradients of a mean over all pixels are small.
 _EPSILON = 1e-15
 _BETAS = (0.9, 0.99)
 
 
-def run_fit(recipe: PlainRecipe[Any], budget: Budget, report: Report) -> Avatar:
+def run_fit(recipe: Recipe[Any], budget: Budget, report: Report) -> Avatar:
     """Fit a recipe's tensors, within the budget.
 
     Args:

@@ -9,9 +9,10 @@ from hwp_bench.methods.contract import Avatar, Budget, Report, TrainingCapture
 from hwp_bench.methods.settings import settings_from
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.gaussians.training import load_frames
+from wildghand.plain.hooks import Material, Recipe
 from wildghand.plain.loop import run_fit
-from wildghand.plain.recipe import Material, PlainRecipe
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import PlainRecipe
+from wildghand.plain.settings import FitSettings, LoopSettings
 from wildghand.splat.threads import denormals_flushed
 
 
@@ -31,9 +32,9 @@ class RecipeMethod:
     #: Name in messages about settings.
     name: ClassVar[str]
     #: The settings' dataclass.
-    settings_type: ClassVar[type[FitSettings]] = FitSettings
+    settings_type: ClassVar[type[LoopSettings]] = FitSettings
     #: The recipe's class.
-    recipe_type: ClassVar[type[PlainRecipe[Any]]] = PlainRecipe
+    recipe_type: ClassVar[type[Recipe[Any]]] = PlainRecipe
 
     def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
         self.settings = settings_from(self.settings_type, settings, self.name)

@@ -50,7 +50,7 @@ def skin_atlas(subject: Subject) -> SkinAtlas:
         subject: whose; `painting.of_side` where the hands look different.
     """
     hand = subject_hand(subject, "right")
-    return kept(hand, subject, "", lambda: _paint(hand, subject))
+    return kept(hand, subject, "", lambda: painted_atlas(hand, subject))
 
 
 def kept(
@@ -92,14 +92,21 @@ def _store(path: Path, atlas: SkinAtlas) -> None:
     atomic_write(path, buffer.getvalue())
 
 
-def _paint(hand: SubjectHand, subject: Subject) -> SkinAtlas:
+def painted_atlas(hand: SubjectHand, subject: Subject, edge: int = ATLAS) -> SkinAtlas:
+    """Paint the skin of a hand; nothing is kept.
+
+    Args:
+        hand: on which it lies.
+        subject: whose skin.
+        edge: of the textures, in texels.
+    """
     from scipy.ndimage import distance_transform_edt
 
     flat = np.concatenate([hand.corner_uv, np.zeros((*hand.corner_uv.shape[:2], 1))], axis=2)
     tracer = Tracer(flat.reshape(-1, 3), np.arange(flat.shape[0] * 3).reshape(-1, 3), Counter())
-    ticks = (np.arange(ATLAS) + 0.5) / ATLAS
+    ticks = (np.arange(edge) + 0.5) / edge
     u, v = np.meshgrid(ticks, 1.0 - ticks)
-    origins = np.stack([u.ravel(), v.ravel(), np.ones(ATLAS * ATLAS)], axis=1)
+    origins = np.stack([u.ravel(), v.ravel(), np.ones(edge * edge)], axis=1)
     down = np.broadcast_to(np.array([0.0, 0.0, -1.0]), origins.shape)
     hits = tracer.first_hits(origins, down, "atlas")
     corners = hand.faces[hits.face]
@@ -116,15 +123,15 @@ def _paint(hand: SubjectHand, subject: Subject) -> SkinAtlas:
         template, hand.betas, spread(rest), unit(spread(normals)), weights, hand.joints
     )
     skin = painted(anatomy, subject, fine=True)
-    layers = np.zeros((ATLAS * ATLAS, 5), dtype=np.float32)
+    layers = np.zeros((edge * edge, 5), dtype=np.float32)
     layers[hits.ray] = np.column_stack([skin.albedo, skin.height, skin.roughness])
-    empty = np.ones(ATLAS * ATLAS, dtype=bool)
+    empty = np.ones(edge * edge, dtype=bool)
     empty[hits.ray] = False
     # Texels outside the atlas's islands repeat the nearest one inside, so that no seam shows.
     nearest = distance_transform_edt(
-        empty.reshape(ATLAS, ATLAS), return_distances=False, return_indices=True
+        empty.reshape(edge, edge), return_distances=False, return_indices=True
     )
-    layers = layers.reshape(ATLAS, ATLAS, 5)[nearest[0], nearest[1]]
+    layers = layers.reshape(edge, edge, 5)[nearest[0], nearest[1]]
     return SkinAtlas(
         np.ascontiguousarray(layers[..., :3]),
         np.ascontiguousarray(layers[..., 3]),

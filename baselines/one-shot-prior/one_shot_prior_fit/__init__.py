@@ -1,0 +1,1 @@
+"""One-shot-prior: the shipped prior, frozen, and few tensors that bend it to a person."""
