@@ -31,7 +31,7 @@ QUALITY = 82
 
 @dataclass(frozen=True)
 class Shot:
-    """What one method drew of one frame."""
+    """The drawing of one frame by one method."""
 
     #: Name of the entry.
     entry: str
