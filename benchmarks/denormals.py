@@ -29,7 +29,7 @@ TERMS = {
     **{
         f"terms.{name}": getattr(TermWeights(), name)
         for name in TermWeights.__dataclass_fields__
-        if name not in ("dssim_weight", "outside_weight")
+        if name not in ("dssim_weight", "outside_weight", "leave_hidden")
     },
     "dpd.gain_weight": 0.1,
     "dpd.omega_weight": 1.0,
