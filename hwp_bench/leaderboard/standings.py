@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from hwp_bench.analysis.statistics.pairing import MethodRuns, group_runs
+from hwp_bench.analysis.statistics.pairing import group_runs
 from hwp_bench.analysis.statistics.ranks import Rank, rank_methods, verdict
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table
+from hwp_bench.leaderboard.board_rows import BoardRow, board_rows
 from hwp_bench.leaderboard.entries import Entry
-from hwp_bench.leaderboard.rules import HEADLINE, current, missing, tables_of
+from hwp_bench.leaderboard.rules import HEADLINE, current, tables_of
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.report.evaluation_tables import labels, score_column
 from hwp_bench.report.ranking_tables import METRIC
@@ -18,8 +19,8 @@ from hwp_bench.report.ranking_tables import METRIC
 def board_tables(entries: Sequence[Entry]) -> list[Table]:
     """Return a table for each suite and protocol, best row first.
 
-    Rows that another one revises are left out. A row that lacks a part of its suite is shown
-    without a rank. Entries that differ only in the seed are ranked together and have a row each.
+    Entries that another one revises are left out. A row that lacks a part of its suite is shown
+    without a rank. Entries that differ only in the seed are one row.
 
     Args:
         entries: entries that `rules.check_entries` has passed.
@@ -29,22 +30,17 @@ def board_tables(entries: Sequence[Entry]) -> list[Table]:
 
 
 def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
-    whole = [entry for entry in entries if not missing(entry.results)]
-    ranks, sentence = _ranks(whole)
-    titles = dict(
-        zip(
-            (entry.name for entry in entries),
-            labels([entry.results for entry in entries]),
-            strict=True,
-        )
-    )
+    rows = board_rows(entries)
+    ranks, sentence = _ranks(rows)
+    names = labels([row.first for row in rows])
+    titles = {row.entries[0].name: name for row, name in zip(rows, names, strict=True)}
     order = sorted(
-        entries,
-        key=lambda entry: (
-            entry not in whole,
-            ranks[entry.name].rank if entry.name in ranks else len(entries),
-            -entry.results.scores[METRIC],
-            entry.name,
+        rows,
+        key=lambda row: (
+            not row.whole,
+            ranks[row.entries[0].name].rank if row.entries[0].name in ranks else len(rows),
+            -row.scores[METRIC],
+            row.entries[0].name,
         ),
     )
     columns = (
@@ -53,28 +49,30 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
         Column("95 %", group="Rank"),
         *(score_column(name) for name in HEADLINE),
         Column("Fit [s]", 1),
+        Column("Seeds", 0),
         Column("Level"),
         Column("Badge"),
         Column("Entry"),
     )
-    rows: list[tuple[Cell, ...]] = []
-    for entry in order:
-        rank = ranks.get(entry.name)
-        fits = [c.fit_seconds for c in entry.results.captures if c.fit_seconds is not None]
-        rows.append(
+    cells: list[tuple[Cell, ...]] = []
+    for row in order:
+        first = row.entries[0].name
+        rank = ranks.get(first)
+        cells.append(
             (
-                titles[entry.name],
+                titles[first],
                 rank.rank if rank else None,
                 _interval(rank) if rank else None,
-                *(entry.results.scores[name] for name in HEADLINE),
-                sum(fits) / len(fits) if fits else None,
-                entry.level,
-                entry.badge,
-                entry.name,
+                *(row.scores[name] for name in HEADLINE),
+                row.fit_seconds,
+                len(row.seeds),
+                row.level,
+                row.badge,
+                ", ".join(entry.name for entry in row.entries),
             )
         )
     notes = [sentence] if sentence else []
-    lacking = frozenset(place for place, entry in enumerate(order) if entry not in whole)
+    lacking = frozenset(place for place, row in enumerate(order) if not row.whole)
     if lacking:
         notes.append("Rows that lack captures or test frames of the suite have no rank.")
     if protocol != HWP_V1.name:
@@ -82,7 +80,7 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
     return Table(
         f"Suite {suite}, protocol {protocol}",
         columns,
-        tuple(rows),
+        tuple(cells),
         tuple(notes),
         unranked=lacking,
     )
@@ -92,22 +90,22 @@ def _interval(rank: Rank) -> str:
     return f"{rank.best}" if rank.best == rank.worst else f"{rank.best} to {rank.worst}"
 
 
-def _ranks(entries: Sequence[Entry]) -> tuple[dict[str, Rank], str]:
-    """Return the rank of each entry by its name, and the sentence that says who wins."""
-    if not entries:
+def _ranks(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
+    """Return ranks by the name of a row's first entry, and the sentence that says who wins."""
+    results = [entry.results for row in rows if row.whole for entry in row.entries]
+    if not results:
         return {}, ""
     try:
-        runs = group_runs([entry.results for entry in entries])
+        runs = group_runs(results)
         ranking = rank_methods(runs, METRIC)
     except UsageError as error:
         # Such as one run that was submitted twice, or methods without a seed in common.
         return {}, f"No ranks: {error.problem}."
     by_label = {item.standing.label: item for item in ranking.ranks}
-    names = {
-        entry.name: by_label[run.label] for entry in entries for run in runs if _has(run, entry)
+    found = {
+        row.entries[0].name: by_label[run.label]
+        for row in rows
+        for run in runs
+        if any(row.first is results for results in run.seeds.values())
     }
-    return names, verdict(ranking)
-
-
-def _has(run: MethodRuns, entry: Entry) -> bool:
-    return any(results is entry.results for results in run.seeds.values())
+    return found, verdict(ranking)

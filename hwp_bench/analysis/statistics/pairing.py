@@ -45,6 +45,17 @@ def _capture(results: Results, identifier: str) -> CaptureResult:
     return next(capture for capture in results.captures if capture.id == identifier)
 
 
+def same_but_seed(result: Results) -> str:
+    """Return a digest (hex) that two evaluations share when they differ in nothing but the seed.
+
+    Method, preset, settings, budget, kind of training frames and suite count; machine and captures
+    do not.
+    """
+    method = result.method
+    state = [method.name, method.title, method.digest, method.preset, method.settings]
+    return sha256_json([state, result.budget, result.frames, result.suite])
+
+
 def group_runs(results: Sequence[Results]) -> list[MethodRuns]:
     """Put evaluations that differ in nothing but the seed together, in the order given.
 
@@ -53,13 +64,11 @@ def group_runs(results: Sequence[Results]) -> list[MethodRuns]:
     """
     groups: dict[str, dict[int, Results]] = {}
     for result in results:
-        method = result.method
-        state = [method.name, method.title, method.digest, method.preset, method.settings]
-        key = sha256_json([state, result.budget, result.frames, result.suite])
-        seeds = groups.setdefault(key, {})
+        seeds = groups.setdefault(same_but_seed(result), {})
         if result.seed in seeds:
             raise UsageError(
-                f"two results are of {method.title} with seed {result.seed} and the same settings",
+                f"two results are of {result.method.title} with seed {result.seed} and the same "
+                "settings",
                 remedy="Give each result once.",
             )
         seeds[result.seed] = result

@@ -1,0 +1,88 @@
+"""Rows of several seeds. Oracle: means of constructed scores, and constructed checks."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from made_entries import complete_results
+
+from hwp_bench.leaderboard.board_rows import board_rows
+from hwp_bench.leaderboard.entries import make_entry
+from hwp_bench.leaderboard.records import Check, Submission
+from hwp_bench.leaderboard.standings import board_tables
+
+
+def results(name: str, level: float, seed: int):
+    """Every frame of a method scores its level, which moves by a decibel from seed to seed."""
+    found = complete_results(name, lambda capture, frame: level + seed, suite_name="mini")
+    return replace(found, seed=seed)
+
+
+def check(entry, kind: str, verdict: str) -> Check:
+    return Check(
+        entry=entry.name,
+        entry_digest=entry.digest,
+        kind=kind,
+        verdict=verdict,
+        date="2026-01-01T00:00:00+00:00",
+        by="us",
+        toolkit="0.1.0",
+        code="c",
+        machine="m",
+        frames=1,
+        cross_checked=1,
+        differences=0,
+    )
+
+
+def test_entries_that_differ_in_the_seed_alone_are_one_row_of_means() -> None:
+    mine = [make_entry(results("mine", 24.0, seed)) for seed in (2, 0, 1)]
+    plain = make_entry(results("plain", 20.0, 0))
+    (table,) = board_tables([mine[0], plain, *mine[1:]])
+    columns = [column.title for column in table.columns]
+    rows = [dict(zip(columns, row, strict=True)) for row in table.rows]
+    assert [(row["Method"], row["Seeds"]) for row in rows] == [("Mine", 3), ("Plain", 1)]
+    assert table.rows[0][columns.index("95 %") + 1] == pytest.approx(25.0)
+    assert rows[0]["Entry"] == ", ".join(mine[place].name for place in (1, 2, 0))
+    assert table.notes[0].startswith("Mine wins with PSNR ")
+
+
+def test_another_budget_is_another_row() -> None:
+    first = results("mine", 24.0, 0)
+    longer = replace(results("mine", 24.0, 1), budget={"seconds": 99.0})
+    assert [row.seeds for row in board_rows(map(make_entry, (first, longer)))] == [(0,), (1,)]
+
+
+def test_an_incomplete_entry_and_a_second_one_of_a_seed_stand_alone() -> None:
+    whole = make_entry(results("mine", 24.0, 0))
+    short = make_entry(replace(results("mine", 24.0, 1), captures=whole.results.captures[1:]))
+    twin = make_entry(whole.results, Submission(by="B"))
+    rows = board_rows([whole, short, twin])
+    assert [row.entries for row in rows] == [(whole,), (short,), (twin,)]
+    assert [row.whole for row in rows] == [True, False, True]
+
+
+def test_a_row_was_checked_as_far_as_every_one_of_its_entries() -> None:
+    first, second = (make_entry(results("mine", 24.0, seed)) for seed in (0, 1))
+    first = replace(first, checks=(check(first, "re-run", "reproduces"),))
+    (row,) = board_rows([first, second])
+    assert (row.level, row.badge) == ("self-reported", "not tried")
+    second = replace(second, checks=(check(second, "rescored", "reproduces"),))
+    (row,) = board_rows([first, second])
+    assert (row.level, row.badge) == ("rescored", "scores hold")
+    second = replace(second, checks=(check(second, "rescored", "differs"),))
+    (row,) = board_rows([first, second])
+    assert row.badge == "differs"
+
+
+def test_seconds_are_means_over_seeds_or_unknown() -> None:
+    def timed(seed: int, seconds: float | None):
+        made = results("mine", 24.0, seed)
+        captures = tuple(replace(one, fit_seconds=seconds) for one in made.captures)
+        return make_entry(replace(made, captures=captures))
+
+    (row,) = board_rows([timed(0, 10.0), timed(1, 20.0)])
+    assert row.fit_seconds == pytest.approx(15.0)
+    (row,) = board_rows([timed(0, None)])
+    assert row.fit_seconds is None
