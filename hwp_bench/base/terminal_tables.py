@@ -149,13 +149,16 @@ def _total(widths: Sequence[int]) -> int:
 
 
 def _narrowed(table: Table, widths: Sequence[int], keys: int, width: int) -> list[int]:
-    """Return widths with texts folded: those that name rows leave half of the line to numbers."""
+    """Return widths with texts folded.
+
+    Those that name rows are folded until all fits, or until they leave half of the line to numbers.
+    """
     least, most = _FOLDED
     found = list(widths)
     for index in range(keys):
         if not _is_number(table, index):
             found[index] = min(found[index], most)
-    while _total(found[:keys]) > max(width // 2, least):
+    while _total(found[:keys]) > max(width // 2, least) and _total(found) > width:
         wide = [i for i in range(keys) if not _is_number(table, i) and found[i] > least]
         if not wide:
             break
@@ -214,14 +217,52 @@ def _block_lines(
         lines.append(_joined(table, columns, widths, [head[depth] for head in heads], "bold"))
     lines.append(rule)
     styles = {0: "bold", 1: "underline", None: ""}
-    for row in range(len(table.rows)):
+    cells = _row_parts(table, columns, widths, marks)
+    for row, parts in enumerate(cells):
         lines += [rule] if row in table.breaks else []
-        cells = [_parts(_cell(table, row, i, marks), widths[i]) for i in columns]
-        for depth in range(max(map(len, cells))):
-            pieces = [cell[depth] if depth < len(cell) else "" for cell in cells]
-            ranks = [styles[table.rank(row, i)] for i in columns]
+        ranks = [styles[table.rank(row, i)] for i in columns]
+        for depth in range(max(map(len, parts))):
+            pieces = [part[depth] if depth < len(part) else "" for part in parts]
             lines.append(_joined(table, columns, widths, pieces, ranks))
     return lines
+
+
+def _row_parts(
+    table: Table, columns: Sequence[int], widths: Sequence[int], marks: bool
+) -> list[list[list[str]]]:
+    """Return the folded lines of each cell of each row.
+
+    Where blocks of rows begin with the same texts, a text stands once and flows down over the rows
+    that repeat it. The last column that names rows is always printed.
+    """
+    found = [
+        [_parts(_cell(table, row, i, marks), widths[i]) for i in columns]
+        for row in range(len(table.rows))
+    ]
+    if not table.breaks:
+        return found
+    named = sum(1 for i in columns if i < _keys(table)) - 1
+    for place in range(named):
+        for run in _repeats(table, columns[: place + 1]):
+            left = found[run[0]][place]
+            for row in run:
+                own = max(len(part) for part in found[row][place + 1 :])
+                room = len(left) if row == run[-1] else own
+                found[row][place], left = left[:room], left[room:]
+    return found
+
+
+def _repeats(table: Table, columns: Sequence[int]) -> list[list[int]]:
+    """Return the runs of rows of one block that have the same texts in some columns."""
+    runs: list[list[int]] = []
+    for row in range(len(table.rows)):
+        texts = [table.text(row, i) for i in columns]
+        again = runs and row not in table.breaks
+        if again and texts == [table.text(runs[-1][0], i) for i in columns]:
+            runs[-1].append(row)
+        else:
+            runs.append([row])
+    return runs
 
 
 def _parts(text: str, width: int) -> list[str]:

@@ -118,3 +118,47 @@ def test_long_texts_are_folded_and_lines_separate_blocks() -> None:
     assert sum(line.count("word") for line in lines) == 30
     assert "".join(lines).count("a" * 12) >= 3
     assert sum(set(line) == {"─"} for line in lines) == 2
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.lists(NUMBERS, min_size=2, max_size=12), st.integers(1, 4), st.integers(40, 90))
+def test_a_block_says_once_what_its_rows_share(
+    numbers: list[float | None], size: int, width: int
+) -> None:
+    rows = tuple(
+        (f"block{place // size}", f"row{place}", number) for place, number in enumerate(numbers)
+    )
+    columns = (Column("Block"), Column("Row"), Column("Value", 2, True))
+    table = Table("T", columns, rows, breaks=tuple(range(size, len(rows), size)))
+    words = [word for line in table_lines(table, width) for word in line.text.split()]
+    repeats = range(0, len(rows), size) if table.breaks else range(len(rows))
+    assert [word for word in words if word.startswith("block")] == [rows[i][0] for i in repeats]
+    assert [word for word in words if word.startswith("row")] == [row[1] for row in rows]
+    assert all(table.text(row, 2) in words for row in range(len(rows)))
+
+
+def test_a_repeated_text_flows_down_over_the_rows_that_repeat_it() -> None:
+    columns = (Column("What is new"), Column("Class"), Column("Method"), Column("PSNR", 2, True))
+    what = "Angle to the nearest training normal of all"
+    rows = tuple(
+        (what, kind, method, 20.0 + place)
+        for place, (kind, method) in enumerate(
+            (kind, method) for kind in ("near", "far") for method in ("A", "B", "C")
+        )
+    )
+    printed = [line.text for line in table_lines(Table("T", columns, rows, breaks=(3,)), 30)]
+    assert printed[2:] == [
+        "What is new   Class  Method      ↑",
+        "──────────────────────────────────",
+        "Angle to the  near   A       20.00",
+        "nearest              B       21.00",
+        "training             C       22.00",
+        "normal of",
+        "all",
+        "──────────────────────────────────",
+        "Angle to the  far    A       23.00",
+        "nearest              B       24.00",
+        "training             C       25.00",
+        "normal of",
+        "all",
+    ]
