@@ -12,14 +12,14 @@ if TYPE_CHECKING:
     from hwp_bench.importers.video import ImportedClip
 
 _EXAMPLES = """examples:
+  hwp-bench data track hand.mp4
   hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture
   hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture --focal 1020 --hand left
   hwp-bench data import-video hand.mp4 --landmarks hand.npz part --frames 100:400 --stride 2
 
-LANDMARKS.npz comes from a hand tracker such as MediaPipe and holds, for every frame of the
-video, image (F, 21, 2 or 3) in pixels, world (F, 21, 3) in metres and score (F,) in [0, 1];
-score 0 means that no hand was seen. docs/video.md explains how to make it and how to read the
-result.
+LANDMARKS.npz comes from `hwp-bench data track` or another hand tracker and contains, for every
+frame of the video, image (F, 21, 2 or 3) in pixels, world (F, 21, 3) in metres and score (F,) in
+[0, 1]; score 0 means that no hand was seen. docs/video.md explains how to read the result.
 """
 
 
@@ -33,7 +33,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--landmarks", type=Path, required=True, metavar="LANDMARKS.npz", help="tracked landmarks"
     )
     parser.add_argument(
-        "--hand", choices=("right", "left"), default="right", help="which hand (default: right)"
+        "--hand",
+        choices=("right", "left"),
+        help="which hand (default: the one that is seen most, if the landmarks say its side; else "
+        "right)",
     )
     parser.add_argument(
         "--focal", type=float, metavar="PX", help="focal length of the whole frame; else estimated"
@@ -79,10 +82,11 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     # FFmpeg would print its own messages about a damaged video next to our one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    from hwp_bench.importers.shared.hand_tracks import tracked_side
     from hwp_bench.importers.video import VideoImport, import_video, parse_frame_range
 
     options = VideoImport(
-        hand=args.hand,
+        hand=args.hand or tracked_side(args.landmarks),
         focal=args.focal,
         masks=args.masks,
         size=args.size,

@@ -27,6 +27,7 @@ def command_tree() -> Command:
         "get": Command("download a public data set", f"{here}.data_get"),
         "import": Command("make captures of other data", commands=imports),
         "import-video": Command("make a capture of a video", f"{here}.import_video"),
+        "track": Command("track the hands of a video", f"{here}.data_track"),
         "publish": Command(
             "divide captures into a public and a sealed part", f"{here}.data_publish"
         ),

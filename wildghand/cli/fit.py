@@ -31,7 +31,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("-o", "--out", type=Path, required=True, help="avatar folder to make")
     parser.add_argument("--landmarks", type=Path, metavar="NPZ", help="landmarks of a video")
     parser.add_argument(
-        "--side", choices=("right", "left"), default="right", help="the hand in a video"
+        "--side",
+        choices=("right", "left"),
+        help="the hand in a video (default: as the landmarks say, else right)",
     )
     parser.add_argument(
         "--hand", default="anny", metavar="MODEL", help="hand model for a video: anny or mano:PATH"
@@ -138,8 +140,9 @@ def _capture(args: argparse.Namespace) -> Path:
             "is a file; a video needs the landmarks that a tracker found in it",
             where=args.source,
             field="--landmarks",
-            remedy="docs/video.md says how to make them.",
+            remedy="`hwp-bench data track VIDEO` makes them.",
         )
+    from hwp_bench.importers.shared.hand_tracks import tracked_side
     from hwp_bench.importers.video import VideoImport, import_video
 
     folder = args.out.with_name(args.out.name + ".capture")
@@ -148,6 +151,6 @@ def _capture(args: argparse.Namespace) -> Path:
             args.source,
             args.landmarks,
             folder,
-            VideoImport(hand=args.side, hand_model=args.hand),
+            VideoImport(hand=args.side or tracked_side(args.landmarks), hand_model=args.hand),
         )
     return folder

@@ -10,6 +10,7 @@ import numpy as np
 
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.errors import BadInput
+from hwp_bench.importers.shared.hand_tracks import tracks_of
 
 #: MediaPipe (= OpenPose) order, the order of every landmark array in this package.
 LANDMARK_NAMES = (
@@ -49,13 +50,17 @@ class Landmarks:
         )
 
 
-def read_landmarks(path: str | os.PathLike[str], *, min_score: float) -> Landmarks:
+def read_landmarks(
+    path: str | os.PathLike[str], *, min_score: float, side: str | None = None
+) -> Landmarks:
     """Read a tracker's npz file.
 
     Args:
         path: npz with `image` (F, 21, 2 or 3), `world` (F, 21, 3) and `score` (F,). A frame in
             which the tracker saw nothing has score 0; its landmarks may be NaN.
         min_score: frames below this score count as not detected.
+        side: `right` or `left`: the hand that is read where the file has several (version 2) and
+            one is of this side; else that which is seen most.
 
     Returns:
         The landmarks; values of frames that are not detected are zero.
@@ -66,7 +71,7 @@ def read_landmarks(path: str | os.PathLike[str], *, min_score: float) -> Landmar
             hand.
     """
     path = Path(path)
-    arrays = _load(path)
+    arrays = _load(path, side)
     image, world, score = (_floats(path, arrays, name) for name in ("image", "world", "score"))
     frames = len(score) if score.ndim == 1 else -1
     if frames < 1:
@@ -152,8 +157,16 @@ def check_against_video(
     return Landmarks(landmarks.image, landmarks.world, landmarks.score, detected)
 
 
-def _load(path: Path) -> dict[str, np.ndarray]:
+def _load(path: Path, side: str | None) -> dict[str, np.ndarray]:
     arrays = read_npz(path)
+    tracks = None if side is None else tracks_of(arrays, path)
+    hand = None if tracks is None or side is None else tracks.hand_of(side)
+    if tracks is not None and hand is not None:
+        return {
+            "image": tracks.image[hand],
+            "world": tracks.world[hand],
+            "score": tracks.score[hand],
+        }
     missing = [name for name in ("image", "world", "score") if name not in arrays]
     if missing:
         raise BadInput(f"lacks the arrays {', '.join(missing)}", where=path)

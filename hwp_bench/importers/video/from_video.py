@@ -11,6 +11,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.progress import progress
 from hwp_bench.capture.schema import MAX_FRAMES, check_id
 from hwp_bench.hands import load_template
+from hwp_bench.importers.shared.hand_tracks import warn_of_other_side
 from hwp_bench.importers.shared.landmarks import check_against_video, read_landmarks
 from hwp_bench.importers.shared.windows import follow_hand
 from hwp_bench.importers.shared.writing import refuse_existing
@@ -67,7 +68,8 @@ def read_source(
 ) -> VideoSource:
     """Read and check everything that the import needs from outside."""
     info = probe(video)
-    every = read_landmarks(landmarks, min_score=options.min_score)
+    every = read_landmarks(landmarks, min_score=options.min_score, side=options.hand)
+    warn_of_other_side(landmarks, options.hand)
     # Containers may state a wrong number of frames. A whole video is counted as it is decoded.
     # The end of a part is never read, so the header is trusted.
     part = options.frames.stop is not None

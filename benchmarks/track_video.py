@@ -1,0 +1,106 @@
+"""Hand tracking: distance from MediaPipe's own landmarks, speed, and the runtimes of the networks.
+
+Run from the repository: `python -m benchmarks.track_video VIDEO [--landmarks NPZ]`, where NPZ is the
+file that `tools/track_mediapipe.py` made of the video; or `python -m benchmarks.track_video
+--runtimes`, which times each network in LiteRT and in OpenCV's DNN module. Both need the networks
+(`hwp-bench data track --fetch`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from hwp_bench.importers.shared.hand_tracks import HandTracks
+from hwp_bench.importers.shared.landmarks import read_landmarks
+from hwp_bench.tracking import track_video
+from hwp_bench.tracking.model_files import load_models
+from hwp_bench.tracking.networks import LiteRtNetworks
+
+#: Calls of a network that are timed.
+CALLS = 20
+
+
+def agreement(hands: HandTracks, landmarks: Path) -> dict[str, float]:
+    """Distances in px and mm from another tracker's landmarks, and frames that one of them lacks."""
+    other = read_landmarks(landmarks, min_score=0.0)
+    seen = hands.seen(0)
+    both = seen & other.detected
+    pixels = np.linalg.norm(hands.image[0, both, :, :2] - other.image[both], axis=2)
+    metres = np.linalg.norm(hands.world[0, both] - other.world[both], axis=2)
+    frames = pixels.mean(axis=1)
+    return {
+        "frames": float(len(seen)),
+        "only here": float((seen & ~other.detected).sum()),
+        "only there": float((other.detected & ~seen).sum()),
+        "median px": float(np.median(pixels)),
+        "95th percentile px": float(np.percentile(pixels, 95)),
+        "99th percentile px": float(np.percentile(pixels, 99)),
+        "frames above 1 px": float((frames > 1).sum()),
+        "frames above 3 px": float((frames > 3).sum()),
+        "median mm": float(np.median(metres) * 1000),
+    }
+
+
+def runtimes() -> dict[str, float]:
+    """Milliseconds of processor time of one call of each network, one thread."""
+    cv2.setNumThreads(1)
+    models, rng = load_models(), np.random.default_rng(0)
+    ours = LiteRtNetworks(models)
+    found = {}
+    for name, content, edge, call in (
+        ("palm", models.palm, 192, ours.palms),
+        ("hand", models.hand, 224, ours.hand),
+    ):
+        image = rng.integers(0, 256, (edge, edge, 3), dtype=np.uint8)
+        net = cv2.dnn.readNetFromTFLite(np.frombuffer(content, np.uint8))
+        net.setInput(cv2.dnn.blobFromImage(image, 1 / 255))
+        found[f"{name}, LiteRT"] = _milliseconds(lambda call=call, image=image: call(image))
+        found[f"{name}, OpenCV"] = _milliseconds(net.forward)
+    return found
+
+
+def _milliseconds(call: Callable[[], object]) -> float:
+    """Mean processor time of a call, after one that does not count."""
+    call()
+    began = time.process_time()
+    for _ in range(CALLS):
+        call()
+    return (time.process_time() - began) / CALLS * 1000
+
+
+def _show(values: Mapping[str, float]) -> None:
+    for name, value in values.items():
+        print(f"{name:24s} {value:10.3f}")
+
+
+def main() -> int:
+    """Run the benchmark; returns the exit status."""
+    parser = argparse.ArgumentParser(description="Distance from MediaPipe, and speed.")
+    parser.add_argument("video", type=Path, nargs="?")
+    parser.add_argument("--landmarks", type=Path, help="made by tools/track_mediapipe.py")
+    parser.add_argument("--runtimes", action="store_true", help="time the networks alone")
+    args = parser.parse_args()
+    if args.runtimes:
+        _show(runtimes())
+    if args.video is not None:
+        began = time.process_time()
+        with tempfile.TemporaryDirectory() as folder:
+            tracked = track_video(args.video, Path(folder) / "hands.npz")
+        spent = time.process_time() - began
+        frames = tracked.hands.score.shape[1]
+        _show({"seconds": tracked.seconds, "ms of processor/frame": spent / frames * 1000})
+        if args.landmarks is not None:
+            _show(agreement(tracked.hands, args.landmarks))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,128 @@
+"""`hwp-bench data track`. Oracle: videos of discs; what the importer reads of the result."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from fake_networks import LAYOUT, RADIUS, SIZE, FakeNetworks, picture
+
+from hwp_bench.base.arrays import write_npz
+from hwp_bench.base.errors import BadInput
+from hwp_bench.cli.main import main
+from hwp_bench.importers.shared.hand_tracks import (
+    read_hand_tracks,
+    tracked_side,
+    warn_of_other_side,
+)
+from hwp_bench.importers.shared.landmarks import read_landmarks
+from hwp_bench.tracking import track_video
+
+
+def write_video(path: Path, clip: list[dict[str, tuple[float, float]]]) -> Path:
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 30, SIZE)
+    for discs in clip:
+        writer.write(np.ascontiguousarray(picture(discs)[:, :, ::-1]))
+    writer.release()
+    return path
+
+
+@pytest.fixture
+def video(tmp_path: Path) -> Path:
+    """A left hand in eight frames, and a right one in the first four."""
+    clip: list[dict[str, tuple[float, float]]] = [{"left": (40 + k, 60)} for k in range(8)]
+    for k in range(4):
+        clip[k]["right"] = (120, 60)
+    return write_video(tmp_path / "hands.avi", clip)
+
+
+def test_the_importer_reads_each_hand(video: Path, tmp_path: Path) -> None:
+    out = tmp_path / "hands.npz"
+    tracked = track_video(video, out, networks=FakeNetworks())
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["hands.avi", "hands.npz"]
+    left = read_landmarks(out, min_score=0.5, side="left")
+    np.testing.assert_allclose(left.image[0], [40, 60] + LAYOUT * RADIUS, atol=2)
+    assert left.detected.all()
+    right = read_landmarks(out, min_score=0.5, side="right")
+    np.testing.assert_array_equal(right.detected, np.arange(8) < 4)
+    # A reader of version 1 finds the hand that is seen most.
+    np.testing.assert_array_equal(read_landmarks(out, min_score=0.5).image, left.image)
+    assert tracked_side(out) == "left"
+    read = read_hand_tracks(out)
+    assert read is not None
+    assert read.size == SIZE
+    for name in ("image", "world", "score", "right", "track"):
+        np.testing.assert_array_equal(getattr(read, name), getattr(tracked.hands, name))
+
+
+def test_a_side_that_the_pictures_contradict_is_a_warning(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    video = write_video(tmp_path / "one.avi", [{"right": (60, 60)}] * 5)
+    track_video(video, tmp_path / "one.npz", networks=FakeNetworks())
+    capsys.readouterr()
+    warn_of_other_side(tmp_path / "one.npz", "right")
+    assert capsys.readouterr().err == ""
+    warn_of_other_side(tmp_path / "one.npz", "left")
+    said = capsys.readouterr().err
+    assert "in 5 frames the tracker votes right 0.95, left 0.05" in said
+    # Files of version 1 say nothing of sides.
+    arrays = {"image": np.ones((1, 21, 3)), "world": np.ones((1, 21, 3)), "score": np.ones(1)}
+    old = write_npz(tmp_path / "old.npz", arrays)
+    warn_of_other_side(old, "left")
+    assert capsys.readouterr().err == ""
+    assert tracked_side(old) == "right"
+    newer = write_npz(tmp_path / "newer.npz", {**arrays, "version": np.array([3])})
+    with pytest.raises(BadInput, match="newer version"):
+        read_hand_tracks(newer)
+
+
+def test_the_command(
+    video: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from hwp_bench.tracking import track_video as module_function  # noqa: F401
+
+    module = sys.modules["hwp_bench.tracking.track_video"]
+    monkeypatch.setattr(module, "load_models", lambda model: None)
+    monkeypatch.setattr(module, "LiteRtNetworks", lambda models: FakeNetworks())
+    sheet = video.with_name("sheet.png")
+    assert main(["data", "track", str(video), "--sheet", str(sheet), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["frames"] == 8
+    assert [hand["side"] for hand in facts["hands"]] == ["left", "right"]
+    assert [hand["frames_seen"] for hand in facts["hands"]] == [8, 4]
+    assert sheet.stat().st_size > 1000
+    assert main(["data", "track", str(video)]) == 2
+    assert "exists already" in capsys.readouterr().err
+    assert main(["data", "track", str(video), "--force"]) == 0
+    assert "left hand: seen in 8 frames" in capsys.readouterr().out
+    empty = write_video(video.with_name("empty.avi"), [{}] * 3)
+    assert main(["data", "track", str(empty)]) == 1
+    said = capsys.readouterr().err
+    assert "none of 3 frames shows a hand" in said
+    assert "Traceback" not in said
+    assert not empty.with_suffix(".npz").exists()
+
+
+def test_mistakes_are_one_line(
+    video: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "cache"))
+    broken = tmp_path / "broken.avi"
+    broken.write_bytes(b"RIFF")
+    for arguments, status, message in (
+        (["data", "track"], 2, "VIDEO is missing"),
+        (["data", "track", str(tmp_path / "none.mp4")], 1, "does not exist"),
+        (["data", "track", str(broken)], 1, "broken.avi"),
+        (["data", "track", str(video), "-o", str(tmp_path / "x.txt")], 2, ".npz"),
+        (["data", "track", str(video), "--model", str(broken)], 1, "not a readable archive"),
+        (["data", "track", str(video), "--min-confidence", "2"], 2, "between 0 and 1"),
+    ):
+        assert main(arguments) == status, arguments
+        said = capsys.readouterr().err
+        assert message in said
+        assert "Traceback" not in said
