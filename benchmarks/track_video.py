@@ -1,7 +1,7 @@
 """Hand tracking: distance from MediaPipe's own landmarks, speed, and the runtimes of the networks.
 
-Run from the repository: `python -m benchmarks.track_video VIDEO [--landmarks NPZ]`, where NPZ is the
-file that `tools/track_mediapipe.py` made of the video; or `python -m benchmarks.track_video
+Run from the repository: `python -m benchmarks.track_video VIDEO [--landmarks NPZ]`, where NPZ is
+the file that `tools/track_mediapipe.py` made of the video; or `python -m benchmarks.track_video
 --runtimes`, which times each network in LiteRT and in OpenCV's DNN module. Both need the networks
 (`hwp-bench data track --fetch`).
 """
@@ -29,7 +29,7 @@ CALLS = 20
 
 
 def agreement(hands: HandTracks, landmarks: Path) -> dict[str, float]:
-    """Distances in px and mm from another tracker's landmarks, and frames that one of them lacks."""
+    """Distances in px and mm from another tracker's landmarks, and frames that one lacks."""
     other = read_landmarks(landmarks, min_score=0.0)
     seen = hands.seen(0)
     both = seen & other.detected

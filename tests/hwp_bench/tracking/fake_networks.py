@@ -12,8 +12,8 @@ from hwp_bench.tracking.palms import PALM_EDGE, anchors
 
 #: Size of the pictures, (width, height), and the discs' radius, px.
 SIZE, RADIUS = (160, 120), 9
-#: An open hand around a disc's centre, in units of the radius, y down; straight upwards, since a disc
-#: does not say how it is turned.
+#: An open hand around a disc's centre, in units of the radius, y down; straight upwards, since a
+#: disc does not say how it is turned.
 LAYOUT = np.array(
     [(0, 1.2)]
     + [(-1.1 + 0.1 * k, 0.6 - 0.3 * k) for k in range(4)]
