@@ -53,8 +53,8 @@ class LiteRtNetworks:
                 "ai-edge-litert is not installed, which runs the networks of the hand tracker",
                 remedy="pip install 'hwp-bench[track]'",
             ) from error
-        palm_outputs = [(1, ANCHOR_COUNT, PALM_VALUES), (1, ANCHOR_COUNT, 1)]
-        hand_outputs = [(1, 63), (1, 1), (1, 1), (1, 63)]
+        palm_outputs: list[tuple[int, ...]] = [(1, ANCHOR_COUNT, PALM_VALUES), (1, ANCHOR_COUNT, 1)]
+        hand_outputs: list[tuple[int, ...]] = [(1, 63), (1, 1), (1, 1), (1, 63)]
         self._palm = _Network(runtime, models.palm, models.source, PALM_EDGE, palm_outputs, threads)
         self._hand = _Network(runtime, models.hand, models.source, HAND_EDGE, hand_outputs, threads)
 

@@ -33,7 +33,7 @@ def landmark_sheet(tracked: TrackedVideo, *, count: int = 16, edge: int = 320) -
     frames = tracked.hands.score.shape[1]
     stride = -(-frames // count)
     left, top, right, bottom = _window(tracked.hands)
-    tiles = []
+    tiles: list[np.ndarray] = []
     for index, frame in read_frames(tracked.video, FrameRange(stride=stride)):
         if index < frames and len(tiles) < count:
             part = np.ascontiguousarray(frame[top:bottom, left:right])
