@@ -2,8 +2,9 @@
 
 Run from the repository: `python -m benchmarks.track_video VIDEO [--landmarks NPZ]`, where NPZ is
 the file that `tools/track_mediapipe.py` made of the video; or `python -m benchmarks.track_video
---runtimes`, which times each network in LiteRT and in OpenCV's DNN module. Both need the networks
-(`hwp-bench data track --fetch`).
+--runtimes`, which times each network in LiteRT and in OpenCV's DNN module. With `--mirrored` each
+frame of the video is put next to its mirror image, so that there are two hands of known sides. All
+need the networks (`hwp-bench data track --fetch`).
 """
 
 from __future__ import annotations
@@ -12,7 +13,7 @@ import argparse
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 
 import cv2
@@ -20,9 +21,12 @@ import numpy as np
 
 from hwp_bench.importers.shared.hand_tracks import HandTracks
 from hwp_bench.importers.shared.landmarks import read_landmarks
-from hwp_bench.tracking import track_video
+from hwp_bench.importers.video.decode import probe, read_frames
+from hwp_bench.importers.video.video_settings import FrameRange
+from hwp_bench.tracking import TrackerSettings, track_video
 from hwp_bench.tracking.model_files import load_models
 from hwp_bench.tracking.networks import LiteRtNetworks
+from hwp_bench.tracking.track_video import track_frames
 
 #: Calls of a network that are timed.
 CALLS = 20
@@ -46,6 +50,47 @@ def agreement(hands: HandTracks, landmarks: Path) -> dict[str, float]:
         "frames above 1 px": float((frames > 1).sum()),
         "frames above 3 px": float((frames > 3).sum()),
         "median mm": float(np.median(metres) * 1000),
+    }
+
+
+def mirrored(video: Path) -> dict[str, float]:
+    """Hands and sides that are found in a video of one hand next to its mirror image.
+
+    The right half is the video, so that its hands are of the video's side and those of the left
+    half of the other. Two hands must have landmarks that mirror each other.
+    """
+
+    def frames() -> Iterator[np.ndarray]:
+        for _, frame in read_frames(probe(video), FrameRange()):
+            half = cv2.resize(frame, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA)
+            yield np.concatenate([half[:, ::-1], half], axis=1)
+
+    info = probe(video)
+    width = 2 * (info.width // 2)
+    networks = LiteRtNetworks(load_models())
+    collected = track_frames(frames(), networks, TrackerSettings())
+    hands = collected.hands((width, info.height // 2), 2)
+    if hands is None or len(hands.score) != 2:
+        return {"hands": 0.0 if hands is None else 1.0}
+    x = hands.image[:, :, :, 0].mean(axis=2)
+    both = hands.seen(0) & hands.seen(1)
+    wrong = sum(
+        int(
+            (hands.seen(hand) & ((x[hand] > width / 2) != (x[hand][both].mean() > width / 2))).sum()
+        )
+        for hand in range(2)
+    )
+    flipped = hands.image[1, both, :, :2] * [-1, 1] + [width, 0]
+    apart = np.linalg.norm(hands.image[0, both, :, :2] - flipped, axis=2)
+    return {
+        "hands": 2.0,
+        "frames": float(collected.frames),
+        "frames with both": float(both.sum()),
+        "frames in the other half": float(wrong),
+        "tracks": float(sum(len(np.unique(hands.track[i][hands.seen(i)])) for i in range(2))),
+        "right, half of the video": hands.votes(int(x[0][both].mean() < width / 2))["right"],
+        "right, mirrored half": hands.votes(int(x[0][both].mean() > width / 2))["right"],
+        "median px apart": float(np.median(apart)),
     }
 
 
@@ -78,7 +123,7 @@ def _milliseconds(call: Callable[[], object]) -> float:
 
 def _show(values: Mapping[str, float]) -> None:
     for name, value in values.items():
-        print(f"{name:24s} {value:10.3f}")
+        print(f"{name:26s} {value:10.3f}")
 
 
 def main() -> int:
@@ -86,11 +131,14 @@ def main() -> int:
     parser = argparse.ArgumentParser(description="Distance from MediaPipe, and speed.")
     parser.add_argument("video", type=Path, nargs="?")
     parser.add_argument("--landmarks", type=Path, help="made by tools/track_mediapipe.py")
+    parser.add_argument("--mirrored", action="store_true", help="next to its mirror image")
     parser.add_argument("--runtimes", action="store_true", help="time the networks alone")
     args = parser.parse_args()
     if args.runtimes:
         _show(runtimes())
-    if args.video is not None:
+    if args.video is not None and args.mirrored:
+        _show(mirrored(args.video))
+    elif args.video is not None:
         began = time.process_time()
         with tempfile.TemporaryDirectory() as folder:
             tracked = track_video(args.video, Path(folder) / "hands.npz")
