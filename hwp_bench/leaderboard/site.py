@@ -12,10 +12,12 @@ from markupsafe import Markup
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, canonical_json
+from hwp_bench.leaderboard.board_rows import board_rows
 from hwp_bench.leaderboard.entries import Entry, digest
 from hwp_bench.leaderboard.gallery import write_gallery
 from hwp_bench.leaderboard.records import BADGES, LEVEL_TEXTS, Submission
-from hwp_bench.leaderboard.rules import SUITES, check_entries, current, history
+from hwp_bench.leaderboard.rules import SUITES, check_entries, current, history, tables_of
+from hwp_bench.leaderboard.standings import rank_interval, ranks_of
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import aggregate
@@ -178,12 +180,28 @@ def board_page(entries: Sequence[Entry], *, pictures: bool = False) -> str:
         (make_row(entry, entries) for entry in current(entries) if entry.protocol == HWP_V1.name),
         key=lambda row: (SUITES.index(row.suite), -(row.scores["macro"]["psnr"] or 0.0), row.name),
     )
+    ranks, verdicts = {}, {}
+    for (suite, protocol), found in tables_of(current(entries)).items():
+        if protocol == HWP_V1.name:
+            grouped = board_rows(found)
+            placed, verdicts[suite] = ranks_of(grouped)
+            # Every seed of a method shows the rank of the method.
+            ranks.update(
+                {
+                    entry.name: (rank.rank, rank_interval(rank))
+                    for row in grouped
+                    if (rank := placed.get(row.entries[0].name))
+                    for entry in row.entries
+                }
+            )
     return render_template(
         "hwp_bench.leaderboard",
         "board.html.j2",
         title=TITLE,
         style=style_sheet(),
         rows=rows,
+        ranks=ranks,
+        verdicts={suite: text for suite, text in verdicts.items() if text},
         scopes=SCOPES,
         metrics=[metric_facts(name) for name in METRICS],
         suites=[suite for suite in SUITES if any(row.suite == suite for row in rows)],

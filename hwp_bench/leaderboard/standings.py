@@ -31,7 +31,7 @@ def board_tables(entries: Sequence[Entry]) -> list[Table]:
 
 def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
     rows = board_rows(entries)
-    ranks, sentence = _ranks(rows)
+    ranks, sentence = ranks_of(rows)
     names = labels([row.first for row in rows])
     titles = {row.entries[0].name: name for row, name in zip(rows, names, strict=True)}
     order = sorted(
@@ -62,7 +62,7 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
             (
                 titles[first],
                 rank.rank if rank else None,
-                _interval(rank) if rank else None,
+                rank_interval(rank) if rank else None,
                 *(row.scores[name] for name in HEADLINE),
                 row.fit_seconds,
                 len(row.seeds),
@@ -86,12 +86,18 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
     )
 
 
-def _interval(rank: Rank) -> str:
+def rank_interval(rank: Rank) -> str:
+    """Return the ranks that the data allow in words: `1`, or `1 to 3`."""
     return f"{rank.best}" if rank.best == rank.worst else f"{rank.best} to {rank.worst}"
 
 
-def _ranks(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
-    """Return ranks by the name of a row's first entry, and the sentence that says who wins."""
+def ranks_of(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
+    """Return ranks by the name of a row's first entry, and the sentence that says who wins.
+
+    Args:
+        rows: of one suite and one version of the protocol. Those that lack a part of the suite
+            get no rank. Where the others cannot be ranked the sentence says why.
+    """
     results = [entry.results for row in rows if row.whole for entry in row.entries]
     if not results:
         return {}, ""

@@ -1,8 +1,9 @@
-"""The board on the terminal. Oracle: constructed scores."""
+"""Ranks on the terminal and on the site. Oracle: constructed scores."""
 
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from made_entries import complete_results
 from hwp_bench.cli.main import main
 from hwp_bench.leaderboard.entries import make_entry, write_check, write_entry
 from hwp_bench.leaderboard.records import Check, Submission
+from hwp_bench.leaderboard.site import board_page
 from hwp_bench.leaderboard.standings import board_tables
 
 
@@ -90,3 +92,42 @@ def test_the_command_shows_levels_and_badges_in_80_columns(
     (table,) = json.loads(capsys.readouterr().out)
     assert [row["Level"] for row in table["rows"]] == ["self-reported", "rescored"]
     assert main([*words, "--suite", "full"]) == 2
+
+
+def test_the_site_has_the_ranks_of_the_terminal_and_one_verdict_a_suite(entries) -> None:
+    page = board_page(entries)
+    assert re.findall(r'data-key="rank" data-number="(\d*)">(.*?)</td>', page) == [
+        ("", "–"),
+        ("1", "1"),
+        ("2", "2"),
+    ]
+    (sentence,) = re.findall(r'class="note verdict">(.*?)</p>', page)
+    assert sentence.startswith("mini: Mine wins with PSNR ")
+
+
+def test_the_site_says_which_ranks_the_data_allow_and_escapes_titles() -> None:
+    found = []
+    for name, sign in (("left", 1), ("right", -1)):
+        # Each is better on every other capture, by the same amount but for a hundredth.
+        results = complete_results(
+            name, lambda c, f, sign=sign: 25 + sign * ((-1) ** c + 0.01), suite_name="mini"
+        )
+        method = replace(results.method, title=f"<b>{name}</b>")
+        found.append(make_entry(replace(results, method=method)))
+    page = board_page(found)
+    ranks = re.findall(r'data-key="rank" data-number="(\d*)">(.*?)</td>', page)
+    assert sorted(ranks) == [("1", "1 (1 to 2)"), ("2", "2 (1 to 2)")]
+    assert "<b>left" not in page
+    assert "&lt;b&gt;left" in page.partition('note verdict">')[2]
+
+
+def test_every_seed_of_a_method_shows_the_rank_of_the_method_on_the_site() -> None:
+    found = []
+    for name, level, seeds in (("mine", 26.0, (0, 1)), ("plain", 25.0, (0,))):
+        for seed in seeds:
+            results = complete_results(name, scorer(level), suite_name="mini")
+            found.append(make_entry(replace(results, seed=seed)))
+    page = board_page(found)
+    ranks = re.findall(r'data-key="rank" data-number="(\d*)">(.*?)</td>', page)
+    assert sorted(ranks) == [("1", "1"), ("1", "1"), ("2", "2")]
+    assert len(re.findall(r'class="note verdict">', page)) == 1
