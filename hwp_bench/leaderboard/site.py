@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -12,112 +11,24 @@ from markupsafe import Markup
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, canonical_json
-from hwp_bench.leaderboard.board_rows import board_rows
+from hwp_bench.leaderboard.board_rows import BoardRow, board_rows
+from hwp_bench.leaderboard.curve_plot import curve_plot
 from hwp_bench.leaderboard.entries import Entry, digest
 from hwp_bench.leaderboard.gallery import write_gallery
-from hwp_bench.leaderboard.records import BADGES, LEVEL_TEXTS, Submission
-from hwp_bench.leaderboard.rules import SUITES, check_entries, current, history, tables_of
+from hwp_bench.leaderboard.lead import reference_lead
+from hwp_bench.leaderboard.method_pages import MethodPage, method_pages, write_method_pages
+from hwp_bench.leaderboard.page_row import METRICS, SCOPES, Row, budget_text, make_row
+from hwp_bench.leaderboard.records import BADGES, LEVEL_TEXTS
+from hwp_bench.leaderboard.rules import SUITES, check_entries, current, tables_of
 from hwp_bench.leaderboard.standings import rank_interval, ranks_of
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.metrics.aggregate import aggregate
 from hwp_bench.report.page.render import render_template, style_sheet, write_report
 from hwp_bench.report.sources import ResultsSource, open_captures_of
 from hwp_bench.results.published import NOTE, read_published
-from hwp_bench.results.schema import score_rows
-from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
-#: Metrics of the board.
-METRICS = ("psnr", "ssim", "oriented_distance")
-#: Scopes that can be chosen, with their headings.
-SCOPES = {
-    "macro": "All perturbations (macro mean)",
-    "single": "Single hands",
-    "interacting": "Interacting hands",
-    **{name: perturbation(name).heading for name in PERTURBATIONS},
-}
 #: Title of the site.
 TITLE = "HWP bench leaderboard"
-
-
-@dataclass(frozen=True)
-class Row:
-    """One measured row."""
-
-    #: Name of the entry.
-    name: str
-    #: Title of the method.
-    title: str
-    #: Its suite.
-    suite: str
-    #: Its budget in words.
-    budget: str
-    #: Device that the method says it ran on.
-    device: str
-    #: Seed of everything random.
-    seed: int
-    #: Day of the evaluation, ISO 8601.
-    date: str
-    #: Scores by scope and metric; None where the suite has no such capture.
-    scores: Mapping[str, Mapping[str, float | None]]
-    #: Mean seconds of a fit.
-    fit: float | None
-    #: Frames that failed.
-    failed: int
-    #: Name of the protocol of the scores; rows of two protocols are never in one table.
-    protocol: str
-    #: How far it was checked, one of `records.LEVELS`.
-    level: str
-    #: Its reproducibility badge, one of `records.BADGES`.
-    badge: str
-    #: What the submitter added: links, digests of avatars, what is revised and why.
-    submission: Submission
-    #: 1 for a first entry, one more for each correction.
-    revision: int
-
-
-def make_row(entry: Entry, entries: Sequence[Entry] = ()) -> Row:
-    """Return the row of an entry.
-
-    Args:
-        entry: the entry.
-        entries: those among which the ones that it revises are found.
-    """
-    results = entry.results
-    mean = aggregate(score_rows(results))
-    found: dict[str, Mapping[str, float]] = {
-        "macro": mean.overall.macro,
-        "single": mean.single.capture_mean if mean.single else {},
-        "interacting": mean.interacting.capture_mean if mean.interacting else {},
-        **mean.overall.perturbations,
-    }
-    fits = [c.fit_seconds for c in results.captures if c.fit_seconds is not None]
-    return Row(
-        name=entry.name,
-        title=results.method.title,
-        suite=results.suite,
-        budget=budget_text(results.budget),
-        device=", ".join(sorted({c.device for c in results.captures if c.device})) or "not said",
-        seed=results.seed,
-        date=results.started[:10],
-        scores={
-            scope: {name: found.get(scope, {}).get(name) for name in METRICS} for scope in SCOPES
-        },
-        fit=sum(fits) / len(fits) if fits else None,
-        failed=sum(capture.failed_frames for capture in results.captures),
-        protocol=entry.protocol,
-        level=entry.level,
-        badge=entry.badge,
-        submission=entry.submission,
-        revision=1 + len(history(entry, entries)),
-    )
-
-
-def budget_text(budget: Mapping[str, Any]) -> str:
-    """Return a budget in words: `60 s`, `500 steps`, `60 s, 500 steps` or `no limit`."""
-    units = {"seconds": "s", "steps": "steps"}
-    parts = [f"{budget[name]:g} {unit}" for name, unit in units.items() if budget.get(name)]
-    return ", ".join(parts) or "no limit"
 
 
 def build_site(
@@ -144,8 +55,11 @@ def build_site(
             for entry in current(entries)
             if digest(entry.results) in folders
         ]
-        scenes = write_gallery(temporary, shown, captures, _titles(entries))
-        page = board_page(entries, pictures=bool(scenes))
+        titles = _titles([entry for entry, _ in shown])
+        scenes = write_gallery(temporary, shown, captures, titles)
+        pages = method_pages(_rows(entries))
+        write_method_pages(temporary, pages, scenes)
+        page = board_page(entries, pictures=bool(scenes), pages=_addresses(pages))
         (temporary / "index.html").write_text(page, encoding="utf-8")
         (temporary / "board.js").write_text(script(), encoding="utf-8")
         if scenes:
@@ -169,31 +83,51 @@ def _titles(entries: Sequence[Entry]) -> dict[str, str]:
     }
 
 
-def board_page(entries: Sequence[Entry], *, pictures: bool = False) -> str:
+def _rows(entries: Sequence[Entry]) -> list[tuple[BoardRow, Row]]:
+    """The rows of this version's protocol with what the page shows of them, best first."""
+    found = [
+        (row, make_row(row, entries))
+        for (_, protocol), rows in tables_of(current(entries)).items()
+        if protocol == HWP_V1.name
+        for row in board_rows(rows)
+    ]
+    return sorted(
+        found,
+        key=lambda pair: (
+            SUITES.index(pair[1].suite),
+            -(pair[1].scores["macro"]["psnr"] or 0.0),
+            pair[1].name,
+        ),
+    )
+
+
+def _addresses(pages: Sequence[MethodPage]) -> dict[str, str]:
+    """The page of the method of each row, by the row's name."""
+    return {shown.name: page.path for page in pages for _, shown in page.rows}
+
+
+def board_page(
+    entries: Sequence[Entry], *, pictures: bool = False, pages: Mapping[str, str] | None = None
+) -> str:
     """Return the page of the board.
 
     Args:
         entries: the measured rows.
         pictures: whether the viewer's pictures lie next to the page.
+        pages: addresses of the methods' pages by the row's name; rows without one lead to a report.
     """
-    rows = sorted(
-        (make_row(entry, entries) for entry in current(entries) if entry.protocol == HWP_V1.name),
-        key=lambda row: (SUITES.index(row.suite), -(row.scores["macro"]["psnr"] or 0.0), row.name),
-    )
-    ranks, verdicts = {}, {}
-    for (suite, protocol), found in tables_of(current(entries)).items():
-        if protocol == HWP_V1.name:
-            grouped = board_rows(found)
-            placed, verdicts[suite] = ranks_of(grouped)
-            # Every seed of a method shows the rank of the method.
-            ranks.update(
-                {
-                    entry.name: (rank.rank, rank_interval(rank))
-                    for row in grouped
-                    if (rank := placed.get(row.entries[0].name))
-                    for entry in row.entries
-                }
-            )
+    found = _rows(entries)
+    rows = [shown for _, shown in found]
+    suites = list(dict.fromkeys(row.suite for row in rows))
+    ranks: dict[str, tuple[int, str]] = {}
+    leads, verdicts = [], {}
+    plots = {}
+    for suite in suites:
+        table = [row for row, shown in found if shown.suite == suite]
+        placed, verdicts[suite] = ranks_of(table)
+        ranks |= {name: (rank.rank, rank_interval(rank)) for name, rank in placed.items()}
+        leads.append(reference_lead(table))
+        plots[suite] = curve_plot(table)
     return render_template(
         "hwp_bench.leaderboard",
         "board.html.j2",
@@ -201,10 +135,13 @@ def board_page(entries: Sequence[Entry], *, pictures: bool = False) -> str:
         style=style_sheet(),
         rows=rows,
         ranks=ranks,
+        leads=[text for text in leads if text],
         verdicts={suite: text for suite, text in verdicts.items() if text},
+        plots={suite: plot for suite, plot in plots.items() if plot is not None},
+        pages=pages or {},
         scopes=SCOPES,
         metrics=[metric_facts(name) for name in METRICS],
-        suites=[suite for suite in SUITES if any(row.suite == suite for row in rows)],
+        suites=suites,
         budgets=list(dict.fromkeys(row.budget for row in rows)),
         published=_published(),
         note=NOTE,

@@ -49,6 +49,8 @@ PALETTE: Mapping[str, str] = {
 SERIES = 8
 #: Dashes of the series, in turn, so that no curve depends on its colour.
 DASHES: Sequence[Any] = ("-", (0, (7, 3)), (0, (2, 3)), (0, (9, 3, 2, 3)))
+#: Most methods whose bands are all drawn: more of them hide each other.
+_BANDS = 4
 #: Width of every figure, px; a page scales it.
 WIDTH = 460.0
 #: Marks an artist whose name becomes a class of the element in a page.
@@ -126,10 +128,10 @@ def heading(axes: Axes, text: str, above: float = 5.0) -> None:
 
 
 def series_style(index: int) -> dict[str, Any]:
-    """Return colour and dashes of a method's curve."""
+    """Return colour and dashes of a method's curve, different ones for the first 32 methods."""
     return {
         "color": PALETTE[f"s{index % SERIES}"],
-        "linestyle": DASHES[index % len(DASHES)],
+        "linestyle": DASHES[(index + index // SERIES) % len(DASHES)],
         "linewidth": 2,
     }
 
@@ -141,6 +143,8 @@ def draw_pareto(
     order: Mapping[str, int] | None = None,
 ) -> Figure:
     """Draw mean validation score over the seconds of fitting, the front behind the curves.
+
+    Where there are many methods, only those of the front have their bands.
 
     Args:
         curves: the methods' mean curves, at least one.
@@ -165,9 +169,11 @@ def draw_pareto(
         _seconds_axis(axes, start, stop)
         scale_up(axes, *up)
         _draw_front(axes, {curve.label: curve for curve in curves}, front, facts.higher_is_better)
+        leading = {part.label for part in front}
         for curve in curves:
             style = series_style(places[curve.label])
-            if curve.low is not None and curve.high is not None:
+            banded = len(curves) <= _BANDS or curve.label in leading
+            if banded and curve.low is not None and curve.high is not None:
                 bottom, top = np.clip(curve.low, low, high), np.clip(curve.high, low, high)
                 axes.fill_between(
                     curve.seconds, bottom, top, color=style["color"], alpha=0.13, linewidth=0,

@@ -90,6 +90,9 @@ if (typeof document !== "undefined") {
         });
         row.hidden = !Board.shown(facts(row), { suite: state.suite, budget: state.budget });
       });
+      Array.prototype.forEach.call(document.querySelectorAll(".suite-plot"), function (plot) {
+        plot.hidden = !Board.shown({ suite: plot.dataset.suite }, { suite: state.suite });
+      });
       var cells = rows.map(function (row) { return value(row, state.sort); });
       Board.order(cells, state.down === "1").forEach(function (index) {
         body.appendChild(rows[index]);

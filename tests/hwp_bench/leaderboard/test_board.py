@@ -10,9 +10,11 @@ from typing import Any
 import pytest
 from browser import PHONE, least_contrast, open_page, overflow, show
 
+from hwp_bench.leaderboard.board_rows import BoardRow
 from hwp_bench.leaderboard.entries import Entry, entry_name, make_entry
+from hwp_bench.leaderboard.page_row import budget_text, make_row
 from hwp_bench.leaderboard.records import Submission
-from hwp_bench.leaderboard.site import board_page, budget_text, build_site, make_row, script
+from hwp_bench.leaderboard.site import board_page, build_site, script
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult
 
@@ -56,7 +58,7 @@ def entries(make_results) -> list[Entry]:
 
 
 def test_rows_hold_the_means_of_every_scope(entries) -> None:
-    row = make_row(entries[0])
+    row = make_row(BoardRow((entries[0],)))
     assert row.scores["macro"]["psnr"] == pytest.approx(20.0)
     assert row.scores["motion_blur"]["psnr"] == pytest.approx(10.0)
     assert row.scores["interacting"]["psnr"] is None
@@ -150,8 +152,11 @@ def test_the_board_in_chromium(browser) -> None:
     browser.get("about:blank")
     browser.get(address)
     assert visible(browser) == ["Beta"]
-    # A row is opened by keyboard as well.
+    # A row is opened by keyboard as well: the page of its method, and from there its report.
     browser.find_element(By.LINK_TEXT, "Beta").send_keys(Keys.ENTER)
+    assert "/methods/1-m1.html" in browser.current_url
+    assert "60 s" in browser.find_element(By.CSS_SELECTOR, "table.made").text
+    browser.find_element(By.LINK_TEXT, "Report of seed 0").send_keys(Keys.ENTER)
     assert "/reports/m1-smoke-60s" in browser.current_url
     assert "HWP bench: Beta" in browser.title
 
@@ -213,6 +218,6 @@ def test_the_board_shows_the_current_revision_of_one_protocol(entries) -> None:
     assert second.name in page
     assert f"reports/{first.name}/" not in page
     assert "Omega" not in page
-    assert page.count('data-key="level"') == 3
-    row = make_row(second, rows)
+    assert page.count('<td data-key="level"') == 3
+    row = make_row(BoardRow((second,)), rows)
     assert (row.revision, row.level, row.badge) == (2, "self-reported", "not tried")

@@ -1,0 +1,109 @@
+"""A row as the board's page shows it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from hwp_bench.leaderboard.board_rows import BoardRow
+from hwp_bench.leaderboard.entries import Entry
+from hwp_bench.leaderboard.rules import history
+from hwp_bench.metrics.aggregate import aggregate
+from hwp_bench.results.schema import score_rows
+from hwp_bench.taxonomy import PERTURBATIONS, perturbation
+
+#: Metrics of the board.
+METRICS = ("psnr", "ssim", "oriented_distance")
+#: Scopes that can be chosen, with their headings.
+SCOPES = {
+    "macro": "All perturbations (macro mean)",
+    "single": "Single hands",
+    "interacting": "Interacting hands",
+    **{name: perturbation(name).heading for name in PERTURBATIONS},
+}
+
+
+@dataclass(frozen=True)
+class Row:
+    """One measured row: a method with one budget on one suite, over its seeds."""
+
+    #: Name of its first entry, which stands for the row.
+    name: str
+    #: Title of the method.
+    title: str
+    #: Its suite.
+    suite: str
+    #: Its budget in words.
+    budget: str
+    #: Device that the method says it ran on.
+    device: str
+    #: Names of its entries by seed, the lowest first.
+    seeds: Mapping[int, str]
+    #: Day of the latest evaluation, ISO 8601.
+    date: str
+    #: Scores by scope and metric, means over seeds; None where the suite has no such capture.
+    scores: Mapping[str, Mapping[str, float | None]]
+    #: Mean seconds of a fit.
+    fit: float | None
+    #: Frames that failed, over all seeds.
+    failed: int
+    #: How far all of it was checked, one of `records.LEVELS`.
+    level: str
+    #: Its reproducibility badge, one of `records.BADGES`.
+    badge: str
+    #: 1 for a first entry, one more for each correction; the largest of its entries.
+    revision: int
+
+
+def make_row(row: BoardRow, entries: Sequence[Entry] = ()) -> Row:
+    """Return a row as the page shows it.
+
+    Args:
+        row: the row.
+        entries: those among which the ones that it revises are found.
+    """
+    found = [_scopes(entry) for entry in row.entries]
+    captures = [capture for entry in row.entries for capture in entry.results.captures]
+    return Row(
+        name=row.entries[0].name,
+        title=row.first.method.title,
+        suite=row.first.suite,
+        budget=budget_text(row.first.budget),
+        device=", ".join(sorted({one.device for one in captures if one.device})) or "not said",
+        seeds={entry.results.seed: entry.name for entry in row.entries},
+        date=max(entry.results.started for entry in row.entries)[:10],
+        scores={
+            scope: {name: _mean([one[scope].get(name) for one in found]) for name in METRICS}
+            for scope in SCOPES
+        },
+        fit=row.fit_seconds,
+        failed=sum(capture.failed_frames for capture in captures),
+        level=row.level,
+        badge=row.badge,
+        revision=max(1 + len(history(entry, entries)) for entry in row.entries),
+    )
+
+
+def _scopes(entry: Entry) -> dict[str, Mapping[str, float]]:
+    """Means of the metrics of an entry by scope; an empty one where it has no such capture."""
+    mean = aggregate(score_rows(entry.results))
+    return {
+        **{scope: {} for scope in SCOPES},
+        "macro": mean.overall.macro,
+        "single": mean.single.capture_mean if mean.single else {},
+        "interacting": mean.interacting.capture_mean if mean.interacting else {},
+        **mean.overall.perturbations,
+    }
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
+
+
+def budget_text(budget: Mapping[str, Any]) -> str:
+    """Return a budget in words: `60 s`, `500 steps`, `60 s, 500 steps` or `no limit`."""
+    units = {"seconds": "s", "steps": "steps"}
+    parts = [f"{budget[name]:g} {unit}" for name, unit in units.items() if budget.get(name)]
+    return ", ".join(parts) or "no limit"
