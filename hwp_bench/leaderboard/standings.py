@@ -68,7 +68,7 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
                 len(row.seeds),
                 row.level,
                 row.badge,
-                ", ".join(entry.name for entry in row.entries),
+                first if len(row.seeds) == 1 else f"{first} and {len(row.seeds) - 1} more",
             )
         )
     notes = [sentence] if sentence else []

@@ -15,6 +15,7 @@ from hwp_bench.report.data_groups import DataGroup, data_groups, stacked
 from hwp_bench.report.evaluation_tables import all_tables, same_data
 from hwp_bench.report.free_view_table import free_view_table
 from hwp_bench.report.novelty_table import novelty_table
+from hwp_bench.report.over_seeds import over_seeds
 from hwp_bench.report.paper_layouts import (
     DISTANCE,
     LAYOUTS,
@@ -123,15 +124,17 @@ def _group_table(sources: Sequence[ResultsSource], request: TableRequest) -> Tab
         case "cost":
             table = cost_table(group_runs(results))
         case "severity":
-            return severity_table(sources, find_captures(results, request.captures))
+            found = severity_table(sources, find_captures(results, request.captures))
+            return over_seeds(found, results)
         case "novelty":
-            return novelty_table(sources, open_captures_of(results, request.captures))
+            found = novelty_table(sources, open_captures_of(results, request.captures))
+            return over_seeds(found, results)
         case "free-view":
             return free_view_table(results)
         case "bias":
             return bias_table(sources, find_captures(results, request.captures))
         case _:
-            table = all_tables(results)[request.by]
+            table = over_seeds(all_tables(results)[request.by], results)
     if request.by not in VERDICTS:
         return table
     sentence = winner_note(results)
