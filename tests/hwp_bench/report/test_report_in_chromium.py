@@ -67,6 +67,18 @@ def test_it_is_legible_on_a_phone_and_on_a_desk(browser, width: int, dark: bool)
     assert browser.execute_script(wide)
 
 
+@pytest.mark.parametrize(("width", "height"), [(PHONE, 800), (DESK, 900)])
+def test_the_first_picture_is_on_the_first_screen(browser, width: int, height: int) -> None:
+    """On a phone a third of it is enough: hostile and long names fill many lines here."""
+    show(browser, width)
+    box = "const r = document.images[0].getBoundingClientRect(); return [r.top, r.height]"
+    top, tall = browser.execute_script(box)
+    assert top + tall / 3 <= height
+    assert browser.find_element("id", "look").find_elements("tag name", "img")
+    count = "return document.querySelectorAll('#look img').length"
+    assert browser.execute_script(count) == 2
+
+
 def test_no_mouse_is_needed(browser) -> None:
     from selenium.webdriver.common.keys import Keys
 
