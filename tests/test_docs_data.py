@@ -22,8 +22,8 @@ from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template
 
 ROOT = Path(__file__).resolve().parents[1]
-#: Commands that are proven elsewhere: the tracker needs MediaPipe.
-ELSEWHERE = ("python ", "tracker/bin/", "hwp-bench data import video")
+#: Commands that are proven elsewhere: the tracker and the importer need a true video of a hand.
+ELSEWHERE = ("python ", "hwp-bench data track", "hwp-bench data import video")
 
 
 def commands() -> list[str]:
