@@ -9,6 +9,8 @@ from dataclasses import replace
 from small_captures import results_example
 
 from hwp_bench.capture.splits import split_for
+from hwp_bench.leaderboard.entries import Entry
+from hwp_bench.leaderboard.records import Check
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult, Results
 from hwp_bench.sim.produce.suites import suite
@@ -51,3 +53,21 @@ def complete_results(
     protocols = json.loads(json.dumps({p.name: p.as_dict() for p in PROTOCOLS}))
     given = {"suite": suite_name, "captures": captures, "protocols": protocols, **changes}
     return replace(base, **given)  # type: ignore[arg-type]
+
+
+def check_of(entry: Entry, kind: str = "rescored", verdict: str = "reproduces") -> Check:
+    """A check of an entry, as `leaderboard confirm` would make it."""
+    return Check(
+        entry=entry.name,
+        entry_digest=entry.digest,
+        kind=kind,
+        verdict=verdict,
+        date="2026-01-01T00:00:00+00:00",
+        by="us",
+        toolkit="0.1.0",
+        code="c",
+        machine="m",
+        frames=1,
+        cross_checked=1,
+        differences=0,
+    )

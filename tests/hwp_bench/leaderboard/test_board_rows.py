@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from made_entries import complete_results
+from made_entries import check_of, complete_results
 
 from hwp_bench.leaderboard.board_rows import board_rows
 from hwp_bench.leaderboard.entries import make_entry
-from hwp_bench.leaderboard.records import Check, Submission
+from hwp_bench.leaderboard.records import Submission
 from hwp_bench.leaderboard.standings import board_tables
 
 
@@ -17,23 +17,6 @@ def results(name: str, level: float, seed: int):
     """Every frame of a method scores its level, which moves by a decibel from seed to seed."""
     found = complete_results(name, lambda capture, frame: level + seed, suite_name="mini")
     return replace(found, seed=seed)
-
-
-def check(entry, kind: str, verdict: str) -> Check:
-    return Check(
-        entry=entry.name,
-        entry_digest=entry.digest,
-        kind=kind,
-        verdict=verdict,
-        date="2026-01-01T00:00:00+00:00",
-        by="us",
-        toolkit="0.1.0",
-        code="c",
-        machine="m",
-        frames=1,
-        cross_checked=1,
-        differences=0,
-    )
 
 
 def test_entries_that_differ_in_the_seed_alone_are_one_row_of_means() -> None:
@@ -65,13 +48,13 @@ def test_an_incomplete_entry_and_a_second_one_of_a_seed_stand_alone() -> None:
 
 def test_a_row_was_checked_as_far_as_every_one_of_its_entries() -> None:
     first, second = (make_entry(results("mine", 24.0, seed)) for seed in (0, 1))
-    first = replace(first, checks=(check(first, "re-run", "reproduces"),))
+    first = replace(first, checks=(check_of(first, "re-run", "reproduces"),))
     (row,) = board_rows([first, second])
     assert (row.level, row.badge) == ("self-reported", "not tried")
-    second = replace(second, checks=(check(second, "rescored", "reproduces"),))
+    second = replace(second, checks=(check_of(second, "rescored", "reproduces"),))
     (row,) = board_rows([first, second])
     assert (row.level, row.badge) == ("rescored", "scores hold")
-    second = replace(second, checks=(check(second, "rescored", "differs"),))
+    second = replace(second, checks=(check_of(second, "rescored", "differs"),))
     (row,) = board_rows([first, second])
     assert row.badge == "differs"
 

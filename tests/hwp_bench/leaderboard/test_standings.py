@@ -8,11 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from made_entries import complete_results
+from made_entries import check_of, complete_results
 
 from hwp_bench.cli.main import main
 from hwp_bench.leaderboard.entries import make_entry, write_check, write_entry
-from hwp_bench.leaderboard.records import Check, Submission
+from hwp_bench.leaderboard.records import Submission
 from hwp_bench.leaderboard.site import board_page
 from hwp_bench.leaderboard.standings import board_tables
 
@@ -67,21 +67,7 @@ def test_the_command_shows_levels_and_badges_in_80_columns(
     monkeypatch.delenv("COLUMNS", raising=False)
     for entry in entries[:3]:
         write_entry(tmp_path, entry)
-    check = Check(
-        entry=entries[0].name,
-        entry_digest=entries[0].digest,
-        kind="rescored",
-        verdict="reproduces",
-        date="2026-01-01T00:00:00+00:00",
-        by="us",
-        toolkit="0.1.0",
-        code="c",
-        machine="m",
-        frames=1,
-        cross_checked=1,
-        differences=0,
-    )
-    write_check(tmp_path, check)
+    write_check(tmp_path, check_of(entries[0]))
     words = ["leaderboard", "show", "--entries", str(tmp_path)]
     assert main(words) == 0
     out = capsys.readouterr().out
