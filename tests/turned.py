@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import torch
-from painted import FRAMES, SIZE, cameras, hand_parameters
+from painted import FRAMES, hand_parameters, painted_info, write_drawn
 
 from hwp_bench.base.colors import linear_to_srgb
-from hwp_bench.base.images import as_uint8
-from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, HandModelId
-from hwp_bench.capture.reader import open_capture
+from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import SurfaceAnchors, anchor_uv, load_template
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.methods.contract import Budget, Camera, HandPose, RunSettings, TrainingCapture
+from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.atlas import painted_atlas
@@ -78,31 +77,8 @@ def avatar_of(subject: Subject) -> PlainAvatar:
 
 def paint_turned(path: Path, subject: Subject = STRANGER) -> Capture:
     """Write the capture of a person."""
-    template = load_template("anny", "right")
-    info = CaptureInfo(
-        id="turned",
-        hands="right",
-        action="Turning",
-        device="Test",
-        fps=30.0,
-        width=SIZE,
-        height=SIZE,
-        frame_count=FRAMES,
-        hand_model=HandModelId(template.name, template.digest),
-        perturbations={},
-        source={"kind": "test"},
-        licence="CC0",
-    )
-    hand, clip, avatar = turning_hand(), cameras(), avatar_of(subject)
-    with CaptureWriter(path, info, {"right": hand}, clip) as writer:
-        for frame in range(FRAMES):
-            posed = HandPose("right", hand.pose[frame], hand.betas, hand.transl[frame])
-            camera = Camera(clip.Ks[frame], clip.viewmats[frame], SIZE, SIZE)
-            rgba = avatar.render({"right": posed}, camera).astype(np.float64)
-            image = rgba[..., :3] + (1.0 - rgba[..., 3:]) * 0.35
-            writer.frame(frame, as_uint8(image))
-            writer.mask(frame, np.where(rgba[..., 3] > 0.5, 255, 0).astype(np.uint8))
-    return open_capture(path)
+    info = replace(painted_info("turned"), action="Turning")
+    return write_drawn(path, info, {"right": turning_hand()}, avatar_of(subject))
 
 
 def turned_training(capture: Capture, folder: Path) -> TrainingCapture:

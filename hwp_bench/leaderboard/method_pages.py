@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import json
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,13 +11,13 @@ from typing import Any
 from markdown_it import MarkdownIt
 from markupsafe import Markup
 
-from hwp_bench.base.files import canonical_json
 from hwp_bench.leaderboard.board_rows import BoardRow
 from hwp_bench.leaderboard.entries import Entry
-from hwp_bench.leaderboard.page_row import METRICS, SCOPES, Row, budget_text
+from hwp_bench.leaderboard.page_row import METRICS, SCOPES, Row
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.page.render import render_template, style_sheet
+from hwp_bench.report.provenance import provenance
 
 #: Longest text of a method that is shown, characters.
 _LONGEST = 60_000
@@ -117,45 +116,22 @@ def _pictures(page: MethodPage, scenes: Sequence[Mapping[str, Any]]) -> list[dic
 def _made_with(row: BoardRow) -> dict[str, str]:
     """Say in words how the numbers of a row were made; empty where it is not known."""
     results = row.first
-    environment = results.environment
     captures = [capture for entry in row.entries for capture in entry.results.captures]
     cpu = [capture.cpu_seconds for capture in captures if capture.cpu_seconds is not None]
-    packages = environment.get("packages", {})
-    return {
-        "Suite": f"{results.suite}: {len(results.captures)} captures, {results.frames} frames",
+    seeds = ", ".join(str(seed) for seed in row.seeds)
+    return provenance(results) | {
+        "Suite, frames, seed": f"{results.suite}, {results.frames}, {seeds}",
+        "Started": ", ".join(entry.results.started for entry in row.entries),
         "Protocol": ", ".join(results.protocols),
-        "Seeds": ", ".join(str(seed) for seed in row.seeds),
-        "Budget of a fit": budget_text(results.budget),
-        "Preset": results.method.preset,
-        "Settings": canonical_json(results.method.settings),
         "Seconds on one core": f"{sum(cpu) / len(cpu):.1f} a fit" if cpu else "",
-        "Device": ", ".join(sorted({one.device for one in captures if one.device})),
-        "Machine": ", ".join(
-            str(environment[key]) for key in ("processor", "system") if key in environment
-        )
-        + (f", {environment['cores']} cores" if "cores" in environment else ""),
-        "Python and packages": ", ".join(
-            [str(environment.get("python", "")), *(f"{k} {v}" for k, v in packages.items())]
-            if isinstance(packages, dict)
-            else [json.dumps(packages)]
-        ),
         "Isolation": ", ".join(sorted({one.isolation for one in captures if one.isolation})),
-        "Toolkit": results.toolkit,
-        "Digest of the toolkit's code": str(environment.get("code", "")),
-        "Digest of the method": results.method.digest,
-        "Evaluated": ", ".join(entry.results.started for entry in row.entries),
+        "Digest of the toolkit's code": str(results.environment.get("code", "")),
         "Checked": row.level,
         "Badge": row.badge,
         "Submitted by": _joined(entry.submission.by for entry in row.entries),
         "Corrections": _joined(_correction(entry) for entry in row.entries),
-        "Links": _joined(
-            f"{key}: {value}" for entry in row.entries for key, value in _links(entry)
-        ),
-        "Avatars": _joined(
-            f"{key} {value}"
-            for entry in row.entries
-            for key, value in entry.submission.avatars.items()
-        ),
+        "Links": _named(entry.submission.links for entry in row.entries),
+        "Avatars": _named(entry.submission.avatars for entry in row.entries),
         "Hands and masks made by": _joined(one.made_by or "" for one in captures),
         "Digests of the predictions": _joined(
             f"{one.id} {one.predictions_digest[:16]}" for one in captures
@@ -164,12 +140,13 @@ def _made_with(row: BoardRow) -> dict[str, str]:
     }
 
 
-def _joined(texts: Any) -> str:
+def _joined(texts: Iterable[str]) -> str:
+    """Different texts that are not empty, in their order."""
     return ", ".join(dict.fromkeys(text for text in texts if text))
 
 
-def _links(entry: Entry) -> list[tuple[str, str]]:
-    return list(entry.submission.links.items())
+def _named(values: Iterable[Mapping[str, str]]) -> str:
+    return _joined(f"{key}: {value}" for one in values for key, value in one.items())
 
 
 def _correction(entry: Entry) -> str:

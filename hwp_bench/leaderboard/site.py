@@ -57,9 +57,10 @@ def build_site(
         ]
         titles = _titles([entry for entry, _ in shown])
         scenes = write_gallery(temporary, shown, captures, titles)
-        pages = method_pages(_rows(entries))
+        rows = _rows(entries)
+        pages = method_pages(rows)
         write_method_pages(temporary, pages, scenes)
-        page = board_page(entries, pictures=bool(scenes), pages=_addresses(pages))
+        page = _page(rows, pictures=bool(scenes), pages=_addresses(pages))
         (temporary / "index.html").write_text(page, encoding="utf-8")
         (temporary / "board.js").write_text(script(), encoding="utf-8")
         if scenes:
@@ -106,17 +107,25 @@ def _addresses(pages: Sequence[MethodPage]) -> dict[str, str]:
     return {shown.name: page.path for page in pages for _, shown in page.rows}
 
 
-def board_page(
-    entries: Sequence[Entry], *, pictures: bool = False, pages: Mapping[str, str] | None = None
-) -> str:
-    """Return the page of the board.
+def board_page(entries: Sequence[Entry]) -> str:
+    """Return the page of the board alone: its rows lead to reports, and it has no pictures.
 
     Args:
         entries: the measured rows.
+    """
+    return _page(_rows(entries), pictures=False, pages={})
+
+
+def _page(
+    found: Sequence[tuple[BoardRow, Row]], *, pictures: bool, pages: Mapping[str, str]
+) -> str:
+    """The page of the board.
+
+    Args:
+        found: what `_rows` returned.
         pictures: whether the viewer's pictures lie next to the page.
         pages: addresses of the methods' pages by the row's name; rows without one lead to a report.
     """
-    found = _rows(entries)
     rows = [shown for _, shown in found]
     suites = list(dict.fromkeys(row.suite for row in rows))
     ranks: dict[str, tuple[int, str]] = {}
@@ -138,7 +147,7 @@ def board_page(
         leads=[text for text in leads if text],
         verdicts={suite: text for suite, text in verdicts.items() if text},
         plots={suite: plot for suite, plot in plots.items() if plot is not None},
-        pages=pages or {},
+        pages=pages,
         scopes=SCOPES,
         metrics=[metric_facts(name) for name in METRICS],
         suites=suites,

@@ -129,11 +129,19 @@ def heading(axes: Axes, text: str, above: float = 5.0) -> None:
 
 def series_style(index: int) -> dict[str, Any]:
     """Return colour and dashes of a method's curve, different ones for the first 32 methods."""
-    return {
-        "color": PALETTE[f"s{index % SERIES}"],
-        "linestyle": DASHES[(index + index // SERIES) % len(DASHES)],
-        "linewidth": 2,
-    }
+    color, dashes = _series(index)
+    return {"color": PALETTE[f"s{color}"], "linestyle": DASHES[dashes], "linewidth": 2}
+
+
+def series_classes(index: int) -> str:
+    """Return the classes of the page's style sheet that look like `series_style`."""
+    color, dashes = _series(index)
+    return f"s{color} dash{dashes}"
+
+
+def _series(index: int) -> tuple[int, int]:
+    """Numbers of a method's colour and dashes."""
+    return index % SERIES, (index + index // SERIES) % len(DASHES)
 
 
 def draw_pareto(

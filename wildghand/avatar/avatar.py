@@ -10,12 +10,12 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture.schema import HandModelId
 from hwp_bench.hands import load_template
-from hwp_bench.methods.contract import Camera, HandPose
+from hwp_bench.methods.contract import HandPose
+from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.splat.threads import denormals_flushed
@@ -66,7 +66,7 @@ class PosedGaussians:
         return f"PosedGaussians({len(self)} Gaussians)"
 
 
-class WildGHandAvatar:
+class WildGHandAvatar(HandAvatar):
     """See `hwp_bench.methods.contract.Avatar`.
 
     Args:
@@ -91,6 +91,7 @@ class WildGHandAvatar:
         record: FitRecord,
         weight_masks: Mapping[int, np.ndarray] | None = None,
     ) -> None:
+        super().__init__(model.rigs, model.log_gains.device, record.steps)
         self.model = model
         self.settings = settings
         self.hand_model = hand_model
@@ -107,43 +108,17 @@ class WildGHandAvatar:
             f"Gaussians each, {self.steps} steps on {frames} frames)"
         )
 
-    @property
-    def steps(self) -> int:
-        """Optimizer steps behind it."""
-        return self.record.steps
-
-    @property
-    def device(self) -> str:
-        """Where it is drawn."""
-        return str(self.model.log_gains.device)
-
-    @property
-    def sides(self) -> tuple[str, ...]:
-        """The hands that it has."""
-        return tuple(self.model.rigs)
-
-    @denormals_flushed()
-    @torch.no_grad()
-    def render(self, hands: Mapping[str, HandPose], camera: Camera) -> np.ndarray:
-        """Draw the hands that are given, without what perturbed the training frames.
-
-        Returns:
-            (H, W, 4) float32 in [0, 1]: sRGB colour over black (premultiplied) and coverage.
-
-        Raises:
-            UsageError: no hand, or one that was not fitted.
-        """
-        given = self._tensors(hands)
-        image, coverage = self.model.draw(
-            given,
-            self._tensor(camera.viewmat)[None],
-            self._tensor(camera.K)[None],
-            camera.width,
-            camera.height,
-            refine=self.settings.heads.refinement,
-        )
-        rgba = torch.cat((image, coverage), dim=-1)[0]
-        return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
+    def draw(
+        self,
+        hands: PosedHands,
+        viewmats: torch.Tensor,
+        Ks: torch.Tensor,
+        width: int,
+        height: int,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw the hands without what perturbed the training frames; see `HandAvatar.draw`."""
+        refine = self.settings.heads.refinement
+        return self.model.draw(hands, viewmats, Ks, width, height, refine=refine)
 
     @property
     def gaussians(self) -> PosedGaussians:
@@ -175,7 +150,7 @@ class WildGHandAvatar:
         """
         parts = [
             self.model.gaussians(side, *given, refine=self.settings.heads.refinement)
-            for side, given in self._tensors(hands).items()
+            for side, given in self.posed(hands).items()
         ]
 
         def array(tensors: list[torch.Tensor], fields: int) -> np.ndarray:
@@ -200,27 +175,3 @@ class WildGHandAvatar:
             )
         for frame, mask in self.weight_masks.items():
             write_image(folder / "weights" / f"{frame:06d}.png", mask)
-
-    def _tensors(
-        self, hands: Mapping[str, HandPose]
-    ) -> dict[str, tuple[torch.Tensor, torch.Tensor, torch.Tensor]]:
-        unknown = set(hands) - set(self.model.rigs)
-        if unknown or not hands:
-            raise UsageError(
-                f"asked for {sorted(hands)} of an avatar of {sorted(self.model.rigs)}",
-                field="hands",
-            )
-        return {
-            side: (
-                self._tensor(hands[side].pose)[None],
-                self._tensor(hands[side].betas),
-                self._tensor(hands[side].transl)[None],
-            )
-            for side in self.model.rigs
-            if side in hands
-        }
-
-    def _tensor(self, array: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(
-            np.asarray(array), dtype=torch.float32, device=self.model.log_gains.device
-        )

@@ -23,6 +23,7 @@ from hwp_bench.report.free_view_table import free_view_table
 from hwp_bench.report.page.album import Album, frame_sheets, free_view_sheet, mask_sheet
 from hwp_bench.report.page.elements import inline_svg, to_html
 from hwp_bench.report.page.strips import StripMethod, strip_plot
+from hwp_bench.report.provenance import provenance
 from hwp_bench.report.ranking_tables import rank_table
 from hwp_bench.report.sources import ResultsSource, find_captures, temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
@@ -135,7 +136,7 @@ def gather_report(
         bars=_bars(runs),
         differences=[to_html(table) for table in _differences(runs)],
         captures=_captures(chosen, runs, infos, album),
-        provenance=[_provenance(result) for result in results],
+        provenance=[provenance(result) for result in results],
         digests=[row for result in results for row in _digests(result)],
         left_out=album.left_out,
     )
@@ -262,28 +263,6 @@ def _captures(
             CaptureSection(capture.id, text, strip, info is not None, frames, views, masks)
         )
     return sections
-
-
-def _provenance(result: Results) -> dict[str, str]:
-    environment = result.environment
-    packages = environment.get("packages", {})
-    devices = sorted({capture.device for capture in result.captures if capture.device})
-    limits = [f"{value:g} {name}" for name, value in result.budget.items() if value]
-    return {
-        "Method": f"{result.method.title} ({result.method.name}), preset {result.method.preset}",
-        "Settings": ", ".join(f"{k} = {v}" for k, v in result.method.settings.items()) or "none",
-        "Suite, frames, seed": f"{result.suite}, {result.frames}, {result.seed}",
-        "Budget": ", ".join(limits) or "none",
-        "Started": result.started,
-        "Device": ", ".join(devices) or "not said",
-        "System": f"{environment.get('system', '?')}, {environment.get('processor', '?')}, "
-        f"{environment.get('cores', '?')} cores, Python {environment.get('python', '?')}",
-        "Packages": ", ".join(f"{k} {v}" for k, v in packages.items())
-        if isinstance(packages, dict)
-        else "?",
-        "Toolkit": result.toolkit,
-        "Method digest": result.method.digest,
-    }
 
 
 def _digests(result: Results) -> list[dict[str, str]]:

@@ -11,6 +11,7 @@ from typing import Any
 from markupsafe import Markup
 
 from hwp_bench.base.files import atomic_write
+from hwp_bench.report.figures import series_classes
 from hwp_bench.report.page.content import ReportPage, gather_report
 from hwp_bench.report.sources import ResultsSource
 
@@ -27,6 +28,8 @@ def style_sheet() -> Markup:
 def render_template(package: str, name: str, **values: Any) -> str:
     """Return a filled template; every value that is not `Markup` is escaped.
 
+    Templates can call `series_classes` for the look of a method's curve.
+
     Args:
         package: package with a folder `templates`.
         name: the template in it.
@@ -41,7 +44,7 @@ def render_template(package: str, name: str, **values: Any) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    return environment.get_template(name).render(**values)
+    return environment.get_template(name).render(series_classes=series_classes, **values)
 
 
 def render_report(report: ReportPage, title: str) -> str:

@@ -9,9 +9,10 @@ import cv2
 import numpy as np
 import pytest
 from lit_hand import FRAMES, SIZE, as_input, cameras, developed, hand_parameters, only
+from painted import painted_info
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch
-from hwp_bench.capture import CaptureInfo, CaptureWriter, HandModelId, open_capture
+from hwp_bench.capture import CaptureWriter, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.hands import load_template
 from hwp_bench.hands.footprint import HandSurfaces
@@ -283,22 +284,9 @@ def test_arrays_of_other_frames_are_refused(lit_frames: Lit) -> None:
 
 
 def test_frames_read_from_a_capture_are_judged_the_same(lit_frames: Lit, tmp_path: Path) -> None:
-    images, template = developed(lit_frames[0]), load_template("anny", "right")
+    images = developed(lit_frames[0])
     given = as_input(images, lit_frames[1])
-    info = CaptureInfo(
-        id="lit",
-        hands="right",
-        action="Waving",
-        device="Test",
-        fps=30.0,
-        width=SIZE,
-        height=SIZE,
-        frame_count=FRAMES,
-        hand_model=HandModelId(template.name, template.digest),
-        perturbations={},
-        source={"kind": "test"},
-        licence="CC0",
-    )
+    info = replace(painted_info("lit"), width=SIZE, height=SIZE, frame_count=FRAMES)
     with CaptureWriter(tmp_path / "lit", info, {"right": hand_parameters()}, cameras()) as writer:
         for frame in range(FRAMES):
             writer.frame(frame, images[frame])

@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from painted import FRAMES, SIZE, cameras, hand_parameters
+from painted import FRAMES, cameras, hand_parameters, painted_info
 from safetensors.torch import load_file, save_file
 
 import wildghand
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import sha256_file
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, HandModelId, open_capture
+from hwp_bench.capture import Capture, CaptureWriter, HandModelId, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
@@ -58,20 +58,7 @@ def subjects(
 
 
 def _toned(painted: Capture, path: Path, gains: tuple[float, ...]) -> Path:
-    info = CaptureInfo(
-        id=path.name,
-        hands="right",
-        action="Waving",
-        device="Test",
-        fps=30.0,
-        width=SIZE,
-        height=SIZE,
-        frame_count=FRAMES,
-        hand_model=painted.info.hand_model,
-        perturbations={},
-        source={"kind": "test"},
-        licence="CC0",
-    )
+    info = painted_info(path.name)
     with CaptureWriter(path, info, {"right": hand_parameters("right", 0)}, cameras()) as writer:
         for frame in range(FRAMES):
             image = read_rgb(painted.root / "frames" / f"{frame:06d}.png")

@@ -1,4 +1,4 @@
-"""The base of avatars of methods with a model of their own: checks, tensors, the image."""
+"""The base of every avatar on anchored Gaussians: checks, tensors, the image."""
 
 from __future__ import annotations
 
@@ -25,9 +25,11 @@ class HandAvatar:
     """
 
     def __init__(self, sides: Iterable[str], device: torch.device, steps: int) -> None:
-        self._sides = tuple(sides)
-        self._device = device
+        #: The hands that it has.
+        self.sides = tuple(sides)
+        #: Optimizer steps behind it.
         self.steps = steps
+        self._device = device
 
     @property
     def device(self) -> str:
@@ -66,25 +68,35 @@ class HandAvatar:
         Raises:
             UsageError: no hand, or one that was not fitted.
         """
-        if set(hands) - set(self._sides) or not hands:
-            raise UsageError(
-                f"asked for {sorted(hands)} of an avatar of {sorted(self._sides)}", field="hands"
-            )
-
-        def tensor(array: np.ndarray) -> torch.Tensor:
-            return torch.as_tensor(np.asarray(array), dtype=torch.float32, device=self._device)
-
-        given = {
-            side: (
-                tensor(hands[side].pose)[None],
-                tensor(hands[side].betas),
-                tensor(hands[side].transl)[None],
-            )
-            for side in self._sides
-            if side in hands
-        }
         image, coverage = self.draw(
-            given, tensor(camera.viewmat)[None], tensor(camera.K)[None], camera.width, camera.height
+            self.posed(hands),
+            self._tensor(camera.viewmat)[None],
+            self._tensor(camera.K)[None],
+            camera.width,
+            camera.height,
         )
         rgba = torch.cat((image, coverage), dim=-1)[0]
         return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
+
+    def posed(self, hands: Mapping[str, HandPose]) -> PosedHands:
+        """Return the hands that are given as tensors, in the order in which they were fitted.
+
+        Raises:
+            UsageError: no hand, or one that was not fitted.
+        """
+        if set(hands) - set(self.sides) or not hands:
+            raise UsageError(
+                f"asked for {sorted(hands)} of an avatar of {sorted(self.sides)}", field="hands"
+            )
+        return {
+            side: (
+                self._tensor(hands[side].pose)[None],
+                self._tensor(hands[side].betas),
+                self._tensor(hands[side].transl)[None],
+            )
+            for side in self.sides
+            if side in hands
+        }
+
+    def _tensor(self, array: np.ndarray) -> torch.Tensor:
+        return torch.as_tensor(np.asarray(array), dtype=torch.float32, device=self._device)
