@@ -57,10 +57,10 @@ def build_site(
         ]
         titles = _titles([entry for entry, _ in shown])
         scenes = write_gallery(temporary, shown, captures, titles)
-        rows = _rows(entries)
+        rows = shown_rows(entries)
         pages = method_pages(rows)
         write_method_pages(temporary, pages, scenes)
-        page = _page(rows, pictures=bool(scenes), pages=_addresses(pages))
+        page = board_page(rows, pictures=bool(scenes), pages=_addresses(pages))
         (temporary / "index.html").write_text(page, encoding="utf-8")
         (temporary / "board.js").write_text(script(), encoding="utf-8")
         if scenes:
@@ -84,8 +84,8 @@ def _titles(entries: Sequence[Entry]) -> dict[str, str]:
     }
 
 
-def _rows(entries: Sequence[Entry]) -> list[tuple[BoardRow, Row]]:
-    """The rows of this version's protocol with what the page shows of them, best first."""
+def shown_rows(entries: Sequence[Entry]) -> list[tuple[BoardRow, Row]]:
+    """Return the rows of this version's protocol with what the page shows of them, best first."""
     found = [
         (row, make_row(row, entries))
         for (_, protocol), rows in tables_of(current(entries)).items()
@@ -107,22 +107,13 @@ def _addresses(pages: Sequence[MethodPage]) -> dict[str, str]:
     return {shown.name: page.path for page in pages for _, shown in page.rows}
 
 
-def board_page(entries: Sequence[Entry]) -> str:
-    """Return the page of the board alone: its rows lead to reports, and it has no pictures.
-
-    Args:
-        entries: the measured rows.
-    """
-    return _page(_rows(entries), pictures=False, pages={})
-
-
-def _page(
+def board_page(
     found: Sequence[tuple[BoardRow, Row]], *, pictures: bool, pages: Mapping[str, str]
 ) -> str:
-    """The page of the board.
+    """Return the page of the board.
 
     Args:
-        found: what `_rows` returned.
+        found: what `shown_rows` returned.
         pictures: whether the viewer's pictures lie next to the page.
         pages: addresses of the methods' pages by the row's name; rows without one lead to a report.
     """

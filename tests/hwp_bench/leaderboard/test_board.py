@@ -9,12 +9,13 @@ from typing import Any
 
 import pytest
 from browser import PHONE, least_contrast, open_page, overflow, show
+from made_entries import page_of
 
 from hwp_bench.leaderboard.board_rows import BoardRow
 from hwp_bench.leaderboard.entries import Entry, entry_name, make_entry
 from hwp_bench.leaderboard.page_row import budget_text, make_row
 from hwp_bench.leaderboard.records import Submission
-from hwp_bench.leaderboard.site import board_page, build_site, script
+from hwp_bench.leaderboard.site import build_site, script
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult
 
@@ -68,7 +69,7 @@ def test_rows_hold_the_means_of_every_scope(entries) -> None:
 
 
 def test_names_are_escaped_and_published_rows_stand_apart(entries) -> None:
-    page = board_page(entries)
+    page = page_of(entries)
     assert EVIL not in page
     assert "&lt;img src=x" in page
     measured, published = page.split('id="published"')
@@ -77,7 +78,7 @@ def test_names_are_escaped_and_published_rows_stand_apart(entries) -> None:
     assert "Published, on other data" in measured
     # Without script every row is there, best macro mean of each suite first.
     assert measured.index("Beta") > measured.index("&lt;img")
-    assert "There is no entry yet" in board_page([])
+    assert "There is no entry yet" in page_of([])
 
 
 @pytest.fixture
@@ -214,7 +215,7 @@ def test_the_board_shows_the_current_revision_of_one_protocol(entries) -> None:
     second = make_entry(first.results, again)
     old = replace(entries[2].results, protocols={"hwp-v0": {}})
     rows = [*entries, second, make_entry(replace(old, method=replace(old.method, title="Omega")))]
-    page = board_page(rows)
+    page = page_of(rows)
     assert second.name in page
     assert f"reports/{first.name}/" not in page
     assert "Omega" not in page
