@@ -49,7 +49,14 @@ def complete_results(
             for frame in split.test.tolist()
         ]
         captures.append(
-            replace(base.captures[0], id=item.scene.id, split_digest=split.digest, frames=frames)
+            replace(
+                base.captures[0],
+                id=item.scene.id,
+                hands=item.scene.hands,
+                perturbations=[call.kind for call in item.scene.effects],
+                split_digest=split.digest,
+                frames=frames,
+            )
         )
     protocols = json.loads(json.dumps({p.name: p.as_dict() for p in PROTOCOLS}))
     given = {"suite": suite_name, "captures": captures, "protocols": protocols, **changes}

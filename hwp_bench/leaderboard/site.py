@@ -17,7 +17,14 @@ from hwp_bench.leaderboard.entries import Entry, digest
 from hwp_bench.leaderboard.gallery import write_gallery
 from hwp_bench.leaderboard.lead import reference_lead
 from hwp_bench.leaderboard.method_pages import MethodPage, method_pages, write_method_pages
-from hwp_bench.leaderboard.page_row import METRICS, SCOPES, Row, budget_text, make_row
+from hwp_bench.leaderboard.page_row import (
+    METRICS,
+    SCOPES,
+    Row,
+    budget_text,
+    make_row,
+    severities_of,
+)
 from hwp_bench.leaderboard.records import BADGES, LEVEL_TEXTS
 from hwp_bench.leaderboard.rules import SUITES, check_entries, current, tables_of
 from hwp_bench.leaderboard.standings import rank_interval, ranks_of
@@ -140,6 +147,7 @@ def board_page(
         plots={suite: plot for suite, plot in plots.items() if plot is not None},
         pages=pages,
         scopes=SCOPES,
+        severities=severities_of(rows),
         metrics=[metric_facts(name) for name in METRICS],
         suites=suites,
         budgets=list(dict.fromkeys(row.budget for row in rows)),

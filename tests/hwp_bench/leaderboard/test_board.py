@@ -103,6 +103,8 @@ def test_filters_and_addresses(board) -> None:
     shown = "Board.shown({suite: 'mini', budget: '60 s'}, {suite: %s, budget: %s})"
     for suite, budget, wanted in (("", "", True), ("mini", "60 s", True), ("smoke", "", False)):
         assert board.eval(shown % (json.dumps(suite), json.dumps(budget))) is wanted
+    assert board.eval("Board.scope({scope: 'macro', severity: ''})") == "macro"
+    assert board.eval("Board.scope({scope: 'motion_blur', severity: '4'})") == "motion_blur@4"
     state = {"suite": "mini", "budget": "60 s, 5 steps", "sort": "psnr", "down": ""}
     spelled = board.eval(f"Board.write({json.dumps(state)})")
     assert spelled == "suite=mini&budget=60%20s%2C%205%20steps&sort=psnr"
@@ -143,6 +145,8 @@ def test_the_board_in_chromium(browser) -> None:
     assert visible(browser) == ["Beta", EVIL, "Gamma"]
     cells = browser.find_elements(By.CSS_SELECTOR, '#measured [data-key="psnr"]')
     assert [cell.text for cell in cells] == ["21.00", "10.00", "–"]
+    # Captures of the toy results are of no scene, so that none has a severity.
+    assert [one.text for one in Select(browser.find_element(By.ID, "severity")).options] == ["all"]
     Select(browser.find_element(By.ID, "suite")).select_by_value("smoke")
     assert visible(browser) == ["Beta", EVIL]
     Select(browser.find_element(By.ID, "budget")).select_by_value("60 s")
