@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from browser import PHONE, least_contrast, open_page, overflow, show
+from browser import DESK, PHONE, least_contrast, open_page, overflow, show
 from made_entries import page_of
 
 from hwp_bench.leaderboard.board_rows import BoardRow
@@ -199,7 +199,7 @@ def test_a_hostile_address_changes_nothing(browser) -> None:
 def test_it_is_legible_on_a_phone_in_the_dark_and_on_paper(browser) -> None:
     """WCAG AA asks for a contrast of 4.5; a first column of 60 px holds more than a letter."""
     for width, dark, media in (
-        (1280, False, "screen"),
+        (DESK, False, "screen"),
         (PHONE, True, "screen"),
         (PHONE, False, "print"),
     ):
