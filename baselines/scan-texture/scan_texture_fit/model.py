@@ -96,6 +96,8 @@ class ScanModel(nn.Module):
         settings: sizes.
     """
 
+    textured: Tensor
+
     def __init__(
         self,
         rigs: Mapping[str, HandRig],

@@ -23,7 +23,7 @@ _FARTHEST = 0.008
 # Texels stay below this: shadows are at most 1.
 _BRIGHTEST = 2.0
 # A texel is unseen where the weights of the frames that show it sum up to less than this.
-_LEAST_WEIGHT = 1.0
+_LEAST_WEIGHT = 0.3
 
 
 class ScanRecipe(Recipe[ScanSettings]):

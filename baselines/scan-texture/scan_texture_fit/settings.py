@@ -45,6 +45,6 @@ class ScanSettings(LoopSettings):
     #: Weight of the shadows' distance to 1 (UHM: 0.1, of an L1 of weight 1).
     shadow_one: float = number(1e-3, 0.0, 1e4)
     #: Weight of the shadows' total variation over the texture plane.
-    shadow_smoothness: float = number(1e-3, 0.0, 1e4)
+    shadow_smoothness: float = number(0.0, 0.0, 1e4)
     #: Weight of the total variation of texels that no training frame shows.
-    unseen_smoothness: float = number(1.0, 0.0, 1e4)
+    unseen_smoothness: float = number(0.1, 0.0, 1e4)
