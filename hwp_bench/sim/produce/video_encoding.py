@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.errors import HwpError
+from hwp_bench.base.movies import yuv_planes
 
 #: Encoder in FFmpeg's naming, its preset, and the frames from one that stands alone to the next.
 ENCODER, PRESET, KEYFRAME_EVERY = "libx264", "veryfast", 30
@@ -85,7 +86,7 @@ def _coded(
                 yield _to_rgb(frame.to_ndarray(format="yuv420p"), height, width)
 
     for number, image in enumerate(itertools.chain([first], frames)):
-        frame = av.VideoFrame.from_ndarray(_to_yuv(image), format="yuv420p")
+        frame = av.VideoFrame.from_ndarray(yuv_planes(image), format="yuv420p")
         frame.pts = number
         yield from decoded(encoder.encode(frame))
     yield from decoded(encoder.encode(None))
@@ -118,15 +119,6 @@ def _encoder(av: ModuleType, size: tuple[int, int], bits_per_pixel: float, fps: 
 def _buffer(bits: int, rate: Fraction) -> int:
     """Bits of `BUFFER_FRAMES` frames."""
     return int(bits / rate * BUFFER_FRAMES)
-
-
-def _to_yuv(image: np.ndarray) -> np.ndarray:
-    """Planes Y, U, V of 4:2:0 (ITU-R BT.601) as OpenCV and FFmpeg lay them out."""
-    import cv2
-
-    rows, columns = image.shape[0] % 2, image.shape[1] % 2
-    even = np.pad(image, ((0, rows), (0, columns), (0, 0)), mode="edge")
-    return np.asarray(cv2.cvtColor(even, cv2.COLOR_RGB2YUV_I420))
 
 
 def _to_rgb(planes: np.ndarray, height: int, width: int) -> np.ndarray:
