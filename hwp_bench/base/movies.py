@@ -6,6 +6,7 @@ today's browsers. PyAV's wheels (36 MB) have x264 on Linux, macOS and Windows.
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import os
 from collections.abc import Iterable
@@ -62,7 +63,8 @@ def write_movie(path: str | os.PathLike[str], frames: Iterable[np.ndarray], fps:
     except (OSError, av.error.FFmpegError) as error:
         raise HwpError(f"cannot be written as a video ({error})", where=path) from error
     finally:
-        partial.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):
+            partial.unlink()
     return path
 
 

@@ -6,7 +6,6 @@ its camera: so every side is shown in a light that frames have shown.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
@@ -32,7 +31,7 @@ BACKGROUND = 28
 # Raises when the clip comes out otherwise, so that an older one is drawn again.
 _VERSION = 1
 # Share of the picture that the hands fill; distance of the camera in radii of the hands.
-_FILL, _AWAY = 0.94, 6.0
+_FILL, _AWAY = 0.92, 6.0
 # Seconds for a frame, and those before the first.
 _FRAME, _START = 0.1, 4.0
 
@@ -67,14 +66,16 @@ class Turntable:
     def __init__(self, avatar: WildGHandAvatar, size: int = SIZE) -> None:
         self._avatar = avatar
         self._hands: dict[str, _Placed] = {}
-        across = half = 0.0
+        placed = []
         for side in avatar.sides:
             self._hands[side], points = _placed(avatar, side, len(avatar.sides))
-            across = max(across, float(np.hypot(points[:, 0], points[:, 2]).max()))
-            half = max(half, float(np.abs(points[:, 1]).max()))
-        away = _AWAY * max(across, half)
-        # The largest slopes of any point in any turn: seen from the side, and in front.
-        slope = max(across / math.sqrt(away**2 - across**2), half / (away - across))
+            placed.append(points)
+        x, y, z = np.concatenate(placed).T
+        across = np.hypot(x, z)
+        away = _AWAY * float(np.hypot(across, y).max())
+        # The largest slope at which any point is seen in any turn: from the side, and in front.
+        aside, above = across / np.sqrt(away**2 - across**2), np.abs(y) / (away - across)
+        slope = float(max(aside.max(), above.max()))
         focal = 0.5 * size * _FILL / slope
         K = np.array([[focal, 0.0, size / 2], [0.0, focal, size / 2], [0.0, 0.0, 1.0]])
         self._camera = Camera(viewmat=np.eye(4), K=K, width=size, height=size)
