@@ -11,14 +11,14 @@ from typing import TYPE_CHECKING
 from hwp_bench.base.lazy_names import lazy_names
 
 if TYPE_CHECKING:
-    from wildghand.api import fit as fit
     from wildghand.avatar.avatar import WildGHandAvatar as WildGHandAvatar
     from wildghand.avatar.files import load_avatar as load_avatar
+    from wildghand.from_video.api import fit as fit
     from wildghand.splat import rasterize as rasterize
 
 _HOMES = {
     "WildGHandAvatar": "wildghand.avatar.avatar",
-    "fit": "wildghand.api",
+    "fit": "wildghand.from_video.api",
     "load_avatar": "wildghand.avatar.files",
     "rasterize": "wildghand.splat",
 }

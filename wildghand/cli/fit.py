@@ -81,8 +81,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the command, in one process or in those that torchrun started."""
     # FFmpeg would print its own messages about a damaged video next to our one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    from wildghand.api import is_video
     from wildghand.fitting.parallel import run_in_world
+    from wildghand.from_video.api import is_video
     from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings
 

@@ -1,4 +1,4 @@
-"""What is done of a job, and with which inputs: the file that lets a stopped job go on."""
+"""The record of a job: which stages are done, and with which inputs, so that a stopped one goes on."""
 
 from __future__ import annotations
 

@@ -139,7 +139,7 @@ def _library(where: str) -> ModuleType:
             "its sensor stores H.264, and nothing here can encode that",
             where=where,
             field="sensor.h264",
-            remedy="Install PyAV: pip install 'hwp-bench[h264]'; or leave the field out.",
+            remedy="Install PyAV: pip install av; or leave the field out.",
         ) from error
     library: ModuleType = av
     return library

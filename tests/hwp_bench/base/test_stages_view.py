@@ -3,27 +3,17 @@
 from __future__ import annotations
 
 import sys
-from types import SimpleNamespace
 
 import pytest
+from stopped_clock import Clock, stop_clock
 
 from hwp_bench.base.progress import OUTER, progress
 from hwp_bench.base.stages_view import StagesView
 
 
-class Clock:
-    """A clock that stands still unless it is told to go on, seconds."""
-
-    now = 100.0
-
-
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
-    made = Clock()
-    stopped = SimpleNamespace(perf_counter=lambda: made.now)
-    monkeypatch.setattr("hwp_bench.base.progress.time", stopped)
-    monkeypatch.setattr("hwp_bench.base.stages_view.time", stopped)
-    return made
+    return stop_clock(monkeypatch, "hwp_bench.base.progress", "hwp_bench.base.stages_view")
 
 
 def test_off_a_terminal_each_stage_is_a_line(clock: Clock, capsys) -> None:
