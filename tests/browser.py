@@ -15,7 +15,7 @@ _FLAGS = (
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 )
 #: Width of a phone and of a desk's window, px.
-PHONE, DESK = 390, 1280
+PHONE, DESK = 400, 1400
 
 
 def _program(*names: str) -> str:
@@ -59,7 +59,7 @@ def open_page(page: Path, profile: Path) -> Iterator[Any]:
 
 def show(driver: Any, width: int = DESK, *, dark: bool = False, media: str = "screen") -> None:
     """Show the page at a width, in light or dark, on the screen or as it is printed."""
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width == PHONE}
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width <= PHONE}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": media, "features": [scheme]})
