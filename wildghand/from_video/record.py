@@ -1,4 +1,4 @@
-"""The record of a job: which stages are done, and with which inputs, so that a stopped one goes on."""
+"""The record of a job: stages that are done, and their inputs, so that a stopped job goes on."""
 
 from __future__ import annotations
 
