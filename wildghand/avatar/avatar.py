@@ -100,6 +100,8 @@ class WildGHandAvatar(HandAvatar):
         self.seed = seed
         self.record = record
         self.weight_masks = dict(weight_masks or {})
+        #: The folder that holds it; None until it is written or if it was not read from one.
+        self.folder: Path | None = None
 
     def __repr__(self) -> str:
         hands, frames = " and ".join(self.sides), len(self.record.frames)

@@ -60,6 +60,11 @@ class _Clock:
         return time.perf_counter() - self._start
 
 
+def unfinished(out: Path) -> Path:
+    """Return the folder of the state of a fit to an avatar folder, until it is finished."""
+    return out.with_name(out.name + ".fit")
+
+
 @denormals_flushed()
 def fit_capture(
     source: str | os.PathLike[str],
@@ -112,7 +117,7 @@ def fit_capture(
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
     capture = open_capture(source)
     split = every_frame(capture) if all_frames else _split(capture)
-    work = out.with_name(out.name + ".fit")
+    work = unfinished(out)
     with exclusive(work) if world.is_main else contextlib.nullcontext():
         if world.is_main:
             write_request(work / "request", capture, split, run)
