@@ -177,6 +177,7 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
 def report_outcome(out: Path, results: Results) -> int:
     """Print where the results are and which captures failed; returns the exit status."""
     from hwp_bench.base.progress import notice
+    from hwp_bench.run.output import LOG
 
     failed = [capture for capture in results.captures if capture.failed_frames]
     for capture in failed:
@@ -185,6 +186,9 @@ def report_outcome(out: Path, results: Results) -> int:
             f"failed: {capture.id}: {capture.failed_frames} of {len(capture.frames)} frames: "
             f"{reason}"
         )
+        log = out / "captures" / capture.id / LOG
+        if capture.failure and log.is_file():
+            notice(f"log: {log}")
     notice(f"results: {out / 'results.json'}; tables: {out / 'tables'}")
     for capture in results.captures:
         picture = out / "captures" / capture.id / "pictures" / "comparison.png"

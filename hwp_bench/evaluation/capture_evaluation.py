@@ -36,7 +36,7 @@ from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, CurvePoint
 from hwp_bench.run.engine import Folder, Job, Needs
 from hwp_bench.run.engine.job import OnProgress, ignore
-from hwp_bench.run.output import CHECKPOINTS, RunFacts
+from hwp_bench.run.output import CHECKPOINTS, LOG, RunFacts
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
 
@@ -197,8 +197,21 @@ def _run(
                 on_progress=on_progress,
             )
         except (MethodFailed, BadMethod) as error:
-            return None, str(error)
+            return None, _lasting(error, output)
     return record, None
+
+
+def _lasting(error: HwpError, output: Path) -> str:
+    """Return an error's text for the result, which outlives the folder of the run.
+
+    The log moves next to `result.json`, and the result may be read on another machine: a path
+    into the run's folder would lead nowhere.
+    """
+    if error.where is None or not Path(error.where).is_relative_to(output):
+        return str(error)
+    log = f"{LOG} next to {RESULT} holds what it printed."
+    advice = " ".join(text for text in (error.remedy, log) if text)
+    return str(HwpError(error.problem, field=error.field, remedy=advice))
 
 
 def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:

@@ -128,7 +128,6 @@ def run_method(
         raise MethodFailed(
             f"{manifest.name} failed on {capture_id}: {_reason(output, outcome.status)}",
             where=log,
-            remedy="The log holds what it printed.",
         )
     if manifest.kind == "python" and not (output / RUN).is_file():
         raise MethodFailed(

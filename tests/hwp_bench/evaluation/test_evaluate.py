@@ -216,6 +216,9 @@ def test_a_crash_on_one_capture_loses_nothing_and_is_tried_again(captures, tmp_p
     assert "RuntimeError: no luck" in results.captures[0].failure
     assert results.captures[1].failed_frames == 0
     assert "RuntimeError: no luck" in (out / "captures" / "single" / "log.txt").read_text()
+    # The folder of the run is gone; the text must not lead there.
+    assert "/run/" not in results.captures[0].failure
+    assert "log.txt next to result.json" in results.captures[0].failure
     run(method, captures, out)
     assert (method / "fits.log").read_text() == "pair "
 
