@@ -14,11 +14,12 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
-from hwp_bench.base.progress import JobsView
+from hwp_bench.base.progress import JobsView, notice
 from hwp_bench.base.tables import write_tables
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
+from hwp_bench.evaluation.outcome import outcome_lines
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.methods.setting_files import check_settings
@@ -99,6 +100,8 @@ def evaluate(
             engine=engine,
         )
     write_tables(folder / "tables", {**all_tables([results]), **free_view_tables([results])})
+    for line in outcome_lines(folder, results):
+        notice(line)
     return results
 
 

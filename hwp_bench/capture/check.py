@@ -14,7 +14,7 @@ import numpy as np
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.images import pixel_digest
 from hwp_bench.capture.reader import Capture, open_capture
-from hwp_bench.capture.schema import IMAGE_FOLDERS, image_path
+from hwp_bench.capture.schema import IMAGE_FOLDERS, SIMULATED, CaptureInfo, image_path
 from hwp_bench.capture.tracks import arrays_digest, hand_arrays
 from hwp_bench.capture.writer import combine
 from hwp_bench.hands.template import HandTemplate
@@ -94,10 +94,7 @@ def _facts(capture: Capture) -> dict[str, Any]:
         "fps": info.fps,
         "hand_model": info.hand_model.name,
         "made_by": info.made_by or "not stated",
-        "perturbed_frames": {
-            name: None if values is None else sum(value > 0 for value in values)
-            for name, values in info.perturbations.items()
-        },
+        "perturbed_frames": _perturbed_frames(info),
         "valid_frames": {side: int(hand.valid.sum()) for side, hand in capture.hands.items()},
         "truth": [
             name
@@ -111,6 +108,19 @@ def _facts(capture: Capture) -> dict[str, Any]:
         "free_view_frames": _count(capture),
         "licence": info.licence,
         "digest": capture.digest,
+    }
+
+
+def _perturbed_frames(info: CaptureInfo) -> dict[str, int | None] | None:
+    """Frames by perturbation, None where it is not known in which; None where nothing is known.
+
+    A simulated capture declares all that acts. An import that declares nothing was not judged.
+    """
+    if not info.perturbations and info.source.get("kind") != SIMULATED:
+        return None
+    return {
+        name: None if values is None else sum(value > 0 for value in values)
+        for name, values in info.perturbations.items()
     }
 
 

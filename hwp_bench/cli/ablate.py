@@ -131,6 +131,8 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
         write_record,
     )
     from hwp_bench.evaluation.ablate.effects import cost_effects, score_effects
+    from hwp_bench.evaluation.ablate.runs import result_folder
+    from hwp_bench.evaluation.outcome import outcome_lines
     from hwp_bench.report.evaluation_tables import HEADLINE
 
     metrics = common_metrics(list(ablation.runs.values()), HEADLINE)
@@ -148,17 +150,13 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
                 print_table(tables[name])
     _draw(ablation, out)
     notice(f"record: {write_record(out, record)}; tables: {out / 'tables'}")
-    failures = [
-        f"failed: {result.method.title}, seed {result.seed}, {capture.id}: "
-        f"{capture.failed_frames} of {len(capture.frames)} frames: "
-        f"{capture.failure or next(f.failure for f in capture.frames if f.failure)}"
-        for result in ablation.results
-        for capture in result.captures
-        if capture.failed_frames
-    ]
-    for text in failures:
-        notice(text)
-    return 1 if failures else 0
+    for name, runs in ablation.runs.items():
+        for seed, result in runs.seeds.items():
+            head = f"{result.method.title}, seed {seed}, "
+            for line in outcome_lines(out / result_folder(name, seed), result, head):
+                notice(line)
+    failed = any(item.failed_frames for result in ablation.results for item in result.captures)
+    return 1 if failed else 0
 
 
 def _draw(ablation: AblationRuns, out: Path) -> None:

@@ -91,6 +91,7 @@ def _report(runs: BudgetRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.evaluation.budget.budget import budget_tables, make_budget, next_work
     from hwp_bench.evaluation.budget.picture import budget_sheet
+    from hwp_bench.evaluation.outcome import outcome_lines
 
     budget = make_budget(runs)
     tables = budget_tables(budget)
@@ -104,12 +105,9 @@ def _report(runs: BudgetRuns, out: Path, *, print_json: bool) -> int:
         print_table(tables["budget"])
         print(next_work(budget))
     notice(f"record: {record}; tables: {out / 'tables'}; picture: {picture}")
-    failed = [
-        f"failed: {name}: {capture.id}: {capture.failed_frames} of {len(capture.frames)} frames"
-        for name, results in runs.results.items()
-        for capture in results.captures
-        if capture.failed_frames
-    ]
-    for text in failed:
-        notice(text)
-    return 1 if failed else 0
+    status = 0
+    for name, results in runs.results.items():
+        for line in outcome_lines(runs.folders[name], results, f"{name}: "):
+            notice(line)
+        status |= any(capture.failed_frames for capture in results.captures)
+    return int(status)

@@ -175,26 +175,18 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
 
 
 def report_outcome(out: Path, results: Results) -> int:
-    """Print where the results are and which captures failed; returns the exit status."""
+    """Print where the results are and which frames failed; returns the exit status."""
     from hwp_bench.base.progress import notice
-    from hwp_bench.run.output import LOG
+    from hwp_bench.evaluation.outcome import outcome_lines
 
-    failed = [capture for capture in results.captures if capture.failed_frames]
-    for capture in failed:
-        reason = capture.failure or next(f.failure for f in capture.frames if f.failure)
-        notice(
-            f"failed: {capture.id}: {capture.failed_frames} of {len(capture.frames)} frames: "
-            f"{reason}"
-        )
-        log = out / "captures" / capture.id / LOG
-        if capture.failure and log.is_file():
-            notice(f"log: {log}")
+    for line in outcome_lines(out, results):
+        notice(line)
     notice(f"results: {out / 'results.json'}; tables: {out / 'tables'}")
     for capture in results.captures:
         picture = out / "captures" / capture.id / "pictures" / "comparison.png"
         if picture.is_file():
             notice(f"images: {picture}")
-    return 1 if failed else 0
+    return 1 if any(capture.failed_frames for capture in results.captures) else 0
 
 
 def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:

@@ -18,6 +18,7 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import EXTRA
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.artifacts import keep_artifacts
+from hwp_bench.evaluation.colour_check import colour_warnings, keep_warnings
 from hwp_bench.evaluation.free_view import keep_free_view, read_free_targets, score_free_view
 from hwp_bench.evaluation.scoring import (
     mean_scores,
@@ -150,6 +151,7 @@ def evaluate_capture(
     )
     if free is not None:
         keep_free_view(folder, free)
+    keep_warnings(folder, colour_warnings(targets, predictions))
     keep_artifacts(folder, output, source, evaluation.capture, scores, predictions)
     result = replace(result, job_seconds=time.perf_counter() - began)
     write_json(folder / RESULT, asdict(result))

@@ -165,18 +165,22 @@ def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
 def drawn(avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: str) -> np.ndarray:
     """Render hands and bring the image to 8 bits: clipped, rounded half to even.
 
+    A fourth channel is dropped: the data set owns the mask.
+
     Raises:
         MethodFailed: the result has another shape or is not finite; it says the `name`.
     """
-    rgba = np.asarray(avatar.render(hands, camera))
-    size = (camera.height, camera.width, 4)
-    if rgba.shape != size:
-        raise MethodFailed(f"render returned shape {rgba.shape}, not {size}", field=name)
-    if not np.isfinite(rgba).all():
+    image = np.asarray(avatar.render(hands, camera))
+    size = (camera.height, camera.width)
+    if image.shape not in ((*size, 3), (*size, 4)):
+        raise MethodFailed(
+            f"render returned shape {image.shape}, not {(*size, 3)} or {(*size, 4)}", field=name
+        )
+    if not np.isfinite(image).all():
         raise MethodFailed("render returned NaN or infinity", field=name)
     from hwp_bench.base.images import as_uint8
 
-    return as_uint8(np.asarray(rgba[:, :, :3], dtype=np.float64))
+    return as_uint8(np.asarray(image[:, :, :3], dtype=np.float64))
 
 
 def device_name(avatar: Avatar) -> str:

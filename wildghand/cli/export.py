@@ -21,7 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--ply", type=Path, required=True, metavar="FILE", help="file to write")
     parser.add_argument("--poses", type=Path, metavar="CAPTURE", help="capture to take a pose from")
     parser.add_argument("--frame", type=int, default=0, help="its frame (default: 0)")
-    parser.add_argument("--hand", metavar="MODEL", help="hand model: anny or mano:PATH")
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -30,7 +32,7 @@ def run(args: argparse.Namespace) -> int:
     from wildghand.avatar.files import load_avatar
     from wildghand.avatar.ply import write_ply
 
-    avatar = load_avatar(args.avatar, hand=args.hand)
+    avatar = load_avatar(args.avatar, hand=args.hand_model)
     hands = avatar.rest_poses()
     if args.poses is not None:
         capture = open_capture(args.poses)

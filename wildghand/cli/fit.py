@@ -36,7 +36,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="the hand in a video (default: as the landmarks say, else right)",
     )
     parser.add_argument(
-        "--hand", default="anny", metavar="MODEL", help="hand model for a video: anny or mano:PATH"
+        "--hand-model", default="anny", metavar="MODEL", help="for a video: anny or mano:PATH"
     )
     parser.add_argument("--steps", type=int, help="optimizer steps")
     parser.add_argument("--seconds", type=float, help="most seconds of fitting")
@@ -151,6 +151,6 @@ def _capture(args: argparse.Namespace) -> Path:
             args.source,
             args.landmarks,
             folder,
-            VideoImport(hand=args.side or tracked_side(args.landmarks), hand_model=args.hand),
+            VideoImport(hand=args.side or tracked_side(args.landmarks), hand_model=args.hand_model),
         )
     return folder

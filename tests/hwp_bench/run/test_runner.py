@@ -90,6 +90,21 @@ def test_a_python_method_fits_and_renders(request_folder: Path, tmp_path: Path) 
     assert facts.checkpoint_frames == [16, 17]
 
 
+def test_three_channels_are_as_good_as_four(request_folder: Path, tmp_path: Path) -> None:
+    # Oracle: the same method with a coverage channel.
+    pictures = []
+    for name, body in (("four", "pass"), ("three", "Avatar.render = rgb")):
+        manifest = python_method(tmp_path / name, body)
+        with open(tmp_path / name / "mean_colour.py", "a") as stream:
+            stream.write(
+                "def rgb(self, hands, camera):\n"
+                "    return np.broadcast_to(self.colour, (camera.height, camera.width, 3))\n"
+            )
+        record = run_method(manifest, "tiny", request_folder, tmp_path / f"{name}-output")
+        pictures.append(read_prediction(record.predictions, 18, (32, 32)).pixels)
+    np.testing.assert_array_equal(*pictures)
+
+
 def test_a_command_fits_and_renders(request_folder: Path, tmp_path: Path) -> None:
     script = """
 import json, pathlib, shutil, sys
