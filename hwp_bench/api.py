@@ -19,10 +19,10 @@ from hwp_bench.base.tables import write_tables
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
+from hwp_bench.evaluation.foresight import check_call, check_suite
 from hwp_bench.evaluation.outcome import outcome_lines
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
-from hwp_bench.methods.setting_files import check_settings
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.evaluation_tables import HEADLINE, all_tables
 from hwp_bench.report.free_view_table import free_view_tables
@@ -86,7 +86,10 @@ def evaluate(
         run=RunSettings(dict(settings or {}), seed, Budget(seconds, steps), frames),
     )
     folder = Path(out) if out is not None else default_folder(os.fspath(method), plan)
-    check_settings(read_manifest(find_method(os.fspath(method))), settings or {})
+    manifest = read_manifest(find_method(os.fspath(method)))
+    check_call(manifest, plan, folder)
+    if suite != "captures":
+        check_suite(manifest, plan, folder)
     view = JobsView()
     engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
     with engine, view if engine.in_turn else nullcontext():

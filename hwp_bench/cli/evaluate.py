@@ -13,7 +13,11 @@ from hwp_bench.run.engine.options import add_engine_arguments
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from hwp_bench.capture.splits import Split
     from hwp_bench.evaluation.evaluate import EvaluationSettings
+    from hwp_bench.methods.manifest import MethodManifest
     from hwp_bench.publish import SealedPart
     from hwp_bench.results import Results
     from hwp_bench.run.engine import Engine
@@ -119,7 +123,6 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluation.evaluate import default_folder, evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.methods.setting_files import check_settings
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.report.free_view_table import free_view_tables
     from hwp_bench.run.engine.options import engine_for, needs_of
@@ -128,12 +131,12 @@ def run(args: argparse.Namespace) -> int:
     sealed = _sealed_part(args)
     if sealed is not None:
         settings = replace(settings, suite=f"sealed-{sealed.commitment[:12]}")
-    # A wrong method directory is reported before a suite is rendered for it.
-    check_settings(read_manifest(find_method(args.method)), settings.run.settings, "--set")
+    manifest = read_manifest(find_method(args.method))
     out = Path(args.out) if args.out else default_folder(args.method, settings)
     splits = read_splits(args.splits) if args.splits else None
     if sealed is not None:
         splits = sealed.splits
+    look_ahead(args, manifest, settings, out, splits)
     with engine_for(args) as engine:
         captures = chosen_captures(args, engine) if sealed is None else list(sealed.captures)
         with JobsView() if engine.in_turn else nullcontext() as jobs:
@@ -157,6 +160,26 @@ def run(args: argparse.Namespace) -> int:
         for name in ("overall", "captures", *novel):
             print_table(tables[name])
     return report_outcome(out, results)
+
+
+def look_ahead(
+    args: argparse.Namespace,
+    manifest: MethodManifest,
+    settings: EvaluationSettings,
+    out: Path,
+    splits: Mapping[str, Split] | None,
+) -> None:
+    """Report whatever is wrong with a call before a suite is rendered for it.
+
+    Raises:
+        HwpError: as `check_call` and `check_suite`.
+    """
+    from hwp_bench.evaluation.foresight import check_call, check_suite
+
+    check_call(manifest, settings, out, "--set")
+    if not args.capture and not getattr(args, "sealed", None):
+        local = args.engine == "local"
+        check_suite(manifest, settings, out, splits, rehearse=local)
 
 
 def _sealed_part(args: argparse.Namespace) -> SealedPart | None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
-from hwp_bench.base.files import write_json
+from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.progress import notice
 from hwp_bench.capture.schema import frame_name
@@ -32,6 +32,7 @@ from hwp_bench.run.output import (
     FREE_VIEW,
     PREDICTIONS,
     PROGRESS,
+    REHEARSAL,
     RUN,
     Checkpoint,
     RunFacts,
@@ -44,17 +45,22 @@ PROGRESS_INTERVAL = 0.5
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a method on a request; returns the exit status."""
+    """Run a method on a request, or only make it (`--rehearse`); returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("request", type=Path)
     parser.add_argument("output", type=Path)
     parser.add_argument("--method", type=Path, required=True)
     parser.add_argument("--entry", required=True)
+    parser.add_argument("--rehearse", action="store_true")
     args = parser.parse_args(arguments)
     args.output.mkdir(parents=True, exist_ok=True)
     try:
         factory = load_entry(args.method, args.entry)
-        run(open_request(args.request), factory, args.output)
+        if args.rehearse:
+            asked = read_json(args.request / REHEARSAL)
+            factory(asked["settings"], asked["seed"])
+        else:
+            run(open_request(args.request), factory, args.output)
     except HwpError as error:
         write_json(args.output / FAILURE, {"problem": str(error)})
         print(f"error: {error}", file=sys.stderr)
