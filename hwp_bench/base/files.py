@@ -60,6 +60,25 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
     return path
 
 
+def refuse_existing(
+    path: str | os.PathLike[str], *, overwrite: bool = False, flag: str = ""
+) -> None:
+    """Refuse to make a folder where something is, before work is done for it.
+
+    Args:
+        path: the folder to make.
+        overwrite: a folder that holds something may be replaced; a file may not.
+        flag: the option by which a person asks for that, for the message; empty where none is.
+
+    Raises:
+        UsageError: `path` is a file, or a folder that holds something.
+    """
+    path = Path(path)
+    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
+        another = f", or replace it with {flag}" if flag else ""
+        raise UsageError("exists already", where=path, remedy=f"Choose another place{another}.")
+
+
 @contextlib.contextmanager
 def atomic_folder(
     path: str | os.PathLike[str], *, overwrite: bool = False, flag: str = ""
@@ -79,9 +98,7 @@ def atomic_folder(
         HwpError: the place cannot be written.
     """
     path = Path(path).absolute()
-    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
-        another = f", or replace it with {flag}" if flag else ""
-        raise UsageError("exists already", where=path, remedy=f"Choose another place{another}.")
+    refuse_existing(path, overwrite=overwrite, flag=flag)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         temporary = temporary_name(path)

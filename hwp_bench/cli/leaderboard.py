@@ -79,11 +79,17 @@ reproduces; 1: it differs (the check says so too); 2: no entry fits.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    actions = parser.add_subparsers(
+        dest="action", required=True, metavar="ACTION", help="what to do"
+    )
 
     def action(name: str, text: str, epilog: str = "") -> argparse.ArgumentParser:
         added = actions.add_parser(
-            name, help=text, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
+            name,
+            help=text,
+            description=text[0].upper() + text[1:] + ".",
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         added.add_argument(
             "--entries", metavar="DIR", help="folder of the entries (default leaderboard/entries)"
