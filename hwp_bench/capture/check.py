@@ -13,6 +13,7 @@ import numpy as np
 
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.images import pixel_digest
+from hwp_bench.base.text import bounded
 from hwp_bench.capture.reader import Capture, open_capture
 from hwp_bench.capture.schema import IMAGE_FOLDERS, SIMULATED, CaptureInfo, image_path
 from hwp_bench.capture.tracks import arrays_digest, hand_arrays
@@ -185,7 +186,7 @@ def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
             "warning",
             os.fspath(folder),
             None,
-            f"holds {len(others)} further files (first: {others[0]})",
+            f"holds {len(others)} further files: {bounded(others)}",
             "They are ignored.",
         )
     digests = [digest for digest, _ in results]
@@ -215,7 +216,8 @@ def _geometry(capture: Capture) -> Iterator[Finding]:
                 "error",
                 os.fspath(capture.root / "hands.npz"),
                 f"{side}_transl",
-                f"frame {behind[0]} lies behind its camera ({len(behind)} frames do)",
+                f"the hand lies behind the camera in {len(behind)} of {len(hand.valid)} frames: "
+                f"{bounded(behind)}",
                 "Mark such frames as not valid, or correct the translation.",
             )
 

@@ -34,7 +34,9 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.convert import convert_capture
 
-    errors = convert_capture(open_capture(args.capture), args.out, args.hand_model, overwrite=args.force)
+    errors = convert_capture(
+        open_capture(args.capture), args.out, args.hand_model, overwrite=args.force
+    )
     if args.json:
         print(json.dumps({side: asdict(error) for side, error in errors.items()}, indent=1))
         return 0

@@ -112,7 +112,9 @@ def render_capture(
         check_encoder(scene.id)
     out = Path(out)
     if out.exists() and not overwrite and (out.is_file() or any(out.iterdir())):
-        raise UsageError("exists already", where=out, remedy="Choose another place, or --overwrite.")
+        raise UsageError(
+            "exists already", where=out, remedy="Choose another place, or --overwrite."
+        )
     kind = "-exr" if exr else ""
     waiting = out.absolute().parent / f".{out.name}.{render_key(scene, count, edge)[:16]}{kind}"
     with exclusive(waiting, wait=True):

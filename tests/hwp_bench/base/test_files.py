@@ -64,16 +64,20 @@ def test_a_full_folder_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
 
 def test_a_refusal_names_the_option_where_there_is_one(tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    with pytest.raises(UsageError, match="or replace it with --overwrite") as caught:
-        with atomic_folder(tmp_path, flag="--overwrite"):
-            pass
+    with (
+        pytest.raises(UsageError, match="or replace it with --overwrite") as caught,
+        atomic_folder(tmp_path, flag="--overwrite"),
+    ):
+        pass
     with pytest.raises(UsageError) as plain, atomic_folder(tmp_path):
         pass
     assert "--" not in str(plain.value).replace(str(tmp_path), "")
     assert str(tmp_path) in str(caught.value)
 
 
-@pytest.mark.parametrize(("umask", "file", "folder"), [(0o022, 0o644, 0o755), (0o027, 0o640, 0o750)])
+@pytest.mark.parametrize(
+    ("umask", "file", "folder"), [(0o022, 0o644, 0o755), (0o027, 0o640, 0o750)]
+)
 def test_outputs_have_the_modes_that_the_umask_gives(
     umask: int, file: int, folder: int, tmp_path: Path
 ) -> None:

@@ -25,7 +25,9 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     return made
 
 
-@pytest.mark.parametrize(("reached", "said"), [(116, "116 of 2000 in 65.0 s"), (2000, "2000 in 65.0 s")])
+@pytest.mark.parametrize(
+    ("reached", "said"), [(116, "116 of 2000 in 65.0 s"), (2000, "2000 in 65.0 s")]
+)
 def test_work_that_ends_early_says_how_far_it_came(
     reached: int, said: str, clock: Clock, capsys
 ) -> None:

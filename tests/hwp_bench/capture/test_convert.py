@@ -100,7 +100,10 @@ def test_the_command_rewrites_a_capture(
     info = replace(plain.info, hand_model=HandModelId(free_right.name, free_right.digest))
     rewrite_capture(plain, tmp_path / "sound", info, {"right": bent(10)})
     source, out = str(tmp_path / "sound"), str(tmp_path / "as_mano")
-    assert main(["hands", "convert", source, out, "--hand-model", f"mano:{mano_folder}", "--json"]) == 0
+    assert (
+        main(["hands", "convert", source, out, "--hand-model", f"mano:{mano_folder}", "--json"])
+        == 0
+    )
     error = json.loads(capsys.readouterr().out)["right"]
     assert 0 < error["skin_mm"] <= error["worst_skin_mm"]
     made = open_capture(out)

@@ -69,7 +69,7 @@ def test_a_wrong_call_renders_nothing(
 ) -> None:
     _method(tmp_path / "mine")
     with open(tmp_path / "mine" / "method.toml", "a") as stream:
-        stream.write('[switches.a]\nsettings_off = {level = 0.1}\n')
+        stream.write("[switches.a]\nsettings_off = {level = 0.1}\n")
     assert main([command, "mine", "--suite", "smoke", *words]) == status
     assert problem in capsys.readouterr().err
 

@@ -18,7 +18,9 @@ def _capture(failures: list[str | None]):
 
 def test_every_bad_frame_is_named_with_its_reason() -> None:
     text = failure_text(
-        _capture([None, "000001.png: is empty", "000002.png: does not exist", "000003.png: is empty"])
+        _capture(
+            [None, "000001.png: is empty", "000002.png: does not exist", "000003.png: is empty"]
+        )
     )
     assert text == (
         "capture2: 3 of 4 frames: 000001.png, 000003.png: is empty; 000002.png: does not exist"

@@ -1,4 +1,4 @@
-"""`table`, `cost` and `report` take the same `runs/*`. Oracle: what a person finds in such a folder."""
+"""`table`, `cost` and `report` take the same `runs/*`. Oracle: what lies in such a folder."""
 
 from __future__ import annotations
 
