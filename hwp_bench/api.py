@@ -14,14 +14,15 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
-from hwp_bench.base.progress import JobsView
+from hwp_bench.base.progress import JobsView, notice
 from hwp_bench.base.tables import write_tables
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
+from hwp_bench.evaluation.foresight import check_call, check_suite
+from hwp_bench.evaluation.outcome import outcome_lines
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
-from hwp_bench.methods.setting_files import check_settings
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.evaluation_tables import HEADLINE, all_tables
 from hwp_bench.report.free_view_table import free_view_tables
@@ -85,7 +86,10 @@ def evaluate(
         run=RunSettings(dict(settings or {}), seed, Budget(seconds, steps), frames),
     )
     folder = Path(out) if out is not None else default_folder(os.fspath(method), plan)
-    check_settings(read_manifest(find_method(os.fspath(method))), settings or {})
+    manifest = read_manifest(find_method(os.fspath(method)))
+    check_call(manifest, plan, folder)
+    if suite != "captures":
+        check_suite(manifest, plan, folder)
     view = JobsView()
     engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
     with engine, view if engine.in_turn else nullcontext():
@@ -99,6 +103,8 @@ def evaluate(
             engine=engine,
         )
     write_tables(folder / "tables", {**all_tables([results]), **free_view_tables([results])})
+    for line in outcome_lines(folder, results):
+        notice(line)
     return results
 
 

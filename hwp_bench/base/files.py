@@ -7,9 +7,9 @@ import hashlib
 import json
 import math
 import os
+import secrets
 import shutil
 import stat
-import tempfile
 from collections.abc import Iterable, Iterator
 from functools import lru_cache
 from pathlib import Path
@@ -40,14 +40,13 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
     """
     path = Path(path)
     raw = data.encode() if isinstance(data, str) else data
-    temporary: str | None = None
+    temporary: Path | None = None
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        with os.fdopen(handle, "wb") as stream:
+        temporary = temporary_name(path)
+        # Not by tempfile, whose files are private: a result has the mode that the umask gives.
+        with open(temporary, "xb") as stream:
             stream.write(raw)
-        # mkstemp makes private files; results are meant to be read by others.
-        os.chmod(temporary, 0o644)
         os.replace(temporary, path)
     except OSError as error:
         if temporary is not None:
@@ -61,13 +60,35 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
     return path
 
 
+def refuse_existing(
+    path: str | os.PathLike[str], *, overwrite: bool = False, flag: str = ""
+) -> None:
+    """Refuse to make a folder where something is, before work is done for it.
+
+    Args:
+        path: the folder to make.
+        overwrite: a folder that holds something may be replaced; a file may not.
+        flag: the option by which a person asks for that, for the message; empty where none is.
+
+    Raises:
+        UsageError: `path` is a file, or a folder that holds something.
+    """
+    path = Path(path)
+    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
+        another = f", or replace it with {flag}" if flag else ""
+        raise UsageError("exists already", where=path, remedy=f"Choose another place{another}.")
+
+
 @contextlib.contextmanager
-def atomic_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> Iterator[Path]:
+def atomic_folder(
+    path: str | os.PathLike[str], *, overwrite: bool = False, flag: str = ""
+) -> Iterator[Path]:
     """Fill a folder under a temporary name; it takes its own name only when the block ends well.
 
     Args:
         path: the folder to make.
         overwrite: replace an existing folder; without it an existing non-empty one is refused.
+        flag: the option by which a person asks for that, for the message; empty where none is.
 
     Yields:
         The temporary folder, a sibling of `path`.
@@ -77,14 +98,11 @@ def atomic_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
         HwpError: the place cannot be written.
     """
     path = Path(path).absolute()
-    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
-        raise UsageError(
-            "exists already", where=path, remedy="Choose another place, or allow overwriting it."
-        )
+    refuse_existing(path, overwrite=overwrite, flag=flag)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(dir=path.parent, prefix=f".{path.name}."))
-        os.chmod(temporary, 0o755)
+        temporary = temporary_name(path)
+        temporary.mkdir()
     except OSError as error:
         raise HwpError(f"cannot be made ({error.strerror})", where=path) from error
     try:
@@ -100,6 +118,11 @@ def atomic_folder(path: str | os.PathLike[str], *, overwrite: bool = False) -> I
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+def temporary_name(path: Path) -> Path:
+    """Return a name next to a path that nothing has; what it names is made with `x` or `mkdir`."""
+    return path.with_name(f".{path.name[:200]}.{secrets.token_hex(6)}")
 
 
 def canonical_json(value: Any) -> str:

@@ -64,7 +64,7 @@ def remaining(durations: Sequence[float], left: int) -> float | None:
 def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show how far a piece of work is, with elapsed and remaining time.
 
-    On a terminal a bar; elsewhere one line when the work ends.
+    On a terminal a bar; elsewhere one line when the work ends, which says how much of it was done.
 
     Args:
         description: what is being done.
@@ -80,8 +80,16 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
             yield update
         return
     if not sys.stderr.isatty():
-        yield lambda done: None
-        notice(f"{description}: {total} in {time.perf_counter() - start:.1f} s")
+        reached = 0
+
+        def reach(done: int) -> None:
+            nonlocal reached
+            reached = done
+
+        yield reach
+        # Work may end early: by its budget, or because nothing gets better any more.
+        share = f"{total}" if reached == total else f"{reached} of {total}"
+        notice(f"{description}: {share} in {time.perf_counter() - start:.1f} s")
         return
     with new_bars() as bars:
         task = bars.add_task(description, total=total, left="")

@@ -1,13 +1,20 @@
-"""Text from others: finds and replaces characters that steer a terminal or reverse a line."""
+"""Text for a person: without characters that steer a terminal or reverse a line, and bounded."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 
 #: Control characters except tab and line feed, and the marks that reverse the direction of
 #: writing, as a set of characters in a regular expression (without its brackets).
 ODD_CHARACTERS = "\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069"
 _ODD = re.compile(f"[{ODD_CHARACTERS}]")
+
+
+def bounded(items: Sequence[object], most: int = 12) -> str:
+    """Return items separated by commas, at most some of them, and how many more there are."""
+    text = ", ".join(str(item) for item in items[:most])
+    return text if len(items) <= most else f"{text} and {len(items) - most} more"
 
 
 def has_odd_characters(text: str) -> bool:

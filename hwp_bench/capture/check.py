@@ -13,8 +13,9 @@ import numpy as np
 
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.images import pixel_digest
+from hwp_bench.base.text import bounded
 from hwp_bench.capture.reader import Capture, open_capture
-from hwp_bench.capture.schema import IMAGE_FOLDERS, image_path
+from hwp_bench.capture.schema import IMAGE_FOLDERS, SIMULATED, CaptureInfo, image_path
 from hwp_bench.capture.tracks import arrays_digest, hand_arrays
 from hwp_bench.capture.writer import combine
 from hwp_bench.hands.template import HandTemplate
@@ -94,10 +95,7 @@ def _facts(capture: Capture) -> dict[str, Any]:
         "fps": info.fps,
         "hand_model": info.hand_model.name,
         "made_by": info.made_by or "not stated",
-        "perturbed_frames": {
-            name: None if values is None else sum(value > 0 for value in values)
-            for name, values in info.perturbations.items()
-        },
+        "perturbed_frames": _perturbed_frames(info),
         "valid_frames": {side: int(hand.valid.sum()) for side, hand in capture.hands.items()},
         "truth": [
             name
@@ -111,6 +109,19 @@ def _facts(capture: Capture) -> dict[str, Any]:
         "free_view_frames": _count(capture),
         "licence": info.licence,
         "digest": capture.digest,
+    }
+
+
+def _perturbed_frames(info: CaptureInfo) -> dict[str, int | None] | None:
+    """Frames by perturbation, None where it is not known in which; None where nothing is known.
+
+    A simulated capture declares all that acts. An import that declares nothing was not judged.
+    """
+    if not info.perturbations and info.source.get("kind") != SIMULATED:
+        return None
+    return {
+        name: None if values is None else sum(value > 0 for value in values)
+        for name, values in info.perturbations.items()
     }
 
 
@@ -175,7 +186,7 @@ def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
             "warning",
             os.fspath(folder),
             None,
-            f"holds {len(others)} further files (first: {others[0]})",
+            f"holds {len(others)} further files: {bounded(others)}",
             "They are ignored.",
         )
     digests = [digest for digest, _ in results]
@@ -205,7 +216,8 @@ def _geometry(capture: Capture) -> Iterator[Finding]:
                 "error",
                 os.fspath(capture.root / "hands.npz"),
                 f"{side}_transl",
-                f"frame {behind[0]} lies behind its camera ({len(behind)} frames do)",
+                f"the hand lies behind the camera in {len(behind)} of {len(hand.valid)} frames: "
+                f"{bounded(behind)}",
                 "Mark such frames as not valid, or correct the translation.",
             )
 

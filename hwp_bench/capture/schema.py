@@ -31,6 +31,8 @@ TRUE_TEMPLATE = "truth/template.npz"
 EXTRA = "extra"
 #: Folder of the free-view clip, a small capture of its own; withheld but for hands and cameras.
 FREE_VIEW = "free"
+#: `source.kind` of a capture that was simulated: it declares everything that perturbs it.
+SIMULATED = "simulated"
 
 #: Folder of each kind of image. All but `frames` and `masks` are truth, withheld from methods.
 IMAGE_FOLDERS = {

@@ -84,11 +84,10 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.capture.splits import read_splits
-    from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings
+    from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings, look_ahead
     from hwp_bench.evaluation.ablate.design import make_design
     from hwp_bench.evaluation.ablate.runs import run_ablation
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.methods.setting_files import check_settings
     from hwp_bench.run.engine.options import engine_for, needs_of
 
     if not 1 <= args.seeds <= 100:
@@ -97,10 +96,10 @@ def run(args: argparse.Namespace) -> int:
     settings = evaluation_settings(args)
     # A wrong method, setting or switch must be reported before a suite is rendered for it.
     manifest = read_manifest(find_method(args.method))
-    check_settings(manifest, settings.run.settings, "--set")
     design = make_design(manifest, args.thrown or [], args.only)
     out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}")
     splits = read_splits(args.splits) if args.splits else None
+    look_ahead(args, manifest, settings, out, splits)
     names = ", ".join(variant.name for variant in design.variants)
     notice(f"{len(design.variants)} variants: {names}")
     with engine_for(args) as engine:
@@ -131,6 +130,8 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
         write_record,
     )
     from hwp_bench.evaluation.ablate.effects import cost_effects, score_effects
+    from hwp_bench.evaluation.ablate.runs import result_folder
+    from hwp_bench.evaluation.outcome import outcome_lines
     from hwp_bench.report.evaluation_tables import HEADLINE
 
     metrics = common_metrics(list(ablation.runs.values()), HEADLINE)
@@ -148,17 +149,13 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
                 print_table(tables[name])
     _draw(ablation, out)
     notice(f"record: {write_record(out, record)}; tables: {out / 'tables'}")
-    failures = [
-        f"failed: {result.method.title}, seed {result.seed}, {capture.id}: "
-        f"{capture.failed_frames} of {len(capture.frames)} frames: "
-        f"{capture.failure or next(f.failure for f in capture.frames if f.failure)}"
-        for result in ablation.results
-        for capture in result.captures
-        if capture.failed_frames
-    ]
-    for text in failures:
-        notice(text)
-    return 1 if failures else 0
+    for name, runs in ablation.runs.items():
+        for seed, result in runs.seeds.items():
+            head = f"{result.method.title}, seed {seed}, "
+            for line in outcome_lines(out / result_folder(name, seed), result, head):
+                notice(line)
+    failed = any(item.failed_frames for result in ablation.results for item in result.captures)
+    return 1 if failed else 0
 
 
 def _draw(ablation: AblationRuns, out: Path) -> None:

@@ -50,18 +50,19 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.capture.splits import read_splits
-    from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings
-    from hwp_bench.evaluation.budget.runs import run_budget
+    from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings, look_ahead
+    from hwp_bench.evaluation.budget.runs import check_truths, run_budget
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.methods.material import TRUTHS
-    from hwp_bench.methods.setting_files import check_settings
     from hwp_bench.run.engine.options import engine_for, needs_of
 
     settings = evaluation_settings(args)
     manifest = read_manifest(find_method(args.method))
-    check_settings(manifest, settings.run.settings, "--set")
+    truths = tuple(TRUTHS) if args.truths is None else args.truths
+    check_truths(truths, settings)
     out = Path(args.out or f"runs/budget-{manifest.name}-{settings.suite}")
     splits = read_splits(args.splits) if args.splits else None
+    look_ahead(args, manifest, settings, out, splits)
     with engine_for(args) as engine:
         captures = chosen_captures(args, engine)
         with JobsView() if engine.in_turn else nullcontext() as view:
@@ -75,7 +76,7 @@ def run(args: argparse.Namespace) -> int:
                 captures,
                 out,
                 settings,
-                tuple(TRUTHS) if args.truths is None else args.truths,
+                truths,
                 splits=splits,
                 on_run=on_run,
                 engine=engine,
@@ -91,6 +92,7 @@ def _report(runs: BudgetRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.evaluation.budget.budget import budget_tables, make_budget, next_work
     from hwp_bench.evaluation.budget.picture import budget_sheet
+    from hwp_bench.evaluation.outcome import outcome_lines
 
     budget = make_budget(runs)
     tables = budget_tables(budget)
@@ -104,12 +106,9 @@ def _report(runs: BudgetRuns, out: Path, *, print_json: bool) -> int:
         print_table(tables["budget"])
         print(next_work(budget))
     notice(f"record: {record}; tables: {out / 'tables'}; picture: {picture}")
-    failed = [
-        f"failed: {name}: {capture.id}: {capture.failed_frames} of {len(capture.frames)} frames"
-        for name, results in runs.results.items()
-        for capture in results.captures
-        if capture.failed_frames
-    ]
-    for text in failed:
-        notice(text)
-    return 1 if failed else 0
+    status = 0
+    for name, results in runs.results.items():
+        for line in outcome_lines(runs.folders[name], results, f"{name}: "):
+            notice(line)
+        status |= any(capture.failed_frames for capture in results.captures)
+    return int(status)

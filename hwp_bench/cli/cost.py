@@ -75,7 +75,7 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError("names more than one method", field="--reference")
         reference = named[0]
     found: list[tuple[DataGroup, CostAnalysis]] = []
-    groups = data_groups(read_sources(args.results))
+    groups = data_groups(read_sources(args.results, repeats=False))
     for group in groups:
         results = [source.results for source in group.sources]
         # With several groups a reference is only of the one that it shares its data with.

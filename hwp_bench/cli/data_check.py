@@ -58,6 +58,8 @@ def _print(report: CheckReport) -> None:
 
 
 def _fact(value: object) -> str:
+    if value is None:
+        return "unknown"
     if isinstance(value, dict):
         known = {key: "unknown" if item is None else item for key, item in value.items()}
         return ", ".join(f"{key} {item}" for key, item in known.items()) or "none"

@@ -13,7 +13,11 @@ from hwp_bench.run.engine.options import add_engine_arguments
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from hwp_bench.capture.splits import Split
     from hwp_bench.evaluation.evaluate import EvaluationSettings
+    from hwp_bench.methods.manifest import MethodManifest
     from hwp_bench.publish import SealedPart
     from hwp_bench.results import Results
     from hwp_bench.run.engine import Engine
@@ -119,7 +123,6 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluation.evaluate import default_folder, evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.methods.setting_files import check_settings
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.report.free_view_table import free_view_tables
     from hwp_bench.run.engine.options import engine_for, needs_of
@@ -128,12 +131,12 @@ def run(args: argparse.Namespace) -> int:
     sealed = _sealed_part(args)
     if sealed is not None:
         settings = replace(settings, suite=f"sealed-{sealed.commitment[:12]}")
-    # A wrong method directory is reported before a suite is rendered for it.
-    check_settings(read_manifest(find_method(args.method)), settings.run.settings, "--set")
+    manifest = read_manifest(find_method(args.method))
     out = Path(args.out) if args.out else default_folder(args.method, settings)
     splits = read_splits(args.splits) if args.splits else None
     if sealed is not None:
         splits = sealed.splits
+    look_ahead(args, manifest, settings, out, splits)
     with engine_for(args) as engine:
         captures = chosen_captures(args, engine) if sealed is None else list(sealed.captures)
         with JobsView() if engine.in_turn else nullcontext() as jobs:
@@ -159,6 +162,26 @@ def run(args: argparse.Namespace) -> int:
     return report_outcome(out, results)
 
 
+def look_ahead(
+    args: argparse.Namespace,
+    manifest: MethodManifest,
+    settings: EvaluationSettings,
+    out: Path,
+    splits: Mapping[str, Split] | None,
+) -> None:
+    """Report whatever is wrong with a call before a suite is rendered for it.
+
+    Raises:
+        HwpError: as `check_call` and `check_suite`.
+    """
+    from hwp_bench.evaluation.foresight import check_call, check_suite
+
+    check_call(manifest, settings, out, "--set")
+    if not args.capture and not getattr(args, "sealed", None):
+        local = args.engine == "local"
+        check_suite(manifest, settings, out, splits, rehearse=local)
+
+
 def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
     """Open the sealed part that is asked for, and print its commitment."""
     if args.sealed is None:
@@ -175,22 +198,18 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
 
 
 def report_outcome(out: Path, results: Results) -> int:
-    """Print where the results are and which captures failed; returns the exit status."""
+    """Print where the results are and which frames failed; returns the exit status."""
     from hwp_bench.base.progress import notice
+    from hwp_bench.evaluation.outcome import outcome_lines
 
-    failed = [capture for capture in results.captures if capture.failed_frames]
-    for capture in failed:
-        reason = capture.failure or next(f.failure for f in capture.frames if f.failure)
-        notice(
-            f"failed: {capture.id}: {capture.failed_frames} of {len(capture.frames)} frames: "
-            f"{reason}"
-        )
+    for line in outcome_lines(out, results):
+        notice(line)
     notice(f"results: {out / 'results.json'}; tables: {out / 'tables'}")
     for capture in results.captures:
         picture = out / "captures" / capture.id / "pictures" / "comparison.png"
         if picture.is_file():
             notice(f"images: {picture}")
-    return 1 if failed else 0
+    return 1 if any(capture.failed_frames for capture in results.captures) else 0
 
 
 def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:

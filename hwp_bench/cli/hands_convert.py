@@ -8,8 +8,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 _EXAMPLES = """examples:
-  hwp-bench hands convert my_capture as_mano --hand mano:mano_v1_2/models
-  hwp-bench hands convert mano_capture as_free --hand anny --json
+  hwp-bench hands convert my_capture as_mano --hand-model mano:mano_v1_2/models
+  hwp-bench hands convert mano_capture as_free --hand-model anny --json
 
 Writes the capture again with its hands in another hand model, by fitting, and prints the errors
 of the fit. True hand parameters are left out: they belong to the old model.
@@ -23,7 +23,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("capture", type=Path, metavar="CAPTURE", help="capture folder")
     parser.add_argument("out", type=Path, metavar="OUT", help="capture folder to make")
     parser.add_argument(
-        "--hand", required=True, metavar="MODEL", help="anny, mano:PATH or mano-hd:PATH"
+        "--hand-model", required=True, metavar="MODEL", help="anny, mano:PATH or mano-hd:PATH"
     )
     parser.add_argument("--force", action="store_true", help="replace an existing capture")
     parser.add_argument("--json", action="store_true", help="print the errors as JSON")
@@ -34,7 +34,9 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.convert import convert_capture
 
-    errors = convert_capture(open_capture(args.capture), args.out, args.hand, overwrite=args.force)
+    errors = convert_capture(
+        open_capture(args.capture), args.out, args.hand_model, overwrite=args.force
+    )
     if args.json:
         print(json.dumps({side: asdict(error) for side, error in errors.items()}, indent=1))
         return 0

@@ -79,11 +79,17 @@ reproduces; 1: it differs (the check says so too); 2: no entry fits.
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
+    actions = parser.add_subparsers(
+        dest="action", required=True, metavar="ACTION", help="what to do"
+    )
 
     def action(name: str, text: str, epilog: str = "") -> argparse.ArgumentParser:
         added = actions.add_parser(
-            name, help=text, epilog=epilog, formatter_class=argparse.RawDescriptionHelpFormatter
+            name,
+            help=text,
+            description=text[0].upper() + text[1:] + ".",
+            epilog=epilog,
+            formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         added.add_argument(
             "--entries", metavar="DIR", help="folder of the entries (default leaderboard/entries)"
@@ -247,16 +253,22 @@ def _show(args: argparse.Namespace, folder: Path) -> int:
 def _confirm(args: argparse.Namespace, folder: Path) -> int:
     from dataclasses import asdict
 
+    from hwp_bench.base.errors import UsageError
     from hwp_bench.base.progress import notice
     from hwp_bench.cli.verify import captures_of
-    from hwp_bench.leaderboard.confirm import confirm
+    from hwp_bench.leaderboard.confirm import confirm, entry_of
     from hwp_bench.leaderboard.entries import read_entries, refuse_installed, write_check
-    from hwp_bench.results import result_files
+    from hwp_bench.results import read_results, result_files
 
     refuse_installed(folder)
     (file,) = result_files(args.results)
+    entries = read_entries(folder)
+    # Before a suite is rendered for it.
+    entry_of(entries, read_results(file), args.entry)
+    if not 0 <= args.tolerance <= 100:
+        raise UsageError(f"{args.tolerance} is not between 0 and 100 dB", field="--tolerance")
     check = confirm(
-        read_entries(folder),
+        entries,
         file,
         captures_of(args.captures, file),
         by=args.by,

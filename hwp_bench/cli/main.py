@@ -28,6 +28,7 @@ def command_tree() -> Command:
         "import": Command("make captures of other data", commands=imports),
         "import-video": Command("make a capture of a video", f"{here}.import_video"),
         "track": Command("track the hands of a video", f"{here}.data_track"),
+        "inputs": Command("write the inputs of a program of your own", f"{here}.data_inputs"),
         "publish": Command(
             "divide captures into a public and a sealed part", f"{here}.data_publish"
         ),
@@ -49,6 +50,7 @@ def command_tree() -> Command:
             "data": Command("make, check and show captures", commands=data),
             "hands": Command("hand models", commands=hands),
             "sim": Command("simulate captures", f"{here}.sim"),
+            "completion": Command("print completion for a shell", f"{here}.completion"),
             "stability": Command("run the numerical hard cases", f"{here}.stability"),
         },
     )

@@ -11,6 +11,7 @@ import sys
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 from hwp_bench.base.denormals import flushed_process
 from hwp_bench.base.errors import HwpError
@@ -90,25 +91,35 @@ def _dispatch(program: str, group: Command, words: list[str]) -> int:
     if command.commands:
         return _dispatch(f"{program} {name}", command, rest)
     module = importlib.import_module(command.module)
-    leaf = argparse.ArgumentParser(
-        prog=f"{program} {name}",
-        description=command.summary[0].upper() + command.summary[1:] + ".",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+    leaf = argparse.ArgumentParser(**describe_leaf(f"{program} {name}", command))
     module.add_arguments(leaf)
     return module.run(leaf.parse_args(rest))
 
 
-def _group_parser(program: str, group: Command) -> argparse.ArgumentParser:
+def describe_leaf(program: str, command: Command) -> dict[str, Any]:
+    """Return the keyword arguments of a command's parser."""
+    return {
+        "prog": program,
+        "description": command.summary[0].upper() + command.summary[1:] + ".",
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+    }
+
+
+def describe_group(program: str, group: Command) -> dict[str, Any]:
+    """Return the keyword arguments of the parser of a group of commands."""
     width = max(len(name) for name in group.commands)
     lines = [f"  {name:<{width}}  {item.summary}" for name, item in group.commands.items()]
-    parser = argparse.ArgumentParser(
-        prog=program,
-        usage=f"{program} [-h] COMMAND ...",
-        description=f"{group.summary[0].upper()}{group.summary[1:]}.\n\ncommands:\n"
+    return {
+        "prog": program,
+        "usage": f"{program} [-h] COMMAND ...",
+        "description": f"{group.summary[0].upper()}{group.summary[1:]}.\n\ncommands:\n"
         + "\n".join(lines),
-        epilog=f"`{program} COMMAND --help` explains a command, with examples.",
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
+        "epilog": f"`{program} COMMAND --help` explains a command, with examples.",
+        "formatter_class": argparse.RawDescriptionHelpFormatter,
+    }
+
+
+def _group_parser(program: str, group: Command) -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(**describe_group(program, group))
     parser.add_argument("--version", action="version", version=f"%(prog)s {__version__}")
     return parser

@@ -8,6 +8,7 @@ _EXAMPLES = """examples:
   hwp-bench report runs/plain-mini -o reports/plain
   hwp-bench report runs/mine-mini runs/plain-mini -o reports/mine
   hwp-bench report runs/mine-mini runs/mine-mini-clean runs/plain-mini --base plain -o reports/mine
+  hwp-bench report runs/* -o reports/all
   hwp-bench report runs/mine-captures --captures my_captures/* -o reports/mine
 
 Results on different data get a page each, A/index.html, B/index.html, ..., and index.html leads to
@@ -51,7 +52,7 @@ def run(args: argparse.Namespace) -> int:
 
     pages = write_reports(
         Path(args.out),
-        read_sources(args.results),
+        read_sources(args.results, repeats=False),
         args.captures,
         base=args.base,
         title=args.title,

@@ -27,13 +27,20 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
-    actions = parser.add_subparsers(dest="action", required=True, metavar="ACTION")
-    _add_list(actions.add_parser("list", help="list scenes, suites, objects and effects"))
-    _add_plan(actions.add_parser("plan", help="print what a scene's frames need and will cost"))
-    _add_render(actions.add_parser("render", help="render captures"))
-    _add_preview(actions.add_parser("preview", help="contact sheet and animation of a scene"))
-    _add_gallery(actions.add_parser("gallery", help="images for the documentation"))
-    _add_calibrate(actions.add_parser("calibrate", help="solve strengths for stated losses"))
+    actions = parser.add_subparsers(
+        dest="action", required=True, metavar="ACTION", help="what to do"
+    )
+
+    def action(name: str, text: str) -> argparse.ArgumentParser:
+        described = text[0].upper() + text[1:] + "."
+        return actions.add_parser(name, help=text, description=described)
+
+    _add_list(action("list", "list scenes, suites, objects and effects"))
+    _add_plan(action("plan", "print what a scene's frames need and will cost"))
+    _add_render(action("render", "render captures"))
+    _add_preview(action("preview", "contact sheet and animation of a scene"))
+    _add_gallery(action("gallery", "images for the documentation"))
+    _add_calibrate(action("calibrate", "solve strengths for stated losses"))
 
 
 def run(args: argparse.Namespace) -> int:

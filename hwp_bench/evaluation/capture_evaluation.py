@@ -18,6 +18,7 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import EXTRA
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.artifacts import keep_artifacts
+from hwp_bench.evaluation.colour_check import colour_warnings, keep_warnings
 from hwp_bench.evaluation.free_view import keep_free_view, read_free_targets, score_free_view
 from hwp_bench.evaluation.scoring import (
     mean_scores,
@@ -36,7 +37,7 @@ from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, CurvePoint
 from hwp_bench.run.engine import Folder, Job, Needs
 from hwp_bench.run.engine.job import OnProgress, ignore
-from hwp_bench.run.output import CHECKPOINTS, RunFacts
+from hwp_bench.run.output import CHECKPOINTS, LOG, RunFacts
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
 
@@ -150,6 +151,7 @@ def evaluate_capture(
     )
     if free is not None:
         keep_free_view(folder, free)
+    keep_warnings(folder, colour_warnings(targets, predictions))
     keep_artifacts(folder, output, source, evaluation.capture, scores, predictions)
     result = replace(result, job_seconds=time.perf_counter() - began)
     write_json(folder / RESULT, asdict(result))
@@ -197,8 +199,21 @@ def _run(
                 on_progress=on_progress,
             )
         except (MethodFailed, BadMethod) as error:
-            return None, str(error)
+            return None, _lasting(error, output)
     return record, None
+
+
+def _lasting(error: HwpError, output: Path) -> str:
+    """Return an error's text for the result, which outlives the folder of the run.
+
+    The log moves next to `result.json`, and the result may be read on another machine: a path
+    into the run's folder would lead nowhere.
+    """
+    if error.where is None or not Path(error.where).is_relative_to(output):
+        return str(error)
+    log = f"{LOG} next to {RESULT} holds what it printed."
+    advice = " ".join(text for text in (error.remedy, log) if text)
+    return str(HwpError(error.problem, field=error.field, remedy=advice))
 
 
 def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:

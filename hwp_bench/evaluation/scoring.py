@@ -15,6 +15,7 @@ import numpy as np
 
 from hwp_bench.base.errors import BadCapture, BadImage, BadPrediction
 from hwp_bench.base.images import pixel_digest, read_rgb
+from hwp_bench.base.text import bounded
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.metrics.batch import Frame, score_frames
@@ -55,19 +56,25 @@ def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
 
     Raises:
         BadImage: a frame or mask is missing or damaged.
-        BadCapture: a frame shows no hand that could be scored; no method can be blamed for it.
+        BadCapture: frames show no hand that could be scored; no method can be blamed for it.
     """
     targets = []
+    empty = []
     for frame in frames:
         mask, exact = capture.scoring_mask(frame)
         if not scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact).any():
-            raise BadCapture(
-                f"the mask of test frame {frame} leaves no pixel to score",
-                where=capture.root,
-                field=f"masks[{frame}]",
-                remedy="The test clip must show the hand in every frame.",
-            )
+            empty.append(frame)
+            continue
         targets.append(Target(frame, capture.frame(frame), mask, exact))
+    if empty:
+        several = len(empty) > 1
+        raise BadCapture(
+            f"the mask{'s' if several else ''} of test frame{'s' if several else ''} "
+            f"{bounded(empty)} leave{'' if several else 's'} no pixel to score",
+            where=capture.root,
+            field="masks",
+            remedy="The test clip must show the hand in every frame.",
+        )
     return targets
 
 

@@ -49,7 +49,7 @@ def confirm(
     if not 0 <= tolerance <= 100:
         raise UsageError(f"{tolerance} is not between 0 and 100 dB", field="--tolerance")
     results = read_results(file)
-    entry = _entry_of(entries, results, name)
+    entry = entry_of(entries, results, name)
     own = entry.results == results
     found = verify_results(file, captures)
     differences = len(found.discrepancies)
@@ -86,8 +86,12 @@ def confirm(
     )
 
 
-def _entry_of(entries: Sequence[Entry], results: Results, name: str | None) -> Entry:
-    """Return the entry of that name, or the only one that the results are of or repeat."""
+def entry_of(entries: Sequence[Entry], results: Results, name: str | None) -> Entry:
+    """Return the entry of that name, or the only one that the results are of or repeat.
+
+    Raises:
+        UsageError: no entry fits, or several do.
+    """
     fitting = [entry for entry in entries if entry.results == results]
     fitting = fitting or [entry for entry in entries if _repeats(entry.results, results)]
     if name is None and len(fitting) > 1:

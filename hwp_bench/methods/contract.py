@@ -81,7 +81,8 @@ class Avatar(Protocol):
             camera: the camera.
 
         Returns:
-            (H, W, 4) float in [0, 1]: sRGB colour over black (premultiplied) and coverage.
+            (H, W, 3) float in [0, 1]: sRGB colour over black; or (H, W, 4), with the coverage as
+            a fourth channel, which no score looks at.
         """
         ...
 

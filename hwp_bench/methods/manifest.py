@@ -16,6 +16,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.base.files import inside
 from hwp_bench.base.packages import PACKAGES, data_folder
+from hwp_bench.base.progress import notice
 from hwp_bench.base.records import (
     Line,
     check_json_values,
@@ -141,6 +142,38 @@ class MethodManifest:
                 where=self.root / MANIFEST,
                 field=field,
                 remedy=self._nearest_settings(name),
+            )
+
+    def doubt_setting_names(self, values: Mapping[str, Any], field: str = "settings") -> None:
+        """Refuse a name that is nearly one of the presets', where the method lists no settings.
+
+        Such a method takes any name, so that a mistyped one would run without an effect. A name
+        that resembles none is let through, and said.
+
+        Args:
+            values: a person's settings by name.
+            field: where they come from, for the message.
+
+        Raises:
+            BadMethod: a name is nearly, but not, one that a preset or switch has.
+        """
+        tables = [*self.presets.values(), *(switch.settings for switch in self.switches.values())]
+        known = {name for table in tables for name, _ in flattened(table)}
+        if self.settings or not known:
+            return
+        for name, _ in flattened(values):
+            if name in known:
+                continue
+            close = difflib.get_close_matches(name, sorted(known), n=3, cutoff=0.75)
+            if not close:
+                notice(f"{field}: {name}: {self.name} does not list its settings; not checked")
+                continue
+            raise BadMethod(
+                f"{name[:100]!r} is in no preset or switch of {self.name}",
+                where=self.root / MANIFEST,
+                field=field,
+                remedy=f"Did you mean {' or '.join(map(repr, close))}? If it is a setting, list "
+                "the names of all under `settings`.",
             )
 
     def _nearest_settings(self, wrong: str) -> str:

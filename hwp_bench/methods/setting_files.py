@@ -67,11 +67,12 @@ def check_settings(
         field: where they come from, for the message.
 
     Raises:
-        BadMethod: a name is not a setting of the method.
+        BadMethod: a name is not a setting of the method, or nearly one where it lists none.
         UsageError: a setting names a file that is not there.
         HwpError: the file is not what the method needs.
     """
     manifest.check_setting_names(values, field)
+    manifest.doubt_setting_names(values, field)
     resolved, files = find_setting_files(manifest, values)
     if files and manifest.check_files and _ships(manifest.root):
         module, _, function = manifest.check_files.partition(":")

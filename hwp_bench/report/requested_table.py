@@ -69,6 +69,10 @@ class TableRequest:
     captures: Sequence[str | os.PathLike[str]] = ()
 
 
+#: Tables that show each method, settings and seed once.
+_ONCE = ("rank", "cost", "seeds", "robustness", "free-view")
+
+
 def make_table(request: TableRequest) -> Table:
     """Make the table.
 
@@ -93,7 +97,7 @@ def make_table(request: TableRequest) -> Table:
 
 
 def _ours(request: TableRequest) -> Table:
-    sources = read_sources(request.paths)
+    sources = read_sources(request.paths, repeats=request.by not in _ONCE)
     shown: list[DataGroup] = []
     tables: list[Table] = []
     refused: list[UsageError] = []

@@ -9,12 +9,14 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.analysis.statistics.pairing import same_but_seed
 from hwp_bench.base.errors import BadResult, HwpError
 from hwp_bench.base.files import cache_root, inside, read_json, sha256_json
+from hwp_bench.base.progress import notice
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import CaptureInfo
-from hwp_bench.results import Results, read_results, result_files
+from hwp_bench.results import Results, read_results, results_among
 
 #: Largest file of temporal weights that is read, bytes.
 MAX_WEIGHT_BYTES = 16 * 1024 * 1024
@@ -50,14 +52,30 @@ class TemporalWeights:
     weights: list[float]
 
 
-def read_sources(paths: Iterable[str | os.PathLike[str]]) -> list[ResultsSource]:
+def read_sources(
+    paths: Iterable[str | os.PathLike[str]], *, repeats: bool = True
+) -> list[ResultsSource]:
     """Read every evaluation that some paths stand for, in order.
+
+    Args:
+        paths: results folders and files, ablations; what holds no results is left out and said.
+        repeats: keep a second run of the same method, settings, seed, budget and data; without,
+            it is left out and said, for what shows each of them once.
 
     Raises:
         BadInput, BadResult: one is missing or damaged.
     """
-    files = [file for path in paths for file in result_files(path)]
-    return [ResultsSource(read_results(file), file.parent) for file in files]
+    sources = [ResultsSource(read_results(file), file.parent) for file in results_among(paths)]
+    if repeats:
+        return sources
+    first: dict[str, ResultsSource] = {}
+    for source in sources:
+        result = source.results
+        data = sorted((capture.id, capture.digest) for capture in result.captures)
+        kept = first.setdefault(sha256_json([same_but_seed(result), result.seed, data]), source)
+        if kept is not source:
+            notice(f"left out: {source.folder} repeats {kept.folder} (same method, settings, seed)")
+    return list(first.values())
 
 
 def temporal_weights(source: ResultsSource, capture: str) -> dict[str, TemporalWeights]:

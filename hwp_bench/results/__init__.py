@@ -10,6 +10,7 @@ from hwp_bench.results.schema import (
     read_all,
     read_results,
     result_files,
+    results_among,
     write_results,
 )
 
@@ -23,5 +24,6 @@ __all__ = [
     "read_all",
     "read_results",
     "result_files",
+    "results_among",
     "write_results",
 ]

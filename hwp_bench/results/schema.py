@@ -13,6 +13,7 @@ from typing import Any
 
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import canonical_json, inside, read_json, write_json
+from hwp_bench.base.progress import notice
 from hwp_bench.base.records import parse_record, without_schema
 from hwp_bench.metrics.aggregate import CaptureScores, Scores, aggregate
 
@@ -239,13 +240,37 @@ def result_files(path: str | os.PathLike[str]) -> list[Path]:
         raise BadResult("does not list its results", where=record, field="variants") from error
 
 
+def results_among(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
+    """Return the result files that several paths stand for, such as `runs/*`.
+
+    Folders and files that hold no results (figures, notes, other commands' folders) are left out
+    and said, as long as another path holds some.
+
+    Raises:
+        BadInput, BadResult: as `result_files`.
+    """
+    places = list(paths)
+    strangers = [path for path in places if _holds_none(Path(path))]
+    if len(strangers) == len(places):
+        strangers = []
+    for path in strangers:
+        notice(f"left out: {os.fspath(path)} holds no results")
+    return [file for path in places if path not in strangers for file in result_files(path)]
+
+
+def _holds_none(place: Path) -> bool:
+    if place.is_dir():
+        return not any((place / name).is_file() for name in ("results.json", ABLATION))
+    return place.is_file() and place.suffix != ".json"
+
+
 def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Results]:
     """Read every evaluation that some paths stand for, in order.
 
     Raises:
         BadInput, BadResult: one is missing or damaged.
     """
-    return [read_results(file) for path in paths for file in result_files(path)]
+    return [read_results(file) for file in results_among(paths)]
 
 
 def score_rows(results: Results) -> list[CaptureScores]:

@@ -27,6 +27,8 @@ PROGRESS = "progress.json"
 FAILURE = "failure.json"
 #: The method's printed output.
 LOG = "log.txt"
+#: Settings and seed of a method that is only made, in the place of a request.
+REHEARSAL = "rehearsal.json"
 #: Largest `run.json` that is read, bytes.
 MAX_BYTES = 10 * 1024 * 1024
 

@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 import contextlib
+import os
 import shutil
 import signal
 import sys
+import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed
-from hwp_bench.base.files import inside, read_json
+from hwp_bench.base.files import inside, read_json, write_json
 from hwp_bench.base.text import shown
+from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.run.output import (
     FAILURE,
@@ -21,6 +24,7 @@ from hwp_bench.run.output import (
     LOG,
     PREDICTIONS,
     PROGRESS,
+    REHEARSAL,
     RUN,
     RunFacts,
     read_facts,
@@ -128,7 +132,6 @@ def run_method(
         raise MethodFailed(
             f"{manifest.name} failed on {capture_id}: {_reason(output, outcome.status)}",
             where=log,
-            remedy="The log holds what it printed.",
         )
     if manifest.kind == "python" and not (output / RUN).is_file():
         raise MethodFailed(
@@ -144,6 +147,53 @@ def run_method(
     return RunRecord(output / PREDICTIONS, facts, wall, isolation, clip if offered else None)
 
 
+def rehearse_method(
+    manifest: MethodManifest,
+    settings: RunSettings,
+    *,
+    time_limit: float = DEFAULT_TIME_LIMIT,
+    confinement: Confinement | None = None,
+) -> None:
+    """Make a Python method with its settings and do no more, as `run_method` would begin.
+
+    What fails here would fail on every capture: an import, a setting's value, a device. Of a
+    command it is looked whether its program is there.
+
+    Args:
+        manifest: the method.
+        settings: the preset with its overrides, and the seed.
+        time_limit: seconds after which it is stopped.
+        confinement: how it is confined; None takes the defaults.
+
+    Raises:
+        MethodFailed: it cannot be made; the message has the reason.
+        BadMethod: there is no such program.
+    """
+    if manifest.kind == "command":
+        program = manifest.entry[0]
+        bare = "{" not in program and os.sep not in program
+        if bare and shutil.which(program) is None:
+            raise BadMethod(
+                f"there is no program {program!r}", where=manifest.root, field="entry.command"
+            )
+    if manifest.kind != "python":
+        return
+    confinement = confinement or Confinement()
+    limits = Limits(time_limit, confinement.memory_bytes)
+    with tempfile.TemporaryDirectory(prefix="hwp-rehearsal-") as name:
+        request, output = Path(name) / "request", Path(name) / "output"
+        output.mkdir()
+        asked = {"settings": dict(settings.settings), "seed": settings.seed}
+        write_json(request / REHEARSAL, asked)
+        outcome, _ = _run(manifest, request, output, confinement, limits, None, ("--rehearse",))
+        if outcome.status != 0:
+            broken = outcome.stopped and f"stopped by the limit of {outcome.stopped}"
+            raise MethodFailed(
+                f"{manifest.name} cannot be made: {broken or _reason(output, outcome.status)}",
+                remedy="It fails before it sees a capture, so that nothing was rendered.",
+            )
+
+
 def _run(
     manifest: MethodManifest,
     request: Path,
@@ -151,9 +201,10 @@ def _run(
     confinement: Confinement,
     limits: Limits,
     on_progress: Callable[[int, int], None] | None,
+    options: Sequence[str] = (),
 ) -> tuple[ProcessOutcome, str]:
     """Run in the best sandbox that is asked for and possible; says which it was."""
-    command = _command(manifest, request, output)
+    command = [*_command(manifest, request, output), *options]
 
     def poll() -> None:
         if on_progress is not None:

@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
-from hwp_bench.base.files import write_json
+from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.progress import notice
 from hwp_bench.capture.schema import frame_name
@@ -32,6 +32,7 @@ from hwp_bench.run.output import (
     FREE_VIEW,
     PREDICTIONS,
     PROGRESS,
+    REHEARSAL,
     RUN,
     Checkpoint,
     RunFacts,
@@ -44,17 +45,22 @@ PROGRESS_INTERVAL = 0.5
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a method on a request; returns the exit status."""
+    """Run a method on a request, or only make it (`--rehearse`); returns the exit status."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("request", type=Path)
     parser.add_argument("output", type=Path)
     parser.add_argument("--method", type=Path, required=True)
     parser.add_argument("--entry", required=True)
+    parser.add_argument("--rehearse", action="store_true")
     args = parser.parse_args(arguments)
     args.output.mkdir(parents=True, exist_ok=True)
     try:
         factory = load_entry(args.method, args.entry)
-        run(open_request(args.request), factory, args.output)
+        if args.rehearse:
+            asked = read_json(args.request / REHEARSAL)
+            factory(asked["settings"], asked["seed"])
+        else:
+            run(open_request(args.request), factory, args.output)
     except HwpError as error:
         write_json(args.output / FAILURE, {"problem": str(error)})
         print(f"error: {error}", file=sys.stderr)
@@ -165,18 +171,22 @@ def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
 def drawn(avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: str) -> np.ndarray:
     """Render hands and bring the image to 8 bits: clipped, rounded half to even.
 
+    A fourth channel is dropped: the data set owns the mask.
+
     Raises:
         MethodFailed: the result has another shape or is not finite; it says the `name`.
     """
-    rgba = np.asarray(avatar.render(hands, camera))
-    size = (camera.height, camera.width, 4)
-    if rgba.shape != size:
-        raise MethodFailed(f"render returned shape {rgba.shape}, not {size}", field=name)
-    if not np.isfinite(rgba).all():
+    image = np.asarray(avatar.render(hands, camera))
+    size = (camera.height, camera.width)
+    if image.shape not in ((*size, 3), (*size, 4)):
+        raise MethodFailed(
+            f"render returned shape {image.shape}, not {(*size, 3)} or {(*size, 4)}", field=name
+        )
+    if not np.isfinite(image).all():
         raise MethodFailed("render returned NaN or infinity", field=name)
     from hwp_bench.base.images import as_uint8
 
-    return as_uint8(np.asarray(rgba[:, :, :3], dtype=np.float64))
+    return as_uint8(np.asarray(image[:, :, :3], dtype=np.float64))
 
 
 def device_name(avatar: Avatar) -> str:

@@ -74,6 +74,11 @@ def test_it_is_written_again_as_todays_version(tmp_path: Path) -> None:
     save_avatar(avatar, tmp_path / "avatar")
     written = json.loads((tmp_path / "avatar" / "avatar.json").read_text())
     assert written["schema"] == "wildghand-avatar/2"
+    # Everybody may read it whom the umask allows: its mode is that of a file made by hand.
+    (tmp_path / "plain").touch()
+    usual = (tmp_path / "plain").stat().st_mode
+    files = [path for path in (tmp_path / "avatar").rglob("*") if path.is_file()]
+    assert {path.stat().st_mode for path in files} == {usual}
     assert "loss" not in written["fit"]
     again = load_avatar(tmp_path / "avatar")
     assert again.settings == avatar.settings

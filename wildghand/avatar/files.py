@@ -64,7 +64,7 @@ def save_avatar(
     Raises:
         UsageError: something is there and may not be replaced.
     """
-    from safetensors.torch import save_file
+    from safetensors.torch import save
 
     description = _Description(
         schema=SCHEMA,
@@ -76,12 +76,11 @@ def save_avatar(
         settings=dataclasses.asdict(avatar.settings),
         fit=avatar.record,
     )
-    with atomic_folder(path, overwrite=overwrite) as folder:
+    with atomic_folder(path, overwrite=overwrite, flag="--overwrite") as folder:
         tensors = avatar.model.state_dict()
-        save_file(
-            {name: value.detach().cpu().contiguous() for name, value in tensors.items()},
-            folder / MODEL,
-        )
+        # Not `save_file`, which makes a file that only its owner may read.
+        data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
+        (folder / MODEL).write_bytes(data)
         write_json(folder / DESCRIPTION, dataclasses.asdict(description))
         write_weight_masks(avatar, folder / WEIGHTS)
     avatar.folder = Path(path)

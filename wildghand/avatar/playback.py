@@ -64,7 +64,7 @@ def render_clip(
     if video is not None:
         check_encoder()
     seconds, images = 0.0, []
-    with atomic_folder(out, overwrite=overwrite) as folder:
+    with atomic_folder(out, overwrite=overwrite, flag="--overwrite") as folder:
         for frame in track(frames, "Drawing"):
             poses, camera = capture.hand_poses(frame), capture.camera(frame)
             started = time.perf_counter()

@@ -22,7 +22,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("capture", type=Path, help="capture folder that it was fitted to")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="PNG file")
     parser.add_argument("--frames", type=int, nargs="+", metavar="N", help="frames of the capture")
-    parser.add_argument("--hand", metavar="MODEL", help="hand model: anny or mano:PATH")
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -33,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     from wildghand.avatar.files import load_avatar
 
     capture = open_capture(args.capture)
-    found = explain_frames(load_avatar(args.avatar, hand=args.hand), capture, args.frames)
+    found = explain_frames(load_avatar(args.avatar, hand=args.hand_model), capture, args.frames)
     names = {
         item.frame: ", ".join(
             kind.replace("_", " ")

@@ -40,7 +40,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="store_true",
         help="as SuperSplat shows it well: y down, ten units in a metre (.ply)",
     )
-    parser.add_argument("--hand", metavar="MODEL", help="hand model: anny or mano:PATH")
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace what exists")
     parser.add_argument("--json", action="store_true", help="print counts as JSON")
 
@@ -61,7 +63,7 @@ def run(args: argparse.Namespace) -> int:
     from wildghand.avatar.files import load_avatar
 
     capture = None if args.poses is None else open_capture(args.poses)
-    avatar = load_avatar(args.avatar, hand=args.hand)
+    avatar = load_avatar(args.avatar, hand=args.hand_model)
     counts = export(
         avatar, args.out, settings, capture=capture, frame=args.frame, overwrite=args.overwrite
     )

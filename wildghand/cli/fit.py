@@ -50,7 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--model", type=Path, metavar="FILE", help="the tracker's networks, as `data track` takes"
     )
     parser.add_argument(
-        "--hand", default="anny", metavar="MODEL", help="hand model for a video: anny or mano:PATH"
+        "--hand-model", default="anny", metavar="MODEL", help="for a video: anny or mano:PATH"
     )
     parser.add_argument("--steps", type=int, help="optimizer steps")
     parser.add_argument("--seconds", type=float, help="most seconds of optimizing")
@@ -98,7 +98,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
 
     options = VideoFit(
         side=args.side or "auto",
-        hand_model=args.hand,
+        hand_model=args.hand_model,
         landmarks=args.landmarks,
         tracker=args.model,
         quick=args.quick,

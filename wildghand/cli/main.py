@@ -28,6 +28,7 @@ def command_tree() -> Command:
             "explain": Command(
                 "show what the biases took out of training frames", "wildghand.cli.explain"
             ),
+            "completion": Command("print completion for a shell", "wildghand.cli.completion"),
             "info": Command("show what renders here, and check it", "wildghand.cli.info"),
         },
     )

@@ -10,6 +10,7 @@ _EXAMPLES = """examples:
   wildghand render my_avatar --poses my_capture -o frames
   wildghand render my_avatar --poses other_capture -o frames --frames 100:200 --background 255
   wildghand render my_avatar --poses my_capture -o frames --video turn.mp4
+  wildghand render my_avatar --poses my_capture -o frames --overwrite   # in place of older frames
 
 The poses are those of a capture: its hand parameters and cameras. PNG files are named by frame.
 """
@@ -28,7 +29,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--background", type=int, default=0, metavar="GREY", help="0 black to 255 white"
     )
     parser.add_argument("--video", type=Path, metavar="MP4", help="also write a video")
-    parser.add_argument("--hand", metavar="MODEL", help="hand model: anny or mano:PATH")
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
     parser.add_argument("--overwrite", action="store_true", help="replace an existing folder")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -42,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
 
     if not 0 <= args.background <= 255:
         raise UsageError(f"is {args.background}", field="--background", remedy="Use 0 to 255.")
-    avatar = load_avatar(args.avatar, hand=args.hand)
+    avatar = load_avatar(args.avatar, hand=args.hand_model)
     capture = open_capture(args.poses)
     frames = _frames(args.frames, capture.info.frame_count)
     facts = render_clip(

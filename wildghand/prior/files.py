@@ -154,7 +154,7 @@ def save_prior(
         steps=steps,
         weights=hashlib.sha256(data).hexdigest(),
     )
-    with atomic_folder(path, overwrite=overwrite) as folder:
+    with atomic_folder(path, overwrite=overwrite, flag="--overwrite") as folder:
         (folder / WEIGHTS).write_bytes(data)
         write_json(folder / DESCRIPTION, dataclasses.asdict(record))
     return Prior(record, {name: value.float() for name, value in halves.items()})

@@ -64,17 +64,7 @@ def run_budget(
         UsageError: a truth has no such name, or the settings ask for other frames.
         BadMethod, BadCapture, BadInput, BadImage, BadSplit: as `evaluate`.
     """
-    if settings.run.frames != FRAME_CHOICES[0]:
-        raise UsageError(
-            f"{settings.run.frames!r} is an oracle itself", field="--frames", remedy="Leave it out."
-        )
-    unknown = sorted(set(truths) - set(TRUTHS))
-    if unknown:
-        raise UsageError(
-            f"{unknown[0]!r} is not an estimate",
-            field="--truths",
-            remedy=f"Known: {', '.join(TRUTHS)}.",
-        )
+    check_truths(truths, settings)
     opened = tuple(open_capture(path) for path in captures)
     if "mesh" in truths:
         # Captures that were rendered before it was stored get it from their scene.
@@ -95,6 +85,25 @@ def run_budget(
             needs=needs,
         )
     return BudgetRuns(opened, results, folders)
+
+
+def check_truths(truths: Sequence[str], settings: EvaluationSettings) -> None:
+    """Refuse what no error budget is made of.
+
+    Raises:
+        UsageError: a truth has no such name, or the settings ask for other frames.
+    """
+    if settings.run.frames != FRAME_CHOICES[0]:
+        raise UsageError(
+            f"{settings.run.frames!r} is an oracle itself", field="--frames", remedy="Leave it out."
+        )
+    unknown = sorted(set(truths) - set(TRUTHS))
+    if unknown:
+        raise UsageError(
+            f"{unknown[0]!r} is not an estimate",
+            field="--truths",
+            remedy=f"Known: {', '.join(TRUTHS)}.",
+        )
 
 
 def variants_of(

@@ -5,12 +5,11 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import refuse_existing as refuse_folder
 from hwp_bench.base.progress import progress
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter
 from hwp_bench.hands.parameters import HandParameters
@@ -32,9 +31,7 @@ def refuse_existing(out: str | os.PathLike[str], *, overwrite: bool) -> None:
     Raises:
         UsageError: `out` is a file, or a folder that is not empty.
     """
-    path = Path(out)
-    if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
-        raise UsageError("exists already", where=path, remedy="Choose another place, or --force.")
+    refuse_folder(out, overwrite=overwrite, flag="--force")
 
 
 def write_capture(

@@ -14,6 +14,7 @@ import numpy as np
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import MAX_PIXELS, read_gray
+from hwp_bench.base.text import bounded
 from hwp_bench.importers.shared.windows import CropWindows, cut, resample
 from hwp_bench.importers.video.contour import FIELD_SIZE
 from hwp_bench.importers.video.video_settings import FrameRange
@@ -173,7 +174,7 @@ def read_masks(
     missing = [int(frame) for frame in indices if int(frame) not in numbered]
     if missing:
         raise BadInput(
-            f"{len(missing)} of {len(indices)} frames have no mask, first frame {missing[0]}",
+            f"{len(missing)} of {len(indices)} frames have no mask: {bounded(missing)}",
             where=folder,
             field="--masks",
             remedy="Name the masks by the frame's number in the video, from 0: 000000.png, ...",

@@ -7,14 +7,13 @@ import io
 import os
 import shutil
 import stat
-import tempfile
 import zipfile
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from hwp_bench.base.errors import BadInput, HwpError
-from hwp_bench.base.files import inside
+from hwp_bench.base.files import inside, temporary_name
 
 #: Largest folder that is sent, in bytes of content.
 MAX_BYTES = 8 << 30
@@ -96,9 +95,9 @@ def unpack(parcel: Parcel, target: Path, *, replace: bool = False) -> None:
     """
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
-        temporary = Path(tempfile.mkdtemp(dir=target.parent, prefix=f".{target.name}."))
+        temporary = temporary_name(target)
+        temporary.mkdir()
         try:
-            os.chmod(temporary, 0o755)
             _extract(parcel.data, temporary)
             if folder_digest(temporary) != parcel.digest:
                 raise BadInput("arrived damaged: its digest is different", where=target)
@@ -143,7 +142,10 @@ def _extract(data: bytes, root: Path) -> None:
                 # Written as plain files whatever the archive calls them, so there are no links.
                 with archive.open(item) as source, open(path, "xb") as stream:
                     shutil.copyfileobj(source, stream, _CHUNK)
-                os.chmod(path, 0o755 if item.external_attr >> 16 & 0o100 else 0o644)
+                if item.external_attr >> 16 & 0o100:
+                    # Whoever may read it may run it; the rest of the mode is the umask's.
+                    mode = path.stat().st_mode
+                    path.chmod(mode | (mode & 0o444) >> 2)
     except (zipfile.BadZipFile, FileExistsError, NotADirectoryError, ValueError, EOFError) as error:
         raise BadInput(f"is damaged ({error})", where=root) from error
 

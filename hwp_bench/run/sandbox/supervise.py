@@ -23,7 +23,8 @@ from hwp_bench.run.sandbox.root import Place
 if TYPE_CHECKING:
     import psutil
 
-#: Bytes of a program's output that are kept; the rest is counted and thrown away.
+#: Bytes of a program's output that are kept, half of its beginning and half of its end; the middle
+#: is counted and thrown away.
 MAX_LOG_BYTES = 1024 * 1024
 #: Most processes that a program may have at once.
 MAX_PROCESSES = 1024
@@ -191,16 +192,25 @@ def _end(process: subprocess.Popen[bytes]) -> None:
 
 
 def _drain(stream: IO[bytes], log: Path) -> None:
+    """Keep both ends of what a program prints: what it is, and what it died of."""
+    half = MAX_LOG_BYTES // 2
     kept = 0
     dropped = 0
+    tail = bytearray()
     with open(log, "wb") as target:
-        while chunk := stream.read(65536):
-            part = chunk[: MAX_LOG_BYTES - kept]
-            target.write(part)
-            kept += len(part)
-            dropped += len(chunk) - len(part)
+        # Whatever has come, and not whole blocks: the log can be followed while the program runs.
+        while chunk := os.read(stream.fileno(), 65536):
+            head = chunk[: half - kept]
+            target.write(head)
+            target.flush()
+            kept += len(head)
+            tail += chunk[len(head) :]
+            surplus = max(0, len(tail) - half)
+            del tail[:surplus]
+            dropped += surplus
         if dropped:
-            target.write(f"\n[{dropped} further bytes were not kept]\n".encode())
+            target.write(f"\n[{dropped} bytes in the middle were not kept]\n".encode())
+        target.write(tail)
 
 
 def _processes_of(root: int) -> list[psutil.Process]:

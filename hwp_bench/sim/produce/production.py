@@ -24,7 +24,7 @@ from hwp_bench.capture import (
     HandModelId,
     open_capture,
 )
-from hwp_bench.capture.schema import FREE_VIEW
+from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.sim.effects.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.produce.estimates import estimate_hands, estimate_mask
@@ -112,7 +112,9 @@ def render_capture(
         check_encoder(scene.id)
     out = Path(out)
     if out.exists() and not overwrite and (out.is_file() or any(out.iterdir())):
-        raise UsageError("exists already", where=out, remedy="Choose another place or overwrite.")
+        raise UsageError(
+            "exists already", where=out, remedy="Choose another place, or --overwrite."
+        )
     kind = "-exr" if exr else ""
     waiting = out.absolute().parent / f".{out.name}.{render_key(scene, count, edge)[:16]}{kind}"
     with exclusive(waiting, wait=True):
@@ -272,7 +274,7 @@ def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
             call.kind: tuple(item.severity[call.kind] for item in plans) for call in scene.effects
         },
         source={
-            "kind": "simulated",
+            "kind": SIMULATED,
             "scene": scene.id,
             "title": scene.title,
             "scene_digest": scene.digest,

@@ -11,7 +11,7 @@ from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import read_json, sha256_json
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture import Capture
-from hwp_bench.capture.schema import EXTRA, TRUE_TEMPLATE
+from hwp_bench.capture.schema import EXTRA, SIMULATED, TRUE_TEMPLATE
 from hwp_bench.capture.subject_mesh import write_subject_mesh
 from hwp_bench.hands.template import HandTemplate, rebuilt
 from hwp_bench.sim.geometry.mesh import surface_normals
@@ -80,7 +80,7 @@ def add_subject_mesh(capture: Capture) -> bool:
     path, source = capture.root / EXTRA / "scene.json", capture.info.source
     if (capture.root / TRUE_TEMPLATE).is_file():
         return True
-    if source.get("kind") != "simulated" or not path.is_file():
+    if source.get("kind") != SIMULATED or not path.is_file():
         return False
     try:
         scene = read_json(path)

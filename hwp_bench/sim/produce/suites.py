@@ -149,9 +149,34 @@ def ensure_captures(
     Raises:
         HwpError: a render failed; captures that were finished stay.
     """
+    engine = engine or LocalEngine()
+    jobs = _render_jobs(items, cache, workers, engine, needs or Needs(), free_view=free_view)
+    if not all(job.finished() for job in jobs):
+        engine.run(jobs, lambda index: None)
+    return [job.output for job in jobs]
+
+
+def is_rendered(name: str, cache: str | os.PathLike[str] | None = None) -> bool:
+    """Whether every capture of a suite is in the cache.
+
+    Raises:
+        UsageError: there is no such suite.
+    """
+    jobs = _render_jobs(suite(name), cache, None, LocalEngine(), Needs(), free_view=True)
+    return all(job.finished() for job in jobs)
+
+
+def _render_jobs(
+    items: Sequence[SuiteItem],
+    cache: str | os.PathLike[str] | None,
+    workers: int | None,
+    engine: Engine,
+    needs: Needs,
+    *,
+    free_view: bool,
+) -> list[Job]:
     from hwp_bench.sim.produce.production import render_key
 
-    engine, needs = engine or LocalEngine(), needs or Needs()
     root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
     each = workers_each(workers, engine, needs)
     jobs = []
@@ -168,9 +193,7 @@ def ensure_captures(
             free_view=free_view,
         )
         jobs.append(render_job(work, folder, needs))
-    if not all(job.finished() for job in jobs):
-        engine.run(jobs, lambda index: None)
-    return [job.output for job in jobs]
+    return jobs
 
 
 @dataclass(frozen=True)

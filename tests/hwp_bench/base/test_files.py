@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -58,6 +60,46 @@ def test_a_full_folder_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
     with atomic_folder(target, overwrite=True) as folder:
         (folder / "new").write_text("x")
     assert [item.name for item in target.iterdir()] == ["new"]
+
+
+def test_a_refusal_names_the_option_where_there_is_one(tmp_path: Path) -> None:
+    (tmp_path / "file").touch()
+    with (
+        pytest.raises(UsageError, match="or replace it with --overwrite") as caught,
+        atomic_folder(tmp_path, flag="--overwrite"),
+    ):
+        pass
+    with pytest.raises(UsageError) as plain, atomic_folder(tmp_path):
+        pass
+    assert "--" not in str(plain.value).replace(str(tmp_path), "")
+    assert str(tmp_path) in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("umask", "file", "folder"), [(0o022, 0o644, 0o755), (0o027, 0o640, 0o750)]
+)
+def test_outputs_have_the_modes_that_the_umask_gives(
+    umask: int, file: int, folder: int, tmp_path: Path
+) -> None:
+    # In a process of its own, because a umask belongs to a whole process.
+    script = f"""
+import os
+os.umask({umask})
+from pathlib import Path
+import numpy as np
+from hwp_bench.base.files import atomic_folder, atomic_write, write_json
+from hwp_bench.base.images import write_image
+from hwp_bench.run.engine.parcel import pack, unpack
+root = Path({str(tmp_path)!r})
+with atomic_folder(root / "made") as made:
+    atomic_write(made / "text", "x")
+    write_json(made / "value.json", 1)
+    write_image(made / "image.png", np.zeros((2, 2, 3), np.uint8))
+unpack(pack(root / "made"), root / "sent")
+"""
+    subprocess.run([sys.executable, "-c", script], check=True)
+    for path in sorted(tmp_path.rglob("*")):
+        assert path.stat().st_mode & 0o777 == (folder if path.is_dir() else file), path
 
 
 @pytest.mark.parametrize(

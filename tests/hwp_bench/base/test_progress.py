@@ -7,13 +7,26 @@ import sys
 import pytest
 from stopped_clock import Clock, stop_clock
 
-from hwp_bench.base.progress import JobsView, track
+from hwp_bench.base.progress import JobsView, progress, track
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The clock that progress looks at."""
     return stop_clock(monkeypatch, "hwp_bench.base.progress")
+
+
+@pytest.mark.parametrize(
+    ("reached", "said"), [(116, "116 of 2000 in 65.0 s"), (2000, "2000 in 65.0 s")]
+)
+def test_work_that_ends_early_says_how_far_it_came(
+    reached: int, said: str, clock: Clock, capsys
+) -> None:
+    with progress("Fitting", 2000) as update:
+        update(100)
+        update(reached)
+        clock.now += 65.0
+    assert capsys.readouterr().err == f"Fitting: {said}\n"
 
 
 @pytest.mark.parametrize("terminal", [False, True])

@@ -11,7 +11,7 @@ import pytest
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.progress import notice
 from hwp_bench.base.records import parse_record
-from hwp_bench.base.text import has_odd_characters, shown
+from hwp_bench.base.text import bounded, has_odd_characters, shown
 
 
 def test_exactly_controls_and_direction_marks_are_odd() -> None:
@@ -22,6 +22,13 @@ def test_exactly_controls_and_direction_marks_are_odd() -> None:
         odd = control or unicodedata.bidirectional(char) in directions
         assert has_odd_characters(f"a{char}b") == odd, hex(code)
         assert shown(char) == ("?" if odd else char)
+
+
+@pytest.mark.parametrize(
+    ("count", "text"), [(0, ""), (1, "0"), (3, "0, 1, 2"), (4, "0, 1, 2 and 1 more")]
+)
+def test_lists_are_bounded_and_counted(count: int, text: str) -> None:
+    assert bounded(range(count), most=3) == text
 
 
 def test_notices_do_not_steer_the_terminal(capsys: pytest.CaptureFixture[str]) -> None:

@@ -226,7 +226,7 @@ def test_the_check_names_damaged_images_and_strangers(make_capture: CaptureMaker
     problems = {Path(f.where).name: f.problem for f in report.findings}
     assert problems["000004.png"] == "is empty (0 bytes)"
     assert problems["000002.png"] == "does not exist"
-    assert problems["frames"] == "holds 1 further files (first: notes.txt)"
+    assert problems["frames"] == "holds 1 further files: notes.txt"
 
 
 def test_a_hand_behind_the_camera_and_an_empty_mask_are_found(
@@ -242,7 +242,7 @@ def test_a_hand_behind_the_camera_and_an_empty_mask_are_found(
             writer.mask(frame, mask * (frame != 3))
     findings = check_capture(tmp_path / "x").findings
     assert [(f.level, f.field) for f in findings] == [("error", "right_transl"), ("warning", None)]
-    assert "frame 6 lies behind its camera" in findings[0].problem
+    assert "the hand lies behind the camera in 1 of 10 frames: 6" in findings[0].problem
     assert "covers 0.00 %" in findings[1].problem
 
 

@@ -100,7 +100,10 @@ def test_the_command_rewrites_a_capture(
     info = replace(plain.info, hand_model=HandModelId(free_right.name, free_right.digest))
     rewrite_capture(plain, tmp_path / "sound", info, {"right": bent(10)})
     source, out = str(tmp_path / "sound"), str(tmp_path / "as_mano")
-    assert main(["hands", "convert", source, out, "--hand", f"mano:{mano_folder}", "--json"]) == 0
+    assert (
+        main(["hands", "convert", source, out, "--hand-model", f"mano:{mano_folder}", "--json"])
+        == 0
+    )
     error = json.loads(capsys.readouterr().out)["right"]
     assert 0 < error["skin_mm"] <= error["worst_skin_mm"]
     made = open_capture(out)
@@ -109,7 +112,7 @@ def test_the_command_rewrites_a_capture(
     assert made.info.source["converted"]["from"] == "anny-1"
     assert made.true_hands is None
     np.testing.assert_array_equal(made.frame(3), plain.frame(3))
-    assert main(["hands", "convert", source, out, "--hand", "anny"]) == 2
+    assert main(["hands", "convert", source, out, "--hand-model", "anny"]) == 2
     assert main(["hands", "convert", str(plain.root), str(tmp_path / "x"), "--hand", "anny"]) == 1
     assert "another edition of hand model anny-1" in capsys.readouterr().err
 

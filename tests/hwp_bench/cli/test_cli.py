@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -136,6 +137,22 @@ def test_evaluate_prints_the_table_and_says_where_things_are(
     (entry / "predictions" / "tiny" / "000019.png").unlink()
     assert main(words) == 1
     assert "1 of 2 frames: 000019.png: does not exist" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("jobs", ["1", "2"])
+def test_the_log_that_is_named_is_there(
+    make_capture: CaptureMaker, tmp_path: Path, capsys, jobs: str
+) -> None:
+    from toy_method import write_toy_method
+
+    method, out = write_toy_method(tmp_path / "toy"), tmp_path / "out"
+    capture = make_capture(frames=20)
+    words = ["evaluate", str(method), "--capture", str(capture.root), "--out", str(out)]
+    assert main([*words, "--set", "fail=tiny", "--jobs", jobs]) == 1
+    said = capsys.readouterr().err
+    named = re.findall(r"\S+log\.txt", said.replace("\n", " "))
+    assert named == [str(out / "captures" / "tiny" / "log.txt")]
+    assert "no luck" in Path(named[0]).read_text()
 
 
 def test_a_reader_that_stops_reading_is_no_traceback() -> None:

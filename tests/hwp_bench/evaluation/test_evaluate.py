@@ -216,6 +216,9 @@ def test_a_crash_on_one_capture_loses_nothing_and_is_tried_again(captures, tmp_p
     assert "RuntimeError: no luck" in results.captures[0].failure
     assert results.captures[1].failed_frames == 0
     assert "RuntimeError: no luck" in (out / "captures" / "single" / "log.txt").read_text()
+    # The folder of the run is gone; the text must not lead there.
+    assert "/run/" not in results.captures[0].failure
+    assert "log.txt next to result.json" in results.captures[0].failure
     run(method, captures, out)
     assert (method / "fits.log").read_text() == "pair "
 
@@ -230,9 +233,10 @@ def test_faults_of_the_capture_are_errors_before_the_method_runs(
     short = make_capture("short", frames=2, perturbations={})
     with pytest.raises(BadSplit, match="has 2 frames, too few"):
         run(method, [short], tmp_path / "out")
-    write_image(pair.root / "masks" / "000019.png", np.zeros((48, 48), np.uint8))
-    with pytest.raises(BadCapture, match="mask of test frame 19 leaves no pixel"):
-        run(method, [pair], tmp_path / "out")
+    for frame, problem in ((19, "mask of test frame 19 leaves"), (18, "test frames 18, 19 leave")):
+        write_image(pair.root / "masks" / f"{frame:06d}.png", np.zeros((48, 48), np.uint8))
+        with pytest.raises(BadCapture, match=problem):
+            run(method, [pair], tmp_path / "out")
     (single.root / "frames" / "000018.png").write_bytes(b"")
     with pytest.raises(BadImage, match=r"000018\.png: is empty"):
         run(method, [single], tmp_path / "out")

@@ -90,6 +90,21 @@ def test_a_python_method_fits_and_renders(request_folder: Path, tmp_path: Path) 
     assert facts.checkpoint_frames == [16, 17]
 
 
+def test_three_channels_are_as_good_as_four(request_folder: Path, tmp_path: Path) -> None:
+    # Oracle: the same method with a coverage channel.
+    pictures = []
+    for name, body in (("four", "pass"), ("three", "Avatar.render = rgb")):
+        manifest = python_method(tmp_path / name, body)
+        with open(tmp_path / name / "mean_colour.py", "a") as stream:
+            stream.write(
+                "def rgb(self, hands, camera):\n"
+                "    return np.broadcast_to(self.colour, (camera.height, camera.width, 3))\n"
+            )
+        record = run_method(manifest, "tiny", request_folder, tmp_path / f"{name}-output")
+        pictures.append(read_prediction(record.predictions, 18, (32, 32)).pixels)
+    np.testing.assert_array_equal(*pictures)
+
+
 def test_a_command_fits_and_renders(request_folder: Path, tmp_path: Path) -> None:
     script = """
 import json, pathlib, shutil, sys
@@ -129,13 +144,26 @@ def test_a_method_that_hangs_is_stopped(request_folder: Path, tmp_path: Path) ->
         _run(method, request_folder, tmp_path, limit=1.5)
 
 
-def test_megabytes_of_output_are_cut(request_folder: Path, tmp_path: Path) -> None:
-    manifest = command_method(tmp_path / "m", "print('x' * 5_000_000)\nraise SystemExit(4)")
+def test_megabytes_of_output_keep_both_ends(request_folder: Path, tmp_path: Path) -> None:
+    # Oracle: the bytes that were printed, cut by hand.
+    script = "print('start', 'x' * 5_000_000, 'the reason')\nraise SystemExit(4)"
     with pytest.raises(MethodFailed, match="exit status 4"):
-        _run(manifest, request_folder, tmp_path)
+        _run(command_method(tmp_path / "m", script), request_folder, tmp_path)
     log = (tmp_path / "output" / "log.txt").read_bytes()
-    assert len(log) < MAX_LOG_BYTES + 100
-    assert b"further bytes were not kept" in log[-60:]
+    printed = b"start " + b"x" * 5_000_000 + b" the reason\n"
+    half = MAX_LOG_BYTES // 2
+    gap = f"\n[{len(printed) - 2 * half} bytes in the middle were not kept]\n".encode()
+    assert log == printed[:half] + gap + printed[-half:]
+
+
+@pytest.mark.parametrize("count", [MAX_LOG_BYTES - 1, MAX_LOG_BYTES])
+def test_output_that_fits_is_kept_as_it_is(
+    count: int, request_folder: Path, tmp_path: Path
+) -> None:
+    script = f"import sys\nsys.stdout.write('y' * {count})\nraise SystemExit(4)"
+    with pytest.raises(MethodFailed):
+        _run(command_method(tmp_path / "m", script), request_folder, tmp_path)
+    assert (tmp_path / "output" / "log.txt").read_bytes() == b"y" * count
 
 
 def test_a_method_does_not_inherit_the_environment_or_learn_where_the_capture_is(

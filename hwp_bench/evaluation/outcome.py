@@ -1,0 +1,65 @@
+"""An evaluation's failures and doubts in words: every bad frame by name, bounded, with a count."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from hwp_bench.evaluation.colour_check import read_warnings
+from hwp_bench.results import CaptureResult, FrameResult, Results
+from hwp_bench.run.output import LOG
+
+#: Most frames that are named of a capture; the others are counted.
+SHOWN = 12
+
+
+def failure_text(capture: CaptureResult) -> str:
+    """Say which frames of a capture failed and why; empty where none did.
+
+    A method that failed on the whole capture has one reason; otherwise frames of the same reason
+    stand together, at most `SHOWN` of them by name.
+    """
+    if capture.failure is not None:
+        failed, count = capture.failed_frames, len(capture.frames)
+        return f"{capture.id}: {failed} of {count} frames: {capture.failure}"
+    return _frames_text(capture.id, capture.frames)
+
+
+def free_view_text(capture: CaptureResult) -> str:
+    """Say the same of the frames of the free-view clip."""
+    if capture.free_view is None or capture.failure is not None:
+        return ""
+    return _frames_text(f"{capture.id}, free view", capture.free_view.frames)
+
+
+def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
+    """Return a line for each failure, log and doubt of an evaluation.
+
+    Args:
+        out: its results folder, with `captures/ID/`.
+        results: its results.
+        head: what the captures' names begin with, such as a variant and a seed.
+    """
+    lines = []
+    for capture in results.captures:
+        folder = out / "captures" / capture.id
+        texts = [text for text in (failure_text(capture), free_view_text(capture)) if text]
+        lines += [f"failed: {head}{text}" for text in texts]
+        if capture.failure and (folder / LOG).is_file():
+            lines.append(f"log: {folder / LOG}")
+        lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
+    return lines
+
+
+def _frames_text(name: str, frames: Sequence[FrameResult]) -> str:
+    failed = [frame for frame in frames if frame.failure is not None]
+    if not failed:
+        return ""
+    by_reason: dict[str, list[str]] = {}
+    for frame in failed[:SHOWN]:
+        file, _, reason = (frame.failure or "").partition(": ")
+        by_reason.setdefault(reason, []).append(file)
+    parts = [", ".join(files) + f": {reason}" for reason, files in by_reason.items()]
+    if len(failed) > SHOWN:
+        parts.append(f"and {len(failed) - SHOWN} more")
+    return f"{name}: {len(failed)} of {len(frames)} frames: {'; '.join(parts)}"

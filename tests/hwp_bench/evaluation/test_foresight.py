@@ -1,0 +1,139 @@
+"""Whatever is wrong with a call is said before a suite is rendered. Oracle: nothing is rendered."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import pytest
+
+from hwp_bench.cli.main import main
+
+METHOD = """
+class Method:
+    def __init__(self, settings, seed):
+        self.level = float(settings["level"])
+"""
+MANIFEST = """
+schema = "hwp-method/1"
+name = "mine"
+[entry]
+{entry}
+[presets.default]
+level = 0.5
+[presets.default.light]
+degree = 2
+"""
+
+
+class Rendered(Exception):
+    """A suite would be rendered now."""
+
+
+@pytest.fixture(autouse=True)
+def no_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An empty cache, and a stop where rendering would begin."""
+
+    def stop(*_: object, **__: object) -> None:
+        raise Rendered
+
+    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("hwp_bench.sim.produce.suites.ensure_captures", stop)
+    monkeypatch.chdir(tmp_path)
+
+
+def _method(folder: Path, entry: str = 'python = "mine:Method"', code: str = METHOD) -> Path:
+    folder.mkdir()
+    (folder / "mine.py").write_text(code)
+    (folder / "method.toml").write_text(MANIFEST.format(entry=entry))
+    return folder
+
+
+@pytest.mark.parametrize("command", ["evaluate", "ablate", "budget"])
+@pytest.mark.parametrize(
+    ("words", "status", "problem"),
+    [
+        (["--set", "levl=1"], 1, "Did you mean 'level'?"),
+        (["--set", "light.degre=1"], 1, "Did you mean 'light.degree'?"),
+        (["--preset", "fast"], 1, "has no preset 'fast'"),
+        (["--expose", "nowhere"], 2, "nowhere: --expose: does not exist"),
+        (["--out", "mine/mine.py"], 1, "cannot be a results folder"),
+        (["--out", "mine/mine.py/deeper"], 1, "cannot be a results folder"),
+        (["--splits", "nowhere.json"], 1, "nowhere.json: does not exist"),
+        (["--engine", "rai"], 2, "is not an engine"),
+        (["--set", "level=bright"], 1, "mine cannot be made: ValueError: could not convert"),
+    ],
+)
+def test_a_wrong_call_renders_nothing(
+    command: str, words: list[str], status: int, problem: str, tmp_path: Path, capsys
+) -> None:
+    _method(tmp_path / "mine")
+    with open(tmp_path / "mine" / "method.toml", "a") as stream:
+        stream.write("[switches.a]\nsettings_off = {level = 0.1}\n")
+    assert main([command, "mine", "--suite", "smoke", *words]) == status
+    assert problem in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("entry", "code", "problem"),
+    [
+        ('python = "mine:Method"', "import no_such_package", "cannot import mine"),
+        ('python = "mine:Missing"', METHOD, "mine has no Missing"),
+        ('command = ["no-such-program", "{request}"]', "", "no program 'no-such-program'"),
+        ('predictions = "predictions"', "", "has predictions of no capture of this suite"),
+    ],
+)
+def test_a_method_that_cannot_start_renders_nothing(
+    entry: str, code: str, problem: str, tmp_path: Path, capsys
+) -> None:
+    _method(tmp_path / "mine", entry.replace("{request}", "{{request}}"), code)
+    assert main(["evaluate", "mine", "--suite", "smoke"]) == 1
+    assert problem in capsys.readouterr().err
+
+
+def test_a_folder_that_another_run_writes_to_is_said_at_once(tmp_path: Path, capsys) -> None:
+    from hwp_bench.base.locks import exclusive
+
+    _method(tmp_path / "mine")
+    with exclusive(tmp_path / "out"):
+        assert main(["evaluate", "mine", "--suite", "smoke", "--out", "out"]) == 1
+    assert "another run is writing here" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["evaluate", "mine", "--suite", "smoke"],
+        ["evaluate", "mine", "--suite", "smoke", "--set", "level=1", "--set", "light.degree=3"],
+        ["demo", "--methods", "mine"],
+    ],
+    ids=" ".join,
+)
+def test_a_sound_call_goes_on_to_render(words: Sequence[str], tmp_path: Path) -> None:
+    _method(tmp_path / "mine")
+    with pytest.raises(Rendered):
+        main(words)
+
+
+def test_a_name_like_none_of_a_method_without_a_list_is_said(tmp_path: Path, capsys) -> None:
+    _method(tmp_path / "mine")
+    with pytest.raises(Rendered):
+        main(["evaluate", "mine", "--suite", "smoke", "--set", "wholly_other=1"])
+    assert "wholly_other: mine does not list its settings" in capsys.readouterr().err
+
+
+def test_a_wrong_truth_renders_nothing(tmp_path: Path, capsys) -> None:
+    _method(tmp_path / "mine")
+    assert main(["budget", "mine", "--suite", "smoke", "--truths", "posse"]) == 2
+    assert "'posse' is not an estimate" in capsys.readouterr().err
+
+
+def test_python_looks_ahead_too(tmp_path: Path) -> None:
+    import hwp_bench
+    from hwp_bench.base.errors import BadMethod, UsageError
+
+    _method(tmp_path / "mine")
+    with pytest.raises(BadMethod, match="Did you mean 'level'"):
+        hwp_bench.evaluate("mine", "smoke", settings={"levl": 1})
+    with pytest.raises(UsageError, match="is not one of perturbed"):
+        hwp_bench.evaluate("mine", "smoke", frames="cleen")

@@ -1,0 +1,38 @@
+"""An outcome in words names every bad frame, up to a bound, and counts the others."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+from small_captures import results_example
+
+from hwp_bench.evaluation.outcome import SHOWN, failure_text, outcome_lines
+from hwp_bench.results import FrameResult
+
+
+def _capture(failures: list[str | None]):
+    frames = [FrameResult(i, {"psnr": 0.0}, text) for i, text in enumerate(failures)]
+    return replace(results_example().captures[0], frames=frames)
+
+
+def test_every_bad_frame_is_named_with_its_reason() -> None:
+    text = failure_text(
+        _capture(
+            [None, "000001.png: is empty", "000002.png: does not exist", "000003.png: is empty"]
+        )
+    )
+    assert text == (
+        "capture2: 3 of 4 frames: 000001.png, 000003.png: is empty; 000002.png: does not exist"
+    )
+
+
+def test_many_bad_frames_are_bounded_and_counted() -> None:
+    text = failure_text(_capture([f"{i:06d}.png: does not exist" for i in range(900)]))
+    assert text.count(".png") == SHOWN
+    assert text.endswith(f"and {900 - SHOWN} more")
+    assert "900 of 900 frames" in text
+
+
+def test_sound_captures_say_nothing(tmp_path: Path) -> None:
+    assert outcome_lines(tmp_path, results_example()) == []
