@@ -1,0 +1,29 @@
+"""Arguments of the commands that serve a page."""
+
+from __future__ import annotations
+
+import argparse
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from wildghand.viewer.server import Address
+
+
+def add_address(parser: argparse.ArgumentParser) -> None:
+    """Add --host and --port."""
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="address to serve at (default: 127.0.0.1, for this machine only)",
+    )
+    parser.add_argument(
+        "--port", type=int, default=8080, help="port; the next free one if it is taken"
+    )
+
+
+def address_of(args: argparse.Namespace) -> Address:
+    """Return what `add_address` read."""
+    from wildghand.viewer.server import Address
+
+    return Address(args.host, args.port)
