@@ -117,7 +117,9 @@ class HandAngles:
         poses = self.named_poses()
         if name not in poses:
             raise UsageError(
-                f"there is no pose {name[:40]!r}", field="pose", remedy=f"Known: {', '.join(poses)}."
+                f"there is no pose {name[:40]!r}",
+                field="pose",
+                remedy=f"Known: {', '.join(poses)}.",
             )
         return poses[name]
 

@@ -7,12 +7,15 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from wildghand.cli.serving import add_address, watching
+
 if TYPE_CHECKING:
     from wildghand.fitting.parallel import World
 
 _EXAMPLES = """examples:
   wildghand fit my_capture -o my_avatar
   wildghand fit my_capture -o my_avatar --seconds 60
+  wildghand fit my_capture -o my_avatar --live --port 9000
   wildghand fit hand.mp4 --landmarks hand.npz -o my_avatar
   wildghand fit my_capture -o paper --set mode=paper --set network.size=paper --set device=cuda
   torchrun --nproc-per-node 4 -m wildghand.cli.main fit my_capture -o my_avatar \\
@@ -57,6 +60,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PRIOR",
         help="start from it (made by `wildghand pretrain`; default: the one that ships)",
     )
+    parser.add_argument(
+        "--live",
+        action="store_true",
+        help="show the fit in the browser while it runs (needs viser); changes nothing of it",
+    )
+    add_address(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace an existing avatar")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -84,16 +93,18 @@ def _run(args: argparse.Namespace, world: World) -> int:
         raise UsageError(f"is {args.seconds}", field="--seconds", remedy="Use more than 0.")
     if args.seed < 0:
         raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
-    avatar = fit_capture(
-        _shared_capture(args, world),
-        args.out,
-        settings=_settings(args),
-        budget=Budget(seconds=args.seconds, steps=args.steps),
-        seed=args.seed,
-        all_frames=args.all_frames,
-        overwrite=args.overwrite,
-        world=world,
-    )
+    with watching(args, shown=args.live and world.is_main) as watch:
+        avatar = fit_capture(
+            _shared_capture(args, world),
+            args.out,
+            settings=_settings(args),
+            budget=Budget(seconds=args.seconds, steps=args.steps),
+            seed=args.seed,
+            all_frames=args.all_frames,
+            overwrite=args.overwrite,
+            world=world,
+            watch=watch,
+        )
     if not world.is_main:
         return 0
     record = avatar.record

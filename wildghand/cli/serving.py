@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from wildghand.fitting.optimize import Watch
     from wildghand.viewer.server import Address
 
 
@@ -27,3 +30,21 @@ def address_of(args: argparse.Namespace) -> Address:
     from wildghand.viewer.server import Address
 
     return Address(args.host, args.port)
+
+
+@contextlib.contextmanager
+def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[Watch | None]:
+    """Serve the page of a fit while the block runs, if it is `shown`.
+
+    Yields:
+        What the fit is given as `watch`.
+    """
+    if not shown:
+        yield None
+        return
+    from hwp_bench.base.progress import notice
+    from wildghand.viewer.live import serve_fit
+
+    with serve_fit(address_of(args)) as served:
+        notice(f"The fit is shown at {served.url}")
+        yield served.watch

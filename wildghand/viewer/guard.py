@@ -46,9 +46,7 @@ def guarded(loopback: bool) -> Iterator[None]:
 
     @functools.wraps(serve)
     def guarded_serve(*args: Any, process_request: Any = None, **options: Any) -> Any:
-        return serve(
-            *args, process_request=_first_asked(process_request, loopback), **options
-        )
+        return serve(*args, process_request=_first_asked(process_request, loopback), **options)
 
     setattr(server, "serve", guarded_serve)  # noqa: B010  mypy knows a class there
     try:

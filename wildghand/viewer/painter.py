@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from hwp_bench.methods.contract import Camera
 from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar
 from wildghand.avatar.inline import over
 from wildghand.splat import rasterize
 from wildghand.splat.threads import denormals_flushed
-from hwp_bench.methods.contract import Camera
 from wildghand.viewer.posing import Hands
 
 

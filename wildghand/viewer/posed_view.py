@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import threading
 from collections.abc import Callable
 
@@ -16,6 +17,8 @@ from wildghand.viewer.posing import Hands, with_angle, with_fingers
 
 #: Edge of the picture that gets everything compiled before a page asks, px.
 _FIRST_EDGE = 64
+# How far a page's camera stands behind the studio's, as a share of the distance.
+_BACK = 0.3
 
 
 class PosedView:
@@ -90,9 +93,11 @@ class PosedView:
         self.changed()
 
     def studio_viewpoint(self) -> Viewpoint:
-        """Where a camera sees the hands at rest."""
+        """Where a camera sees the hands at rest, with room for the panel next to them."""
         studio = self.avatar.studio
-        return viewpoint(studio.camera(_FIRST_EDGE, _FIRST_EDGE), studio.centre)
+        place = viewpoint(studio.camera(_FIRST_EDGE, _FIRST_EDGE), studio.centre)
+        back = _BACK * (place.look_at - place.position)
+        return dataclasses.replace(place, position=place.position - back)
 
     def frame_viewpoint(self, frame: int) -> Viewpoint:
         """Where the camera of a frame stood."""

@@ -152,9 +152,7 @@ class Screen:
             began = time.perf_counter()
             scene = page.client.scene
             if draft:
-                scene.set_background_image(
-                    picture.image, format="jpeg", jpeg_quality=DRAFT_QUALITY
-                )
+                scene.set_background_image(picture.image, format="jpeg", jpeg_quality=DRAFT_QUALITY)
                 sent = time.perf_counter() - began
                 page.pace.took(picture.edge, picture.pixels + sent, picture.other)
             else:

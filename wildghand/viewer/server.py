@@ -72,9 +72,7 @@ def serving(address: Address, title: str) -> Iterator[ViserServer]:
     with contextlib.redirect_stdout(sys.stderr), guarded(address.loopback):
         server = Server(host=address.host, port=address.port, label=title, verbose=False)
     try:
-        server.gui.configure_theme(
-            show_logo=False, show_share_button=False, control_width="medium"
-        )
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         yield server
     finally:
         with contextlib.redirect_stdout(sys.stderr):

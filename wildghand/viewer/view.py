@@ -32,9 +32,7 @@ class ViewSettings:
         if not 64 <= self.edge <= 4096:
             raise UsageError(f"is {self.edge}", field="--size", remedy="Use 64 to 4096 px.")
         if not all(0 <= part <= 255 for part in self.background):
-            raise UsageError(
-                f"is {self.background}", field="--background", remedy="Use 0 to 255."
-            )
+            raise UsageError(f"is {self.background}", field="--background", remedy="Use 0 to 255.")
 
 
 @dataclass(frozen=True, eq=False)

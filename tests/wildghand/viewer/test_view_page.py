@@ -1,0 +1,167 @@
+"""The pages of views in a browser. Oracles: `wildghand render` of the pose, the server's state."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from browser import open_page
+from PIL import Image
+
+from hwp_bench.base.images import read_rgb
+from hwp_bench.capture import Capture
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.avatar.files import save_avatar
+from wildghand.avatar.inline import over
+from wildghand.cli.main import main
+from wildghand.fitting import fit_capture
+from wildghand.viewer.live import serve_fit
+from wildghand.viewer.motion import Motion
+from wildghand.viewer.server import Address
+from wildghand.viewer.view import ServedView, ViewSettings, serve_view
+
+pytest.importorskip("viser")
+pytestmark = pytest.mark.slow
+
+#: Any free port.
+ANYWHERE = Address(port=0)
+#: Rows and columns of the window that no panel and no notice of viser's covers.
+CLEAR = slice(170, 880), slice(330, 900)
+#: Most seconds for Chromium, which draws WebGL in software, on a machine that is busy.
+PATIENCE = 240.0
+_TYPE = """
+const row = [...document.querySelectorAll("label")].find(l => l.textContent === arguments[0]);
+for (let at = row; at; at = at.parentElement) {
+  const field = at.querySelector("input[type=text], input[inputmode]");
+  if (field) { return field; }
+}
+return null;
+"""
+
+
+def window(driver: Any) -> np.ndarray:
+    """(H, W, 3) float, what the window shows."""
+    data = driver.get_screenshot_as_png()
+    return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(float)
+
+
+def psnr(first: np.ndarray, second: np.ndarray) -> float:
+    """dB of 8-bit pictures over the clear part of the window."""
+    error = (first[CLEAR] - second[CLEAR]) / 255.0
+    return -10.0 * np.log10(np.square(error).mean() + 1e-12)
+
+
+def wait_until(done: Callable[[], Any]) -> Any:
+    """What `done` gives as soon as it is true."""
+    deadline = time.monotonic() + PATIENCE
+    while not (found := done()):
+        assert time.monotonic() < deadline, "the page did not get there"
+        time.sleep(0.3)
+    return found
+
+
+def settled(driver: Any, served: ServedView, reached: Callable[[np.ndarray], bool]) -> np.ndarray:
+    """The window once the server has sent its full picture and the page shows one."""
+
+    def look() -> list[np.ndarray]:
+        if not served.server.get_clients() or not served.screen.still:
+            return []
+        shown = window(driver)
+        return [shown] if reached(shown) else []
+
+    return wait_until(look)[0]
+
+
+def test_the_page_shows_what_render_draws_and_a_slider_poses_the_hand(
+    tiny_avatar: WildGHandAvatar,
+    make_painted: Callable[..., Capture],
+    tmp_path: Path,
+) -> None:
+    capture = make_painted()
+    save_avatar(tiny_avatar, tmp_path / "avatar")
+    words = ["render", str(tmp_path / "avatar"), "--poses", str(capture.root), "--frames", "0"]
+    assert main([*words, "--background", "255", "-o", str(tmp_path / "frames")]) == 0
+    rendered = read_rgb(tmp_path / "frames" / "000000.png")
+    motion = Motion(tiny_avatar, capture)
+    with (
+        serve_view(tiny_avatar, motion, ANYWHERE, ViewSettings(edge=1280)) as served,
+        open_page(served.url, tmp_path / "profile", webgl=True) as driver,
+    ):
+        from selenium.webdriver.common.keys import Keys
+
+        def drawn(hands: Any) -> np.ndarray:
+            """The window if it showed the avatar's own drawing for the page's camera."""
+            (client,) = served.server.get_clients().values()
+            height, width = client.camera.image_height, client.camera.image_width
+            # The frame's own camera, for a picture of the window's shape.
+            camera = motion.camera(0)
+            scale = height / camera.height
+            K = camera.K * [[scale], [scale], [1.0]]
+            K[0, 2] = width / 2
+            wide = type(camera)(K, camera.viewmat, width, height)
+            return over(tiny_avatar.render(hands, wide), (255, 255, 255)).astype(float)
+
+        hands = served.view.hands
+        wait_until(lambda: served.server.get_clients())
+        expected = drawn(hands)
+        shown = settled(driver, served, lambda got: psnr(got, expected) >= 30.0)
+        # The command's picture is smaller and square: the middle of the window.
+        height, width = expected.shape[:2]
+        middle = expected[:, (width - height) // 2 : (width + height) // 2]
+        small = cv2.resize(middle, rendered.shape[1::-1], interpolation=cv2.INTER_AREA)
+        error = np.square((small - rendered) / 255.0).mean()
+        assert -10.0 * np.log10(error) >= 25.0  # splats are wider than these few large pixels
+
+        field = wait_until(lambda: driver.execute_script(_TYPE, "index1 flexion"))
+        field.click()
+        field.send_keys(Keys.CONTROL, "a")
+        field.send_keys("70", Keys.ENTER)
+        wait_until(lambda: served.view.hands is not hands)
+        angles = served.view.angles["right"].angles(served.view.hands["right"].pose)
+        assert angles[1, 0] == pytest.approx(70.0)
+        bent = drawn(served.view.hands)
+        assert psnr(bent, expected) < 28.0
+        after = settled(driver, served, lambda got: psnr(got, bent) >= 30.0)
+        assert psnr(after, shown) < 28.0
+
+        # A drag over the picture moves the camera, and the picture follows.
+        from selenium.webdriver import ActionChains
+
+        (client,) = served.server.get_clients().values()
+        before = client.camera.position
+        chain = ActionChains(driver).move_by_offset(600, 500).click_and_hold()
+        chain.move_by_offset(120, 0).release().perform()
+        wait_until(lambda: np.linalg.norm(client.camera.position - before) > 0.05)
+        turned = settled(driver, served, lambda got: psnr(got, after) < 25.0)
+        assert turned[CLEAR].min() < 200.0
+
+
+def test_the_page_of_a_fit_shows_its_steps_and_pictures(
+    make_painted: Callable[..., Capture], tmp_path: Path
+) -> None:
+    settings = {
+        "gaussians": 400,
+        "device": "cpu",
+        "network.identity_resolution": 24,
+        "network.plane_resolution": 12,
+        "schedule.steps": 5,
+    }
+    with (
+        serve_fit(ANYWHERE, pause=0.0) as served,
+        open_page(served.url, tmp_path / "profile", webgl=True) as driver,
+    ):
+        wait_until(lambda: served.server.get_clients())
+        fit_capture(make_painted().root, settings=settings, watch=served.watch)
+        text = "return document.body.textContent"
+        words = wait_until(lambda: "step 5" in (found := driver.execute_script(text)) and found)
+        assert "loss" in words
+        assert "dB" in words
+        # The painted frames stand before a gray wall of 0.35.
+        wall = np.array([0.35 * 255.0] * 3)
+        wait_until(lambda: (np.abs(window(driver) - wall).max(axis=-1) < 8.0).sum() > 10_000)
