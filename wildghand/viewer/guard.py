@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import functools
 import http
+import inspect
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 from urllib.parse import urlsplit
@@ -62,7 +63,7 @@ def _first_asked(then: Any, loopback: bool) -> Callable[[Any, Any], Any]:
         reason = refusal(request.headers, loopback)
         if reason is not None:
             return connection.respond(http.HTTPStatus.FORBIDDEN, reason + "\n")
-        answer = then(connection, request) if then is not None else None
-        return await answer if hasattr(answer, "__await__") else answer
+        answer: Any = then(connection, request) if then is not None else None
+        return await answer if inspect.isawaitable(answer) else answer
 
     return process

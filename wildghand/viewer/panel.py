@@ -69,7 +69,7 @@ class Panel:
             shown = shown_angles(hand, self._view.angles[side])
             for (of, joint, angle), slider in self._sliders.items():
                 if of == side:
-                    slider.value = float(shown[joint, angle])
+                    _put(slider, float(shown[joint, angle]))
 
     def stop(self) -> None:
         """End playback."""
@@ -111,7 +111,7 @@ class Panel:
         def _(event: GuiEvent[Any]) -> None:
             self._pause()
             self._view.rest()
-            named.value = REST
+            _put(named, REST)
             self.show_angles()
             self._put_camera(self._view.studio_viewpoint())
 
@@ -122,7 +122,7 @@ class Panel:
         speed = gui.add_slider("speed", min=0.1, max=2.0, step=0.1, initial_value=1.0)
 
         def show(due: int) -> None:
-            frame.value = due
+            _put(frame, due)
             view.set_frame(due)
 
         player = Player(count, fps, show)
@@ -155,4 +155,9 @@ class Panel:
     def _pause(self) -> None:
         """Stop playback, so that it does not undo what a person changes."""
         if self._player is not None and self._playing.value:
-            self._playing.value = False
+            _put(self._playing, False)
+
+
+def _put(handle: Any, value: Any) -> None:
+    """Set what an element of the page shows; mypy takes viser's property for a read-only one."""
+    handle.value = value
