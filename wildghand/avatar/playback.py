@@ -47,20 +47,7 @@ def render_clip(
         MissingDependency: a video is asked for, and PyAV is not installed.
         HwpError: the video cannot be written.
     """
-    sides = [side for side in capture.info.sides if side in avatar.sides]
-    if not sides:
-        raise UsageError(
-            f"shows the {' and '.join(capture.info.sides)} hand, the avatar is of the "
-            f"{' and '.join(avatar.sides)} hand",
-            where=capture.root,
-        )
-    if capture.info.hand_model.name != avatar.hand_model.name:
-        raise UsageError(
-            f"has parameters of the hand model {capture.info.hand_model.name}, "
-            f"the avatar takes those of {avatar.hand_model.name}",
-            where=capture.root,
-            remedy="Convert them with `hwp-bench hands convert`.",
-        )
+    sides = shown_sides(avatar, capture)
     if video is not None:
         check_encoder()
     seconds, images = 0.0, []
@@ -78,3 +65,26 @@ def render_clip(
     if video is not None:
         write_movie(video, images, capture.info.fps)
     return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
+
+
+def shown_sides(avatar: WildGHandAvatar, capture: Capture) -> list[str]:
+    """Return the hands of a capture that an avatar has.
+
+    Raises:
+        UsageError: there are none, or the capture belongs to another hand model.
+    """
+    sides = [side for side in capture.info.sides if side in avatar.sides]
+    if not sides:
+        raise UsageError(
+            f"shows the {' and '.join(capture.info.sides)} hand, the avatar is of the "
+            f"{' and '.join(avatar.sides)} hand",
+            where=capture.root,
+        )
+    if capture.info.hand_model.name != avatar.hand_model.name:
+        raise UsageError(
+            f"has parameters of the hand model {capture.info.hand_model.name}, "
+            f"the avatar takes those of {avatar.hand_model.name}",
+            where=capture.root,
+            remedy="Convert them with `hwp-bench hands convert`.",
+        )
+    return sides

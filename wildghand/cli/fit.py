@@ -8,6 +8,8 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from wildghand.cli.serving import add_address, watching
+
 if TYPE_CHECKING:
     from wildghand.fitting.parallel import World
     from wildghand.from_video import MadeAvatar
@@ -16,6 +18,7 @@ _EXAMPLES = """examples:
   wildghand fit hand.mp4 -o my_hand
   wildghand fit hand.mp4 -o my_hand --quick
   wildghand fit my_capture -o my_avatar --seconds 60
+  wildghand fit my_capture -o my_avatar --live --port 9000
   wildghand fit my_capture -o paper --set mode=paper --set network.size=paper --set device=cuda
   torchrun --nproc-per-node 4 -m wildghand.cli.main fit my_capture -o my_avatar \\
       --set schedule.batch=4
@@ -73,6 +76,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PRIOR",
         help="start from it (made by `wildghand pretrain`; default: the one that ships)",
     )
+    parser.add_argument(
+        "--live",
+        action="store_true",
+        help="show the fit in the browser while it runs (needs viser); changes nothing of it",
+    )
+    add_address(parser)
     parser.add_argument("--overwrite", action="store_true", help="replace an existing avatar")
     parser.add_argument("--json", action="store_true", help="print JSON")
 
@@ -108,7 +117,10 @@ def _video(args: argparse.Namespace, world: World) -> int:
         seed=args.seed,
         settings=_settings(args),
     )
-    made = make_avatar(args.source, args.out, options, overwrite=args.overwrite, world=world)
+    with watching(args, shown=args.live and world.is_main) as watch:
+        made = make_avatar(
+            args.source, args.out, options, overwrite=args.overwrite, world=world, watch=watch
+        )
     if world.is_main:
         print(json.dumps(made.facts(), indent=1)) if args.json else _print(made)
     return 0
@@ -141,16 +153,18 @@ def _capture(args: argparse.Namespace, world: World) -> int:
         raise UsageError(f"is {args.seconds}", field="--seconds", remedy="Use more than 0.")
     if args.seed < 0:
         raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
-    avatar = fit_capture(
-        args.source,
-        args.out,
-        settings=with_quick(_settings(args), quick=args.quick),
-        budget=Budget(seconds=args.seconds, steps=args.steps),
-        seed=args.seed,
-        all_frames=args.all_frames is True,
-        overwrite=args.overwrite,
-        world=world,
-    )
+    with watching(args, shown=args.live and world.is_main) as watch:
+        avatar = fit_capture(
+            args.source,
+            args.out,
+            settings=with_quick(_settings(args), quick=args.quick),
+            budget=Budget(seconds=args.seconds, steps=args.steps),
+            seed=args.seed,
+            all_frames=args.all_frames is True,
+            overwrite=args.overwrite,
+            world=world,
+            watch=watch,
+        )
     if not world.is_main:
         return 0
     record = avatar.record

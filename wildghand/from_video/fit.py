@@ -43,6 +43,7 @@ def _run(job: Job) -> None:
         all_frames=options.all_frames,
         overwrite=True,
         world=job.world,
+        watch=job.watch,
     )
 
 

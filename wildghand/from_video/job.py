@@ -17,6 +17,7 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadCapture
 from hwp_bench.capture.schema import check_id
+from wildghand.fitting.optimize import Watch
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.from_video.settings import VideoFit
 
@@ -30,12 +31,14 @@ class Job:
         folder: of the avatar.
         options: the choices.
         world: the processes that fit together.
+        watch: who is shown the fit while it runs.
     """
 
     video: Path
     folder: Path
     options: VideoFit
     world: World = SINGLE_PROCESS
+    watch: Watch | None = None
 
     @property
     def work(self) -> Path:

@@ -15,6 +15,7 @@ from hwp_bench.base.movies import check_encoder
 from hwp_bench.importers.video.decode import probe
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
+from wildghand.fitting.optimize import Watch
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.from_video.job import Job
 from wildghand.from_video.record import JobRecord
@@ -78,6 +79,7 @@ def make_avatar(
     overwrite: bool = False,
     world: World = SINGLE_PROCESS,
     stages: Sequence[Stage] = STAGES,
+    watch: Watch | None = None,
 ) -> MadeAvatar:
     """Make an avatar of the hand in a video, with a clip and a sheet to look at.
 
@@ -92,6 +94,7 @@ def make_avatar(
         overwrite: make everything again; replace an avatar that came from elsewhere.
         world: the processes that fit together.
         stages: what is run.
+        watch: who is shown the fit while it runs.
 
     Raises:
         BadInput: the video cannot be used, or shows too few frames with a hand.
@@ -103,7 +106,7 @@ def make_avatar(
     """
     options = options or VideoFit()
     folder = default_folder(Path(video)) if out is None else Path(out)
-    job = Job(Path(video), folder, options, world)
+    job = Job(Path(video), folder, options, world, watch)
     chosen = read_settings(options.method_settings())
     world.shard(chosen.schedule.batch)
     if world.is_main:
