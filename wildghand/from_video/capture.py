@@ -37,7 +37,9 @@ def _options(job: Job) -> VideoImport:
         overwrite=True,
         fit=job.options.importer,
     )
-    landmarks = read_landmarks(job.landmarks, min_score=choices.min_score, side=hand)
+    # Of two hands, that which is seen most counts.
+    one = hand if hand in ("right", "left") else None
+    landmarks = read_landmarks(job.landmarks, min_score=choices.min_score, side=one)
     step = stride(len(landmarks.score), job.options.most_frames)
     seen = int(np.count_nonzero(landmarks.detected[::step]))
     if seen < FEWEST:
