@@ -19,7 +19,7 @@ from wildghand.from_video.track import frame_count, video_digest
 #: Fewest frames with a hand that an avatar is made of.
 FEWEST = 12
 #: Seconds for an imported frame, and for a frame that is decoded only.
-_FRAME, _DECODED = 0.25, 0.005
+_FRAME, _DECODED = 0.3, 0.005
 
 
 def stride(count: int, most: int) -> int:
