@@ -19,7 +19,7 @@ from wildghand.from_video.track import frame_count, video_digest
 #: Fewest frames with a hand that an avatar is made of.
 FEWEST = 12
 #: Seconds for an imported frame, and for a frame that is decoded only.
-_FRAME, _DECODED = 0.25, 0.005
+_FRAME, _DECODED = 0.3, 0.005
 
 
 def stride(count: int, most: int) -> int:
@@ -37,7 +37,9 @@ def _options(job: Job) -> VideoImport:
         overwrite=True,
         fit=job.options.importer,
     )
-    landmarks = read_landmarks(job.landmarks, min_score=choices.min_score, side=hand)
+    # Of two hands, that which is seen most counts.
+    one = hand if hand in ("right", "left") else None
+    landmarks = read_landmarks(job.landmarks, min_score=choices.min_score, side=one)
     step = stride(len(landmarks.score), job.options.most_frames)
     seen = int(np.count_nonzero(landmarks.detected[::step]))
     if seen < FEWEST:

@@ -17,7 +17,7 @@ from wildghand.from_video.stage import Stage
 from wildghand.model.settings import read_settings
 
 #: Seconds for a step of 12,337 Gaussians, and what goes before the first.
-_STEP, _START = 0.05, 20.0
+_STEP, _START = 0.05, 25.0
 
 
 def _facts(job: Job) -> dict[str, str]:
