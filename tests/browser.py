@@ -14,8 +14,9 @@ _FLAGS = (
     *("--headless", "--no-sandbox", "--disable-gpu", "--disable-quic", "--no-first-run"),
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
 )
+_WEBGL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
 #: Width of a phone and of a desk's window, px.
-PHONE, DESK = 390, 1280
+PHONE, DESK = 400, 1400
 
 
 def _program(*names: str) -> str:
@@ -27,12 +28,13 @@ def _program(*names: str) -> str:
 
 
 @contextmanager
-def open_page(page: Path, profile: Path) -> Iterator[Any]:
+def open_page(page: Path | str, profile: Path, *, webgl: bool = False) -> Iterator[Any]:
     """Open a page in Chromium; at the end nothing may have been complained of in its console.
 
     Args:
-        page: the file.
+        page: the file, or the address of a server on this machine.
         profile: a folder for the browser.
+        webgl: the page draws with WebGL, which Chromium's own software does without a GPU.
 
     Yields:
         A selenium driver.
@@ -44,13 +46,13 @@ def open_page(page: Path, profile: Path) -> Iterator[Any]:
 
     options = webdriver.ChromeOptions()
     options.binary_location = binary
-    for flag in (*_FLAGS, f"--user-data-dir={profile}"):
+    for flag in (*_FLAGS, *(_WEBGL if webgl else ()), f"--user-data-dir={profile}"):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=Service(chromedriver))
     try:
         show(driver)
-        driver.get(page.as_uri())
+        driver.get(page if isinstance(page, str) else page.as_uri())
         yield driver
         assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
     finally:
@@ -59,7 +61,7 @@ def open_page(page: Path, profile: Path) -> Iterator[Any]:
 
 def show(driver: Any, width: int = DESK, *, dark: bool = False, media: str = "screen") -> None:
     """Show the page at a width, in light or dark, on the screen or as it is printed."""
-    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width == PHONE}
+    size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": width <= PHONE}
     driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
     scheme = {"name": "prefers-color-scheme", "value": "dark" if dark else "light"}
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"media": media, "features": [scheme]})

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import numpy as np
-from painted import FRAMES, cameras, painted_info
+from painted import FRAMES, SIZE, cameras, painted_info
 
 from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Capture, CaptureWriter

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 from small_captures import results_example
@@ -11,6 +11,7 @@ from small_captures import results_example
 from hwp_bench.capture.splits import split_for
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.records import Check
+from hwp_bench.leaderboard.site import board_page, shown_rows
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult, Results
 from hwp_bench.sim.produce.suites import suite
@@ -48,7 +49,14 @@ def complete_results(
             for frame in split.test.tolist()
         ]
         captures.append(
-            replace(base.captures[0], id=item.scene.id, split_digest=split.digest, frames=frames)
+            replace(
+                base.captures[0],
+                id=item.scene.id,
+                hands=item.scene.hands,
+                perturbations=[call.kind for call in item.scene.effects],
+                split_digest=split.digest,
+                frames=frames,
+            )
         )
     protocols = json.loads(json.dumps({p.name: p.as_dict() for p in PROTOCOLS}))
     given = {"suite": suite_name, "captures": captures, "protocols": protocols, **changes}
@@ -71,3 +79,8 @@ def check_of(entry: Entry, kind: str = "rescored", verdict: str = "reproduces") 
         cross_checked=1,
         differences=0,
     )
+
+
+def page_of(entries: Sequence[Entry]) -> str:
+    """The page of the board alone: without pictures, and its rows lead to reports."""
+    return board_page(shown_rows(entries), pictures=False, pages={})

@@ -1,7 +1,8 @@
 """Progress and notices on standard error, so that standard output stays the result.
 
 On a terminal work is shown as bars; elsewhere (logs, CI) as a few lines of text. One piece of work
-is shown by `progress` or `track`, a list of jobs by `JobsView`.
+is shown by `progress` or `track`, a list of jobs by `JobsView`, stages of unequal length by
+`hwp_bench.base.stages_view`.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import contextlib
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self, TypeVar
 
@@ -19,6 +21,13 @@ if TYPE_CHECKING:
     from rich.progress import Progress, TaskID
 
 Item = TypeVar("Item")
+#: What `progress` does: takes a description and a total, yields a function that takes how many
+#: steps are done.
+Shows = Callable[[str, int], contextlib.AbstractContextManager[Callable[[int], None]]]
+
+#: A display on the terminal around the pieces of work of this context, which shows them itself:
+#: two displays would overwrite each other.
+OUTER: ContextVar[Shows | None] = ContextVar("outer", default=None)
 
 #: Jobs that took less than this share of the longest one were found finished; an estimate of the
 #: remaining time leaves them out.
@@ -65,6 +74,11 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
         A function that takes the number of steps that are done by now.
     """
     start = time.perf_counter()
+    outer = OUTER.get()
+    if outer is not None:
+        with outer(description, total) as update:
+            yield update
+        return
     if not sys.stderr.isatty():
         reached = 0
 
@@ -77,9 +91,9 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
         share = f"{total}" if reached == total else f"{reached} of {total}"
         notice(f"{description}: {share} in {time.perf_counter() - start:.1f} s")
         return
-    with _bars() as bars:
+    with new_bars() as bars:
         task = bars.add_task(description, total=total, left="")
-        yield lambda done: _update(bars, task, start, done, total)
+        yield lambda done: update_bar(bars, task, start, done, total)
 
 
 def track(items: Iterable[Item], description: str, total: int | None = None) -> Iterator[Item]:
@@ -111,7 +125,7 @@ class JobsView:
 
     def __init__(self, *, quiet: bool = False) -> None:
         self._quiet = quiet
-        self._bars = _bars() if sys.stderr.isatty() and not quiet else None
+        self._bars = new_bars() if sys.stderr.isatty() and not quiet else None
         self._all: TaskID | None = None
         self._running: dict[int, _Running] = {}
         self._durations: list[float] = []
@@ -170,7 +184,7 @@ class JobsView:
         """Say how far a job is."""
         job = self._running.get(index)
         if self._bars is not None and job is not None and job.task is not None:
-            _update(self._bars, job.task, job.began, done, total)
+            update_bar(self._bars, job.task, job.began, done, total)
             self._update_all()
 
     def end(self, index: int, text: str, problem: str | None = None) -> None:
@@ -217,7 +231,7 @@ class JobsView:
             now = time.perf_counter()
             spent = sum(now - job.began for job in list(self._running.values()))
             left = max(left - spent, 0.0) / len(self._running)
-        self._bars.update(self._all, completed=self._ended, left=_left(left))
+        self._bars.update(self._all, completed=self._ended, left=left_text(left))
 
 
 @dataclass
@@ -228,7 +242,8 @@ class _Running:
     task: TaskID | None = None
 
 
-def _bars() -> Progress:
+def new_bars() -> Progress:
+    """Return an empty display of bars on standard error; each has a field `left`."""
     from rich.console import Console
     from rich.progress import (
         BarColumn,
@@ -248,10 +263,12 @@ def _bars() -> Progress:
     )
 
 
-def _update(bars: Progress, task: TaskID, began: float, done: int, total: int) -> None:
+def update_bar(bars: Progress, task: TaskID, began: float, done: int, total: int) -> None:
+    """Show how far a bar is, and what is left at the pace since `began` (`time.perf_counter`)."""
     left = (time.perf_counter() - began) * (total - done) / done if done else None
-    bars.update(task, completed=done, total=total, left=_left(left))
+    bars.update(task, completed=done, total=total, left=left_text(left))
 
 
-def _left(seconds: float | None) -> str:
+def left_text(seconds: float | None) -> str:
+    """Return the words for the seconds that are left, to follow those that have passed."""
     return "" if seconds is None else f", about {clock(seconds)} left"

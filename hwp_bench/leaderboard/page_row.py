@@ -9,7 +9,8 @@ from typing import Any
 from hwp_bench.leaderboard.board_rows import BoardRow
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.rules import history
-from hwp_bench.metrics.aggregate import aggregate
+from hwp_bench.leaderboard.severity_scopes import at_severity, suite_severities
+from hwp_bench.metrics.aggregate import CaptureScores, aggregate
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
@@ -22,6 +23,8 @@ SCOPES = {
     "interacting": "Interacting hands",
     **{name: perturbation(name).heading for name in PERTURBATIONS},
 }
+#: Severities that can be chosen.
+SEVERITIES = (1, 2, 3, 4, 5)
 
 
 @dataclass(frozen=True)
@@ -43,6 +46,7 @@ class Row:
     #: Day of the latest evaluation, ISO 8601.
     date: str
     #: Scores by scope and metric, means over seeds; None where the suite has no such capture.
+    #: `motion_blur@3` is the scope of captures whose motion blur is of severity 3.
     scores: Mapping[str, Mapping[str, float | None]]
     #: Mean seconds of a fit.
     fit: float | None
@@ -75,7 +79,7 @@ def make_row(row: BoardRow, entries: Sequence[Entry] = ()) -> Row:
         date=max(entry.results.started for entry in row.entries)[:10],
         scores={
             scope: {name: _mean([one[scope].get(name) for one in found]) for name in METRICS}
-            for scope in SCOPES
+            for scope in found[0]
         },
         fit=row.fit_seconds,
         failed=sum(capture.failed_frames for capture in captures),
@@ -87,7 +91,17 @@ def make_row(row: BoardRow, entries: Sequence[Entry] = ()) -> Row:
 
 def _scopes(entry: Entry) -> dict[str, Mapping[str, float]]:
     """Means of the metrics of an entry by scope; an empty one where it has no such capture."""
-    mean = aggregate(score_rows(entry.results))
+    captures = score_rows(entry.results)
+    found = _means(captures)
+    severities = suite_severities(entry.results.suite)
+    for level in SEVERITIES:
+        if chosen := at_severity(captures, severities, level):
+            found |= {f"{scope}@{level}": means for scope, means in _means(chosen).items() if means}
+    return found
+
+
+def _means(captures: Sequence[CaptureScores]) -> dict[str, Mapping[str, float]]:
+    mean = aggregate(captures)
     return {
         **{scope: {} for scope in SCOPES},
         "macro": mean.overall.macro,
@@ -95,6 +109,12 @@ def _scopes(entry: Entry) -> dict[str, Mapping[str, float]]:
         "interacting": mean.interacting.capture_mean if mean.interacting else {},
         **mean.overall.perturbations,
     }
+
+
+def severities_of(rows: Sequence[Row]) -> list[int]:
+    """Return the severities that captures of the rows have, rising."""
+    scopes = {scope for row in rows for scope in row.scores}
+    return [level for level in SEVERITIES if f"macro@{level}" in scopes]
 
 
 def _mean(values: Sequence[float | None]) -> float | None:

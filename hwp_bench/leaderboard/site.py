@@ -17,7 +17,14 @@ from hwp_bench.leaderboard.entries import Entry, digest
 from hwp_bench.leaderboard.gallery import write_gallery
 from hwp_bench.leaderboard.lead import reference_lead
 from hwp_bench.leaderboard.method_pages import MethodPage, method_pages, write_method_pages
-from hwp_bench.leaderboard.page_row import METRICS, SCOPES, Row, budget_text, make_row
+from hwp_bench.leaderboard.page_row import (
+    METRICS,
+    SCOPES,
+    Row,
+    budget_text,
+    make_row,
+    severities_of,
+)
 from hwp_bench.leaderboard.records import BADGES, LEVEL_TEXTS
 from hwp_bench.leaderboard.rules import SUITES, check_entries, current, tables_of
 from hwp_bench.leaderboard.standings import rank_interval, ranks_of
@@ -57,10 +64,10 @@ def build_site(
         ]
         titles = _titles([entry for entry, _ in shown])
         scenes = write_gallery(temporary, shown, captures, titles)
-        rows = _rows(entries)
+        rows = shown_rows(entries)
         pages = method_pages(rows)
         write_method_pages(temporary, pages, scenes)
-        page = _page(rows, pictures=bool(scenes), pages=_addresses(pages))
+        page = board_page(rows, pictures=bool(scenes), pages=_addresses(pages))
         (temporary / "index.html").write_text(page, encoding="utf-8")
         (temporary / "board.js").write_text(script(), encoding="utf-8")
         if scenes:
@@ -84,8 +91,8 @@ def _titles(entries: Sequence[Entry]) -> dict[str, str]:
     }
 
 
-def _rows(entries: Sequence[Entry]) -> list[tuple[BoardRow, Row]]:
-    """The rows of this version's protocol with what the page shows of them, best first."""
+def shown_rows(entries: Sequence[Entry]) -> list[tuple[BoardRow, Row]]:
+    """Return the rows of this version's protocol with what the page shows of them, best first."""
     found = [
         (row, make_row(row, entries))
         for (_, protocol), rows in tables_of(current(entries)).items()
@@ -107,22 +114,13 @@ def _addresses(pages: Sequence[MethodPage]) -> dict[str, str]:
     return {shown.name: page.path for page in pages for _, shown in page.rows}
 
 
-def board_page(entries: Sequence[Entry]) -> str:
-    """Return the page of the board alone: its rows lead to reports, and it has no pictures.
-
-    Args:
-        entries: the measured rows.
-    """
-    return _page(_rows(entries), pictures=False, pages={})
-
-
-def _page(
+def board_page(
     found: Sequence[tuple[BoardRow, Row]], *, pictures: bool, pages: Mapping[str, str]
 ) -> str:
-    """The page of the board.
+    """Return the page of the board.
 
     Args:
-        found: what `_rows` returned.
+        found: what `shown_rows` returned.
         pictures: whether the viewer's pictures lie next to the page.
         pages: addresses of the methods' pages by the row's name; rows without one lead to a report.
     """
@@ -149,6 +147,7 @@ def _page(
         plots={suite: plot for suite, plot in plots.items() if plot is not None},
         pages=pages,
         scopes=SCOPES,
+        severities=severities_of(rows),
         metrics=[metric_facts(name) for name in METRICS],
         suites=suites,
         budgets=list(dict.fromkeys(row.budget for row in rows)),

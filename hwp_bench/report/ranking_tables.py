@@ -61,9 +61,9 @@ def rank_table(runs: Sequence[MethodRuns]) -> Table:
         )
     notes = (
         verdict(ranking),
-        "Macro means. Interval of a rank: what pairs that differ significantly leave (Holm over "
-        "all pairs), so that all intervals hold together with 95 %. Methods that share a letter "
-        "are tied.",
+        "Macro means. Interval of a rank: what a method's significant differences leave "
+        "(Bonferroni over its pairs), so that each interval holds with 95 %. Methods that share "
+        "a letter are tied (Holm over all pairs).",
     )
     return Table(f"Ranks by {facts.label}", tuple(columns), tuple(rows), notes)
 

@@ -22,6 +22,10 @@ from hwp_bench.tracking.networks import HandNetworks, LiteRtNetworks
 from hwp_bench.tracking.tracker import HandTracker, TrackerSettings
 
 
+class NoHandSeen(HwpError):
+    """A tracker found a hand in none of the frames."""
+
+
 @dataclass(frozen=True, eq=False)
 class TrackedVideo:
     """The hands of a video.
@@ -80,7 +84,8 @@ def track_video(
 
     Raises:
         BadInput: video or model cannot be used.
-        HwpError: no frame shows a hand, or the networks are not available.
+        NoHandSeen: no frame shows a hand.
+        HwpError: the networks are not available.
         MissingDependency: `ai-edge-litert` is not installed.
         UsageError: `out` exists, or is not an `.npz`.
     """
@@ -99,7 +104,7 @@ def track_video(
         collected = track_frames(frames, networks, settings, update)
     hands = collected.hands((info.width, info.height), settings.hands)
     if hands is None:
-        raise HwpError(
+        raise NoHandSeen(
             f"none of {collected.frames} frames shows a hand",
             where=info.path,
             remedy="The whole hand must be visible. Lower --min-confidence to accept less.",

@@ -1,4 +1,4 @@
-"""The fitted avatar: drawing, files, clips, export."""
+"""The fitted avatar: drawing, files, clips."""
 
 from wildghand.avatar.avatar import FitRecord, PosedGaussians, WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,7 +15,10 @@ from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture.schema import HandModelId
 from hwp_bench.hands import load_template
-from hwp_bench.methods.contract import HandPose
+from hwp_bench.methods.contract import Camera, HandPose
+from wildghand.avatar import inline
+from wildghand.avatar.hand_angles import REST
+from wildghand.avatar.studio import Pose, Studio
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
@@ -100,6 +104,8 @@ class WildGHandAvatar(HandAvatar):
         self.seed = seed
         self.record = record
         self.weight_masks = dict(weight_masks or {})
+        #: The folder that holds it; None until it is written or if it was not read from one.
+        self.folder: Path | None = None
 
     def __repr__(self) -> str:
         hands, frames = " and ".join(self.sides), len(self.record.frames)
@@ -119,6 +125,78 @@ class WildGHandAvatar(HandAvatar):
         """Draw the hands without what perturbed the training frames; see `HandAvatar.draw`."""
         refine = self.settings.heads.refinement
         return self.model.draw(hands, viewmats, Ks, width, height, refine=refine)
+
+    @functools.cached_property
+    def studio(self) -> Studio:
+        """Where the hands and a camera stand when nobody says where."""
+        templates = {side: rig.template for side, rig in self.model.rigs.items()}
+        return Studio(self.hand_model.source, templates, self.betas)
+
+    def render(
+        self,
+        hands: Mapping[str, HandPose] | Pose = REST,
+        camera: Camera | None = None,
+        *,
+        size: int = 512,
+    ) -> np.ndarray:
+        """Draw the hands in a pose.
+
+        Args:
+            hands: hands by side; or a pose in which every hand stands upright before the
+                camera: the name of one (`fist`), angles in degrees (`{"index1 flexion": 60}`),
+                or axis-angle vectors.
+            camera: None: one that sees all of the hands at rest (`studio`).
+            size: edge of the picture without a camera, px.
+
+        Returns:
+            (H, W, 4) float32 in [0, 1]: sRGB colour over black (premultiplied) and coverage.
+
+        Raises:
+            UsageError: no hand, one that was not fitted, or a pose that is none.
+        """
+        if camera is None:
+            inline.check_edge(size)
+            camera = self.studio.camera(size, size)
+        return super().render(self._hands(hands), camera)
+
+    def show(
+        self,
+        pose: Mapping[str, HandPose] | Pose | None = None,
+        *,
+        size: int = 320,
+        background: tuple[int, int, int] = (255, 255, 255),
+    ) -> inline.InlinePicture:
+        """Show the avatar in a notebook: in a pose, or from all around.
+
+        Args:
+            pose: as `render` takes it; None: a turn at rest, or the interactive page where
+                this installation can write one.
+            size: edge, px.
+            background: sRGB, 0 to 255.
+
+        Raises:
+            UsageError: a pose that is none, or a size out of range.
+        """
+        inline.check_edge(size)
+        page = inline.page_of(self) if pose is None else None
+        if pose is not None or page is not None:
+            drawn = self.render(REST if pose is None else pose, size=size)
+            return inline.still(drawn, background, repr(self), page)
+        return inline.turntable(
+            lambda turn: self.render(self.studio.posed(REST, turn), size=size),
+            background,
+            repr(self),
+        )
+
+    def _hands(self, hands: Mapping[str, HandPose] | Pose) -> Mapping[str, HandPose]:
+        """Hands as they are, or those that stand in the studio in a pose."""
+        if isinstance(hands, Mapping):
+            given = {side: hand for side, hand in hands.items() if isinstance(hand, HandPose)}
+            if len(given) == len(hands):
+                return given
+            angles = {name: x for name, x in hands.items() if not isinstance(x, HandPose)}
+            return self.studio.posed(angles)
+        return self.studio.posed(hands)
 
     @property
     def gaussians(self) -> PosedGaussians:

@@ -83,7 +83,8 @@ def save_avatar(
         (folder / MODEL).write_bytes(data)
         write_json(folder / DESCRIPTION, dataclasses.asdict(description))
         write_weight_masks(avatar, folder / WEIGHTS)
-    return Path(path)
+    avatar.folder = Path(path)
+    return avatar.folder
 
 
 def write_weight_masks(avatar: WildGHandAvatar, folder: Path) -> None:
@@ -161,9 +162,11 @@ def load_avatar(
         if not bool(torch.isfinite(tensor).all()):
             raise BadInput("holds NaN or infinity", where=file, field=name)
     betas = {side: np.array(given) for side, given in value.betas.items()}
-    return WildGHandAvatar(
+    avatar = WildGHandAvatar(
         model.eval(), settings, value.hand_model, betas, mean_color, value.seed, value.fit
     )
+    avatar.folder = root
+    return avatar
 
 
 def _check_description(value: _Description) -> None:

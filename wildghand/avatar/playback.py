@@ -8,9 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder
 from hwp_bench.base.images import write_image
+from hwp_bench.base.movies import check_encoder, write_movie
 from hwp_bench.base.progress import track
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
@@ -34,7 +35,7 @@ def render_clip(
         frames: which of its frames.
         out: the folder.
         background: grey level behind the hand, 0 to 255.
-        video: MP4 file to write, too.
+        video: MP4 file (H.264) to write, too.
         overwrite: replace what exists.
 
     Returns:
@@ -43,7 +44,34 @@ def render_clip(
     Raises:
         UsageError: the capture shows no hand that the avatar has, or belongs to another hand
             model.
+        MissingDependency: a video is asked for, and PyAV is not installed.
         HwpError: the video cannot be written.
+    """
+    sides = shown_sides(avatar, capture)
+    if video is not None:
+        check_encoder()
+    seconds, images = 0.0, []
+    with atomic_folder(out, overwrite=overwrite, flag="--overwrite") as folder:
+        for frame in track(frames, "Drawing"):
+            poses, camera = capture.hand_poses(frame), capture.camera(frame)
+            started = time.perf_counter()
+            rgba = avatar.render({side: poses[side] for side in sides}, camera)
+            seconds += time.perf_counter() - started
+            behind = (1.0 - rgba[..., 3:]) * (background / 255.0)
+            image = np.rint(255.0 * (rgba[..., :3] + behind)).clip(0, 255).astype(np.uint8)
+            write_image(folder / f"{frame:06d}.png", image)
+            if video is not None:
+                images.append(image)
+    if video is not None:
+        write_movie(video, images, capture.info.fps)
+    return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
+
+
+def shown_sides(avatar: WildGHandAvatar, capture: Capture) -> list[str]:
+    """Return the hands of a capture that an avatar has.
+
+    Raises:
+        UsageError: there are none, or the capture belongs to another hand model.
     """
     sides = [side for side in capture.info.sides if side in avatar.sides]
     if not sides:
@@ -59,32 +87,4 @@ def render_clip(
             where=capture.root,
             remedy="Convert them with `hwp-bench hands convert`.",
         )
-    seconds, images = 0.0, []
-    with atomic_folder(out, overwrite=overwrite, flag="--overwrite") as folder:
-        for frame in track(frames, "Drawing"):
-            poses, camera = capture.hand_poses(frame), capture.camera(frame)
-            started = time.perf_counter()
-            rgba = avatar.render({side: poses[side] for side in sides}, camera)
-            seconds += time.perf_counter() - started
-            behind = (1.0 - rgba[..., 3:]) * (background / 255.0)
-            image = np.rint(255.0 * (rgba[..., :3] + behind)).clip(0, 255).astype(np.uint8)
-            write_image(folder / f"{frame:06d}.png", image)
-            if video is not None:
-                images.append(image)
-    if video is not None:
-        _write_video(video, images, capture.info.fps)
-    return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
-
-
-def _write_video(path: Path, images: list[np.ndarray], fps: float) -> None:
-    import cv2
-
-    height, width = images[0].shape[:2]
-    partial = path.with_name(f".{path.stem}.partial.mp4")
-    writer = cv2.VideoWriter(str(partial), cv2.VideoWriter.fourcc(*"mp4v"), fps, (width, height))
-    if not writer.isOpened():
-        raise HwpError("cannot be written as a video", where=path)
-    for image in images:
-        writer.write(image[:, :, ::-1])
-    writer.release()
-    partial.replace(path)
+    return sides

@@ -6,11 +6,15 @@ import argparse
 from pathlib import Path
 
 _EXAMPLES = """examples:
-  wildghand export my_avatar --ply hand.ply
-  wildghand export my_avatar --ply hand.ply --poses my_capture --frame 100
+  wildghand export my_avatar -o hand.ply
+  wildghand export my_avatar -o hand.spz --poses my_capture --frame 100
+  wildghand export my_avatar -o hand.ply --supersplat
+  wildghand export my_avatar -o splats.glb
+  wildghand export my_avatar -o hand.glb --mesh --poses my_capture
 
-The PLY file has the layout of 3DGS, which viewers of Gaussian splats read: metres, the hands at
-rest unless a capture and a frame are named.
+The extension decides the format: .ply, Gaussians in the layout of 3DGS; .spz, the same in a tenth
+of the size; .glb, Gaussians as glTF (KHR_gaussian_splatting, a release candidate), or with --mesh
+a skinned mesh with 16 joints a hand, a texture and a motion. Lengths are metres.
 """
 
 
@@ -18,27 +22,53 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
     parser.epilog = _EXAMPLES
     parser.add_argument("avatar", type=Path, help="avatar folder")
-    parser.add_argument("--ply", type=Path, required=True, metavar="FILE", help="file to write")
-    parser.add_argument("--poses", type=Path, metavar="CAPTURE", help="capture to take a pose from")
-    parser.add_argument("--frame", type=int, default=0, help="its frame (default: 0)")
+    parser.add_argument(
+        *("-o", "--out"), type=Path, required=True, metavar="FILE", help="file to write"
+    )
+    parser.add_argument(
+        "--mesh", action="store_true", help="a skinned mesh instead of Gaussians (.glb)"
+    )
+    parser.add_argument(
+        "--poses", type=Path, metavar="CAPTURE", help="capture to take a pose or a motion from"
+    )
+    parser.add_argument("--frame", type=int, help="its frame, for Gaussians (default: 0)")
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="units of the file in a metre (default: 1)"
+    )
+    parser.add_argument(
+        "--supersplat",
+        action="store_true",
+        help="as SuperSplat shows it well: y down, ten units in a metre (.ply)",
+    )
     parser.add_argument(
         "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
     )
+    parser.add_argument("--overwrite", action="store_true", help="replace what exists")
+    parser.add_argument("--json", action="store_true", help="print counts as JSON")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.errors import UsageError
+    from wildghand.export.formats import ExportSettings, check_target, export
+
+    settings = ExportSettings(mesh=args.mesh, scale=args.scale, supersplat=args.supersplat)
+    check_target(args.out, settings, overwrite=args.overwrite)
+    if args.frame is not None and (args.poses is None or args.mesh):
+        raise UsageError("needs --poses, and no --mesh", field="--frame")
+
+    import json
+
     from hwp_bench.capture import open_capture
     from wildghand.avatar.files import load_avatar
-    from wildghand.avatar.ply import write_ply
 
+    capture = None if args.poses is None else open_capture(args.poses)
     avatar = load_avatar(args.avatar, hand=args.hand_model)
-    hands = avatar.rest_poses()
-    if args.poses is not None:
-        capture = open_capture(args.poses)
-        poses = capture.hand_poses(args.frame)
-        hands = {side: pose for side, pose in poses.items() if side in avatar.sides}
-    posed = avatar.pose(hands)
-    write_ply(args.ply, posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
-    print(f"{args.ply}: {len(posed)} Gaussians")
+    counts = export(
+        avatar, args.out, settings, capture=capture, frame=args.frame, overwrite=args.overwrite
+    )
+    if args.json:
+        print(json.dumps({"file": str(args.out), **counts}))
+    else:
+        print(f"{args.out}: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
     return 0

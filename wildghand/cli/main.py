@@ -21,6 +21,7 @@ def command_tree() -> Command:
             "render": Command(
                 "draw an avatar along the poses of a capture", "wildghand.cli.render"
             ),
+            "view": Command("pose an avatar in the browser", "wildghand.cli.view"),
             "export": Command("write an avatar as Gaussians for viewers", "wildghand.cli.export"),
             "judge": Command(
                 "judge the frames of a capture: clean or perturbed", "wildghand.cli.judge"

@@ -45,15 +45,38 @@ def shown_frames(
     for rows in torch.arange(count).split(_CHUNK):
         says = visible(rows)
         here = rows.to(clip.viewmats.device)
-        viewmats, Ks = clip.viewmats[here], clip.Ks[here]
         hands = {side: clip.hand(side, here) for side in rigs}
-        places = {side: _project(hand.positions, viewmats, Ks) for side, hand in hands.items()}
-        nearest = _depth_image(places, says.shape[1:])
-        for side, hand in hands.items():
-            pixels, depth = places[side]
-            seen = _facing(hand, viewmats) > _FACING
-            seen &= depth < _read(nearest, pixels / _cell(says.shape[1])) + _BEHIND
-            found[side] += (_read(says, pixels) * seen).sum(dim=0)
+        shown = seen_anchors(hands, clip.viewmats[here], clip.Ks[here], says.shape[1:])
+        for side, (pixels, facing) in shown.items():
+            found[side] += (_read(says, pixels) * (facing > 0.0)).sum(dim=0)
+    return found
+
+
+@torch.no_grad()
+def seen_anchors(
+    hands: Mapping[str, AnchorPoses], viewmats: Tensor, Ks: Tensor, size: torch.Size
+) -> dict[str, tuple[Tensor, Tensor]]:
+    """Project anchors into B frames, and tell which of them neither hand hides.
+
+    Args:
+        hands: posed anchors by side.
+        viewmats: (B, 4, 4) world to camera.
+        Ks: (B, 3, 3) px.
+        size: height and width of the frames, px.
+
+    Returns:
+        By side, (B, N, 2) px, and (B, N) cosine between normal and viewing direction, 0 where the
+        anchor is not seen.
+    """
+    places = {side: _project(hand.positions, viewmats, Ks) for side, hand in hands.items()}
+    nearest = _depth_image(places, size)
+    found = {}
+    for side, hand in hands.items():
+        pixels, depth = places[side]
+        facing = _facing(hand, viewmats)
+        seen = facing > _FACING
+        seen &= depth < _read(nearest, pixels / _cell(size[0])) + _BEHIND
+        found[side] = pixels, facing * seen
     return found
 
 

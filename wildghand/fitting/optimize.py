@@ -18,6 +18,9 @@ from wildghand.gaussians.fit_loop import Guard, Loss, batches, read_losses, repe
 #: Fall of the mean loss from window to window, as a share, that still counts as progress.
 PROGRESS = 1e-3
 
+#: Looks at a fit: (fit, steps so far, loss of the last one). It changes nothing of the fit.
+Watch = Callable[[Fit, int, Loss], None]
+
 
 class Watchers:
     """Guard and plateau: the watchers of the loss of a fit.
@@ -48,6 +51,7 @@ def optimize(
     start: int = 0,
     watchers: Watchers | None = None,
     after_step: Callable[[int, Watchers], None] | None = None,
+    watch: Watch | None = None,
 ) -> WildGHandAvatar:
     """Take steps until the budget is spent, the loss stands still, or the fit diverges.
 
@@ -58,6 +62,7 @@ def optimize(
         start: steps that `fit` has behind it.
         watchers: those of the fit so far, where it goes on.
         after_step: called with the number of steps after each; saves, for instance.
+        watch: looks at the fit after each step, and changes nothing of it.
 
     Returns:
         The last state; the best one if the fit diverged later. Of several processes, rank 0's
@@ -89,6 +94,8 @@ def optimize(
             report(step, fit.avatar(step))
             if after_step is not None:
                 after_step(step, watchers)
+            if watch is not None:
+                watch(fit, step, loss)
             if watchers.plateau.reached(loss):
                 window = settings.schedule.plateau_steps
                 _tell(world, f"The loss has stood still for {window} steps; finished early.")

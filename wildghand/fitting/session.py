@@ -22,10 +22,11 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import save_avatar
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import Watchers, optimize
+from wildghand.fitting.optimize import Watch, Watchers, optimize
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.ready import ready_fit
 from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.gaussians.fit_loop import Loss
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.splat.threads import denormals_flushed
 
@@ -47,6 +48,15 @@ class _Clock:
         self._start = time.perf_counter() - before
         self._show = show
 
+    @contextlib.contextmanager
+    def standing_still(self) -> Iterator[None]:
+        """Leave what happens within this out of the seconds of the fit."""
+        entered = time.perf_counter()
+        try:
+            yield
+        finally:
+            self._start += time.perf_counter() - entered
+
     def __call__(self, step: int, avatar: Avatar) -> None:
         """Take a checkpoint: none is ever due."""
 
@@ -60,6 +70,11 @@ class _Clock:
         return time.perf_counter() - self._start
 
 
+def unfinished(out: Path) -> Path:
+    """Return the folder of the state of a fit to an avatar folder, until it is finished."""
+    return out.with_name(out.name + ".fit")
+
+
 @denormals_flushed()
 def fit_capture(
     source: str | os.PathLike[str],
@@ -71,6 +86,7 @@ def fit_capture(
     all_frames: bool = False,
     overwrite: bool = False,
     world: World = SINGLE_PROCESS,
+    watch: Watch | None = None,
 ) -> WildGHandAvatar:
     """Fit an avatar to a capture, and write it if a folder is named.
 
@@ -86,6 +102,7 @@ def fit_capture(
         all_frames: fit the validation and test frames too: for an avatar, not for a score.
         overwrite: replace an avatar that is there.
         world: the processes that fit together; only rank 0 writes.
+        watch: looks at the fit after each step, while its clock stands still.
 
     Raises:
         BadMethod: a setting is unknown or out of range.
@@ -106,18 +123,18 @@ def fit_capture(
         split = every_frame(capture) if all_frames else _split(capture)
         with tempfile.TemporaryDirectory() as folder:
             write_request(Path(folder) / "request", capture, split, run)
-            return _fit_in(Path(folder), capture, run, chosen, world, save=False)
+            return _fit_in(Path(folder), capture, run, chosen, world, watch, save=False)
     out = Path(out)
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
     capture = open_capture(source)
     split = every_frame(capture) if all_frames else _split(capture)
-    work = out.with_name(out.name + ".fit")
+    work = unfinished(out)
     with exclusive(work) if world.is_main else contextlib.nullcontext():
         if world.is_main:
             write_request(work / "request", capture, split, run)
         world.wait_for_main()
-        avatar = _fit_in(work, capture, run, chosen, world)
+        avatar = _fit_in(work, capture, run, chosen, world, watch)
         if world.is_main:
             save_avatar(avatar, out, overwrite=overwrite)
             shutil.rmtree(work, ignore_errors=True)
@@ -131,6 +148,7 @@ def _fit_in(
     run: RunSettings,
     chosen: WildGHandSettings,
     world: World,
+    watch: Watch | None,
     *,
     save: bool = True,
 ) -> WildGHandAvatar:
@@ -163,8 +181,19 @@ def _fit_in(
                 save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
                 saved = time.perf_counter()
 
+        def look(fit: Fit, step: int, loss: Loss) -> None:
+            if watch is not None:
+                with clock.standing_still():
+                    watch(fit, step, loss)
+
         return optimize(
-            fit, run.budget, clock, start=start, watchers=watchers, after_step=after_step
+            fit,
+            run.budget,
+            clock,
+            start=start,
+            watchers=watchers,
+            after_step=after_step,
+            watch=look,
         )
 
 

@@ -1,4 +1,4 @@
-"""Ranks of methods with simultaneous intervals, and the sentence that says who wins."""
+"""Ranks of methods with intervals, and the sentence that says who wins."""
 
 from __future__ import annotations
 
@@ -45,8 +45,12 @@ def rank_methods(
     """Rank methods by their macro mean.
 
     The interval of a rank goes from one more than the number of methods that are significantly
-    better to the number of all less those that are significantly worse. Pairs are tested with
-    Holm's adjustment over all pairs, so that all intervals hold together with 95 %.
+    better to the number of all less those that are significantly worse. Each method is tested
+    against every other one, with Bonferroni's adjustment over these pairs: the interval of each
+    method holds with 95 %, and so does the claim that the first is the best, although the data
+    chose it. (A wrong claim needs that some method beats the truly best one in a test at
+    `ALPHA` / (m - 1); there are m - 1 such tests.) The tie groups speak of all pairs at once and
+    claim less.
 
     Args:
         runs: the methods, which must have passed `statistics.pairing.refuse_unlike`.
@@ -57,8 +61,9 @@ def rank_methods(
     Raises:
         UsageError: two methods have no seed in common.
 
-    Source: Al Mohamad, Goeman and van Zwet, Simultaneous confidence intervals for ranks with
-    application to ranking institutions, Biometrics 78(1), 2022 (section 3: all pairs).
+    Source: Mogstad, Romano, Shaikh and Wilhelm, Inference for ranks with applications to mobility
+    across neighbourhoods and academic achievement across countries, Review of Economic Studies
+    91(1), 2024 (marginal confidence sets: the pairs of one population), in a single step.
     """
     differences = compare(runs, metric, resamples=resamples, seed=seed, scope=MACRO)
     order = standings(runs, metric, differences)
@@ -68,7 +73,7 @@ def rank_methods(
     leads = {}
     for item in differences:
         value = item.estimate.value if higher else -item.estimate.value
-        differs = item.p_adjusted is not None and item.p_adjusted < ALPHA
+        differs = _differs(item, len(runs))
         signs[item.first, item.second] = (value > 0) - (value < 0) if differs else 0
         signs[item.second, item.first] = -signs[item.first, item.second]
         leads[item.first, item.second] = item.estimate
@@ -87,6 +92,11 @@ def rank_methods(
             )
         )
     return Ranking(metric, tuple(ranks), tuple(differences))
+
+
+def _differs(item: Difference, methods: int) -> bool:
+    """Whether a pair differs significantly, as one of the pairs that a method has with others."""
+    return item.estimate.p is not None and item.estimate.p * (methods - 1) < ALPHA
 
 
 def turned(estimate: Estimate) -> Estimate:
@@ -138,7 +148,8 @@ def verdict(ranking: Ranking) -> str:
         )
     return (
         f"No clear winner: {first.standing.label} leads with {mean} (macro mean), {text}, and "
-        f"is tied with {', '.join(tied)} (not significantly different, Holm over all pairs)."
+        f"is tied with {', '.join(tied)} (not significantly different, Bonferroni over the "
+        f"{len(rest)} pairs of the leader)."
     )
 
 
@@ -147,7 +158,6 @@ def _tied_with(label: str, ranking: Ranking) -> list[str]:
     found = {
         item.second if item.first == label else item.first
         for item in ranking.differences
-        if label in (item.first, item.second)
-        and not (item.p_adjusted is not None and item.p_adjusted < ALPHA)
+        if label in (item.first, item.second) and not _differs(item, len(ranking.ranks))
     }
     return [item.standing.label for item in ranking.ranks if item.standing.label in found]

@@ -27,6 +27,11 @@ var Board = {
     });
   },
 
+  // The name of the scores that perturbation and severity ask for together.
+  scope: function (state) {
+    return state.severity === "" ? state.scope : state.scope + "@" + state.severity;
+  },
+
   // The state of the page as the part of its address behind "#", and back.
   write: function (state) {
     return Object.keys(state)
@@ -60,10 +65,11 @@ if (typeof document !== "undefined") {
     var selects = {
       suite: document.getElementById("suite"),
       scope: document.getElementById("scope"),
+      severity: document.getElementById("severity"),
       budget: document.getElementById("budget"),
     };
     var status = document.getElementById("status");
-    var state = { suite: "", scope: "macro", budget: "", sort: "psnr", down: "1" };
+    var state = { suite: "", scope: "macro", severity: "", budget: "", sort: "psnr", down: "1" };
 
     function facts(row) {
       return { suite: row.dataset.suite, budget: row.dataset.budget };
@@ -73,7 +79,7 @@ if (typeof document !== "undefined") {
       var cell = row.querySelector('[data-key="' + key + '"]');
       if (!cell) { return null; }
       if (cell.dataset.scores) {
-        var score = JSON.parse(cell.dataset.scores)[state.scope];
+        var score = JSON.parse(cell.dataset.scores)[Board.scope(state)];
         return score === undefined ? null : score;
       }
       if (cell.dataset.number !== undefined) {

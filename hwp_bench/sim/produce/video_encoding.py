@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.errors import HwpError
+from hwp_bench.base.movies import yuv_planes
 
 #: Encoder in FFmpeg's naming, its preset, and the frames from one that stands alone to the next.
 ENCODER, PRESET, KEYFRAME_EVERY = "libx264", "veryfast", 30
@@ -85,7 +86,7 @@ def _coded(
                 yield _to_rgb(frame.to_ndarray(format="yuv420p"), height, width)
 
     for number, image in enumerate(itertools.chain([first], frames)):
-        frame = av.VideoFrame.from_ndarray(_to_yuv(image), format="yuv420p")
+        frame = av.VideoFrame.from_ndarray(yuv_planes(image), format="yuv420p")
         frame.pts = number
         yield from decoded(encoder.encode(frame))
     yield from decoded(encoder.encode(None))
@@ -120,15 +121,6 @@ def _buffer(bits: int, rate: Fraction) -> int:
     return int(bits / rate * BUFFER_FRAMES)
 
 
-def _to_yuv(image: np.ndarray) -> np.ndarray:
-    """Planes Y, U, V of 4:2:0 (ITU-R BT.601) as OpenCV and FFmpeg lay them out."""
-    import cv2
-
-    rows, columns = image.shape[0] % 2, image.shape[1] % 2
-    even = np.pad(image, ((0, rows), (0, columns), (0, 0)), mode="edge")
-    return np.asarray(cv2.cvtColor(even, cv2.COLOR_RGB2YUV_I420))
-
-
 def _to_rgb(planes: np.ndarray, height: int, width: int) -> np.ndarray:
     import cv2
 
@@ -147,7 +139,7 @@ def _library(where: str) -> ModuleType:
             "its sensor stores H.264, and nothing here can encode that",
             where=where,
             field="sensor.h264",
-            remedy="Install PyAV: pip install 'hwp-bench[h264]'; or leave the field out.",
+            remedy="Install PyAV: pip install av; or leave the field out.",
         ) from error
     library: ModuleType = av
     return library

@@ -3,26 +3,17 @@
 from __future__ import annotations
 
 import sys
-from types import SimpleNamespace
 
 import pytest
+from stopped_clock import Clock, stop_clock
 
 from hwp_bench.base.progress import JobsView, progress, track
-
-
-class Clock:
-    """A clock that stands still unless it is told to go on, seconds."""
-
-    now = 100.0
 
 
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Clock:
     """The clock that progress looks at."""
-    made = Clock()
-    stopped = SimpleNamespace(perf_counter=lambda: made.now)
-    monkeypatch.setattr("hwp_bench.base.progress.time", stopped)
-    return made
+    return stop_clock(monkeypatch, "hwp_bench.base.progress")
 
 
 @pytest.mark.parametrize(

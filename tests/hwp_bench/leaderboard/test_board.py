@@ -8,13 +8,14 @@ from dataclasses import replace
 from typing import Any
 
 import pytest
-from browser import PHONE, least_contrast, open_page, overflow, show
+from browser import DESK, PHONE, least_contrast, open_page, overflow, show
+from made_entries import page_of
 
 from hwp_bench.leaderboard.board_rows import BoardRow
 from hwp_bench.leaderboard.entries import Entry, entry_name, make_entry
 from hwp_bench.leaderboard.page_row import budget_text, make_row
 from hwp_bench.leaderboard.records import Submission
-from hwp_bench.leaderboard.site import board_page, build_site, script
+from hwp_bench.leaderboard.site import build_site, script
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult
 
@@ -68,7 +69,7 @@ def test_rows_hold_the_means_of_every_scope(entries) -> None:
 
 
 def test_names_are_escaped_and_published_rows_stand_apart(entries) -> None:
-    page = board_page(entries)
+    page = page_of(entries)
     assert EVIL not in page
     assert "&lt;img src=x" in page
     measured, published = page.split('id="published"')
@@ -77,7 +78,7 @@ def test_names_are_escaped_and_published_rows_stand_apart(entries) -> None:
     assert "Published, on other data" in measured
     # Without script every row is there, best macro mean of each suite first.
     assert measured.index("Beta") > measured.index("&lt;img")
-    assert "There is no entry yet" in board_page([])
+    assert "There is no entry yet" in page_of([])
 
 
 @pytest.fixture
@@ -102,6 +103,8 @@ def test_filters_and_addresses(board) -> None:
     shown = "Board.shown({suite: 'mini', budget: '60 s'}, {suite: %s, budget: %s})"
     for suite, budget, wanted in (("", "", True), ("mini", "60 s", True), ("smoke", "", False)):
         assert board.eval(shown % (json.dumps(suite), json.dumps(budget))) is wanted
+    assert board.eval("Board.scope({scope: 'macro', severity: ''})") == "macro"
+    assert board.eval("Board.scope({scope: 'motion_blur', severity: '4'})") == "motion_blur@4"
     state = {"suite": "mini", "budget": "60 s, 5 steps", "sort": "psnr", "down": ""}
     spelled = board.eval(f"Board.write({json.dumps(state)})")
     assert spelled == "suite=mini&budget=60%20s%2C%205%20steps&sort=psnr"
@@ -142,6 +145,8 @@ def test_the_board_in_chromium(browser) -> None:
     assert visible(browser) == ["Beta", EVIL, "Gamma"]
     cells = browser.find_elements(By.CSS_SELECTOR, '#measured [data-key="psnr"]')
     assert [cell.text for cell in cells] == ["21.00", "10.00", "–"]
+    # Captures of the toy results are of no scene, so that none has a severity.
+    assert [one.text for one in Select(browser.find_element(By.ID, "severity")).options] == ["all"]
     Select(browser.find_element(By.ID, "suite")).select_by_value("smoke")
     assert visible(browser) == ["Beta", EVIL]
     Select(browser.find_element(By.ID, "budget")).select_by_value("60 s")
@@ -194,7 +199,7 @@ def test_a_hostile_address_changes_nothing(browser) -> None:
 def test_it_is_legible_on_a_phone_in_the_dark_and_on_paper(browser) -> None:
     """WCAG AA asks for a contrast of 4.5; a first column of 60 px holds more than a letter."""
     for width, dark, media in (
-        (1280, False, "screen"),
+        (DESK, False, "screen"),
         (PHONE, True, "screen"),
         (PHONE, False, "print"),
     ):
@@ -214,7 +219,7 @@ def test_the_board_shows_the_current_revision_of_one_protocol(entries) -> None:
     second = make_entry(first.results, again)
     old = replace(entries[2].results, protocols={"hwp-v0": {}})
     rows = [*entries, second, make_entry(replace(old, method=replace(old.method, title="Omega")))]
-    page = board_page(rows)
+    page = page_of(rows)
     assert second.name in page
     assert f"reports/{first.name}/" not in page
     assert "Omega" not in page

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from browser import DESK, PHONE, least_contrast, open_page, overflow, show
 from made_entries import complete_results
 from made_results import made_results
 
@@ -15,6 +16,7 @@ from hwp_bench.leaderboard.entries import make_entry
 from hwp_bench.leaderboard.method_pages import method_pages, write_method_pages
 from hwp_bench.leaderboard.page_row import make_row
 from hwp_bench.leaderboard.records import Submission
+from hwp_bench.leaderboard.site import build_site
 from hwp_bench.methods.manifest import shipped_methods
 
 EVIL = "</td><script>alert(1)</script>"
@@ -126,3 +128,18 @@ def test_without_curves_there_is_no_plot() -> None:
     bare = results("plain")
     bare = replace(bare, captures=[replace(one, curve=[]) for one in bare.captures])
     assert curve_plot(board_rows([make_entry(bare)])) is None
+
+
+@pytest.mark.slow
+def test_a_page_is_legible_on_a_desk_and_on_a_phone(tmp_path: Path) -> None:
+    """WCAG AA asks for a contrast of 4.5; only tables may be scrolled sideways."""
+    entries = [make_entry(replace(results("trimmed"), seed=seed)) for seed in (0, 1)]
+    site = build_site(tmp_path / "site", entries)
+    page = next((site.parent / "methods").glob("*.html"))
+    with open_page(page, tmp_path / "profile") as driver:
+        assert "Trimmed" in driver.title
+        for width in (DESK, PHONE):
+            for dark in (False, True):
+                show(driver, width, dark=dark)
+                assert least_contrast(driver) >= 4.5
+                assert overflow(driver) <= 0

@@ -8,12 +8,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from made_entries import check_of, complete_results
+from made_entries import check_of, complete_results, page_of
 
 from hwp_bench.cli.main import main
 from hwp_bench.leaderboard.entries import make_entry, write_check, write_entry
 from hwp_bench.leaderboard.records import Submission
-from hwp_bench.leaderboard.site import board_page
 from hwp_bench.leaderboard.standings import board_tables
 
 
@@ -81,7 +80,7 @@ def test_the_command_shows_levels_and_badges_in_80_columns(
 
 
 def test_the_site_has_the_ranks_of_the_terminal_and_one_verdict_a_suite(entries) -> None:
-    page = board_page(entries)
+    page = page_of(entries)
     assert re.findall(r'data-key="rank" data-number="(\d*)">(.*?)</td>', page) == [
         ("", "–"),
         ("1", "1"),
@@ -100,7 +99,7 @@ def test_the_site_says_which_ranks_the_data_allow_and_escapes_titles() -> None:
         )
         method = replace(results.method, title=f"<b>{name}</b>")
         found.append(make_entry(replace(results, method=method)))
-    page = board_page(found)
+    page = page_of(found)
     ranks = re.findall(r'data-key="rank" data-number="(\d*)">(.*?)</td>', page)
     assert sorted(ranks) == [("1", "1 (1 to 2)"), ("2", "2 (1 to 2)")]
     assert "<b>left" not in page
@@ -113,7 +112,7 @@ def test_seeds_of_a_method_are_one_row_of_the_site_with_a_report_each() -> None:
         for seed in seeds:
             results = complete_results(name, scorer(level), suite_name="mini")
             found.append(make_entry(replace(results, seed=seed)))
-    page = board_page(found)
+    page = page_of(found)
     ranks = re.findall(r'data-key="rank" data-number="(\d*)">(.*?)</td>', page)
     assert sorted(ranks) == [("1", "1"), ("2", "2")]
     for entry in found:

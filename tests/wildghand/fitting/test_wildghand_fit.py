@@ -203,7 +203,7 @@ def test_the_commands_make_draw_and_export_an_avatar(
     assert sorted(path.name for path in pictures.iterdir()) == [f"{f:06d}.png" for f in (2, 3, 4)]
     assert read_rgb(pictures / "000002.png").max() > 0
     assert (tmp_path / "clip.mp4").stat().st_size > 0
-    assert main(["export", str(avatar), "--ply", str(tmp_path / "hand.ply")]) == 0
+    assert main(["export", str(avatar), "-o", str(tmp_path / "hand.ply")]) == 0
     header, _, body = (tmp_path / "hand.ply").read_bytes().partition(b"end_header\n")
     assert b"element vertex 600" in header
     # x y z, normal, f_dc, opacity, scale, rotation.

@@ -1,0 +1,347 @@
+"""From a video to an avatar at toy size: made, kept, killed and continued, and in one line refused.
+
+Oracles: the synthetic clip's own landmarks, the run that was never stopped, and decoders.
+"""
+
+from __future__ import annotations
+
+import functools
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from painted import QUICK
+from synthetic_clip import make_clip, write_landmarks, write_video
+
+import wildghand
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.images import read_rgb
+from hwp_bench.capture import open_capture
+from hwp_bench.importers.video import FitSettings
+from hwp_bench.tracking.model_files import HAND, PALM, models_folder
+from wildghand.avatar.files import load_avatar
+from wildghand.cli.main import main
+from wildghand.from_video import VideoFit, make_avatar
+from wildghand.from_video.capture import stride
+from wildghand.from_video.settings import QUICK as QUICK_CHANGES
+from wildghand.from_video.settings import QUICK_FRAMES, with_quick
+from wildghand.from_video.stages import STAGES
+from wildghand.model.settings import read_settings
+
+pytestmark = pytest.mark.slow
+
+COUNT, STEPS = 16, 6
+NAMES = [stage.name for stage in STAGES]
+#: An import that is only as good as the perfect landmarks of the clip.
+IMPORT = FitSettings(
+    start_steps=30, landmark_steps=30, contour_steps=3, contour_rounds=1, texture_weight=0.0
+)
+CLIP = Path(__file__).resolve().parents[4] / "shared" / "data" / "real_hand"
+
+
+def choices(folder: Path, **changes: Any) -> VideoFit:
+    given: dict[str, Any] = {
+        "landmarks": folder / "hand.npz",
+        "importer": IMPORT,
+        "settings": {**QUICK, "schedule.steps": STEPS},
+    }
+    return VideoFit(**{**given, **changes})
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder with a video, its landmarks, and the avatar that was made of them."""
+    folder = tmp_path_factory.mktemp("made")
+    clip = make_clip(COUNT)
+    write_video(folder / "hand.avi", [clip.picture(frame) for frame in range(COUNT)])
+    write_landmarks(folder / "hand.npz", clip.landmarks)
+    result = make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder))
+    assert result.kept == ()
+    return folder
+
+
+@pytest.fixture
+def folder(made: Path, tmp_path: Path) -> Path:
+    """A copy of it; the record has no paths."""
+    shutil.copytree(made, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def tensors(path: Path) -> dict[str, torch.Tensor]:
+    return load_avatar(path).model.state_dict()
+
+
+def same(first: Path, second: Path) -> bool:
+    one, other = tensors(first), tensors(second)
+    return one.keys() == other.keys() and all(torch.equal(one[k], other[k]) for k in one)
+
+
+def test_the_folder_is_an_avatar_with_clip_and_sheet(made: Path, tmp_path: Path) -> None:
+    av = pytest.importorskip("av")
+    out = made / "my_hand"
+    found = sorted(path.name for path in out.iterdir())
+    files = ["avatar.json", "model.safetensors", "sheet.jpg", "turntable.mp4", "weights", "work"]
+    assert found == files
+    capture = open_capture(out / "work" / "capture")
+    assert (capture.info.id, len(capture)) == ("my_hand", COUNT)
+    with av.open(str(out / "turntable.mp4")) as container:
+        assert container.streams.video[0].codec_context.name == "h264"
+    clip = cv2.VideoCapture(str(out / "turntable.mp4"))
+    views = []
+    while (read := clip.read())[0]:
+        views.append(read[1])
+    assert len(views) == 96
+    # The hand is there, and turns.
+    assert all((view.max(axis=2) > 60).mean() > 0.05 for view in views)
+    assert np.abs(views[0].astype(int) - views[48]).mean() > 1
+    assert read_rgb(out / "sheet.jpg").shape[0] > 1000
+    # What other commands expect of an avatar.
+    words = ["render", str(out), "--poses", str(out / "work" / "capture"), "--frames", "3:5"]
+    assert main([*words, "-o", str(tmp_path / "frames")]) == 0
+    assert main(["export", str(out), "--ply", str(tmp_path / "hand.ply")]) == 0
+
+
+def test_the_same_command_keeps_everything(folder: Path, capsys) -> None:
+    before = (folder / "my_hand" / "turntable.mp4").stat().st_mtime_ns
+    result = make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder))
+    assert list(result.kept) == NAMES
+    assert result.avatar.folder == folder / "my_hand"
+    assert (folder / "my_hand" / "turntable.mp4").stat().st_mtime_ns == before
+    assert "all is done already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("changes", "again", "named"),
+    [
+        ({"seed": 1}, NAMES[2:], "seed"),
+        ({"all_frames": False}, NAMES[2:], "choice of frames"),
+        # The side that is named is the one that was found: the capture stays what it was, and so
+        # does all that depends on it.
+        ({"side": "right"}, ["import"], "side"),
+    ],
+)
+def test_what_changed_is_named_and_made_again(
+    changes: dict[str, Any], again: list[str], named: str, folder: Path, capsys
+) -> None:
+    result = make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder, **changes))
+    assert [name for name in NAMES if name not in result.kept] == again
+    assert f"changed since the last run: {named}." in capsys.readouterr().err
+    fitted = COUNT - 2 if changes.get("all_frames", True) else round(0.8 * COUNT)
+    assert len(result.avatar.record.frames) == pytest.approx(fitted, abs=1)
+
+
+def test_another_video_of_the_same_name_is_noticed(folder: Path, capsys) -> None:
+    clip = make_clip(COUNT, bend=0.2)
+    write_video(folder / "hand.avi", [clip.picture(frame) for frame in range(COUNT)])
+    result = make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder))
+    assert "Importing the hand again; changed since the last run: video." in capsys.readouterr().err
+    assert "import" not in result.kept
+
+
+#: Ends its own process, as hard as can be, within a stage: argument 3 says where.
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+sys.path[:0] = sys.argv[4:]
+from test_from_video import choices
+from wildghand.fitting import session
+from wildghand.from_video import capture, make_avatar, run, turntable
+folder, out, where = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
+def die(*args, **more):
+    os.kill(os.getpid(), signal.SIGKILL)
+if where == "fit":
+    session.SAVE_EVERY, save = 0.0, session.save_state
+    def save_and_die(*args, **more):
+        save(*args, **more)
+        if more["step"] == 3:
+            die()
+    session.save_state = save_and_die
+elif where == "import":
+    capture.import_video = die
+elif where == "turntable":
+    turntable.as_uint8 = die
+elif where == "between":
+    write = run.write_record
+    def write_and_die(path, record):
+        write(path, record)
+        if record.stages["import"].done:
+            die()
+    run.write_record = write_and_die
+make_avatar(folder / "hand.avi", out, choices(folder))
+"""
+
+
+@pytest.mark.parametrize(
+    ("where", "kept", "told"),
+    [
+        ("import", 1, "Importing the hand once more: the last run was stopped there."),
+        ("between", 2, "Done before and kept: track, import."),
+        ("fit", 2, "Going on after 3 steps."),
+        ("turntable", 4, "Drawing the turntable once more: the last run was stopped there."),
+    ],
+)
+def test_a_killed_run_goes_on_to_the_same_avatar(
+    where: str, kept: int, told: str, folder: Path, made: Path, capsys
+) -> None:
+    """Oracle: the run that was never stopped."""
+    # What the module's run had done before the stage is taken over, to save time.
+    out = folder / "my_hand"
+    record = json.loads((out / "work" / "stages.json").read_text())
+    place = {"between": 1, "import": 1, "fit": 2, "turntable": 4}[where]
+    record["stages"] = {name: record["stages"][name] for name in NAMES[:place]}
+    (out / "work" / "stages.json").write_text(json.dumps(record))
+    tests = Path(__file__).resolve().parents[2]
+    words = (str(folder), str(out), where, str(tests), str(Path(__file__).parent))
+    ended = subprocess.run([sys.executable, "-c", KILLED, *words], capture_output=True, text=True)
+    assert ended.returncode == -9, ended.stderr
+    result = make_avatar(folder / "hand.avi", out, choices(folder))
+    assert len(result.kept) == kept
+    assert told in capsys.readouterr().err
+    assert result.avatar.steps == STEPS
+    assert same(out, made / "my_hand")
+
+
+def test_the_command(folder: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny = functools.partial(VideoFit, importer=IMPORT)
+    monkeypatch.setattr("wildghand.from_video.VideoFit", tiny)
+    settings = {**QUICK, "schedule.steps": STEPS}
+    sets = [word for name, value in settings.items() for word in ("--set", f"{name}={value}")]
+    words = ["fit", str(folder / "hand.avi"), "--landmarks", str(folder / "hand.npz"), *sets]
+    assert main([*words, "-o", str(folder / "my_hand"), "--json"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["hands"] == ["right"]
+    assert facts["steps"] == STEPS
+    assert [stage["name"] for stage in facts["stages"]] == NAMES
+    assert all(stage["kept"] for stage in facts["stages"])
+    for name in ("avatar", "turntable", "sheet", "capture"):
+        assert Path(facts[name]).exists()
+    assert main([*words, "-o", str(folder / "my_hand")]) == 0
+    assert "turntable: " in capsys.readouterr().out
+
+
+def test_from_python(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a folder it goes next to the video, under the video's name."""
+    monkeypatch.setattr(
+        "wildghand.from_video.api.VideoFit", functools.partial(VideoFit, importer=IMPORT)
+    )
+    (folder / "my_hand").rename(folder / "hand_avatar")
+    avatar = wildghand.fit(
+        folder / "hand.avi",
+        landmarks=folder / "hand.npz",
+        settings={**QUICK, "schedule.steps": STEPS},
+    )
+    assert avatar.folder == folder / "hand_avatar"
+    assert avatar.steps == STEPS
+    with pytest.raises(UsageError, match="side"):
+        wildghand.fit(folder / "hand_avatar" / "work" / "capture", side="left")
+
+
+@pytest.mark.parametrize(
+    ("words", "status", "message"),
+    [
+        (["absent.mp4"], 1, "does not exist"),
+        (["text.mp4"], 1, "is not a video that can be read"),
+        (["empty.mp4"], 1, "is empty"),
+        (["hand.avi", "-o", "taken"], 2, "exists and is not the folder of an avatar"),
+        (["hand.avi", "-o", "hand.npz"], 2, "is a file"),
+        (["hand.avi", "--steps", "0"], 2, "--steps"),
+        (["hand.avi", "--set", "gausians=3"], 1, "gaussians"),
+        (["hand.avi", "--landmarks", "absent.npz"], 1, "absent.npz"),
+        (["taken", "--side", "left", "-o", "x"], 2, "--side: is for videos"),
+        (["taken"], 2, "--out: is missing"),
+    ],
+)
+def test_wrong_calls_are_one_line(
+    words: list[str], status: int, message: str, folder: Path, capsys, monkeypatch
+) -> None:
+    monkeypatch.chdir(folder)
+    (folder / "text.mp4").write_text("not a video\n" * 100)
+    (folder / "empty.mp4").touch()
+    (folder / "taken").mkdir()
+    (folder / "taken" / "thesis.tex").touch()
+    assert main(["fit", *words]) == status
+    told = capsys.readouterr()
+    assert told.out == ""
+    error = told.err.splitlines()[-1]
+    assert error.startswith("wildghand: error: ")
+    assert message in error
+    assert (folder / "taken" / "thesis.tex").exists()
+
+
+def test_too_few_frames_with_a_hand(folder: Path) -> None:
+    clip = make_clip(COUNT)
+    score = np.where(np.arange(COUNT) < 5, 0.9, 0.0)
+    write_landmarks(folder / "hand.npz", clip.landmarks, score=score)
+    with pytest.raises(BadInput, match="shows a right hand in 5 of 16 frames"):
+        make_avatar(folder / "hand.avi", folder / "other", choices(folder))
+
+
+def test_without_the_tracker_or_the_network_one_line_says_so(
+    folder: Path, capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    words = ["fit", str(folder / "hand.avi"), "-o", str(folder / "other")]
+
+    def offline(address: str) -> Any:
+        raise OSError("network is unreachable")
+
+    with monkeypatch.context() as here:
+        here.setenv("HWP_CACHE", str(folder / "cache"))
+        here.setattr("hwp_bench.tracking.model_files._open", offline)
+        assert main(words) == 1
+        told = capsys.readouterr().err
+        assert "cannot be downloaded (network is unreachable)" in told
+        assert "hwp-bench data track --fetch" in told
+    if not all((models_folder() / name).is_file() for name in (PALM, HAND)):
+        pytest.skip("the networks are not in the cache: hwp-bench data track --fetch")
+    monkeypatch.setitem(sys.modules, "ai_edge_litert.interpreter", None)
+    assert main(words) == 1
+    assert "pip install 'hwp-bench[track]'" in capsys.readouterr().err
+
+
+def test_a_video_without_a_hand(tmp_path: Path, capsys) -> None:
+    if not all((models_folder() / name).is_file() for name in (PALM, HAND)):
+        pytest.skip("the networks are not in the cache: hwp-bench data track --fetch")
+    write_video(tmp_path / "wall.avi", [np.full((96, 128, 3), 120, np.uint8)] * 3)
+    assert main(["fit", str(tmp_path / "wall.avi")]) == 1
+    told = capsys.readouterr().err
+    assert "none of 3 frames shows a hand" in told
+    assert "--landmarks" in told
+
+
+def test_a_real_hand(tmp_path: Path) -> None:
+    """The whole chain on 16 frames of a real video. Oracle: its hand is known to be a right one."""
+    video = CLIP / "human_hand_video.mp4"
+    if not video.is_file():
+        pytest.skip("the real video is not here")
+    if not all((models_folder() / name).is_file() for name in (PALM, HAND)):
+        pytest.skip("the networks are not in the cache: hwp-bench data track --fetch")
+    source, frames = cv2.VideoCapture(str(video)), []
+    while len(frames) < COUNT:
+        frames.append(source.read()[1][:, :, ::-1])
+    write_video(tmp_path / "hand.avi", frames)
+    options = VideoFit(importer=IMPORT, settings={**QUICK, "schedule.steps": STEPS})
+    result = make_avatar(tmp_path / "hand.avi", None, options)
+    assert result.job.folder == tmp_path / "hand_avatar"
+    assert result.avatar.sides == ("right",)
+    assert result.job.turntable.is_file()
+
+
+def test_quick_takes_fewer_frames_and_smaller_fits() -> None:
+    for count in (3, 100, 200, 299, 621, 1200, 5000):
+        taken = len(range(0, count, stride(count, QUICK_FRAMES)))
+        assert taken <= 1.5 * QUICK_FRAMES
+        assert taken >= min(count, QUICK_FRAMES // 2)
+    quick = read_settings(with_quick({}, quick=True))
+    assert quick.gaussians == QUICK_CHANGES["gaussians"] < read_settings({}).gaussians
+    assert quick.schedule.steps < read_settings({}).schedule.steps
+    # What a person says wins, in either form.
+    for said in ({"schedule.steps": 5}, {"schedule": {"steps": 5}}):
+        chosen = read_settings(with_quick(said, quick=True))
+        assert (chosen.schedule.steps, chosen.gaussians) == (5, QUICK_CHANGES["gaussians"])

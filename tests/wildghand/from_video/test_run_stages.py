@@ -1,0 +1,185 @@
+"""Stages that are kept, run again, stopped and continued. Oracle: the rules, written out again."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from hwp_bench.base.errors import BadInput, HwpError
+from wildghand.from_video.job import Job
+from wildghand.from_video.pace import Pace
+from wildghand.from_video.record import JobRecord, StageRecord, read_record, write_record
+from wildghand.from_video.run import run_stages
+from wildghand.from_video.settings import VideoFit
+from wildghand.from_video.stage import Stage
+
+NAMES = ("one", "two", "three")
+
+
+class Workshop:
+    """Three stages: each writes its input and the result of the stage before it to a file."""
+
+    def __init__(self, folder: Path) -> None:
+        self.job = Job(folder / "video.mp4", folder / "hand", VideoFit())
+        self.inputs = dict.fromkeys(NAMES, "a")
+        self.ran: list[str] = []
+        self.discarded: list[str] = []
+        self.stop_in = ""
+
+    def result(self, name: str) -> Path:
+        return self.job.work / name
+
+    def stage(self, name: str, before: str | None) -> Stage:
+        def content() -> str:
+            old = "" if before is None else self.result(before).read_text()
+            return f"{old}{name}:{self.inputs[name]};"
+
+        def facts(job: Job) -> dict[str, str]:
+            old = {} if before is None else {before: self.result(before).read_text()}
+            return {**old, f"input of {name}": self.inputs[name]}
+
+        def run(job: Job) -> None:
+            self.ran.append(name)
+            if self.stop_in == name:
+                raise KeyboardInterrupt
+            self.result(name).write_text(content())
+
+        return Stage(
+            name=name,
+            title=f"Doing {name}",
+            facts=facts,
+            result=lambda job: self.result(name),
+            run=run,
+            expected=lambda job: 1.0,
+            discard=lambda job: self.discarded.append(name),
+        )
+
+    @property
+    def stages(self) -> list[Stage]:
+        return [self.stage(*pair) for pair in zip(NAMES, (None, *NAMES), strict=False)]
+
+    def go(self) -> list[str]:
+        """Run the stages; returns the names of those that ran."""
+        self.ran, self.discarded = [], []
+        self.job.work.mkdir(parents=True, exist_ok=True)
+        run_stages(self.job, self.stages)
+        return self.ran
+
+
+@pytest.fixture
+def workshop(tmp_path: Path) -> Workshop:
+    return Workshop(tmp_path)
+
+
+def test_a_second_run_does_nothing_and_says_so(workshop: Workshop, capsys) -> None:
+    assert workshop.go() == list(NAMES)
+    assert "[1/3] Doing one (0:00 elapsed, about 0:03 left)" in capsys.readouterr().err
+    assert workshop.go() == []
+    assert "all is done already" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stage_that_was_stopped_goes_on(name: str, workshop: Workshop, capsys) -> None:
+    workshop.stop_in = name
+    with pytest.raises(KeyboardInterrupt):
+        workshop.go()
+    workshop.stop_in = ""
+    capsys.readouterr()
+    place = NAMES.index(name)
+    assert workshop.go() == list(NAMES[place:])
+    # What it left behind is of the same inputs.
+    assert name not in workshop.discarded
+    told = capsys.readouterr().err
+    assert f"Doing {name} once more: the last run was stopped there." in told
+    assert ("Done before and kept: one" in told) is (place > 0)
+    assert workshop.result("three").read_text() == "one:a;two:a;three:a;"
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_stopped_stage_with_other_inputs_begins_again(name: str, workshop: Workshop) -> None:
+    workshop.stop_in = name
+    with pytest.raises(KeyboardInterrupt):
+        workshop.go()
+    workshop.stop_in, workshop.inputs[name] = "", "b"
+    workshop.go()
+    assert name in workshop.discarded
+    assert f"{name}:b;" in workshop.result("three").read_text()
+
+
+def test_a_missing_result_is_made_again(workshop: Workshop, capsys) -> None:
+    workshop.go()
+    workshop.result("two").unlink()
+    assert workshop.go() == ["two"]
+    assert "Doing two once more: its result is missing." in capsys.readouterr().err
+
+
+@given(st.dictionaries(st.sampled_from(NAMES), st.sampled_from("abc"), max_size=3))
+def test_what_builds_on_a_change_is_made_again(tmp_path_factory, changes: dict[str, str]) -> None:
+    workshop = Workshop(tmp_path_factory.mktemp("job"))
+    workshop.go()
+    workshop.inputs |= changes
+    first = [place for place, name in enumerate(NAMES) if workshop.inputs[name] != "a"]
+    assert workshop.go() == (list(NAMES[first[0] :]) if first else [])
+    expected = "".join(f"{name}:{workshop.inputs[name]};" for name in NAMES)
+    assert workshop.result("three").read_text() == expected
+
+
+def test_a_change_is_named(workshop: Workshop, capsys) -> None:
+    workshop.go()
+    workshop.inputs["two"] = "b"
+    workshop.go()
+    told = capsys.readouterr().err
+    assert "Doing two again; changed since the last run: input of two." in told
+    assert "Doing three again; changed since the last run: two." in told
+
+
+def test_a_failing_stage_is_not_done(workshop: Workshop) -> None:
+    def fail(job: Job) -> None:
+        raise HwpError("no luck")
+
+    workshop.job.work.mkdir(parents=True)
+    with pytest.raises(HwpError, match="no luck"):
+        run_stages(workshop.job, [replace(workshop.stages[0], run=fail)])
+    assert workshop.go() == list(NAMES)
+
+
+def test_stages_of_another_version_are_forgotten(workshop: Workshop) -> None:
+    workshop.go()
+    record, kept = run_stages(workshop.job, workshop.stages[:1])
+    assert (list(record.stages), kept) == (["one"], ["one"])
+
+
+@pytest.mark.parametrize(
+    "content", ["", "[]", '{"schema": "wildghand-stages/9"}', '{"stages": {"a": {"facts": 3}}}']
+)
+def test_a_damaged_record_is_one_line(content: str, tmp_path: Path) -> None:
+    path = tmp_path / "stages.json"
+    path.write_text(content)
+    with pytest.raises(BadInput, match="Delete it, or give --overwrite") as caught:
+        read_record(path)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
+    record = JobRecord().having("one", StageRecord({"video": "0a"}, True, 1.5, 2.5))
+    write_record(tmp_path / "stages.json", record)
+    assert read_record(tmp_path / "stages.json") == record
+    assert read_record(tmp_path / "absent.json") == JobRecord()
+    # The format is read by later versions.
+    assert json.loads((tmp_path / "stages.json").read_text())["schema"] == "wildghand-stages/1"
+    assert record.changed("one", {"video": "0a"}) == []
+    assert record.changed("one", {"video": "0b", "side": "left"}) == ["video", "side"]
+    assert record.changed("two", {}) is None
+
+
+def test_the_time_that_is_left_goes_by_what_was_measured() -> None:
+    """Oracle: by hand. Stages that were kept say nothing of this machine."""
+    pace = Pace([10.0, 20.0, 30.0])
+    assert pace.left(1) == (20.0, 30.0)
+    pace.ran(1, 40.0)
+    assert pace.left(2) == (60.0, 0.0)

@@ -1,0 +1,114 @@
+"""A fit that is watched. Oracles: the same fit that nobody watches, a clock that a test turns."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from painted import SilentReport
+
+from hwp_bench.capture import Capture
+from hwp_bench.methods.contract import Budget, TrainingCapture
+from wildghand.fitting import fit_capture
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.glance import Glance, glance
+from wildghand.fitting.optimize import optimize
+from wildghand.model.settings import read_settings
+from wildghand.viewer.live import Live
+
+QUICK: dict[str, Any] = {
+    "gaussians": 400,
+    "device": "cpu",
+    "network.identity_resolution": 24,
+    "network.plane_resolution": 12,
+}
+TrainingMaker = Callable[..., TrainingCapture]
+
+
+@pytest.mark.parametrize("changes", [{}, {"mode": "paper"}, {"dpd.pay_back": 1.5}], ids=str)
+def test_a_watched_fit_gives_the_same_bits(
+    changes: dict[str, Any], make_training: TrainingMaker
+) -> None:
+    training = make_training()
+    settings = read_settings({**QUICK, "schedule.steps": 10, **changes})
+    seen: list[Glance] = []
+
+    def fitted(**options: Any) -> dict[str, torch.Tensor]:
+        fit = Fit(training, settings, 0, torch.device("cpu"))
+        return optimize(fit, Budget(), SilentReport(), **options).model.state_dict()
+
+    expected = fitted()
+    found = fitted(watch=Live(seen.append, row=lambda count: len(seen) % count, pause=0.0))
+    assert expected.keys() == found.keys()
+    assert all(torch.equal(expected[name], found[name]) for name in expected)
+    assert [look.step for look in seen] == list(range(1, 11))
+    assert len({look.frame for look in seen}) == 10
+
+
+def test_a_glance_shows_the_frame_the_avatar_and_the_weights(make_training: TrainingMaker) -> None:
+    training = make_training()
+    settings = read_settings({**QUICK, "schedule.steps": 60})
+    fit = Fit(training, settings, 0, torch.device("cpu"))
+    first = glance(fit, 2, 0, 1.0)
+    avatar = optimize(fit, Budget(), SilentReport())
+    last = glance(fit, 2, 60, 0.5)
+    assert last.psnr > first.psnr + 3.0
+    frame = last.frame
+    assert frame == training.train[2]
+    np.testing.assert_array_equal(last.truth, training.frame(frame))
+    drawn = avatar.render(training.hand_poses(frame), training.camera(frame))[..., :3]
+    hand = training.mask(frame) > 127
+    # The painted poses are true, so the frame's own place and pose change little.
+    assert np.abs(last.avatar[hand] / 255.0 - drawn[hand]).mean() < 0.03
+    assert last.weights.max() == 255
+    assert last.weights[hand].mean() > 2.0 * last.weights[~hand].mean()
+
+
+def test_the_clock_of_a_fit_stands_still_while_it_is_watched(
+    make_painted: Callable[..., Capture],
+) -> None:
+    slept = []
+
+    def watch(fit: Fit, step: int, loss: Any) -> None:
+        began = time.perf_counter()
+        time.sleep(0.5)
+        slept.append(time.perf_counter() - began)
+
+    began = time.perf_counter()
+    settings = {**QUICK, "prior": ""}
+    avatar = fit_capture(
+        make_painted().root, settings=settings, budget=Budget(steps=4), watch=watch
+    )
+    took = time.perf_counter() - began
+    assert len(slept) == 4
+    assert 0.0 < avatar.record.seconds <= took - sum(slept)
+
+
+def test_a_look_waits_for_its_time_and_for_somebody_who_looks(
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = Fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
+    now, seen, looked = [100.0], [], [False]
+    monkeypatch.setattr("wildghand.viewer.live.time.monotonic", lambda: now[0])
+
+    def show(look: Glance) -> None:
+        seen.append(look.step)
+        now[0] += 0.5  # seconds that the picture takes
+
+    live = Live(show, wanted=lambda: looked[0], pause=1.0)
+    live(fit, 1, 0.1)
+    assert seen == []
+    looked[0] = True
+    live(fit, 2, 0.1)
+    assert seen == [2]
+    # A tenth of the time: after half a second nothing for the nine times as long.
+    now[0] += 4.0
+    live(fit, 3, 0.1)
+    assert seen == [2]
+    now[0] += 1.0
+    live(fit, 4, torch.tensor(0.1))
+    assert seen == [2, 4]

@@ -1,0 +1,136 @@
+"""The server of views: who reaches it, how it ends. Oracles: a WebSocket client, exit statuses."""
+
+from __future__ import annotations
+
+import builtins
+import json
+import os
+import signal
+import subprocess
+import sys
+import urllib.error
+import urllib.request
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from hwp_bench.base.errors import UsageError
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.avatar.files import save_avatar
+from wildghand.cli.main import main
+from wildghand.viewer.server import Address, serving, url
+
+viser = pytest.importorskip("viser")
+
+
+def connect(address: str, origin: str | None, host: str | None = None) -> str:
+    """What a WebSocket client of some page gets: `open`, or the status of the refusal."""
+    from websockets.exceptions import InvalidStatus
+    from websockets.sync.client import connect as open_socket
+
+    headers = {} if origin is None else {"Origin": origin}
+    place = address.replace("http", "ws")
+    try:
+        with open_socket(
+            place if host is None else place.replace("127.0.0.1", host),
+            additional_headers=headers,
+            subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
+            host="127.0.0.1",
+            proxy=None,
+        ):
+            return "open"
+    except InvalidStatus as error:
+        return str(error.response.status_code)
+
+
+def test_other_pages_cannot_look(capfd: pytest.CaptureFixture[str]) -> None:
+    with serving(Address(port=0), "test") as server:
+        address = url(server)
+        assert address.startswith("http://127.0.0.1:")
+        assert urllib.request.urlopen(address, timeout=30).status == 200
+        assert connect(address, address) == "open"
+        assert connect(address, None) == "open"
+        assert connect(address, "https://elsewhere.org") == "403"
+        assert connect(address, "http://127.0.0.1:1") == "403"
+        asked = urllib.request.Request(address, headers={"Host": "rebound.org"})
+        with pytest.raises(urllib.error.HTTPError) as refused:
+            urllib.request.urlopen(asked, timeout=30)
+        assert refused.value.code == 403
+        assert server.request_share_url() is None
+    # Results go to standard output; what viser says does not.
+    assert capfd.readouterr().out == ""
+    with pytest.raises(OSError, match="refused"):
+        urllib.request.urlopen(address, timeout=5)
+
+
+def test_a_port_that_is_taken_is_passed_over() -> None:
+    with (
+        serving(Address(port=0), "one") as first,
+        serving(Address(port=first.get_port()), "two") as second,
+    ):
+        assert second.get_port() != first.get_port()
+
+
+@pytest.mark.parametrize(
+    ("address", "message"),
+    [
+        (Address("no.such.host.invalid"), "--host: 'no.such.host.invalid' is not an address"),
+        (Address("192.0.2.1"), "--host: '192.0.2.1' is not an address of this machine"),
+        (Address(port=70_000), "--port: is 70000"),
+    ],
+    ids=str,
+)
+def test_an_address_that_cannot_be_used_is_refused(address: Address, message: str) -> None:
+    with pytest.raises(UsageError, match=message), serving(address, "never"):
+        pass
+
+
+@pytest.mark.parametrize(
+    "words", [["view", "avatar"], ["fit", "capture", "-o", "avatar", "--live"]], ids=" ".join
+)
+def test_without_the_extra_a_command_says_how_to_get_it(
+    words: list[str],
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    tmp_path: Path,
+) -> None:
+    found = builtins.__import__
+
+    def missing(name: str, *args: Any, **options: Any) -> Any:
+        if name.partition(".")[0] == "viser":
+            raise ImportError(name)
+        return found(name, *args, **options)
+
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(builtins, "__import__", missing)
+    assert main(words) == 1
+    said = capsys.readouterr()
+    assert said.out == ""
+    (line,) = said.err.splitlines()
+    assert "viser is not installed" in line
+    assert "pip install 'hwp-bench[view]'" in line
+
+
+@pytest.mark.slow
+def test_ctrl_c_ends_the_view_with_status_0(tiny_avatar: WildGHandAvatar, tmp_path: Path) -> None:
+    save_avatar(tiny_avatar, tmp_path / "avatar")
+    command = [sys.executable, "-m", "wildghand.cli.main", "view", str(tmp_path / "avatar")]
+    running = subprocess.Popen(
+        [*command, "--port", "0", "--json"],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env={**os.environ},
+    )
+    try:
+        assert running.stdout is not None
+        facts = json.loads(running.stdout.readline())
+        assert urllib.request.urlopen(facts["url"], timeout=60).status == 200
+        running.send_signal(signal.SIGINT)
+        out, err = running.communicate(timeout=120)
+    finally:
+        running.kill()
+    assert running.returncode == 0, err
+    assert out == ""
+    assert "Traceback" not in err

@@ -1,0 +1,189 @@
+"""The parts of a view that need no browser. Oracles: projections, the avatar's own drawing."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from hwp_bench.methods.contract import Camera
+from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.avatar.inline import over
+from wildghand.fitting.glance import Glance
+from wildghand.viewer.cameras import PageCamera, viewpoint
+from wildghand.viewer.guard import refusal
+from wildghand.viewer.live_sheet import live_sheet
+from wildghand.viewer.pace import LEAST, MOST, TARGET, Pace
+from wildghand.viewer.painter import Painter
+from wildghand.viewer.posed_view import PosedView
+from wildghand.viewer.posing import shown_angles, with_angle, with_fingers
+
+
+def psnr(first: np.ndarray, second: np.ndarray) -> float:
+    """dB between two 8-bit pictures."""
+    return -10.0 * np.log10(np.square((first.astype(float) - second) / 255.0).mean() + 1e-12)
+
+
+def look_from(camera: Camera, centre: np.ndarray, edge: int) -> Camera:
+    """The camera that a page has after it was put at the viewpoint of another."""
+    place = viewpoint(camera, centre)
+    ahead = place.look_at - place.position
+    ahead /= np.linalg.norm(ahead)
+    right = np.cross(ahead, place.up)
+    axes = np.stack([right, -place.up, ahead], axis=1)
+    x, y, z, w = Rotation.from_matrix(axes).as_quat()
+    page = PageCamera(
+        np.array([w, x, y, z]), place.position, place.fov, camera.width, camera.height
+    )
+    assert page.sound()
+    return page.camera(edge)
+
+
+def a_camera(seed: int) -> Camera:
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    viewmat[:3, 3] = np.random.default_rng(seed).normal(0.0, 0.3, 3)
+    K = np.array([[300.0, 0.0, 160.0], [0.0, 300.0, 120.0], [0.0, 0.0, 1.0]])
+    return Camera(K, viewmat, 320, 240)
+
+
+@given(seed=st.integers(0, 1000))
+def test_a_page_at_the_viewpoint_of_a_camera_sees_what_it_saw(seed: int) -> None:
+    camera = a_camera(seed)
+    found = look_from(camera, np.zeros(3), 320)
+    np.testing.assert_allclose(found.viewmat, camera.viewmat, atol=1e-9)
+    np.testing.assert_allclose(found.K, camera.K, atol=1e-6)
+    assert (found.width, found.height) == (320, 240)
+
+
+@given(width=st.integers(1, 4000), height=st.integers(50, 3000), edge=st.integers(64, 4000))
+def test_smaller_pictures_show_the_same_part_of_the_world(
+    width: int, height: int, edge: int
+) -> None:
+    page = PageCamera(np.array([1.0, 0, 0, 0]), np.zeros(3), 0.7, width, height)
+    camera = page.camera(edge)
+    assert max(camera.width, camera.height) <= min(edge, max(width, height))
+    # The corner of the page is the corner of the picture.
+    focal = 0.5 * height / np.tan(0.35)
+    corner = np.array([0.5 * width / focal, 0.5 * height / focal, 1.0])
+    np.testing.assert_allclose(camera.K @ corner, [camera.width, camera.height, 1.0], rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"fov": float("nan")},
+        {"fov": 0.0},
+        {"wxyz": np.zeros(4)},
+        {"position": np.array([0.0, np.inf, 0.0])},
+        {"width": 0},
+        {"width": 100_000},
+    ],
+    ids=str,
+)
+def test_a_camera_that_makes_no_sense_is_not_drawn(changes: dict) -> None:
+    given = {"wxyz": np.array([1.0, 0, 0, 0]), "position": np.zeros(3), "fov": 0.7}
+    assert PageCamera(**{**given, "width": 640, "height": 480}).sound()
+    assert not PageCamera(**{**given, "width": 640, "height": 480, **changes}).sound()
+
+
+def test_one_angle_changes_and_nothing_else(tiny_avatar: WildGHandAvatar) -> None:
+    angles, hands = tiny_avatar.studio.angles, tiny_avatar.studio.posed("point")
+    before = angles["right"].angles(hands["right"].pose)
+    after = with_angle(hands, angles["right"], 4, 0, 12.5)["right"]
+    found = angles["right"].angles(after.pose)
+    assert found[4, 0] == pytest.approx(12.5)
+    before[4, 0] = 12.5
+    np.testing.assert_allclose(found, before, atol=1e-6)
+    np.testing.assert_array_equal(after.transl, hands["right"].transl)
+    far = with_angle(hands, angles["right"], 4, 0, 1e9)
+    assert shown_angles(far["right"], angles["right"])[4, 0] == angles["right"].upper[4, 0]
+
+
+def test_a_named_pose_keeps_the_hand_where_it_is(tiny_avatar: WildGHandAvatar) -> None:
+    angles = tiny_avatar.studio.angles
+    hands = tiny_avatar.studio.posed({"wrist twist": 40.0})
+    fist = angles["right"].named_pose("fist")
+    found = with_fingers(hands, angles, {"right": fist})["right"]
+    np.testing.assert_array_equal(found.pose[0], hands["right"].pose[0])
+    np.testing.assert_allclose(found.pose[1:], angles["right"].pose(fist)[1:])
+    np.testing.assert_array_equal(found.transl, hands["right"].transl)
+
+
+def test_the_full_picture_is_the_avatars_and_a_draft_is_near(tiny_avatar: WildGHandAvatar) -> None:
+    painter, studio = Painter(tiny_avatar), tiny_avatar.studio
+    hands, camera = studio.posed("fist"), studio.camera(96, 64)
+    full = painter.full(hands, camera, (200, 0, 90))
+    expected = over(tiny_avatar.render(hands, camera), (200, 0, 90))
+    np.testing.assert_array_equal(full.image, expected)
+    draft = painter.draft(hands, camera, (200, 0, 90))
+    assert draft.draft
+    assert draft.edge == 96
+    assert psnr(draft.image, expected) > 30.0
+    moved = painter.draft(studio.posed("open"), camera, (200, 0, 90))
+    assert psnr(moved.image, expected) < 25.0
+
+
+def test_changes_of_the_view_reach_its_picture(tiny_avatar: WildGHandAvatar) -> None:
+    view, changes = PosedView(tiny_avatar), []
+    view.changed = lambda: changes.append(1)
+    camera = tiny_avatar.studio.camera(64, 64)
+    rest = view.draw(camera, False).image
+    view.set_fingers("fist")
+    view.set_background((0, 0, 0))
+    fist = over(tiny_avatar.render("fist", camera), (0, 0, 0))
+    np.testing.assert_array_equal(view.draw(camera, False).image, fist)
+    view.rest()
+    view.set_background((255, 255, 255))
+    np.testing.assert_array_equal(view.draw(camera, False).image, rest)
+    assert len(changes) == 4
+    found = look_from(camera, tiny_avatar.studio.centre, 64)
+    np.testing.assert_allclose(found.K, camera.K, atol=1e-6)
+
+
+@given(per_pixel=st.floats(1e-9, 1e-4), other=st.floats(0.0, 0.5), first=st.integers(LEAST, MOST))
+def test_the_pace_settles_where_a_picture_takes_the_time_that_it_may(
+    per_pixel: float, other: float, first: int
+) -> None:
+    pace = Pace(first)
+    for _ in range(60):
+        pace.took(pace.edge, per_pixel * pace.edge**2, other)
+        assert LEAST <= pace.edge <= MOST
+    allowed = max(TARGET - other, TARGET / 3)
+    assert pace.edge == LEAST or per_pixel * (pace.edge - 2) ** 2 <= allowed
+    assert pace.edge == MOST or per_pixel * (pace.edge + 2) ** 2 >= allowed
+
+
+@pytest.mark.parametrize(
+    ("headers", "loopback", "answered"),
+    [
+        ({"Host": "127.0.0.1:8080"}, True, True),
+        ({"Host": "localhost:8080", "Origin": "http://localhost:8080"}, True, True),
+        ({"Host": "[::1]:8080", "Origin": "http://[::1]:8080"}, True, True),
+        ({"Host": "127.0.0.1:8080", "Origin": "https://elsewhere.org"}, True, False),
+        ({"Host": "127.0.0.1:8080", "Origin": "http://127.0.0.1:9999"}, True, False),
+        ({"Host": "127.0.0.1:8080", "Origin": "null"}, True, False),
+        ({"Host": "rebound.org:8080", "Origin": "http://rebound.org:8080"}, True, False),
+        ({"Host": "lab.example:8080", "Origin": "http://lab.example:8080"}, False, True),
+        ({"Host": "lab.example:8080", "Origin": "http://elsewhere.org"}, False, False),
+        ({}, True, False),
+    ],
+    ids=str,
+)
+def test_only_pages_of_the_view_itself_may_connect(
+    headers: dict[str, str], loopback: bool, answered: bool
+) -> None:
+    assert (refusal(headers, loopback) is None) == answered
+
+
+@pytest.mark.parametrize("aspect", [0.4, 1.0, 2.5])
+def test_the_sheet_of_a_fit_has_the_pages_shape_and_shows_all_three(aspect: float) -> None:
+    colours = [(250, 0, 0), (0, 250, 0)]
+    truth, avatar = (np.full((48, 64, 3), colour, dtype=np.uint8) for colour in colours)
+    weights = np.full((48, 64), 3, dtype=np.uint8)
+    page = live_sheet(Glance(3, 0.5, 12, 20.0, truth, avatar, weights), aspect)
+    assert page.shape[1] / page.shape[0] == pytest.approx(aspect, rel=0.01)
+    areas = [int((page == colour).all(axis=-1).sum()) for colour in [*colours, (3, 3, 3)]]
+    assert areas[0] == areas[1] == areas[2] > 48 * 64

@@ -1,0 +1,1 @@
+"""Avatars as files for other programs: Gaussian splats and skinned meshes."""

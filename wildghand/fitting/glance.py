@@ -1,0 +1,79 @@
+"""A look at a fit while it runs: one training frame, the avatar in its place, the pixel weights.
+
+Looking changes nothing: a fit that is watched gives the same bits as one that is not.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hwp_bench.base.images import as_uint8
+from wildghand.fitting.fit import Fit
+from wildghand.splat.threads import denormals_flushed
+
+
+@dataclass(frozen=True, eq=False)
+class Glance:
+    """One training frame in the middle of a fit."""
+
+    #: Optimizer steps so far.
+    step: int
+    #: Loss of the last step.
+    loss: float
+    #: Frame of the capture.
+    frame: int
+    #: dB, of the avatar against the frame over the pixels of the hand; NaN where there are none.
+    psnr: float
+    #: (H, W, 3) uint8: the frame.
+    truth: np.ndarray
+    #: (H, W, 3) uint8 over black: the avatar in the frame's pose, without what perturbed it.
+    avatar: np.ndarray
+    #: (H, W) uint8: how much each pixel counts, 255 for the largest weight.
+    weights: np.ndarray
+
+
+@denormals_flushed()
+@torch.no_grad()
+def glance(fit: Fit, row: int, step: int, loss: float) -> Glance:
+    """Look at one of the frames that are fitted.
+
+    Args:
+        fit: in the middle of its steps; nothing of it is changed.
+        row: which of its training frames.
+        step: optimizer steps so far.
+        loss: of the last step.
+    """
+    rows = torch.tensor([row])
+    # Weighing a frame moves the running medians along.
+    before = fit.weighting.state_dict()
+    try:
+        target = fit.weighting(rows, fit.draw(rows))
+    finally:
+        fit.weighting.load_state_dict(before)
+    without = {side: torch.tensor([False]) for side in fit.model.perturbation}
+    drawn = fit.draw(rows, without).image[0] / fit.model.log_gains[row].exp()
+    frame = int(fit.frames.indices[row])
+    truth = fit.training.frame(frame)
+    image = drawn.clamp(0.0, 1.0).nan_to_num(0.0).float().cpu().numpy()
+    weights = target.weights[0].float()
+    share = weights / weights.max().clamp(min=1e-12)
+    return Glance(
+        step=step,
+        loss=loss,
+        frame=frame,
+        psnr=_psnr(image, truth, fit.training.mask(frame) > 127),
+        truth=truth,
+        avatar=as_uint8(image),
+        weights=(255.0 * share).round().byte().cpu().numpy(),
+    )
+
+
+def _psnr(image: np.ndarray, truth: np.ndarray, hand: np.ndarray) -> float:
+    if not hand.any():
+        return math.nan
+    error = float(np.square(image[hand] - truth[hand] / 255.0).mean())
+    return -10.0 * math.log10(max(error, 1e-10))

@@ -1,0 +1,161 @@
+"""A fit that is watched in the browser while it runs: `wildghand fit --live`."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hwp_bench.base.progress import notice
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.glance import Glance, glance
+from wildghand.gaussians.fit_loop import Loss
+from wildghand.viewer.live_sheet import live_sheet
+from wildghand.viewer.server import Address, serving, url
+
+if TYPE_CHECKING:
+    from viser import ClientHandle, ViserServer
+
+#: Least seconds between two pictures, and the largest share of the time that goes into them.
+LEAST_PAUSE, SHARE = 1.0, 0.1
+#: Points of the chart; of more, every second one is dropped.
+_POINTS = 400
+
+
+class Live:
+    """Looks at a fit now and then; see `wildghand.fitting.optimize.Watch`.
+
+    Args:
+        show: takes what was seen.
+        wanted: whether anybody looks.
+        row: which training frame is looked at.
+        pause: seconds between two looks at least; 0 looks after every step.
+    """
+
+    def __init__(
+        self,
+        show: Callable[[Glance], None],
+        wanted: Callable[[], bool] = lambda: True,
+        row: Callable[[int], int] = lambda count: 0,
+        pause: float = LEAST_PAUSE,
+    ) -> None:
+        self._show, self._wanted, self._row, self._pause = show, wanted, row, pause
+        self._due = 0.0
+
+    def __call__(self, fit: Fit, step: int, loss: Loss) -> None:
+        """Look, where it is time to."""
+        began = time.monotonic()
+        if began < self._due or not self._wanted():
+            return
+        try:
+            self._show(glance(fit, self._row(len(fit.frames)), step, float(loss)))
+        except OSError as error:  # the network's: a page that is gone must not end a fit
+            notice(f"The fit cannot be shown ({error}).")
+        now = time.monotonic()
+        self._due = now + max(self._pause, (now - began) * (1.0 / SHARE - 1.0) * bool(self._pause))
+
+
+class LivePage:
+    """The page of a fit: numbers, a chart, and the pictures of one training frame.
+
+    Args:
+        server: that serves it.
+    """
+
+    def __init__(self, server: ViserServer) -> None:
+        import viser.uplot
+
+        self._server = server
+        self._last: Glance | None = None
+        self._curve: list[tuple[float, float, float]] = []
+        self._text = server.gui.add_markdown("The fit is being prepared.")
+        self._share = server.gui.add_slider(
+            "training frame", min=0, max=100, step=1, initial_value=0, hint="% of the clip"
+        )
+        series = (
+            viser.uplot.Series(label="step"),
+            viser.uplot.Series(label="loss", stroke="#1864ab", scale="loss"),
+            viser.uplot.Series(label="PSNR, dB", stroke="#d9480f", scale="dB"),
+        )
+        self._chart = server.gui.add_uplot(
+            (np.zeros(1), np.zeros(1), np.zeros(1)),
+            series,
+            scales={
+                "x": viser.uplot.Scale(time=False),
+                "loss": viser.uplot.Scale(auto=True),
+                "dB": viser.uplot.Scale(auto=True),
+            },
+            axes=(
+                viser.uplot.Axis(label="step"),
+                viser.uplot.Axis(scale="loss"),
+                viser.uplot.Axis(scale="dB", side=1),
+            ),
+            aspect=1.4,
+        )
+        server.on_client_connect(self._arrive)
+
+    def row(self, count: int) -> int:
+        """Return which of `count` training frames the page asks for."""
+        return min(count - 1, self._share.value * count // 100)
+
+    def wanted(self) -> bool:
+        """Whether a page is open."""
+        return bool(self._server.get_clients())
+
+    def show(self, look: Glance) -> None:
+        """Bring every page up to date."""
+        self._last = look
+        self._curve.append((float(look.step), look.loss, look.psnr))
+        if len(self._curve) > _POINTS:
+            self._curve = self._curve[::2]
+        self._text.content = (
+            f"step **{look.step}**, loss **{look.loss:.4f}**, frame {look.frame}: "
+            f"**{look.psnr:.1f} dB**"
+        )
+        steps, losses, psnrs = np.array(self._curve).T
+        self._chart.data = steps, losses, psnrs
+        for client in self._server.get_clients().values():
+            _draw(client, look)
+
+    def _arrive(self, client: ClientHandle) -> None:
+        if self._last is not None:
+            _draw(client, self._last)
+
+
+def _draw(client: ClientHandle, look: Glance) -> None:
+    width, height = client.camera.image_width, client.camera.image_height
+    aspect = min(max(width / max(height, 1), 0.1), 10.0)
+    client.scene.set_background_image(live_sheet(look, aspect), format="png")
+
+
+@dataclass(frozen=True, eq=False)
+class ServedFit:
+    """The page of a fit while it is served."""
+
+    #: Where a browser opens it.
+    url: str
+    #: What a fit calls after each step.
+    watch: Live
+    #: Its web server.
+    server: ViserServer
+
+
+@contextlib.contextmanager
+def serve_fit(address: Address | None = None, pause: float = LEAST_PAUSE) -> Iterator[ServedFit]:
+    """Serve the page of a fit while the block runs.
+
+    Args:
+        address: where it is served; None: on this machine only.
+        pause: see `Live`.
+
+    Raises:
+        MissingDependency: viser is not installed.
+        UsageError: the address cannot be used.
+    """
+    with serving(address or Address(), "fit") as server:
+        page = LivePage(server)
+        yield ServedFit(url(server), Live(page.show, page.wanted, page.row, pause), server)

@@ -1,0 +1,118 @@
+"""The web server of a view: viser, on this machine only unless asked otherwise."""
+
+from __future__ import annotations
+
+import contextlib
+import socket
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+from hwp_bench.base.errors import MissingDependency, UsageError
+from wildghand.viewer.guard import LOOPBACK, guarded
+
+if TYPE_CHECKING:
+    from viser import ViserServer
+
+
+@dataclass(frozen=True)
+class Address:
+    """Where a view is served."""
+
+    #: Name or address to bind to.
+    host: str = "127.0.0.1"
+    #: Port; where it is taken, the next free one; 0: any.
+    port: int = 8080
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only this machine reaches it."""
+        return self.host in LOOPBACK
+
+
+def require_viser() -> None:
+    """Check that the extra is installed, before work begins.
+
+    Raises:
+        MissingDependency: it is not.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError as error:
+        raise MissingDependency(
+            "viser is not installed, which shows views in a browser",
+            remedy="pip install 'hwp-bench[view]'",
+        ) from error
+
+
+@contextlib.contextmanager
+def serving(address: Address, title: str) -> Iterator[ViserServer]:
+    """Serve a page while the block runs; standard output stays free of viser's own messages.
+
+    Args:
+        address: where.
+        title: over the panel of the page.
+
+    Raises:
+        MissingDependency: viser is not installed.
+        UsageError: the address cannot be used.
+    """
+    require_viser()
+    _check(address)
+    import viser
+
+    class Server(viser.ViserServer):
+        """A server that never offers itself to the internet."""
+
+        def request_share_url(self, verbose: bool = True) -> str | None:
+            """Refuse: a page may ask for a tunnel through a machine of viser's authors."""
+            return None
+
+    with contextlib.redirect_stdout(sys.stderr), guarded(address.loopback):
+        server = Server(host=address.host, port=address.port, label=title, verbose=False)
+    try:
+        server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
+        yield server
+    finally:
+        with contextlib.redirect_stdout(sys.stderr):
+            server.stop()
+
+
+def url(server: ViserServer) -> str:
+    """Return the address of the page, as a browser on this machine opens it."""
+    host = server.get_host()
+    shown = "127.0.0.1" if host in ("0.0.0.0", "::") else host
+    return f"http://{f'[{shown}]' if ':' in shown else shown}:{server.get_port()}"
+
+
+def _check(address: Address) -> None:
+    """Viser tries a thousand ports and then waits for ever where a host cannot be bound."""
+    if not 0 <= address.port <= 65_535:
+        raise UsageError(f"is {address.port}", field="--port", remedy="Use 0 to 65535.")
+    try:
+        family = socket.getaddrinfo(address.host, 0, type=socket.SOCK_STREAM)[0][0]
+        with socket.socket(family, socket.SOCK_STREAM) as probe:
+            probe.bind((address.host, 0))
+    except (OSError, UnicodeError) as error:
+        raise UsageError(
+            f"{address.host[:80]!r} is not an address of this machine ({error})",
+            field="--host",
+            remedy="Use 127.0.0.1 for this machine only, or 0.0.0.0 for every network it is in.",
+        ) from error
+    if address.port:
+        _check_port(address, family)
+
+
+def _check_port(address: Address, family: int) -> None:
+    with socket.socket(family, socket.SOCK_STREAM) as probe:
+        try:
+            probe.bind((address.host, address.port))
+        except PermissionError as error:
+            raise UsageError(
+                f"{address.port} may not be used by this user",
+                field="--port",
+                remedy="Use 1024 or more.",
+            ) from error
+        except OSError:
+            return  # taken: viser goes on to the next one
