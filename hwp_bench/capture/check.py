@@ -217,7 +217,7 @@ def _geometry(capture: Capture) -> Iterator[Finding]:
                 os.fspath(capture.root / "hands.npz"),
                 f"{side}_transl",
                 f"the hand lies behind the camera in {len(behind)} of {len(hand.valid)} frames: "
-                f"{bounded(behind)}",
+                f"{bounded(behind.tolist())}",
                 "Mark such frames as not valid, or correct the translation.",
             )
 

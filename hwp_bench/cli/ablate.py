@@ -88,6 +88,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.evaluation.ablate.design import make_design
     from hwp_bench.evaluation.ablate.runs import run_ablation
     from hwp_bench.methods.manifest import find_method, read_manifest
+    from hwp_bench.methods.setting_files import check_settings
     from hwp_bench.run.engine.options import engine_for, needs_of
 
     if not 1 <= args.seeds <= 100:
@@ -96,6 +97,7 @@ def run(args: argparse.Namespace) -> int:
     settings = evaluation_settings(args)
     # A wrong method, setting or switch must be reported before a suite is rendered for it.
     manifest = read_manifest(find_method(args.method))
+    check_settings(manifest, settings.run.settings, "--set")
     design = make_design(manifest, args.thrown or [], args.only)
     out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}")
     splits = read_splits(args.splits) if args.splits else None

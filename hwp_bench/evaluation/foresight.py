@@ -98,9 +98,8 @@ def check_suite(
 
 def _check_predictions(manifest: MethodManifest, items: Sequence[SuiteItem]) -> None:
     names = [item.scene.id for item in items]
-    missing = [
-        name for name in names if not inside(manifest.root, f"{manifest.entry}/{name}").is_dir()
-    ]
+    folders = {name: inside(manifest.root, f"{manifest.entry}/{name}") for name in names}
+    missing = [name for name, folder in folders.items() if not any(folder.glob("*.png"))]
     if len(missing) == len(names):
         raise BadMethod(
             f"has predictions of no capture of this suite ({', '.join(names)})",

@@ -250,12 +250,12 @@ def results_among(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
         BadInput, BadResult: as `result_files`.
     """
     places = list(paths)
-    strangers = [path for path in places if _holds_none(Path(path))]
-    if len(strangers) == len(places):
-        strangers = []
-    for path in strangers:
+    others = [path for path in places if _holds_none(Path(path))]
+    if len(others) == len(places):
+        others = []
+    for path in others:
         notice(f"left out: {os.fspath(path)} holds no results")
-    return [file for path in places if path not in strangers for file in result_files(path)]
+    return [file for path in places if path not in others for file in result_files(path)]
 
 
 def _holds_none(place: Path) -> bool:

@@ -43,7 +43,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar=("R", "G", "B"),
         help="colour behind the hand, 0 to 255 each (default: white)",
     )
-    parser.add_argument("--hand", metavar="MODEL", help="hand model: anny or mano:PATH")
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
@@ -60,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     red, green, blue = args.background
     settings = ViewSettings(args.size, (red, green, blue))
     require_viser()
-    avatar = load_avatar(args.avatar, hand=args.hand)
+    avatar = load_avatar(args.avatar, hand=args.hand_model)
     poses = args.poses or capture_of(args.avatar)
     motion = None if poses is None else Motion(avatar, open_capture(poses))
     try:

@@ -91,6 +91,18 @@ def test_a_method_that_cannot_start_renders_nothing(
     assert problem in capsys.readouterr().err
 
 
+def test_a_submission_that_is_not_filled_renders_nothing(tmp_path: Path, capsys) -> None:
+    mine = _method(tmp_path / "mine", 'predictions = "predictions"', "")
+    for name in ("capture0", "capture4"):
+        (mine / "predictions" / name).mkdir(parents=True)
+    assert main(["evaluate", "mine", "--suite", "smoke"]) == 1
+    assert "has predictions of no capture of this suite" in capsys.readouterr().err
+    (mine / "predictions" / "capture4" / "000027.png").touch()
+    with pytest.raises(Rendered):
+        main(["evaluate", "mine", "--suite", "smoke"])
+    assert "no predictions of capture0: every frame" in capsys.readouterr().err
+
+
 def test_a_folder_that_another_run_writes_to_is_said_at_once(tmp_path: Path, capsys) -> None:
     from hwp_bench.base.locks import exclusive
 

@@ -53,7 +53,7 @@ def test_a_whole_folder_of_runs_is_taken(command: list[str], runs: Path, capsys)
 
 
 @pytest.mark.parametrize("command", COMMANDS, ids=" ".join)
-def test_nothing_but_strangers_is_an_error(command: list[str], runs: Path, capsys) -> None:
+def test_nothing_but_other_files_is_an_error(command: list[str], runs: Path, capsys) -> None:
     extra = [] if command[0] == "table" else ["-o", str(runs.parent / "out")]
     assert main([*command, str(runs / "cost"), str(runs / "notes.txt"), *extra]) == 1
     assert "results.json: does not exist" in capsys.readouterr().err
