@@ -33,7 +33,7 @@ def run_cell(source: str, names: dict[str, Any], title: str) -> tuple[str, Any]:
         title: for tracebacks.
 
     Returns:
-        What it prints, and the value of its last line (None where that is no expression).
+        What it prints, and the value of its last line (None where that is not an expression).
     """
     tree = ast.parse(source, title)
     last = tree.body.pop() if tree.body and isinstance(tree.body[-1], ast.Expr) else None
@@ -47,7 +47,7 @@ def run_cell(source: str, names: dict[str, Any], title: str) -> tuple[str, Any]:
 
 
 def outputs_of(printed: str, value: Any, count: int) -> list[dict[str, Any]]:
-    """What a notebook stores of a cell that has run."""
+    """Return the outputs that a notebook stores of a cell."""
     outputs: list[dict[str, Any]] = []
     if printed:
         outputs.append({"output_type": "stream", "name": "stdout", "text": printed})

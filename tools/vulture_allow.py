@@ -26,6 +26,10 @@ _.persistent_load  # pickle.Unpickler calls it
 align  # pickles of numpy pass it
 typecode  # pickles of numpy pass it
 _._repr_markdown_  # notebooks call it
+_._repr_mimebundle_  # notebooks call it
+_.up_direction  # viser reads it
+_.request_share_url  # viser's server calls it
+verbose  # viser's server passes it
 _.formatter_class  # argparse reads it
 _.channelnames  # OpenImageIO reads it
 _.camera_position  # pyvista reads it

@@ -55,7 +55,7 @@ class InlinePicture:
         source = _data_uri(self.data, self.media)
         return f'<img src="{source}" width="{self.size}" height="{self.size}" alt="{self.text}">'
 
-    def _repr_mimebundle_(self, include: Any = None, exclude: Any = None) -> dict[str, Any]:
+    def _repr_mimebundle_(self, **_: Any) -> dict[str, Any]:
         """Return what a notebook stores: the picture where it knows its type, HTML, and text."""
         bundle: dict[str, Any] = {"text/html": self._repr_html_(), "text/plain": repr(self)}
         if self.media == "image/png" and self.page is None:

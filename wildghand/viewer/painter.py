@@ -38,8 +38,8 @@ class Picture:
 class Painter:
     """Draws an avatar with the rasterizer that fits and scores it.
 
-    A draft leaves out what the network says anew for each camera (the light that faces it), and
-    keeps the Gaussians for as long as the hands stay: turning the camera then costs pixels only.
+    A draft leaves out what depends on the camera (the light of normals that no frame has shown),
+    and keeps the Gaussians for as long as the hands stay: turning the camera costs pixels only.
 
     Args:
         avatar: what is drawn; one thread at a time may use it.

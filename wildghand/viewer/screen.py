@@ -64,7 +64,7 @@ class Screen:
         self._thread.start()
 
     def touch(self) -> None:
-        """Draw anew in every page: the hands, or what is behind them, have changed."""
+        """Draw every page again: the hands, or what is behind them, have changed."""
         with self._news:
             for page in self._pages.values():
                 self._change(page)

@@ -49,7 +49,15 @@ return null;
 
 def window(driver: Any) -> np.ndarray:
     """(H, W, 3) float, what the window shows."""
-    data = driver.get_screenshot_as_png()
+    from selenium.common.exceptions import TimeoutException
+
+    def taken() -> bytes | None:
+        try:
+            return driver.get_screenshot_as_png()
+        except TimeoutException:  # after ten seconds, on a machine that is busy
+            return None
+
+    data = wait_until(taken)
     return np.asarray(Image.open(io.BytesIO(data)).convert("RGB")).astype(float)
 
 

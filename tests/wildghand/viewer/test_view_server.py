@@ -24,19 +24,17 @@ from wildghand.viewer.server import Address, serving, url
 viser = pytest.importorskip("viser")
 
 
-def connect(address: str, origin: str | None, host: str | None = None) -> str:
+def connect(address: str, origin: str | None) -> str:
     """What a WebSocket client of some page gets: `open`, or the status of the refusal."""
     from websockets.exceptions import InvalidStatus
     from websockets.sync.client import connect as open_socket
 
     headers = {} if origin is None else {"Origin": origin}
-    place = address.replace("http", "ws")
     try:
         with open_socket(
-            place if host is None else place.replace("127.0.0.1", host),
+            address.replace("http", "ws"),
             additional_headers=headers,
             subprotocols=[f"viser-v{viser.__version__}"],  # type: ignore[list-item]
-            host="127.0.0.1",
             proxy=None,
         ):
             return "open"

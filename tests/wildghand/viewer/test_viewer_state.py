@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
+from hwp_bench.base.errors import UsageError
+from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Camera
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.inline import over
@@ -15,8 +21,10 @@ from wildghand.fitting.glance import Glance
 from wildghand.viewer.cameras import PageCamera, viewpoint
 from wildghand.viewer.guard import refusal
 from wildghand.viewer.live_sheet import live_sheet
+from wildghand.viewer.motion import Motion, capture_of
 from wildghand.viewer.pace import LEAST, MOST, TARGET, Pace
 from wildghand.viewer.painter import Painter
+from wildghand.viewer.player import Player
 from wildghand.viewer.posed_view import PosedView
 from wildghand.viewer.posing import shown_angles, with_angle, with_fingers
 
@@ -187,3 +195,53 @@ def test_the_sheet_of_a_fit_has_the_pages_shape_and_shows_all_three(aspect: floa
     assert page.shape[1] / page.shape[0] == pytest.approx(aspect, rel=0.01)
     areas = [int((page == colour).all(axis=-1).sum()) for colour in [*colours, (3, 3, 3)]]
     assert areas[0] == areas[1] == areas[2] > 48 * 64
+
+
+def test_a_motion_plays_round_and_stops() -> None:
+    shown: list[int] = []
+    enough = threading.Event()
+
+    def show(frame: int) -> None:
+        shown.append(frame)
+        if len(set(shown)) == 4 and len(shown) > 8:
+            enough.set()
+
+    player = Player(4, 200.0, show)
+    player.play(2)
+    player.play(0)  # it plays already
+    assert enough.wait(60.0)
+    player.stop()
+    count = len(shown)
+    player.stop()
+    assert set(shown) == set(range(4))
+    assert len(shown) == count
+
+
+def test_the_capture_that_lies_with_an_avatar_is_found(
+    make_capture: Callable[..., Capture], tmp_path: Path
+) -> None:
+    assert capture_of(tmp_path / "avatar") is None
+    next_to_it = make_capture("avatar.capture", frames=10)
+    assert capture_of(tmp_path / "avatar") == next_to_it.root
+    within = make_capture("capture", frames=10, folder=tmp_path / "avatar" / "work")
+    assert capture_of(tmp_path / "avatar") == within.root
+
+
+def test_the_motion_of_a_capture_is_that_of_the_hands_that_the_avatar_has(
+    tiny_avatar: WildGHandAvatar, make_painted: Callable[..., Capture]
+) -> None:
+    capture = make_painted("both")
+    motion = Motion(tiny_avatar, capture)
+    assert len(motion) == capture.info.frame_count
+    view = PosedView(tiny_avatar, motion)
+    view.set_frame(7)
+    assert set(view.hands) == {"right"}
+    expected = tiny_avatar.render({"right": capture.hand_poses(7)["right"]}, capture.camera(7))
+    drawn = view.draw(motion.camera(7), False).image
+    np.testing.assert_array_equal(drawn, over(expected, (255, 255, 255)))
+    found = look_from(motion.camera(7), np.array([0.0, 0.0, 0.4]), 64)
+    np.testing.assert_allclose(found.K, capture.camera(7).K, atol=1e-6)
+    place = view.frame_viewpoint(7)
+    np.testing.assert_allclose(place.position, np.zeros(3), atol=1e-9)
+    with pytest.raises(UsageError, match="shows the left hand"):
+        Motion(tiny_avatar, make_painted("left"))
