@@ -213,7 +213,7 @@ def _basis(values: np.ndarray, poses: np.ndarray, rank: int) -> PoseBasis:
     order = np.argsort(power)[::-1][: min(rank, count - 1)]
     order = order[power[order] > 1e-9 * max(power.max(), 1e-30)]
     roots = np.sqrt(power[order])
-    components = (flat.T @ (vectors[:, order] / roots)).T.reshape(len(order), -1, 3)
+    components = (flat.T @ (vectors[:, order] / roots)).T.reshape(len(order), len(mean), 3)
     coefficients = vectors[:, order] * roots
     peaks = np.abs(components).max(axis=(1, 2), initial=1e-30)
     regression = _ridge(pose_features(poses), coefficients)
