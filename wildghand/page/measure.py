@@ -59,7 +59,10 @@ def fidelity(
     if not errors["baked"]:
         return None
     return Fidelity(
-        **{name: round(float(-10.0 * np.log10(np.mean(e) + 1e-12)), 2) for name, e in errors.items()}
+        **{
+            name: round(float(-10.0 * np.log10(np.mean(e) + 1e-12)), 2)
+            for name, e in errors.items()
+        }
     )
 
 

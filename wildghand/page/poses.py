@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 import torch
@@ -14,9 +14,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
 from hwp_bench.methods.contract import HandPose
 from wildghand.avatar import WildGHandAvatar
-
-if TYPE_CHECKING:
-    from wildghand.page.write import PageSettings
+from wildghand.page.settings import PageSettings
 
 # The camera before a hand at rest: it looks at the back of the hand, fingers upwards.
 _REST_VIEW = np.array([[0.0, 0, -1, 0], [1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])

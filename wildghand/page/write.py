@@ -19,30 +19,13 @@ from wildghand.avatar import WildGHandAvatar, load_avatar
 from wildghand.page.bake import BakedHand, PoseBasis, bake_hand
 from wildghand.page.measure import Fidelity, fidelity, still_image
 from wildghand.page.poses import PoseSamples, hand_controls, sample_poses
+from wildghand.page.settings import PageSettings
 
 if TYPE_CHECKING:
     from markupsafe import Markup
 
 # In the order in which they are run.
 _SCRIPTS = ("hand.js", "splats.js", "controls.js")
-
-
-@dataclass(frozen=True)
-class PageSettings:
-    """How much of the avatar a page holds."""
-
-    #: Principal components of places and of colours that depend on the pose.
-    geometry_rank: int = 6
-    color_rank: int = 12
-    #: Poses of the clip, and random ones within the limits of the joints, that are drawn to bake.
-    clip_samples: int = 80
-    random_samples: int = 48
-    #: Most training frames whose motion is played.
-    most_frames: int = 240
-    #: Edge of the still image for browsers without WebGL2, px.
-    still_size: int = 384
-    #: Of the random poses.
-    seed: int = 0
 
 
 @dataclass(frozen=True)

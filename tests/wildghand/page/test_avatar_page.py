@@ -27,7 +27,7 @@ from wildghand.page import bake_hand, write_page
 from wildghand.page.bake import joint_motions
 from wildghand.page.measure import draw_baked
 from wildghand.page.poses import sample_poses
-from wildghand.page.write import PageSettings
+from wildghand.page.settings import PageSettings
 
 QUICK = {
     "gaussians": 600,
