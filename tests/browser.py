@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -28,13 +28,16 @@ def _program(*names: str) -> str:
 
 
 @contextmanager
-def open_page(page: Path | str, profile: Path, *, webgl: bool = False) -> Iterator[Any]:
+def open_page(
+    page: Path | str, profile: Path, *, webgl: bool = False, flags: Sequence[str] = ()
+) -> Iterator[Any]:
     """Open a page in Chromium; at the end nothing may have been complained of in its console.
 
     Args:
         page: the file, or the address of a server on this machine.
         profile: a folder for the browser.
         webgl: the page draws with WebGL, which Chromium's own software does without a GPU.
+        flags: more of them for the browser.
 
     Yields:
         A selenium driver.
@@ -46,7 +49,7 @@ def open_page(page: Path | str, profile: Path, *, webgl: bool = False) -> Iterat
 
     options = webdriver.ChromeOptions()
     options.binary_location = binary
-    for flag in (*_FLAGS, *(_WEBGL if webgl else ()), f"--user-data-dir={profile}"):
+    for flag in (*_FLAGS, *(_WEBGL if webgl else ()), *flags, f"--user-data-dir={profile}"):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=Service(chromedriver))

@@ -132,6 +132,7 @@ def _print(made: MadeAvatar) -> None:
     print(f"{facts['avatar']}: {hands} hand, {facts['frames']} frames, {facts['steps']} steps")
     print(f"turntable: {facts['turntable']}")
     print(f"sheet: {facts['sheet']}")
+    print(f"page: {facts['page']}")
     took = ", ".join(f"{one['name']} {one['seconds']:.0f}" for one in facts["stages"])
     print(f"seconds: {took}")
 

@@ -23,6 +23,9 @@ def command_tree() -> Command:
             ),
             "view": Command("pose an avatar in the browser", "wildghand.cli.view"),
             "export": Command("write an avatar as Gaussians for viewers", "wildghand.cli.export"),
+            "page": Command(
+                "write an avatar as a page for browsers, one file", "wildghand.cli.page"
+            ),
             "judge": Command(
                 "judge the frames of a capture: clean or perturbed", "wildghand.cli.judge"
             ),

@@ -3,6 +3,7 @@
 my_hand/                    an avatar folder: avatar.json, model.safetensors, weights/
 my_hand/turntable.mp4       the avatar turned around
 my_hand/sheet.jpg           frames, the avatar in their poses, its weights, and all sides
+my_hand/avatar.html         a page that turns and poses the avatar
 my_hand/work/               can be deleted once the avatar pleases; a second run then begins again
     landmarks.npz           the tracked hands
     capture/                the imported capture
@@ -74,6 +75,11 @@ class Job:
     def sheet(self) -> Path:
         """The contact sheet."""
         return self.folder / "sheet.jpg"
+
+    @property
+    def page(self) -> Path:
+        """The page that turns and poses the avatar."""
+        return self.folder / "avatar.html"
 
     @property
     def capture_id(self) -> str:

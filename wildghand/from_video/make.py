@@ -53,6 +53,7 @@ class MadeAvatar:
             "seconds": fit.seconds,
             "turntable": str(job.turntable),
             "sheet": str(job.sheet),
+            "page": str(job.page),
             "capture": str(job.capture),
             "stages": [
                 {

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from wildghand.from_video.capture import IMPORT
 from wildghand.from_video.fit import FIT, PLACE
+from wildghand.from_video.page import PAGE
 from wildghand.from_video.sheet import SHEET
 from wildghand.from_video.stage import Stage
 from wildghand.from_video.track import TRACK
@@ -16,4 +17,5 @@ STAGES: tuple[Stage, ...] = (
     PLACE,
     TURNTABLE,
     SHEET,
+    PAGE,
 )
