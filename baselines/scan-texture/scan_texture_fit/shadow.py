@@ -41,7 +41,8 @@ class ShadowNet(nn.Module):
             # The wrist's turns reach further than those of fingers; neither may drown the view.
             self.pose.weight.mul_(0.3)
             self.last.weight.mul_(0.1)
-            nn.init.constant_(self.last.bias, _LIT)
+            assert self.last.bias is not None
+            self.last.bias.fill_(_LIT)
 
     def _planes(self, values: Tensor) -> Tensor:
         """(B, N, C) to (B, C, cells, cells), means over the anchors of each cell."""
