@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -27,12 +27,13 @@ def _program(*names: str) -> str:
 
 
 @contextmanager
-def open_page(page: Path, profile: Path) -> Iterator[Any]:
+def open_page(page: Path, profile: Path, flags: Sequence[str] = ()) -> Iterator[Any]:
     """Open a page in Chromium; at the end nothing may have been complained of in its console.
 
     Args:
         page: the file.
         profile: a folder for the browser.
+        flags: more of them for the browser.
 
     Yields:
         A selenium driver.
@@ -44,7 +45,7 @@ def open_page(page: Path, profile: Path) -> Iterator[Any]:
 
     options = webdriver.ChromeOptions()
     options.binary_location = binary
-    for flag in (*_FLAGS, f"--user-data-dir={profile}"):
+    for flag in (*_FLAGS, *flags, f"--user-data-dir={profile}"):
         options.add_argument(flag)
     options.set_capability("goog:loggingPrefs", {"browser": "ALL"})
     driver = webdriver.Chrome(options=options, service=Service(chromedriver))

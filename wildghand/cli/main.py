@@ -22,6 +22,9 @@ def command_tree() -> Command:
                 "draw an avatar along the poses of a capture", "wildghand.cli.render"
             ),
             "export": Command("write an avatar as Gaussians for viewers", "wildghand.cli.export"),
+            "page": Command(
+                "write an avatar as a page for browsers, one file", "wildghand.cli.page"
+            ),
             "judge": Command(
                 "judge the frames of a capture: clean or perturbed", "wildghand.cli.judge"
             ),

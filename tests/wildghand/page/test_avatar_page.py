@@ -1,0 +1,210 @@
+"""The page of an avatar. Oracle: `WildGHandAvatar.render`, in the same pose and camera.
+
+Tolerance: 30 dB over the hand's box, which is the mean error of 8 grey levels.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from browser import least_contrast, open_page, overflow, show
+
+import wildghand
+from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.capture import Capture
+from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
+from hwp_bench.methods.contract import HandPose
+from wildghand.avatar import WildGHandAvatar, save_avatar
+from wildghand.cli.main import main
+from wildghand.page import bake_hand, write_page
+from wildghand.page.bake import joint_motions
+from wildghand.page.measure import draw_baked
+from wildghand.page.poses import sample_poses
+from wildghand.page.settings import PageSettings
+
+QUICK = {
+    "gaussians": 600,
+    "prior": "",
+    "network.identity_resolution": 24,
+    "network.plane_resolution": 12,
+    "device": "cpu",
+}
+SMALL = PageSettings(clip_samples=16, random_samples=12, still_size=48)
+GL = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist")
+LEAST = 30.0
+
+
+def psnr(found: np.ndarray, truth: np.ndarray, coverage: np.ndarray) -> float:
+    """Over the box of what is covered, dB."""
+    seen = np.argwhere(coverage > 0.5)
+    box = tuple(slice(a, b + 1) for a, b in zip(seen.min(0), seen.max(0), strict=True))
+    return -10.0 * np.log10(np.square(found[box] - truth[box]).mean() + 1e-12)
+
+
+@pytest.fixture(scope="module")
+def fitted(make_painted: Callable[..., Capture]) -> tuple[WildGHandAvatar, Capture]:
+    capture = make_painted()
+    return wildghand.fit(capture.root, settings=QUICK, steps=60, all_frames=True), capture
+
+
+@pytest.fixture(scope="module")
+def folder(fitted, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return save_avatar(fitted[0], tmp_path_factory.mktemp("page") / "avatar")
+
+
+@pytest.fixture(scope="module")
+def page(fitted, folder: Path) -> Path:
+    out = folder.parent / "avatar.html"
+    write_page(folder, out, capture=fitted[1], settings=SMALL)
+    return out
+
+
+@pytest.fixture(scope="module")
+def opened(page: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Any]:
+    with open_page(page, tmp_path_factory.mktemp("profile"), flags=GL) as driver:
+        driver.execute_script("avatar.setBackground('#000000')")
+        yield driver
+
+
+def drawn(driver: Any, capture: Capture, frame: int) -> np.ndarray:
+    """What the page shows from the camera of a frame, (H, W, 3)."""
+    camera = capture.camera(frame)
+    given = camera.viewmat.tolist(), camera.K.tolist(), camera.width, camera.height
+    driver.execute_script("avatar.setCamera(...arguments)", *given)
+    pixels = driver.execute_script("return avatar.pixels()")
+    return np.array(pixels).reshape(camera.height, camera.width, 3) / 255.0
+
+
+def test_the_page_draws_training_poses_as_the_avatar(opened, fitted) -> None:
+    avatar, capture = fitted
+    for frame in avatar.record.frames[3:12:4]:
+        hand = capture.hand_poses(frame)["right"]
+        given = {"right": [hand.pose.tolist(), hand.transl.tolist()]}
+        opened.execute_script("avatar.setPose(arguments[0])", given)
+        truth = avatar.render({"right": hand}, capture.camera(frame))
+        assert psnr(drawn(opened, capture, frame), truth[..., :3], truth[..., 3]) > LEAST
+
+
+def test_a_slider_bends_the_finger_that_the_avatar_bends(opened, fitted) -> None:
+    avatar, capture = fitted
+    frame = avatar.record.frames[0]
+    hand = capture.hand_poses(frame)["right"]
+    opened.execute_script("avatar.setFrame(0)")
+    before = drawn(opened, capture, frame)
+    for part, degrees in enumerate((50, 5, 0)):
+        opened.execute_script(
+            "const place = `[data-joint='1'][data-part='${arguments[0]}']`;"
+            "const s = document.querySelector(place);"
+            "s.value = arguments[1]; s.dispatchEvent(new Event('input'));",
+            part,
+            degrees,
+        )
+    after = drawn(opened, capture, frame)
+    limits = anatomical_limits(load_template("anny", "right"))
+    angles = torch.zeros(1, 15, 3, dtype=torch.float64)
+    angles[0, 0] = torch.deg2rad(torch.tensor([50.0, 5.0, 0.0], dtype=torch.float64))
+    bent = pose_from_joint_angles(angles, torch.as_tensor(limits.axes))[0, 0].numpy()
+    pose = hand.pose.copy()
+    pose[1] = bent
+    posed = HandPose("right", pose, hand.betas, hand.transl)
+    truth = avatar.render({"right": posed}, capture.camera(frame))
+    assert psnr(after, truth[..., :3], truth[..., 3]) > LEAST
+    assert psnr(after, before, truth[..., 3]) < LEAST
+
+
+def test_the_page_reads_well(opened) -> None:
+    assert opened.execute_script("return document.body.classList.contains('still')") is False
+    for width in (1400, 400):
+        for dark in (False, True):
+            show(opened, width, dark=dark)
+            assert overflow(opened) == 0
+            assert least_contrast(opened) >= 4.5
+
+
+def test_named_poses_and_light_change_the_picture(opened, fitted) -> None:
+    _, capture = fitted
+    pictures = []
+    for name in ("rest", "fist", "point", "pinch", "spread"):
+        opened.execute_script("avatar.setNamed(arguments[0])", name)
+        pictures.append(drawn(opened, capture, 0))
+    opened.execute_script("document.getElementById('relight').click()")
+    pictures.append(drawn(opened, capture, 0))
+    opened.execute_script("document.getElementById('relight').click()")
+    assert all(np.abs(a - b).max() > 0.1 for i, a in enumerate(pictures) for b in pictures[:i])
+
+
+def test_without_webgl_a_picture_is_shown(page: Path, tmp_path: Path) -> None:
+    with open_page(page, tmp_path, flags=("--disable-3d-apis",)) as driver:
+        assert driver.execute_script(
+            "const i = document.querySelector('#fallback img');"
+            "return i.checkVisibility() && i.naturalWidth > 0"
+        )
+
+
+def test_joints_move_as_the_hand_models() -> None:
+    template = load_template("anny", "left").to_torch(torch.float64)
+    random = np.random.default_rng(3)
+    pose, transl = random.normal(0, 0.5, (16, 3)), random.normal(0, 1, 3)
+    from hwp_bench.hands import pose_hand
+
+    truth = pose_hand(
+        template,
+        torch.as_tensor(pose)[None],
+        torch.zeros(10, dtype=torch.float64),
+        torch.as_tensor(transl)[None],
+    ).transforms[0]
+    turns, shifts = joint_motions(template.joints.numpy(), pose, transl)
+    np.testing.assert_allclose(turns, truth[:, :3, :3], atol=1e-12)
+    np.testing.assert_allclose(shifts, truth[:, :3, 3], atol=1e-12)
+
+
+def test_what_was_baked_from_one_pose_is_that_pose(fitted) -> None:
+    avatar, capture = fitted
+    frame = avatar.record.frames[5]
+    hand = capture.hand_poses(frame)["right"]
+    baked = bake_hand(avatar, "right", hand.pose[None], geometry_rank=6, color_rank=12)
+    found = draw_baked({"right": baked}, {"right": hand}, capture.camera(frame))
+    truth = avatar.render({"right": hand}, capture.camera(frame))
+    # Weights are rounded to 16 bits: what remains is far below a grey level.
+    assert psnr(found, truth[..., :3], truth[..., 3]) > 60.0
+
+
+def test_the_command_says_what_it_wrote(fitted, folder: Path, tmp_path: Path, capsys) -> None:
+    out = tmp_path / "rest.html"
+    given = ["page", str(folder), "-o", str(out), "--json"]
+    assert main(given) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["bytes"] == out.stat().st_size
+    assert facts["frames"] == 0
+    assert facts["gaussians"] == len(fitted[0].model.rigs["right"])
+    assert "http" not in out.read_text("utf-8").replace("http://www.w3.org/2000/svg", "").replace(
+        "http-equiv", ""
+    )
+    assert main(given) == 2
+
+
+def test_what_cannot_be_shown_is_refused(fitted, folder: Path, page: Path, tmp_path: Path) -> None:
+    avatar, capture = fitted
+    with pytest.raises(UsageError, match="exists"):
+        write_page(folder, page)
+    with pytest.raises(HwpError, match="is not an avatar"):
+        write_page(tmp_path, tmp_path / "a.html")
+    record = dataclasses.replace(avatar.record, source={"capture": "another"})
+    other = WildGHandAvatar(
+        avatar.model,
+        avatar.settings,
+        avatar.hand_model,
+        avatar.betas,
+        avatar.mean_color,
+        avatar.seed,
+        record,
+    )
+    with pytest.raises(UsageError, match="'another'"):
+        sample_poses(other, capture, SMALL)

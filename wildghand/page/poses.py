@@ -1,0 +1,133 @@
+"""The poses of a page: those that are baked, those that are played, and what moves the joints."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.capture import Capture
+from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
+from hwp_bench.methods.contract import HandPose
+from wildghand.avatar import WildGHandAvatar
+from wildghand.page.settings import PageSettings
+
+# The camera before a hand at rest: it looks at the back of the hand, fingers upwards.
+_REST_VIEW = np.array([[0.0, 0, -1, 0], [1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])
+# Each fourth frame at most is kept out of what is baked, this many at most.
+_HELD_OUT = 8
+
+
+@dataclass(frozen=True, eq=False)
+class PoseSamples:
+    """Poses of an avatar's hands."""
+
+    #: (P, 16, 3) rad by side: the pose at the start, poses of the clip, random ones.
+    baked: Mapping[str, np.ndarray]
+    #: The hands when the page is opened.
+    start: Mapping[str, HandPose]
+    #: Frames that are played, and (F, 51) their poses and translations by side.
+    frames: list[int]
+    motion: Mapping[str, np.ndarray]
+    #: Frames that were not baked, to measure with.
+    held_out: list[int]
+    #: (4, 4) of the camera at the start.
+    viewmat: np.ndarray
+    #: Frames a second.
+    fps: float
+
+
+def sample_poses(
+    avatar: WildGHandAvatar, capture: Capture | None, settings: PageSettings
+) -> PoseSamples:
+    """Choose poses.
+
+    Raises:
+        UsageError: the capture is of other hands, of another hand model, or not what was fitted.
+    """
+    random = np.random.default_rng(settings.seed)
+    if capture is None:
+        start = avatar.rest_poses()
+        clip = {side: start[side].pose[None] for side in avatar.sides}
+        frames, held_out, viewmat, fps = [], [], _REST_VIEW, 30.0
+        motion = {side: np.zeros((0, 51)) for side in avatar.sides}
+    else:
+        _check(avatar, capture)
+        fitted = [frame for frame in avatar.record.frames if _shown(avatar, capture, frame)]
+        if not fitted:
+            raise UsageError("has no fitted frame that shows every hand", where=capture.root)
+        frames = [fitted[pick] for pick in _spread(len(fitted), settings.most_frames)]
+        held_out = [fitted[pick] for pick in _spread(len(fitted), _HELD_OUT + 2)[1:-1]]
+        rest = [frame for frame in fitted if frame not in held_out] or fitted
+        drawn = [rest[pick] for pick in _spread(len(rest), settings.clip_samples)]
+        start = capture.hand_poses(fitted[0])
+        clip, motion = {}, {}
+        for side in avatar.sides:
+            poses = {frame: capture.hand_poses(frame)[side] for frame in fitted}
+            clip[side] = np.stack([start[side].pose, *(poses[frame].pose for frame in drawn)])
+            motion[side] = np.stack(
+                [np.append(poses[frame].pose.ravel(), poses[frame].transl) for frame in frames]
+            )
+        viewmat, fps = capture.camera(fitted[0]).viewmat, float(capture.info.fps)
+    baked = {
+        side: np.concatenate([poses, _random(avatar, side, poses, settings.random_samples, random)])
+        for side, poses in clip.items()
+    }
+    return PoseSamples(baked, start, frames, motion, held_out, viewmat, fps)
+
+
+def hand_controls(avatar: WildGHandAvatar, side: str) -> dict[str, Any]:
+    """Axes and ranges (degrees) of the 15 finger joints, for the page's sliders."""
+    limits = anatomical_limits(load_template(avatar.hand_model.source, side))
+    return {
+        "axes": limits.axes.tolist(),
+        "lower": np.rad2deg(limits.lower).round(1).tolist(),
+        "upper": np.rad2deg(limits.upper).round(1).tolist(),
+    }
+
+
+def _random(
+    avatar: WildGHandAvatar, side: str, clip: np.ndarray, count: int, random: np.random.Generator
+) -> np.ndarray:
+    """(count, 16, 3) poses within the limits of the joints; the wrist is as in the clip."""
+    limits = anatomical_limits(load_template(avatar.hand_model.source, side))
+    share = random.uniform(0.2, 1.0, (count, 1, 1))
+    angles = share * random.uniform(limits.lower, limits.upper, (count, 15, 3))
+    fingers = pose_from_joint_angles(torch.as_tensor(angles), torch.as_tensor(limits.axes))
+    wrists = clip[random.integers(0, len(clip), count), :1]
+    return np.concatenate([wrists, fingers.numpy()], axis=1)
+
+
+def _check(avatar: WildGHandAvatar, capture: Capture) -> None:
+    if set(avatar.sides) - set(capture.info.sides):
+        raise UsageError(
+            f"shows the {' and '.join(capture.info.sides)} hand, the avatar is of the "
+            f"{' and '.join(avatar.sides)} hand",
+            where=capture.root,
+        )
+    if capture.info.hand_model.name != avatar.hand_model.name:
+        raise UsageError(
+            f"has parameters of the hand model {capture.info.hand_model.name}, "
+            f"the avatar takes those of {avatar.hand_model.name}",
+            where=capture.root,
+            remedy="Convert them with `hwp-bench hands convert`.",
+        )
+    origin, fitted = avatar.record.source.get("capture"), avatar.record.frames
+    if origin not in (None, capture.info.id) or not fitted or max(fitted) >= len(capture):
+        raise UsageError(
+            f"is {capture.info.id!r}, the avatar was fitted to {str(origin)[:100]!r}",
+            where=capture.root,
+        )
+
+
+def _shown(avatar: WildGHandAvatar, capture: Capture, frame: int) -> bool:
+    return all(bool(capture.hands[side].valid[frame]) for side in avatar.sides)
+
+
+def _spread(count: int, most: int) -> list[int]:
+    picks = np.linspace(0, count - 1, min(count, most)).round().astype(int)
+    return list(dict.fromkeys(picks.tolist()))

