@@ -50,7 +50,7 @@ class PoseBasis:
 
 @dataclass(frozen=True, eq=False)
 class BakedHand:
-    """What a page knows of one hand with N Gaussians; lengths in m, colours in sRGB."""
+    """One hand with N Gaussians, as a page knows it; lengths in m, colours in sRGB."""
 
     #: (16, 3) rest joints of this person.
     joints: np.ndarray

@@ -30,7 +30,7 @@ _SCRIPTS = ("hand.js", "splats.js", "controls.js")
 
 @dataclass(frozen=True)
 class PageFacts:
-    """What was written."""
+    """Facts about a page that was written."""
 
     #: Size of the file, bytes.
     bytes: int
