@@ -16,6 +16,7 @@ from hwp_bench.base.files import atomic_write
 from hwp_bench.capture import Capture
 from hwp_bench.report.page.render import render_template
 from wildghand.avatar import WildGHandAvatar, load_avatar
+from wildghand.evidence import Evidence
 from wildghand.page.bake import BakedHand, PoseBasis, bake_hand
 from wildghand.page.measure import Fidelity, fidelity, still_image
 from wildghand.page.poses import PoseSamples, hand_controls, sample_poses
@@ -107,6 +108,7 @@ def _html(
             {
                 **_hand(baked),
                 **hand_controls(avatar, side),
+                "seen": _seen(avatar, side),
                 "side": side,
                 "start": samples.start[side].pose.tolist(),
                 "transl": samples.start[side].transl.tolist(),
@@ -155,6 +157,24 @@ def _hand(hand: BakedHand) -> dict[str, Any]:
         "opacities": _pack(hand.opacities.astype("<f4")),
         "normals": _pack(np.rint(hand.normals * 127.0).astype(np.int8)),
     }
+
+
+def _seen(avatar: WildGHandAvatar, side: str) -> str | None:
+    """(N,) uint8: how far the clip has shown each Gaussian; None where the fit did not count.
+
+    255 is the share of the frames at which the fit keeps half of an offset from the skin
+    (`wildghand.evidence`), or more of them.
+    """
+    rigs, buffers = avatar.model.rigs, dict(avatar.model.named_buffers())
+    evidence = Evidence.from_tensors(
+        buffers, {name: len(rig) for name, rig in rigs.items()}, "avatar"
+    )
+    if evidence is None:
+        return None
+    kept = evidence.offsets[side].double().cpu().numpy()
+    # Of frames f and their half h a fit keeps k = f / (f + h); f / h is k / (1 - k).
+    share = np.clip(kept / np.maximum(1.0 - kept, 1e-9), 0.0, 1.0)
+    return _pack(np.rint(share * 255.0).astype(np.uint8))
 
 
 def _linear(basis: PoseBasis) -> dict[str, Any]:

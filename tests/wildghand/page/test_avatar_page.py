@@ -138,6 +138,36 @@ def test_named_poses_and_light_change_the_picture(opened, fitted) -> None:
     assert all(np.abs(a - b).max() > 0.1 for i, a in enumerate(pictures) for b in pictures[:i])
 
 
+VIOLET = """
+avatar.orbit(arguments[0], 0);
+const p = avatar.pixels();
+let sum = 0;
+for (let i = 0; i < p.length; i += 3) sum += p[i + 2] - p[i + 1];
+return sum;
+"""
+
+
+def test_skin_that_no_frame_shows_is_marked(opened) -> None:
+    opened.execute_script("avatar.setFrame(0)")
+    show(opened, 400)
+    seen: list[list[float]] = []
+    for _ in range(3):
+        seen.append([opened.execute_script(VIOLET, yaw) for yaw in (0.0, np.pi)])
+        opened.execute_script("document.getElementById('unseen').click()")
+    opened.execute_script("document.getElementById('unseen').click()")
+    before, marked, after = seen
+    # The painted hand never turns its other side to the camera.
+    assert marked[1] - before[1] > 3.0 * (marked[0] - before[0]) >= 0.0
+    assert after == before
+
+
+def test_the_page_asks_for_no_other_file(opened) -> None:
+    asked = opened.execute_script(
+        "return performance.getEntriesByType('resource').map(e => e.name)"
+    )
+    assert [name for name in asked if not name.startswith("data:")] == []
+
+
 def test_without_webgl_a_picture_is_shown(page: Path, tmp_path: Path) -> None:
     with open_page(page, tmp_path, flags=("--disable-3d-apis",)) as driver:
         assert driver.execute_script(

@@ -25,9 +25,9 @@ function start() {
   let radius = 0.1;
 
   function update() {
-    const light = one("relight").checked && lightOf();
+    const light = one("relight").checked && lightOf(), marks = one("unseen").checked;
     let first = 0;
-    for (const hand of hands) { hand.write(splats.data, first, light); first += hand.count; }
+    for (const hand of hands) { hand.write(splats.data, first, light, marks); first += hand.count; }
     splats.upload();
     const places = hands.flatMap((hand) => hand.chain().places);
     eye.centre = [0, 1, 2].map((i) => {
@@ -228,6 +228,8 @@ function start() {
       if (name !== "relight") one("relight").checked = true;
       changed();
     });
+  one("evidence").hidden = !hands.some((hand) => hand.seen);
+  one("unseen").addEventListener("input", () => changed());
   one("background").addEventListener("input", () => changed(false));
   new ResizeObserver(() => changed(false)).observe(canvas);
   canvas.addEventListener("webglcontextlost", () => fallback("The browser took WebGL2 away."));

@@ -1,5 +1,7 @@
 // A hand of the avatar: from angles of joints to Gaussians in the world.
 "use strict";
+// Colour of skin that no frame has shown; no skin has it.
+const UNSEEN = [0.55, 0.2, 0.85];
 const PARENTS = [-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14];
 
 function unpack(text, Type) {
@@ -68,6 +70,7 @@ class Hand {
     this.covariances = unpack(data.covariances, Float32Array);
     this.opacities = unpack(data.opacities, Float32Array);
     this.restNormals = unpack(data.normals, Int8Array);
+    this.seen = data.seen && unpack(data.seen, Uint8Array);
     this.motion = unpack(data.motion, Float32Array);
     this.start = { pose: data.start, transl: data.transl };
     this.normals = new Float32Array(3 * this.count);
@@ -117,7 +120,7 @@ class Hand {
     return { turns, shifts, places: places.map((p) => p.map((v, i) => v + this.transl[i])) };
   }
   // Write 16 floats a Gaussian: mean, opacity, covariance (6), 2 unused, colour, 1 unused.
-  write(out, first, light) {
+  write(out, first, light, marks) {
     const { turns, shifts } = this.chain();
     this.means.update(this.turns);
     this.colors.update(this.turns);
@@ -164,6 +167,10 @@ class Hand {
       out[o + 12] = rgb[3 * n] * gain;
       out[o + 13] = rgb[3 * n + 1] * gain;
       out[o + 14] = rgb[3 * n + 2] * gain;
+      if (marks && this.seen) {
+        const unseen = 1 - this.seen[n] / 255;
+        for (let i = 0; i < 3; i++) out[o + 12 + i] += unseen * (UNSEEN[i] - out[o + 12 + i]);
+      }
     }
   }
 }
