@@ -10,6 +10,8 @@ WildMethod  # the entry of baselines/wild/method.toml
 JointPoseMethod  # the entry of baselines/joint-pose/method.toml
 ExposureMethod  # the entry of baselines/exposure/method.toml
 OccluderMethod  # the entry of baselines/occluder-splats/method.toml
+ScanMethod  # the entry of baselines/scan-texture/method.toml
+SpaceMethod  # the entry of baselines/texture-space/method.toml
 ShadowMethod  # the entry of baselines/shadow-albedo/method.toml
 OneShotMethod  # the entry of baselines/one-shot-prior/method.toml
 WildGHandMethod  # the entry of wildghand/method.toml and of baselines/network-scratch

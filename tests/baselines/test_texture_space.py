@@ -1,4 +1,4 @@
-"""The space of textures. Oracles: an eigendecomposition, the shipped scenes, a stranger's hand."""
+"""The space of textures. Oracles: eigenvectors, the shipped scenes, another person's hand."""
 
 from __future__ import annotations
 
@@ -43,8 +43,8 @@ def test_the_shipped_file_is_the_one_that_was_measured() -> None:
 
 
 def test_nobody_of_the_space_is_in_a_scene_that_ships() -> None:
-    ours = {person.seed for person in build.people(build.PEOPLE + build.STRANGERS)}
-    assert len(ours) == build.PEOPLE + build.STRANGERS >= 200
+    ours = {person.seed for person in build.people(build.PEOPLE + build.OTHERS)}
+    assert len(ours) == build.PEOPLE + build.OTHERS >= 200
     scenes = [item.scene for name in suite_names() for item in suite(name)]
     scenes += [load_scene(path) for path in (ROOT / "wildghand/priors/scenes").rglob("*.toml")]
     assert len(scenes) > 30

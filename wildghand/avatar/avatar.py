@@ -165,20 +165,22 @@ class WildGHandAvatar(HandAvatar):
         *,
         size: int = 320,
         background: tuple[int, int, int] = (255, 255, 255),
+        interactive: bool = False,
     ) -> inline.InlinePicture:
         """Show the avatar in a notebook: in a pose, or from all around.
 
         Args:
-            pose: as `render` takes it; None: a turn at rest, or the interactive page where
-                this installation can write one.
+            pose: as `render` takes it; None: a turn at rest.
             size: edge, px.
             background: sRGB, 0 to 255.
+            interactive: without a pose, the page of `wildghand.page`, which is turned and posed.
+                It adds some megabytes to the notebook, and takes some seconds to write.
 
         Raises:
             UsageError: a pose that is none, or a size out of range.
         """
         inline.check_edge(size)
-        page = inline.page_of(self) if pose is None else None
+        page = inline.page_of(self) if interactive and pose is None else None
         if pose is not None or page is not None:
             drawn = self.render(REST if pose is None else pose, size=size)
             return inline.still(drawn, background, repr(self), page)

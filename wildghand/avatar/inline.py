@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import importlib
-import importlib.util
 import io
 import tempfile
 from collections.abc import Callable
@@ -121,10 +120,9 @@ def over(rgba: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
     return as_uint8(rgba[..., :3] + behind)
 
 
-def page_of(avatar: object) -> str | None:
-    """Return the interactive page of an avatar as HTML; None where nothing here writes one."""
-    if importlib.util.find_spec("wildghand.page") is None:
-        return None
+def page_of(avatar: object) -> str:
+    """Return the interactive page of an avatar as HTML."""
+    # The page's room stands below this one, and is imported when it is asked for.
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "avatar.html"
         importlib.import_module("wildghand.page").write_page(avatar, path)

@@ -24,7 +24,7 @@ from wildghand.export.splat_glb import splat_glb_bytes
 from wildghand.export.spz import spz_bytes
 from wildghand.export.texture import baked
 
-#: What each extension stands for.
+#: Content by extension.
 FORMATS = {
     ".ply": "Gaussians in the layout of 3DGS",
     ".spz": "Gaussians, a tenth of the size, with rounded numbers",
@@ -36,7 +36,7 @@ _GENERATOR = f"wildghand {__version__}"
 
 @dataclass(frozen=True)
 class ExportSettings:
-    """What is exported, and how it is placed."""
+    """Choices of an export."""
 
     #: A skinned mesh instead of Gaussians; .glb only.
     mesh: bool = False
@@ -50,14 +50,16 @@ def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> No
     """Refuse what cannot be written, before anything is read.
 
     Raises:
-        UsageError: the extension is no format's, does not go with the settings, or the file is
+        UsageError: the extension is not known, does not go with the settings, or the file is
             there and may not be replaced.
     """
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         known = "; ".join(f"{name}: {text}" for name, text in FORMATS.items())
         raise UsageError(
-            f"has the extension {suffix!r}, which is no format", where=path, remedy=f"Use {known}."
+            f"has the extension {suffix!r}, which is not a format",
+            where=path,
+            remedy=f"Use {known}.",
         )
     if settings.mesh and suffix != ".glb":
         raise UsageError("a mesh is written as .glb", where=path, field="--mesh")

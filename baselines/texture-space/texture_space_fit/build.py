@@ -22,8 +22,8 @@ from hwp_bench.sim.subject.hand import subject_hand
 
 #: People, and the number of the first one; no scene that ships has one of these.
 PEOPLE, FIRST_SEED = 240, 700_000
-#: People who are painted after them, and only measure how well the space holds strangers.
-STRANGERS = 16
+#: People who are painted after them, and only measure how well the space holds other people.
+OTHERS = 16
 #: Texels along an edge: painted, and kept.
 PAINTED, EDGE = 256, 128
 #: Principal components.
@@ -91,20 +91,19 @@ def main() -> None:
     parser.add_argument("out", type=Path, help="the file to write, .npz")
     out = parser.parse_args().out
     painted = [
-        log_albedo(one).ravel()
-        for one in track(list(people(PEOPLE + STRANGERS)), "Painting people")
+        log_albedo(one).ravel() for one in track(list(people(PEOPLE + OTHERS)), "Painting people")
     ]
-    samples, strangers = np.stack(painted[:PEOPLE]), np.stack(painted[PEOPLE:])
+    samples, others = np.stack(painted[:PEOPLE]), np.stack(painted[PEOPLE:])
     mean, components, explained = principal_components(samples.astype(np.float64), COMPONENTS)
     steps, scales = eight_bits(components)
     kept = steps * scales[:, None].astype(np.float64)
-    weights, *_ = np.linalg.lstsq(kept.T, (strangers - mean).T, rcond=None)
-    error = float(np.sqrt(np.mean((strangers - mean - (kept.T @ weights).T) ** 2)))
-    spread = float(np.sqrt(np.mean((strangers - mean) ** 2)))
+    weights, *_ = np.linalg.lstsq(kept.T, (others - mean).T, rcond=None)
+    error = float(np.sqrt(np.mean((others - mean - (kept.T @ weights).T) ** 2)))
+    spread = float(np.sqrt(np.mean((others - mean) ** 2)))
     print(
         f"{PEOPLE} people: {COMPONENTS} components explain {100 * explained:.1f} % of the variance"
     )
-    print(f"{STRANGERS} strangers: {error:.3f} of {spread:.3f} is left (log albedo, RMS)")
+    print(f"{OTHERS} others: {error:.3f} of {spread:.3f} is left (log albedo, RMS)")
     buffer = io.BytesIO()
     shape = (EDGE, EDGE, 3)
     np.savez_compressed(

@@ -26,7 +26,7 @@ _LEAST_LIGHT, _MOST_COLOR = 0.02, 4.0
 
 @dataclass(frozen=True, eq=False)
 class SpaceHand:
-    """What is known of one hand before the fit."""
+    """Facts about one hand before the fit."""
 
     #: The hand.
     rig: HandRig

@@ -55,7 +55,7 @@ def test_where_a_page_can_be_written_it_is_shown(
     module.__spec__ = ModuleSpec("wildghand.page", None)
     module.write_page = write_page  # type: ignore[attr-defined]
     monkeypatch.setitem(sys.modules, "wildghand.page", module)
-    bundle = tiny_avatar.show(size=32)._repr_mimebundle_()
+    bundle = tiny_avatar.show(size=32, interactive=True)._repr_mimebundle_()
     (data,) = re.findall(r'<iframe src="data:text/html;base64,([^"]+)"', bundle["text/html"])
     assert base64.b64decode(data).decode() == "<p>turn \u21bb me</p>"
     assert "image/png" not in bundle

@@ -87,7 +87,8 @@ def test_the_folder_is_an_avatar_with_clip_and_sheet(made: Path, tmp_path: Path)
     av = pytest.importorskip("av")
     out = made / "my_hand"
     found = sorted(path.name for path in out.iterdir())
-    files = ["avatar.json", "model.safetensors", "sheet.jpg", "turntable.mp4", "weights", "work"]
+    files = ["avatar.html", "avatar.json", "model.safetensors", "sheet.jpg", "turntable.mp4"]
+    files += ["weights", "work"]
     assert found == files
     capture = open_capture(out / "work" / "capture")
     assert (capture.info.id, len(capture)) == ("my_hand", COUNT)

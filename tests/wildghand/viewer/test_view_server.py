@@ -120,6 +120,8 @@ def test_ctrl_c_ends_the_view_with_status_0(tiny_avatar: WildGHandAvatar, tmp_pa
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ},
+        # A shell lets what it starts in the background ignore Ctrl-C, these tests too.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     try:
         assert running.stdout is not None
