@@ -106,7 +106,7 @@ def test_the_folder_is_an_avatar_with_clip_and_sheet(made: Path, tmp_path: Path)
     # What other commands expect of an avatar.
     words = ["render", str(out), "--poses", str(out / "work" / "capture"), "--frames", "3:5"]
     assert main([*words, "-o", str(tmp_path / "frames")]) == 0
-    assert main(["export", str(out), "--ply", str(tmp_path / "hand.ply")]) == 0
+    assert main(["export", str(out), "-o", str(tmp_path / "hand.ply")]) == 0
 
 
 def test_the_same_command_keeps_everything(folder: Path, capsys) -> None:
