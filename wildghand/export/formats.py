@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture
@@ -16,6 +16,7 @@ from hwp_bench.hands import anchor_uv, load_template
 from hwp_bench.hands.anchors import SurfaceAnchors
 from hwp_bench.methods.contract import HandPose
 from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar
+from wildghand.avatar.playback import shown_sides
 from wildghand.export.motion import capture_motion, closing_motion
 from wildghand.export.placing import SUPERSPLAT_SCALE, half_turned, scaled
 from wildghand.export.ply import ply_bytes
@@ -97,24 +98,15 @@ def export(
         Counts of what is in the file, by name.
 
     Raises:
-        UsageError: `check_target` refuses it; the capture shows none of the avatar's hands.
-        BadInput: the capture's parameters are another hand model's.
+        UsageError: `check_target` refuses it; the capture shows none of the avatar's hands, or
+            belongs to another hand model.
     """
     settings = settings or ExportSettings()
     check_target(path, settings, overwrite=overwrite)
     hands = avatar.rest_poses()
     if capture is not None:
-        if capture.info.hand_model.name != avatar.hand_model.name:
-            raise BadInput(
-                f"has parameters of {capture.info.hand_model.name}, "
-                f"the avatar takes those of {avatar.hand_model.name}",
-                where=capture.root,
-                remedy="Convert them with `hwp-bench hands convert`.",
-            )
         shown = capture.hand_poses(frame or 0)
-        hands = {side: pose for side, pose in shown.items() if side in avatar.sides}
-        if not hands:
-            raise UsageError("shows none of the avatar's hands", where=capture.root)
+        hands = {side: shown[side] for side in shown_sides(avatar, capture)}
     if settings.mesh:
         return _write_mesh(avatar, path, hands, capture)
     posed = _splat_bytes(avatar.pose(hands), path.suffix.lower(), settings, capture is not None)

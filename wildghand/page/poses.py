@@ -14,6 +14,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
 from hwp_bench.methods.contract import HandPose
 from wildghand.avatar import WildGHandAvatar
+from wildghand.avatar.playback import shown_sides
 from wildghand.page.settings import PageSettings
 
 # The camera before a hand at rest: it looks at the back of the hand, fingers upwards.
@@ -103,18 +104,9 @@ def _random(
 
 
 def _check(avatar: WildGHandAvatar, capture: Capture) -> None:
-    if set(avatar.sides) - set(capture.info.sides):
+    if len(shown_sides(avatar, capture)) < len(avatar.sides):
         raise UsageError(
-            f"shows the {' and '.join(capture.info.sides)} hand, the avatar is of the "
-            f"{' and '.join(avatar.sides)} hand",
-            where=capture.root,
-        )
-    if capture.info.hand_model.name != avatar.hand_model.name:
-        raise UsageError(
-            f"has parameters of the hand model {capture.info.hand_model.name}, "
-            f"the avatar takes those of {avatar.hand_model.name}",
-            where=capture.root,
-            remedy="Convert them with `hwp-bench hands convert`.",
+            f"shows the {capture.info.hands} hand alone, the avatar has two", where=capture.root
         )
     origin, fitted = avatar.record.source.get("capture"), avatar.record.frames
     if origin not in (None, capture.info.id) or not fitted or max(fitted) >= len(capture):

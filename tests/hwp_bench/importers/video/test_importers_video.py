@@ -164,7 +164,7 @@ def test_own_masks_are_taken(folder: Path, clip: SyntheticClip) -> None:
 BAD_INPUTS = {
     "landmarks of another video": ("hand.npz", {"count": FRAMES - 2}, BadInput, "frames"),
     "no such masks": ("hand.npz", {"masks": "nowhere"}, BadInput, "--masks"),
-    "missing masks": ("hand.npz", {"masks": "few"}, BadInput, "no mask, first frame 3"),
+    "missing masks": ("hand.npz", {"masks": "few"}, BadInput, "13 of 16 frames have no mask: 3"),
     "no such perturbation": ("hand.npz", {"perturbations": ("fog",)}, BadInput, "fog"),
     "bad id": ("hand.npz", {"id": "a/b"}, BadInput, "a/b"),
     "too few frames": ("hand.npz", {"frames": FrameRange(0, 2)}, UsageError, "--frames"),
