@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -11,6 +12,7 @@ import torch
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Budget, Report
 from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.fitting.closing import learn_light, seconds_for_steps
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.parallel import World
 from wildghand.gaussians.fit_loop import Guard, Loss, batches, read_losses, repeatable, spent
@@ -79,6 +81,8 @@ def optimize(
     watchers = watchers or Watchers(settings.schedule.plateau_steps)
     step = start
     report(step, fit.avatar(step))
+    if budget.seconds is not None:
+        budget = dataclasses.replace(budget, seconds=seconds_for_steps(fit, budget.seconds))
     with repeatable(fit.device):
         while step < steps:
             # All processes go by the clock of rank 0, or some would stop a step before the others.
@@ -102,7 +106,7 @@ def optimize(
                 break
         if not watchers.guard.sound():
             step = _go_back(fit, watchers, step)
-    fit.learn_light()
+    learn_light(fit)
     return fit.avatar(step, report.elapsed, final=world.is_main)
 
 
