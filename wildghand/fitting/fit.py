@@ -9,6 +9,7 @@ import math
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import torch
 
 from hwp_bench.capture.schema import HandModelId
@@ -17,7 +18,7 @@ from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.evidence import shown_frames, weigh_evidence
-from wildghand.fitting.closing import weight_masks
+from wildghand.fitting.closing import LightFit, weight_masks
 from wildghand.fitting.hand_masks import hand_masks
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
@@ -222,6 +223,12 @@ class Fit:
                 features=features,
             )
 
+    @property
+    def light(self) -> LightFit:
+        """The fit of the clip's light, which comes last."""
+        weights = self.weighting.frame_weights
+        return LightFit(self.model, self.clip, weights, self.settings.light, self.seed)
+
     def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
         """The avatar as it stands; it goes on changing with the fit.
 
@@ -244,7 +251,17 @@ class Fit:
                 steps=steps,
                 seconds=seconds,
             ),
-            functools.partial(weight_masks, self) if final else dict,
+            self._weight_masks if final else dict,
+        )
+
+    def _weight_masks(self) -> dict[int, np.ndarray]:
+        pao = self.settings.pao
+        if not pao.enabled:
+            return {}
+        return weight_masks(
+            self.frames.indices.tolist(),
+            lambda rows: self.weighting(rows, self.draw(rows)).weights,
+            unbounded=pao.variant == "printed",
         )
 
     def _precision(self) -> contextlib.AbstractContextManager[object]:

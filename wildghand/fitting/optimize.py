@@ -12,7 +12,6 @@ import torch
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Budget, Report
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.fitting.closing import learn_light, seconds_for_steps
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.parallel import World
 from wildghand.gaussians.fit_loop import Guard, Loss, batches, read_losses, repeatable, spent
@@ -82,7 +81,7 @@ def optimize(
     step = start
     report(step, fit.avatar(step))
     if budget.seconds is not None:
-        budget = dataclasses.replace(budget, seconds=seconds_for_steps(fit, budget.seconds))
+        budget = dataclasses.replace(budget, seconds=fit.light.seconds_for_steps(budget.seconds))
     with repeatable(fit.device):
         while step < steps:
             # All processes go by the clock of rank 0, or some would stop a step before the others.
@@ -106,7 +105,9 @@ def optimize(
                 break
         if not watchers.guard.sound():
             step = _go_back(fit, watchers, step)
-    learn_light(fit)
+    light = fit.light.learn()
+    if light is not None:
+        fit.model.keep(light)
     return fit.avatar(step, report.elapsed, final=world.is_main)
 
 

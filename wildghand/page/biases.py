@@ -1,4 +1,4 @@
-"""What the fit explained as perturbations of its frames, for a page that can show it.
+"""Biases of training frames, for a page that shows what the fit explained as perturbations.
 
 The page draws the canonical hand. With these biases it draws the hand as the fit saw it in a
 frame: what DPD's biases change after the activations, and the frame's gain. They are kept as
@@ -28,7 +28,7 @@ _CHUNK = 8
 
 @dataclass(frozen=True, eq=False)
 class FrameBiases:
-    """What F frames add to the N Gaussians of a hand: the sum over k of c_fk basis_k."""
+    """Additions of F frames to the N Gaussians of a hand: the sum over k of c_fk basis_k."""
 
     #: (K, N, 8) int8.
     basis: np.ndarray

@@ -40,8 +40,8 @@ def mean_weights(
         for side, (pixels, facing) in shown.items():
             # Masks have the size of the frame, unless a person has made them smaller.
             scale = np.array(mask.shape[::-1]) / (camera.width, camera.height)
-            place = (pixels[0].cpu().numpy() * scale - 0.5).astype(np.float32)
-            weight = cv2.remap(mask, place[None], None, cv2.INTER_LINEAR)[0] / 255.0
+            x, y = (pixels[0].cpu().numpy() * scale - 0.5).astype(np.float32).T
+            weight = cv2.remap(mask, x[None], y[None], cv2.INTER_LINEAR)[0] / 255.0
             counts = (facing[0] > 0.0).cpu().numpy()
             sums[side] += counts * np.stack([weight, np.ones_like(weight)])
     if not masks:

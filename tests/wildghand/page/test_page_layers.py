@@ -1,4 +1,4 @@
-"""What a page shows of a fit: biases of frames, weights. Oracles: the model, cv2.projectPoints.
+"""Layers of a page: biases of frames, weights of the fit. Oracles: the model, cv2.projectPoints.
 
 Tolerance of pictures: 30 dB over the hand's box, as in `test_avatar_page.py`.
 """
