@@ -154,6 +154,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RESULTS",
         help="results folders of entries, for the images of their reports",
     )
+    build.add_argument(
+        "--avatar-pages",
+        action="store_true",
+        help="also copy pages of avatars (captures/ID/avatar.html in these folders) and lead to "
+        "them; they run the scripts of whoever made them",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -294,7 +300,12 @@ def _build(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.site import build_site
     from hwp_bench.report.sources import read_sources
 
-    page = build_site(Path(args.out), read_entries(folder), read_sources(args.folders))
+    page = build_site(
+        Path(args.out),
+        read_entries(folder),
+        read_sources(args.folders),
+        avatar_pages=args.avatar_pages,
+    )
     notice(f"site: {page}")
     return 0
 
