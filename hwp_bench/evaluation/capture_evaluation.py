@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -40,6 +39,7 @@ from hwp_bench.run.engine.job import OnProgress, ignore
 from hwp_bench.run.output import CHECKPOINTS, LOG, RunFacts
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
+from hwp_bench.run.scratch import scratch_folder
 
 #: Version of the evaluation itself; a stored result of another version is not taken.
 RECIPE = 1
@@ -184,8 +184,8 @@ def _run(
     evaluation: CaptureEvaluation, output: Path, on_progress: OnProgress
 ) -> tuple[RunRecord | None, str | None]:
     """Run the method on a copy of what it may see; returns the record, or why it failed."""
-    with tempfile.TemporaryDirectory(prefix="hwp-request-") as temporary:
-        request = Path(temporary) / "request"
+    with scratch_folder("hwp-request-") as temporary:
+        request = temporary / "request"
         try:
             if evaluation.manifest.kind != "predictions":
                 write_request(request, evaluation.capture, evaluation.split, evaluation.run)
