@@ -342,6 +342,7 @@ def test_an_archive_is_no_method(tmp_path: Path, form: str) -> None:
     import shutil
 
     from hwp_bench.base.errors import BadMethod
+    from hwp_bench.methods import find_method
 
     method = attack_method(tmp_path / "method", "")
     archive = shutil.make_archive(str(tmp_path / "archive"), form, method)
