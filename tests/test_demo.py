@@ -1,7 +1,4 @@
-"""The README's first command ends in tables and pictures, and again at once from the cache.
-
-It runs with --quick here; `python -m benchmarks.demo` runs it at its true size.
-"""
+"""The README's first command ends in tables and pictures, and again at once from the cache."""
 
 from __future__ import annotations
 
@@ -33,7 +30,7 @@ def test_the_demo_renders_fits_scores_and_draws(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out = tmp_path / "demo"
-    command = [sys.executable, "-m", "hwp_bench.cli.main", "demo", "--quick", "--out", str(out)]
+    command = [sys.executable, "-m", "hwp_bench.cli.main", "demo", "--out", str(out)]
     cache = make_own_cache(tmp_path / "cache", skins=True)
     environment = {**os.environ, "HWP_CACHE": str(cache)}
     first = subprocess.run(
@@ -57,10 +54,7 @@ def test_the_demo_renders_fits_scores_and_draws(
     # Oracle: the same avatar after one step, which knows a hand's place and its mean colour.
     monkeypatch.setenv("HWP_CACHE", str(cache))
     monkeypatch.chdir(tmp_path)
-    captures = sorted(path for path in (cache / "sim" / "captures").iterdir() if path.is_dir())
-    assert [path.name.split("-")[0] for path in captures] == ["capture0", "capture4"]
-    places = [word for path in captures for word in ("--capture", str(path))]
-    unfitted = ["evaluate", "plain", *places, "--preset", "smoke", "--steps", "1"]
+    unfitted = ["evaluate", "plain", "--suite", "smoke", "--steps", "1"]
     assert main([*unfitted, "--out", str(tmp_path / "unfitted")]) == 0
     start = mean_psnr(tmp_path / "unfitted" / "results.json")
     end = plain

@@ -9,17 +9,13 @@ from pathlib import Path
 _EXAMPLES = """examples:
   hwp-bench demo
   hwp-bench demo --out my-demo
-  hwp-bench demo --quick
   hwp-bench demo --methods plain my_method/
 
 Renders the two captures of the smoke suite, fits the plain baseline and WildGHand to their
 training frames, scores both on the test frames, prints the tables and the seconds of each step,
 and draws truth and methods side by side. Needs no data and no network. Started again it takes
-finished fits as they are. With --quick it is the same chain on fewer and smaller pictures: it
-shows that everything works, and its scores are lower.
+finished fits as they are.
 """
-#: Frames of a capture and edge of the image in px with --quick; else the suite's.
-_QUICK = (20, 80)
 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
@@ -33,13 +29,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="METHOD",
         help="methods to run: directories or shipped names (default plain wildghand)",
     )
-    parser.add_argument("--quick", action="store_true", help="fewer and smaller pictures")
 
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from dataclasses import replace
-
     from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.base.tables import Column, Table, print_table, write_tables
     from hwp_bench.capture import open_capture
@@ -50,29 +43,23 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.methods import find_method, read_manifest
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.report.sources import ResultsSource
-    from hwp_bench.sim.produce.suites import ensure_captures, suite
+    from hwp_bench.sim import ensure_suite
 
     out = Path(args.out)
     manifests = [read_manifest(find_method(method)) for method in args.methods]
     names = [manifest.name for manifest in manifests]
-    items, settings = suite("smoke"), [EvaluationSettings("smoke") for _ in manifests]
-    if args.quick:
-        frames, size = _QUICK
-        items = tuple(replace(item, frame_count=frames, size=size) for item in items)
-        presets = [manifest.preset(None, "smoke") for manifest in manifests]
-        # Other pictures than the suite's: the results do not carry its name.
-        settings = [EvaluationSettings(preset=preset) for preset in presets]
-    for manifest, chosen in zip(manifests, settings, strict=True):
-        check_call(manifest, chosen, out / manifest.name)
-        if not args.quick:
-            check_suite(manifest, chosen, out / manifest.name)
+    for manifest in manifests:
+        check_call(manifest, EvaluationSettings("smoke"), out / manifest.name)
+        check_suite(manifest, EvaluationSettings("smoke"), out / manifest.name)
     clock = _Clock()
-    captures = ensure_captures(items)
+    captures = ensure_suite("smoke")
     clock.lap("simulated captures (rendered once, then cached)")
     sources, status = [], 0
-    for method, name, chosen in zip(args.methods, names, settings, strict=True):
+    for method, name in zip(args.methods, names, strict=True):
         with JobsView() as jobs:
-            results = evaluate(method, captures, out / name, chosen, on_capture=jobs.turn)
+            results = evaluate(
+                method, captures, out / name, EvaluationSettings("smoke"), on_capture=jobs.turn
+            )
         clock.lap(f"{results.method.title}: fit, render, score, pictures")
         sources.append(ResultsSource(results, out / name))
         status = max(status, report_outcome(out / name, results))
