@@ -26,10 +26,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any
 
+from benchmarks.patience import finish
+
 #: Kills in a row before a run is left to finish.
 IN_A_ROW = 5
-#: Longest that a run may take, seconds.
-PATIENCE = 600.0
 
 _ROOT = Path(__file__).resolve().parents[1]
 # What two runs of the same work may differ in: times, memory, and checkpoints, which come by time.
@@ -185,7 +185,7 @@ def _start(words: Sequence[str], log: IO[bytes]) -> subprocess.Popen[bytes]:
 def _finish(words: Sequence[str]) -> tuple[int, str]:
     """Run a command to its end; returns its exit status and the line that says why."""
     with tempfile.TemporaryFile() as log:
-        status = _start(words, log).wait(PATIENCE)
+        status = finish(_start(words, log))
         log.seek(0)
         lines = log.read().decode(errors="replace").strip().splitlines()
     reasons = [line for line in lines if "failed:" in line or "error:" in line]

@@ -14,6 +14,9 @@ from small_captures import CaptureMaker, cameras, hand_parameters, hand_picture,
 from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, HandModelId, open_capture
 from hwp_bench.results import Results
 
+#: Skips that nobody allowed fail; and projects for the test of that.
+pytest_plugins = ["skips", "pytester"]
+
 # Workers of pytest-xdist share the processor, so that each of them and what it starts uses one
 # thread; torch and numba read this when they are imported.
 WORKER = "PYTEST_XDIST_WORKER" in os.environ

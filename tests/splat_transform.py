@@ -7,11 +7,11 @@ registry of npm is there. Its SPZ codec is the authors' own.
 from __future__ import annotations
 
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
 
+from benchmarks.patience import run
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.locks import exclusive
 
@@ -29,9 +29,7 @@ def node_packages() -> Path:
         if not done.exists():
             folder.mkdir(parents=True, exist_ok=True)
             words = ["npm", "install", "--silent", "--ignore-scripts", "--prefix", str(folder)]
-            made = subprocess.run(
-                [*words, *PACKAGES], capture_output=True, text=True, timeout=300, check=False
-            )
+            made = run([*words, *PACKAGES])
             if made.returncode != 0:
                 pytest.skip(f"npm cannot install {' '.join(PACKAGES)}: {made.stderr[-200:]}")
             done.touch()
@@ -42,7 +40,7 @@ def transform(source: Path, target: Path, *options: str) -> Path:
     """Let splat-transform read one file and write another."""
     program = node_packages() / "@playcanvas" / "splat-transform" / "bin" / "cli.mjs"
     words = ["node", str(program), "--quiet", "--overwrite", *options, str(source), str(target)]
-    subprocess.run(words, check=True, capture_output=True, timeout=120)
+    run(words).check_returncode()
     return target
 
 
@@ -53,14 +51,8 @@ def validation_errors(path: Path) -> list[str]:
         "v.validateBytes(new Uint8Array(fs.readFileSync(process.argv[1])))"
         ".then(r=>console.log(JSON.stringify(r.issues.messages.filter(m=>m.severity===0))))"
     )
-    made = subprocess.run(
-        ["node", "-e", script, str(path.resolve())],
-        cwd=node_packages().parent,
-        check=True,
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
+    made = run(["node", "-e", script, str(path.resolve())], cwd=node_packages().parent)
+    made.check_returncode()
     import json
 
     return [f"{one['code']}: {one['message']}" for one in json.loads(made.stdout)]

@@ -138,7 +138,9 @@ def test_a_pose_that_is_no_number_gives_a_finite_image() -> None:
     assert np.isfinite(avatar.render({"right": hand}, small_camera())).all()
 
 
-@pytest.mark.skipif(torch.cuda.is_available(), reason="there is a GPU")
-def test_cuda_without_a_gpu_is_an_error(make_training: TrainingMaker) -> None:
+def test_cuda_without_a_gpu_is_an_error(
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(MissingDependency, match="device"):
         PlainMethod({**QUICK, "device": "cuda"}, 0).fit(make_training(), Budget(), SilentReport())

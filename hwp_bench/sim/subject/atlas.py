@@ -50,7 +50,7 @@ def skin_atlas(subject: Subject) -> SkinAtlas:
         subject: whose; `painting.of_side` where the hands look different.
     """
     hand = subject_hand(subject, "right")
-    return kept(hand, subject, "", lambda: painted_atlas(hand, subject))
+    return kept(hand, subject, "", lambda: painted_atlas(hand, subject, ATLAS))
 
 
 def kept(
@@ -92,7 +92,7 @@ def _store(path: Path, atlas: SkinAtlas) -> None:
     atomic_write(path, buffer.getvalue())
 
 
-def painted_atlas(hand: SubjectHand, subject: Subject, edge: int = ATLAS) -> SkinAtlas:
+def painted_atlas(hand: SubjectHand, subject: Subject, edge: int) -> SkinAtlas:
     """Paint the skin of a hand; nothing is kept.
 
     Args:

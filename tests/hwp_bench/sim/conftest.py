@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import pytest
 from tiny_scene import SINGLE
 
+from hwp_bench.sim.render import person
 from hwp_bench.sim.scene.reader import parse_scene
 from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.subject import atlas, forearm
 
 
 @pytest.fixture
@@ -23,3 +25,20 @@ def make_scene() -> Callable[..., Scene]:
         return parse_scene(text, where="tiny.toml")
 
     return make
+
+
+@pytest.fixture
+def small_paintings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+    """Skin of few texels, for a subject of a test's own: painting a whole one takes 8 seconds.
+
+    At 64 px a sixteenth of the texels is still finer than a pixel. Renders in other processes
+    do not see it.
+    """
+    kept = (atlas.skin_atlas, forearm.arm_atlas, person._skin, person._arm_skin)
+    monkeypatch.setattr(atlas, "ATLAS", 256)
+    monkeypatch.setattr(forearm, "_TEXTURE", (64, 64))
+    for function in kept:
+        function.cache_clear()
+    yield
+    for function in kept:
+        function.cache_clear()

@@ -221,7 +221,6 @@ def test_many_callers_at_once() -> None:
                 assert all(torch.equal(a, b) for a, b in zip(got, want, strict=True))
 
 
-@pytest.mark.skipif(sys.platform == "win32", reason="no fork there")
 def test_a_forked_child_can_draw() -> None:
     """DataLoader workers fork after the parent has drawn; numba's own threads would abort."""
     code = """

@@ -23,7 +23,6 @@ from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.looks import PLAIN, Glove, Looks, Polish, Ring, Tattoo, WristWear
 from hwp_bench.sim.scene.schema import Scene, Subject
-from hwp_bench.sim.subject import atlas, forearm
 from hwp_bench.sim.subject.anatomy import Anatomy
 from hwp_bench.sim.subject.forearm import wrist_loop
 from hwp_bench.sim.subject.hand import anatomy_at, subject_hand
@@ -44,13 +43,6 @@ def places() -> Anatomy:
     rest = hand.lift @ (template.vertices + template.shape_basis @ hand.betas)
     normals = surface_normals(rest, hand.faces, hand.normal_sum)
     return anatomy_at(template, hand.betas, rest, normals, hand.lift @ template.weights)
-
-
-@pytest.fixture
-def small_paintings(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Atlases of a few texels: what is tested here is not how fine they are."""
-    monkeypatch.setattr(atlas, "ATLAS", 128)
-    monkeypatch.setattr(forearm, "_TEXTURE", (64, 64))
 
 
 def wearing(**looks: object) -> Subject:

@@ -25,9 +25,7 @@ FRAMES, SIZE = 10, 64
 
 
 @pytest.fixture
-def model(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
-    # Each model's skin is painted anew; at 64 px a sixteenth of the texels is still finer.
-    monkeypatch.setattr("hwp_bench.sim.subject.atlas.ATLAS", 256)
+def model(tmp_path: Path, small_paintings: None) -> str:
     return f"mano:{write_mirrored_mano(tmp_path / 'mano')}"
 
 

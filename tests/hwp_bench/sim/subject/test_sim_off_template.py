@@ -281,10 +281,8 @@ def test_wrong_fields_are_named(make_scene: SceneMaker, line: str, field: str) -
         make_scene(("[camera]", f"[subject.anatomy]\n{line}\n\n[camera]"))
 
 
-def test_a_capture_says_how_far_the_model_is(
-    make_scene: SceneMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hwp_bench.sim.subject.atlas.ATLAS", 256)
+@pytest.mark.usefixtures("small_paintings")
+def test_a_capture_says_how_far_the_model_is(make_scene: SceneMaker, tmp_path: Path) -> None:
     table = "[subject.anatomy]\nbone_length = 6.0\njoint_shift = 4.0\nnail_length = 3.0\n\n[camera]"
     scene = replace(make_scene(("[camera]", table)), effects=())
     capture = render_capture(

@@ -124,15 +124,11 @@ def test_the_surface_is_the_one_that_was_written(
     np.testing.assert_allclose(rig.weights.sum(axis=1), 1.0, atol=1e-9)
 
 
+@pytest.mark.usefixtures("small_paintings")
 @pytest.mark.parametrize("kind", ["closed", "nails", "forearm", "meshes", "boxes"])
 def test_a_scene_shows_one_hand_and_a_sleeve(
-    rigs: dict[str, Path],
-    make_scene: Callable[..., Scene],
-    kind: str,
-    monkeypatch: pytest.MonkeyPatch,
+    rigs: dict[str, Path], make_scene: Callable[..., Scene], kind: str
 ) -> None:
-    # Skin is painted anew for each; at 48 px a sixteenth of the texels is still finer.
-    monkeypatch.setattr("hwp_bench.sim.subject.atlas.ATLAS", 256)
     scene = make_scene(("age = 31.0", f'age = 31.0\nmodel = "gltf:{rigs[kind]}"'))
     shown = render_frame(scene, 36, 40, 48).coverage
     count, labels = cv2.connectedComponents((shown > 0.5).astype(np.uint8))
