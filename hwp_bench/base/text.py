@@ -26,3 +26,8 @@ def has_odd_characters(text: str) -> bool:
 def shown(text: str) -> str:
     """Return a text that can be printed on a terminal: odd characters become `?`."""
     return _ODD.sub("?", text)
+
+
+def one_line(text: str, most: int = 1000) -> str:
+    """Return a text as a record keeps it: one line without odd characters, of bounded length."""
+    return shown(text[:most]).replace("\n", " ")
