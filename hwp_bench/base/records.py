@@ -79,6 +79,8 @@ Message = Annotated[str, Meta(max_length=MAX_TEXT)]
 Seconds = Annotated[float, Meta(ge=0.0, le=MAX_SECONDS)]
 #: A number of steps, frames or bytes: at most the largest that floats count exactly.
 Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
+#: A SHA-256 in hexadecimal digits.
+Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", description="64 hexadecimal digits")]
 #: A seed of random numbers.
 Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
 

@@ -186,7 +186,7 @@ def test_values_that_json_cannot_hold_are_refused(value: Any, message: str) -> N
 def test_fields_of_any_type_are_looked_into(value: Any) -> None:
     """They had been passed on unseen, a terminal's escapes among them."""
     assert read(free={"null": {"is": None}}).free == {"null": {"is": None}}
-    with pytest.raises(BadResult, match="file.json: free"):
+    with pytest.raises(BadResult, match=r"file\.json: free"):
         read(free={"name": value})
 
 
