@@ -16,7 +16,8 @@ from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import MAX_TEXT, parse_record
 from hwp_bench.base.text import one_line, shown
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.schema import EXTRA
+from hwp_bench.capture.content import refuse_changed
+from hwp_bench.capture.schema import EXTRA, IMAGE_FOLDERS
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.artifacts import keep_artifacts
 from hwp_bench.evaluation.colour_check import colour_warnings, keep_warnings
@@ -30,7 +31,7 @@ from hwp_bench.evaluation.scoring import (
     score_predictions,
 )
 from hwp_bench.methods.contents import exposed_digest
-from hwp_bench.methods.contract import RunSettings
+from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
 from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import PROTOCOLS
@@ -106,12 +107,13 @@ def evaluate_capture(
         with the reason and penalties, not an error.
 
     Raises:
-        BadCapture, BadImage: the capture itself is damaged.
+        BadCapture, BadImage: the capture itself is damaged, or was changed after it was written.
     """
     stored = stored_result(evaluation, folder)
     if stored is not None:
         return stored
     began = time.perf_counter()
+    _refuse_changed(evaluation)
     targets = read_targets(evaluation.capture, evaluation.split.test.tolist())
     free_targets = read_free_targets(evaluation.capture)
     shutil.rmtree(folder, ignore_errors=True)
@@ -160,6 +162,23 @@ def evaluate_capture(
     result = replace(result, job_seconds=time.perf_counter() - began)
     write_json(folder / RESULT, asdict(result))
     return result
+
+
+def _refuse_changed(evaluation: CaptureEvaluation) -> None:
+    """Refuse a capture, or a clip in it, whose content is not that of the digests.
+
+    Raises:
+        BadCapture, BadImage: as `hwp_bench.capture.content.refuse_changed`.
+    """
+    clean = evaluation.run.frames != FRAME_CHOICES[0]
+    for capture in (evaluation.capture, evaluation.capture.free_view):
+        if capture is None:
+            continue
+        kinds = ["frames", "masks"]
+        kinds += ["true_masks"] if capture.has_true_masks else []
+        kinds += ["clean", "clean_masks"] if clean and capture.has_clean else []
+        there = [kind for kind in kinds if (capture.root / IMAGE_FOLDERS[kind]).is_dir()]
+        refuse_changed(capture, there)
 
 
 def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult | None:
