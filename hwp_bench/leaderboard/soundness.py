@@ -80,8 +80,14 @@ def _check_data(entry: Entry, capture: CaptureResult, data: CaptureData | None) 
 def _check_frames(entry: Entry, capture: CaptureResult) -> None:
     penalties = penalty()
     scored = 0
+    metrics = set(entry.results.metrics)
+    if capture.free_view is not None and not capture.free_view.frames:
+        raise _wrong(entry, f"{capture.id}.free_view", "has no frame")
     for frame in [*capture.frames, *(capture.free_view.frames if capture.free_view else [])]:
         place = f"{capture.id}, frame {frame.frame}"
+        if metrics != frame.scores.keys():
+            odd = ", ".join(sorted(metrics ^ frame.scores.keys()))
+            raise _wrong(entry, place, f"has other metrics than the first frame ({odd})")
         if absent := sorted(set(metric_names()) - frame.scores.keys()):
             raise _wrong(entry, place, f"lacks the metrics {', '.join(absent)}")
         scored += frame.failure is None

@@ -71,7 +71,14 @@ FORGERIES: dict[str, tuple[Callable[[dict], object], str]] = {
     "settings": (lambda v: v["method"]["settings"].update(steps=1), "is not the key"),
     "a metric": (
         lambda v: [f["scores"].pop("psnr_box") for c in v["captures"] for f in c["frames"]],
-        "lacks the metrics psnr_box",
+        "metrics psnr_box",
+    ),
+    "a metric in one frame": (_scores(mine=1.0), "has other metrics than the first frame"),
+    "a clip without frames": (
+        lambda v: v["captures"][0].update(
+            free_view={"digest": "f", "frames": [], "predictions_digest": "p"}
+        ),
+        "free_view: has no frame",
     ),
     "failure": (lambda v: _frame(v).update(failure="crashed"), "other scores than the penalties"),
     "failure of all": (lambda v: v["captures"][0].update(failure="crashed"), "3 have scores"),
