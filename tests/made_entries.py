@@ -68,7 +68,7 @@ def complete_results(
         )
     protocols = json.loads(json.dumps({p.name: p.as_dict() for p in PROTOCOLS}))
     given = {"suite": suite_name, "captures": captures, "protocols": protocols, **changes}
-    return with_keys(replace(base, **given))  # type: ignore[arg-type]
+    return with_keys(replace(base, **given))
 
 
 def with_keys(results: Results) -> Results:
@@ -83,8 +83,8 @@ def check_of(entry: Entry, kind: str = "rescored", verdict: str = "reproduces") 
     return Check(
         entry=entry.name,
         entry_digest=entry.digest,
-        kind=kind,
-        verdict=verdict,
+        kind=kind,  # type: ignore[arg-type]
+        verdict=verdict,  # type: ignore[arg-type]
         date="2026-01-01T00:00:00+00:00",
         by="us",
         toolkit="0.1.0",

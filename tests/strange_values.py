@@ -38,7 +38,7 @@ NOTED: tuple[Any, ...] = (
     {"a": 1e308},
 )
 
-#: Any JSON value, text that is no Unicode and numbers that overflow among them.
+#: Any JSON value, text that is not Unicode and numbers that overflow among them.
 ANY = st.sampled_from(NOTED) | st.recursive(
     st.none()
     | st.booleans()
@@ -87,5 +87,5 @@ def edited(draw: st.DrawFn, value: Any, most: int = 3) -> Any:
 
 
 def as_json(value: Any) -> str:
-    """The text of a file with that value; text that is no Unicode is written as escapes."""
+    """The text of a file with that value; text that is not Unicode is written as escapes."""
     return json.dumps(value)

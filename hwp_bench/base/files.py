@@ -170,7 +170,7 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
     Raises:
         BadInput: the file is missing, not a regular file, larger than `max_bytes`, not UTF-8, not
             JSON, nested too deeply, or holds a number that is infinite or absurdly large, or text
-            that is no Unicode.
+            that is not Unicode.
     """
     path = Path(path)
     try:
@@ -192,7 +192,7 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
         raise BadInput("is nested too deeply", where=path)
     if _SURROGATE.search(text) and not _is_unicode(value):
         raise BadInput(
-            "holds text that is no Unicode (half of a surrogate pair)",
+            "holds text that is not Unicode (half of a surrogate pair)",
             where=path,
             remedy="Look for an escape from \\ud800 to \\udfff that stands alone.",
         )

@@ -154,7 +154,7 @@ def parse_record(
     except msgspec.ValidationError as fault:
         raise refuse(*explain(twin, value, start)) from fault
     except UnicodeEncodeError as fault:  # the name of a field, before `msgspec` looks it up
-        raise refuse("holds a name that is no Unicode", start) from fault
+        raise refuse("holds a name that is not Unicode", start) from fault
     return build(converted, start)
 
 

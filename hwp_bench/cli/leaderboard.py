@@ -318,7 +318,7 @@ def _refuse_none(folder: Path) -> None:
     from hwp_bench.leaderboard.entries import entry_files
 
     if not entry_files(folder):
-        problem = "holds no entry" if folder.is_dir() else "is no folder"
+        problem = "holds no entry" if folder.is_dir() else "is not a folder"
         raise UsageError(
             problem, where=folder, field="--entries", remedy="Name the folder of the entries."
         )

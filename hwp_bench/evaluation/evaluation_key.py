@@ -24,7 +24,7 @@ def evaluation_key(
     split: str,
     settings: Mapping[str, Any],
     seed: int,
-    budget: Mapping[Any, float | None],
+    budget: Mapping[str, float | None],
     frames: str,
     protocols: Sequence[Mapping[str, Any]],
     networks: Iterable[str],

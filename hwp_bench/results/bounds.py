@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 from msgspec import Meta
 
@@ -30,8 +30,9 @@ _ROUNDING = 1e-9
 ScoreTable = Annotated[
     dict[Line, Annotated[float, Meta(ge=-1e6, le=1e6)]], Meta(max_length=MAX_METRICS)
 ]
+_Limit = Annotated[str, Meta(pattern=r"\A(?:seconds|steps)\Z", description="seconds or steps")]
 #: Limits of a fit by name.
-Limits = dict[Literal["seconds", "steps"], Count | Seconds | None]
+Limits = dict[_Limit, Count | Seconds | None]
 #: A table of any values; `check_table` bounds all of it.
 FreeTable = dict[Line, Any]
 

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated
 
 from msgspec import Meta
 
@@ -83,7 +83,7 @@ class CaptureResult:
     #: Digest of the capture.
     digest: Line
     #: `right`, `left` or `both`.
-    hands: Literal["right", "left", "both"]
+    hands: str = field(metadata={"choices": ("right", "left", "both")})
     #: Names of the perturbations that it declares.
     perturbations: Annotated[list[Line], Meta(max_length=20)]
     #: Digest of the split.

@@ -172,7 +172,7 @@ def test_halves_of_surrogate_pairs_are_refused(tmp_path: Path, text: str) -> Non
     """Oracle: UTF-8 itself; Python's JSON lets them through, and every output fails on them."""
     file = tmp_path / "file.json"
     file.write_text(text)
-    with pytest.raises(BadInput, match="holds text that is no Unicode"):
+    with pytest.raises(BadInput, match="holds text that is not Unicode"):
         read_json(file)
     file.write_text('"\\ud83d\\ude00"')
     assert read_json(file) == "\U0001f600"

@@ -191,7 +191,7 @@ def test_fields_of_any_type_are_looked_into(value: Any) -> None:
 
 
 def test_a_name_that_is_no_unicode_is_refused() -> None:
-    with pytest.raises(BadResult, match="holds a name that is no Unicode"):
+    with pytest.raises(BadResult, match="holds a name that is not Unicode"):
         read(**{"\ud800": 1})
     with pytest.raises(BadResult, match=r"line: is '\?'|line: holds a control character"):
         read(line="\udcff")

@@ -94,7 +94,7 @@ FORGERIES: dict[str, tuple[Callable[[dict], object], str]] = {
         lambda v: v["captures"][0]["frames"].append(_frame(v)),
         "holds a frame twice",
     ),
-    "no Unicode": (lambda v: v["method"].update(title="\ud800"), "no Unicode"),
+    "not Unicode": (lambda v: v["method"].update(title="\ud800"), "not Unicode"),
     "a terminal's escape": (
         lambda v: v["environment"].update(system="\x1b[2J"),
         "environment.system: holds a control character",
