@@ -154,6 +154,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="RESULTS",
         help="results folders of entries, for the images of their reports",
     )
+    build.add_argument(
+        "--avatar-pages",
+        action="store_true",
+        help="also copy pages of avatars (captures/ID/avatar.html in these folders) and lead to "
+        "them; they run the scripts of whoever made them",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -307,7 +313,12 @@ def _build(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.report.sources import read_sources
 
     _refuse_none(folder)
-    page = build_site(Path(args.out), sound_entries(folder), read_sources(args.folders))
+    page = build_site(
+        Path(args.out),
+        sound_entries(folder),
+        read_sources(args.folders),
+        avatar_pages=args.avatar_pages,
+    )
     notice(f"site: {page}")
     return 0
 

@@ -9,6 +9,7 @@ _EXAMPLES = """examples:
   hwp-bench report runs/mine-mini runs/plain-mini -o reports/mine
   hwp-bench report runs/mine-mini runs/mine-mini-clean runs/plain-mini --base plain -o reports/mine
   hwp-bench report runs/* -o reports/all
+  hwp-bench report runs/wildghand-mini --avatar-pages -o reports/wildghand
   hwp-bench report runs/mine-captures --captures my_captures/* -o reports/mine
 
 Results on different data get a page each, A/index.html, B/index.html, ..., and index.html leads to
@@ -39,6 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--base", metavar="NAME", help="method that shares of the gap are counted from"
     )
+    parser.add_argument(
+        "--avatar-pages",
+        action="store_true",
+        help="lead to pages of avatars (captures/ID/avatar.html in a results folder); they run "
+        "the scripts of whoever made them",
+    )
     parser.add_argument("--title", help="heading of the page (default: the methods)")
 
 
@@ -56,6 +63,7 @@ def run(args: argparse.Namespace) -> int:
         args.captures,
         base=args.base,
         title=args.title,
+        avatar_pages=args.avatar_pages,
     )
     for page in pages:
         notice(f"report: {page} ({page.stat().st_size / 1e6:.1f} MB)")

@@ -59,7 +59,7 @@ def write_method_pages(
     """Write the pages into a site.
 
     Args:
-        folder: of the site.
+        folder: of the site; its reports are there already.
         pages: what `method_pages` returned.
         scenes: what `gallery.write_gallery` returned, for pictures.
     """
@@ -78,6 +78,7 @@ def write_method_pages(
             metrics=[metric_facts(name) for name in METRICS],
             scopes=SCOPES,
             pictures=_pictures(page, scenes),
+            avatars=_avatars(folder, page),
             facts=[_made_with(row) for row, _ in page.rows],
         )
         (folder / page.path).write_text(html, encoding="utf-8")
@@ -111,6 +112,18 @@ def _pictures(page: MethodPage, scenes: Sequence[Mapping[str, Any]]) -> list[dic
             if shot["entry"] in names and scene["capture"] not in found:
                 found[scene["capture"]] = {**scene, "shot": shot}
     return list(found.values())
+
+
+def _avatars(folder: Path, page: MethodPage) -> dict[str, str]:
+    """Addresses of avatars by capture, of the first entry of each that has one."""
+    found: dict[str, str] = {}
+    for row, _ in page.rows:
+        for entry in row.entries:
+            for number, capture in enumerate(entry.results.captures):
+                address = f"reports/{entry.name}/avatars/0-{number}.html"
+                if (folder / address).is_file():
+                    found.setdefault(capture.id, address)
+    return found
 
 
 def _made_with(row: BoardRow) -> dict[str, str]:

@@ -39,7 +39,11 @@ TITLE = "HWP bench leaderboard"
 
 
 def build_site(
-    folder: Path, entries: Sequence[Entry], results_folders: Sequence[ResultsSource] = ()
+    folder: Path,
+    entries: Sequence[Entry],
+    results_folders: Sequence[ResultsSource] = (),
+    *,
+    avatar_pages: bool = False,
 ) -> Path:
     """Write the site into a folder that it replaces; returns its first page.
 
@@ -47,6 +51,7 @@ def build_site(
         folder: where to.
         entries: the measured rows.
         results_folders: results with their folders; entries of the same results get images.
+        avatar_pages: also copy the pages of avatars that lie in these folders, and lead to them.
 
     Raises:
         UsageError: entries do not fit together; the folder holds something else than a site.
@@ -66,7 +71,6 @@ def build_site(
         scenes = write_gallery(temporary, shown, captures, titles)
         rows = shown_rows(entries)
         pages = method_pages(rows)
-        write_method_pages(temporary, pages, scenes)
         page = board_page(rows, pictures=bool(scenes), pages=_addresses(pages))
         (temporary / "index.html").write_text(page, encoding="utf-8")
         (temporary / "board.js").write_text(script(), encoding="utf-8")
@@ -76,7 +80,9 @@ def build_site(
             (temporary / "viewer.js").write_text(script("viewer.js"), encoding="utf-8")
         for entry in entries:
             source = ResultsSource(entry.results, folders.get(digest(entry.results)))
-            write_report(temporary / "reports" / entry.name, [source])
+            report = temporary / "reports" / entry.name
+            write_report(report, [source], avatar_pages=avatar_pages)
+        write_method_pages(temporary, pages, scenes)
     return folder / "index.html"
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar
@@ -81,7 +81,8 @@ class WildGHandAvatar(HandAvatar):
         mean_color: (3,) sRGB that the fit started from.
         seed: of the anchors.
         record: what is remembered of the fit.
-        weight_masks: pixel weights by frame of the capture, (H, W) uint8, to look at.
+        weight_masks: gives pixel weights by frame of the capture, (H, W) uint8, to look at. It is
+            called when they are first asked for, because a fit's seconds are not for pictures.
     """
 
     def __init__(
@@ -93,7 +94,7 @@ class WildGHandAvatar(HandAvatar):
         mean_color: torch.Tensor,
         seed: int,
         record: FitRecord,
-        weight_masks: Mapping[int, np.ndarray] | None = None,
+        weight_masks: Callable[[], Mapping[int, np.ndarray]] = dict,
     ) -> None:
         super().__init__(model.rigs, model.log_gains.device, record.steps)
         self.model = model
@@ -103,7 +104,7 @@ class WildGHandAvatar(HandAvatar):
         self.mean_color = mean_color
         self.seed = seed
         self.record = record
-        self.weight_masks = dict(weight_masks or {})
+        self._weigh = weight_masks
         #: The folder that holds it; None until it is written or if it was not read from one.
         self.folder: Path | None = None
 
@@ -245,6 +246,12 @@ class WildGHandAvatar(HandAvatar):
             opacities=array([part.opacities for part in parts], 1),
             colors=array([part.colors for part in parts], 2),
         )
+
+    @functools.cached_property
+    def weight_masks(self) -> Mapping[int, np.ndarray]:
+        """Pixel weights by frame of the capture, (H, W) uint8; empty where none are known."""
+        masks, self._weigh = self._weigh(), dict  # The fit behind them is no longer held.
+        return masks
 
     def write_diagnostics(self, folder: Path) -> None:
         """Write temporal weights and weight masks for the benchmark's tables and figures."""

@@ -8,6 +8,7 @@ weights/000012.png    weight mask of a training frame, to look at
 from __future__ import annotations
 
 import dataclasses
+import functools
 import os
 from pathlib import Path
 from typing import Any
@@ -17,11 +18,11 @@ import torch
 
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
-from hwp_bench.base.images import write_image
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
+from wildghand.avatar.weight_masks import read_weight_masks, write_weight_masks
 from wildghand.evidence import Evidence
 from wildghand.light import KnownLight
 from wildghand.model.assemble import make_model
@@ -38,8 +39,6 @@ MODEL = "model.safetensors"
 WEIGHTS = "weights"
 #: Largest model that is read, bytes.
 MAX_MODEL_BYTES = 4 << 30
-#: Most weight masks that are kept, spread over the clip.
-MAX_MASKS = 100
 
 
 @dataclasses.dataclass(frozen=True)
@@ -85,14 +84,6 @@ def save_avatar(
         write_weight_masks(avatar, folder / WEIGHTS)
     avatar.folder = Path(path)
     return avatar.folder
-
-
-def write_weight_masks(avatar: WildGHandAvatar, folder: Path) -> None:
-    """Write weight masks as images, at most `MAX_MASKS`, evenly spread over the clip."""
-    frames = sorted(avatar.weight_masks)
-    picks = np.linspace(0, len(frames) - 1, min(MAX_MASKS, len(frames))).round().astype(int)
-    for pick in dict.fromkeys(picks.tolist()):
-        write_image(folder / f"{frames[pick]:06d}.png", avatar.weight_masks[frames[pick]])
 
 
 def load_avatar(
@@ -163,7 +154,14 @@ def load_avatar(
             raise BadInput("holds NaN or infinity", where=file, field=name)
     betas = {side: np.array(given) for side, given in value.betas.items()}
     avatar = WildGHandAvatar(
-        model.eval(), settings, value.hand_model, betas, mean_color, value.seed, value.fit
+        model.eval(),
+        settings,
+        value.hand_model,
+        betas,
+        mean_color,
+        value.seed,
+        value.fit,
+        functools.partial(read_weight_masks, root / WEIGHTS, value.fit.frames),
     )
     avatar.folder = root
     return avatar

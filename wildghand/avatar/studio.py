@@ -26,7 +26,7 @@ Pose = str | Mapping[str, float] | np.ndarray
 #: Vertical field of view of the camera, degrees.
 FIELD_OF_VIEW = 30.0
 # Distance of two hands' middles in their common width, and the room around them.
-_ASIDE, _ROOM = 0.6, 1.05
+_ASIDE, _ROOM = 0.6, 1.12
 
 
 class Studio:

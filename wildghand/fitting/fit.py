@@ -18,8 +18,8 @@ from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.evidence import shown_frames, weigh_evidence
+from wildghand.fitting.closing import LightFit, weight_masks
 from wildghand.fitting.hand_masks import hand_masks
-from wildghand.fitting.light_samples import light_samples
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
 from wildghand.fitting.shared_features import SharedFeatures
@@ -30,7 +30,6 @@ from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Loss, repeatable
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.training import TrainingClip, load_frames
-from wildghand.light import fit_light
 from wildghand.model.assemble import make_model
 from wildghand.model.model import RenderedFrames, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
@@ -224,17 +223,11 @@ class Fit:
                 features=features,
             )
 
-    def learn_light(self) -> None:
-        """Fit the light of the clip to what the model says of it, where the settings do."""
-        settings = self.settings.light
-        if not settings.enabled:
-            return
+    @property
+    def light(self) -> LightFit:
+        """The fit of the clip's light, which comes last."""
         weights = self.weighting.frame_weights
-        light = fit_light(
-            light_samples(self.model, self.clip, weights, settings.samples, self.seed), settings
-        )
-        if light is not None:
-            self.model.keep(light)
+        return LightFit(self.model, self.clip, weights, self.settings.light, self.seed)
 
     def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
         """The avatar as it stands; it goes on changing with the fit.
@@ -242,7 +235,7 @@ class Fit:
         Args:
             steps: optimizer steps behind it.
             seconds: of fitting.
-            final: also record the temporal weights and weight masks of all frames.
+            final: also record the temporal weights, and tell the weight masks.
         """
         hands = self.training.hands
         return WildGHandAvatar(
@@ -258,24 +251,18 @@ class Fit:
                 steps=steps,
                 seconds=seconds,
             ),
-            self._weight_masks() if final else None,
+            self._weight_masks if final else dict,
         )
 
-    @torch.no_grad()
     def _weight_masks(self) -> dict[int, np.ndarray]:
-        """The weights of pixels within every training frame as images, 255 = full weight.
-
-        The paper's equations have no bound: with them 255 is the largest weight of the frame.
-        """
-        masks = {}
-        unbounded = self.settings.pao.variant == "printed"
-        if self.settings.pao.enabled:
-            for row, frame in enumerate(self.frames.indices.tolist()):
-                rows = torch.tensor([row])
-                weights = self.weighting(rows, self.draw(rows)).weights[0]
-                largest = weights.max().clamp(min=1e-12 if unbounded else 1.0)
-                masks[frame] = (255.0 * weights / largest).byte().cpu().numpy()
-        return masks
+        pao = self.settings.pao
+        if not pao.enabled:
+            return {}
+        return weight_masks(
+            self.frames.indices.tolist(),
+            lambda rows: self.weighting(rows, self.draw(rows)).weights,
+            unbounded=pao.variant == "printed",
+        )
 
     def _precision(self) -> contextlib.AbstractContextManager[object]:
         if self.settings.mixed_precision and self.device.type == "cuda":

@@ -17,8 +17,8 @@ from wildghand.model.relight import camera_centres
 # Cosine between normal and viewing direction from which a place is seen, and from which its colour
 # counts: at a grazing angle pixels are mixed with what is behind.
 _SEEN, _COUNTED = 0.02, 0.25
-# Frames that are predicted at a time.
-_CHUNK = 16
+#: Frames that are predicted at a time.
+CHUNK = 16
 
 
 @torch.no_grad()
@@ -41,8 +41,8 @@ def light_samples(
     places, normals, light, weights = [], [], [], []
     first = 0
     for side, rig in model.rigs.items():
-        for start in range(0, len(rows), _CHUNK):
-            part = rows[start : start + _CHUNK].to(clip.viewmats.device)
+        for start in range(0, len(rows), CHUNK):
+            part = rows[start : start + CHUNK].to(clip.viewmats.device)
             anchors = clip.hand(side, part)
             prediction = model.predict(side, anchors, clip.parameters[side][0][part])
             turned = quat_third_axis(anchors.orientations)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any
@@ -79,6 +80,8 @@ def optimize(
     watchers = watchers or Watchers(settings.schedule.plateau_steps)
     step = start
     report(step, fit.avatar(step))
+    if budget.seconds is not None:
+        budget = dataclasses.replace(budget, seconds=fit.light.seconds_for_steps(budget.seconds))
     with repeatable(fit.device):
         while step < steps:
             # All processes go by the clock of rank 0, or some would stop a step before the others.
@@ -102,7 +105,9 @@ def optimize(
                 break
         if not watchers.guard.sound():
             step = _go_back(fit, watchers, step)
-    fit.learn_light()
+    light = fit.light.learn()
+    if light is not None:
+        fit.model.keep(light)
     return fit.avatar(step, report.elapsed, final=world.is_main)
 
 

@@ -123,7 +123,9 @@ def fit_capture(
         split = every_frame(capture) if all_frames else _split(capture)
         with tempfile.TemporaryDirectory() as folder:
             write_request(Path(folder) / "request", capture, split, run)
-            return _fit_in(Path(folder), capture, run, chosen, world, watch, save=False)
+            avatar = _fit_in(Path(folder), capture, run, chosen, world, watch, save=False)
+            _ = avatar.weight_masks  # Made while the frames are there.
+            return avatar
     out = Path(out)
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")

@@ -266,8 +266,9 @@ class WildGHandModel(nn.Module):
         *,
         refine: bool = False,
         viewmats: Tensor | None = None,
+        rows: Tensor | None = None,
     ) -> Gaussians:
-        """The Gaussians of one hand in any pose, free of perturbations.
+        """The Gaussians of one hand in any pose, free of perturbations unless frames are named.
 
         Args:
             side: which hand.
@@ -277,6 +278,7 @@ class WildGHandModel(nn.Module):
             refine: apply the network's refinement of the parameters (head iv).
             viewmats: (B, 4, 4) of the cameras that look at them; with these, skin that faces them
                 with a normal that no training frame has shown is drawn by the fitted light.
+            rows: (B,) positions among the training frames, whose biases and gains are added.
         """
         rig = self.rigs[side]
         anchors = rig.pose(pose, betas, transl)
@@ -296,7 +298,14 @@ class WildGHandModel(nn.Module):
         if refine:
             step = prediction.refinement
             anchors = rig.follow(pose + step.pose, betas + step.betas, transl + step.transl)
-        return dress(anchors, prediction, self.network.activation)[0]
+        if rows is None:
+            return dress(anchors, prediction, self.network.activation)[0]
+        perturbation = None
+        if side in self.perturbation:
+            temporal = self.biases_of(side).temporal(rows)
+            perturbation = self._perturbation(side, temporal, anchors, None)
+        made = dress(anchors, prediction, self.network.activation, perturbation)[0]
+        return replace(made, colors=made.colors * self.log_gains[rows].exp()[:, None])
 
     def predict(
         self, side: str, anchors: AnchorPoses, pose: Tensor, features: HandFeatures | None = None

@@ -17,8 +17,8 @@ from wildghand.avatar import WildGHandAvatar
 from wildghand.avatar.playback import shown_sides
 from wildghand.page.settings import PageSettings
 
-# The camera before a hand at rest: it looks at the back of the hand, fingers upwards.
-_REST_VIEW = np.array([[0.0, 0, -1, 0], [1, 0, 0, 0], [0, -1, 0, 0.5], [0, 0, 0, 1]])
+# The camera before a hand at rest: it looks at the palm, fingers upwards.
+_REST_VIEW = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0.5], [0, 0, 0, 1]])
 # Each fourth frame at most is kept out of what is baked, this many at most.
 _HELD_OUT = 8
 

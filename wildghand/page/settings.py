@@ -12,6 +12,8 @@ class PageSettings:
     #: Principal components of places and of colours that depend on the pose.
     geometry_rank: int = 6
     color_rank: int = 12
+    #: Principal components of the biases of the frames that are played; 0: pages cannot show them.
+    bias_rank: int = 4
     #: Poses of the clip, and random ones within the limits of the joints, that are drawn to bake.
     clip_samples: int = 80
     random_samples: int = 48

@@ -18,9 +18,11 @@ from hwp_bench.report.page.render import render_template
 from wildghand.avatar import WildGHandAvatar, load_avatar
 from wildghand.evidence import Evidence
 from wildghand.page.bake import BakedHand, PoseBasis, bake_hand
+from wildghand.page.biases import FrameBiases, bake_biases
 from wildghand.page.measure import Fidelity, fidelity, still_image
 from wildghand.page.poses import PoseSamples, hand_controls, sample_poses
 from wildghand.page.settings import PageSettings
+from wildghand.page.weights import mean_weights
 
 if TYPE_CHECKING:
     from markupsafe import Markup
@@ -85,7 +87,14 @@ def write_page(
         for side in avatar.sides
     }
     measured = None if capture is None else fidelity(avatar, capture, hands, samples.held_out)
-    html = _html(avatar, hands, samples, measured, settings)
+    biases = {
+        side: bake_biases(
+            avatar, side, baked, samples.frames, samples.motion[side], settings.bias_rank
+        )
+        for side, baked in hands.items()
+    }
+    weights = {} if capture is None else mean_weights(avatar, capture, avatar.weight_masks)
+    html = _html(avatar, hands, samples, measured, settings, biases, weights)
     atomic_write(out, html)
     return PageFacts(
         bytes=len(html.encode()),
@@ -101,6 +110,8 @@ def _html(
     samples: PoseSamples,
     measured: Fidelity | None,
     settings: PageSettings,
+    biases: Mapping[str, FrameBiases | None],
+    weights: Mapping[str, np.ndarray],
 ) -> str:
     still = still_image(avatar, samples, settings.still_size)
     content = {
@@ -109,6 +120,8 @@ def _html(
                 **_hand(baked),
                 **hand_controls(avatar, side),
                 "seen": _seen(avatar, side),
+                "biases": _biases(biases[side]),
+                "trusted": _trusted(weights.get(side)),
                 "side": side,
                 "start": samples.start[side].pose.tolist(),
                 "transl": samples.start[side].transl.tolist(),
@@ -175,6 +188,24 @@ def _seen(avatar: WildGHandAvatar, side: str) -> str | None:
     # Of frames f and their half h a fit keeps k = f / (f + h); f / h is k / (1 - k).
     share = np.clip(kept / np.maximum(1.0 - kept, 1e-9), 0.0, 1.0)
     return _pack(np.rint(share * 255.0).astype(np.uint8))
+
+
+def _biases(biases: FrameBiases | None) -> dict[str, Any] | None:
+    if biases is None:
+        return None
+    return {
+        "basis": _pack(biases.basis),
+        "steps": biases.steps.tolist(),
+        "coefficients": biases.coefficients.round(5).tolist(),
+    }
+
+
+def _trusted(weights: np.ndarray | None) -> str | None:
+    """(N,) uint8 mean weights, 254 = full; 255 where no frame shows the place."""
+    if weights is None:
+        return None
+    shares = np.rint(np.nan_to_num(weights).clip(0.0, 1.0) * 254.0)
+    return _pack(np.where(np.isnan(weights), 255, shares).astype(np.uint8))
 
 
 def _linear(basis: PoseBasis) -> dict[str, Any]:

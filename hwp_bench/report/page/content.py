@@ -17,6 +17,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Table
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
+from hwp_bench.report.avatar_pages import AvatarPages
 from hwp_bench.report.evaluation_tables import all_tables, same_data
 from hwp_bench.report.figures import Bar, draw_bars, draw_pareto
 from hwp_bench.report.free_view_table import free_view_table
@@ -54,6 +55,8 @@ class CaptureSection:
     views: Sequence[tuple[str, str]]
     #: Sheets of weight masks: (method, data URI, number of masks).
     masks: Sequence[tuple[str, str, int]]
+    #: Pages of avatars: (method, address).
+    avatars: Sequence[tuple[str, str]]
 
 
 @dataclass(frozen=True)
@@ -90,6 +93,7 @@ def gather_report(
     *,
     base: str | None = None,
     image_bytes: int | None = None,
+    avatar_pages: AvatarPages | None = None,
 ) -> ReportPage:
     """Gather a report.
 
@@ -99,6 +103,7 @@ def gather_report(
         base: name of the method that shares of the gap are counted from; None takes the plain
             baseline where it is among them.
         image_bytes: budget of the images; None takes the default.
+        avatar_pages: what `copy_avatar_pages` returned of `sources`.
 
     Raises:
         UsageError: there are no results, or they are of different data or protocols.
@@ -135,7 +140,9 @@ def gather_report(
         cost_tables=[to_html(table) for table in cost.tables.values()] if cost else [],
         bars=_bars(runs),
         differences=[to_html(table) for table in _differences(runs)],
-        captures=_captures(chosen, runs, infos, album),
+        captures=_captures(
+            chosen, runs, infos, album, _by_label(avatar_pages or {}, sources, runs)
+        ),
         provenance=[provenance(result) for result in results],
         digests=[row for result in results for row in _digests(result)],
         left_out=album.left_out,
@@ -229,11 +236,24 @@ def _differences(runs: Sequence[MethodRuns]) -> list[Table]:
     ]
 
 
+def _by_label(
+    pages: AvatarPages, sources: Sequence[ResultsSource], runs: Sequence[MethodRuns]
+) -> dict[tuple[str, str], str]:
+    """Addresses by label and capture, of the results that stand for their methods."""
+    labels = {id(run.first): run.label for run in runs}
+    return {
+        (labels[id(sources[index].results)], capture): address
+        for (index, capture), address in pages.items()
+        if id(sources[index].results) in labels
+    }
+
+
 def _captures(
     sources: Sequence[ResultsSource],
     runs: Sequence[MethodRuns],
     infos: Mapping[str, CaptureInfo],
     album: Album,
+    pages: Mapping[tuple[str, str], str],
 ) -> list[CaptureSection]:
     first = {run.label: run.first for run in runs}
     shown = [
@@ -242,7 +262,7 @@ def _captures(
     sections = []
     for capture in runs[0].first.captures:
         info = infos.get(capture.digest)
-        methods, frames, views, masks = [], [], [], []
+        methods, frames, views, masks, avatars = [], [], [], [], []
         for index, (label, source) in enumerate(shown):
             own = next(c for c in source.results.captures if c.id == capture.id)
             weights = sound_temporal_weights(source, capture.id)
@@ -253,6 +273,8 @@ def _captures(
                 views.append((label, uri))
             if found := mask_sheet(source, capture.id, album):
                 masks.append((label, *found))
+            if address := pages.get((label, capture.id)):
+                avatars.append((label, address))
         hands = "two hands" if capture.hands == "both" else f"{capture.hands} hand"
         carried = ", ".join(perturbation(name).title for name in capture.perturbations)
         text = f"{hands}; {carried or 'no perturbation'}"
@@ -260,7 +282,7 @@ def _captures(
             text = f"{info.action}: {text}; {info.frame_count} frames, {info.width}x{info.height}"
         strip = strip_plot(methods, info, HEADLINE)
         sections.append(
-            CaptureSection(capture.id, text, strip, info is not None, frames, views, masks)
+            CaptureSection(capture.id, text, strip, info is not None, frames, views, masks, avatars)
         )
     return sections
 

@@ -21,6 +21,7 @@ def write_reports(
     *,
     base: str | None = None,
     title: str | None = None,
+    avatar_pages: bool = False,
 ) -> list[Path]:
     """Write the report of some results, or one report for each of the data that they are on.
 
@@ -31,6 +32,7 @@ def write_reports(
         captures: capture folders, for severities.
         base: method that shares of the gap are counted from; data without it have no shares.
         title: heading; None takes the methods' titles.
+        avatar_pages: as of `write_report`.
 
     Returns:
         The pages, the first one to open first.
@@ -40,14 +42,24 @@ def write_reports(
     """
     groups = data_groups(sources, oracles=True)
     if len(groups) < 2:
-        return [write_report(folder, sources, captures, base=base, title=title)]
+        only = write_report(
+            folder, sources, captures, base=base, title=title, avatar_pages=avatar_pages
+        )
+        return [only]
     names = [{source.results.method.name for source in group.sources} for group in groups]
     if base is not None and not any(base in known for known in names):
         raise UsageError(f"no result is of {base!r}", field="--base")
     pages, rows = [], []
     for group, known in zip(groups, names, strict=True):
         shown = base if base in known else None
-        page = write_report(folder / group.label, group.sources, captures, base=shown, title=title)
+        page = write_report(
+            folder / group.label,
+            group.sources,
+            captures,
+            base=shown,
+            title=title,
+            avatar_pages=avatar_pages,
+        )
         pages.append(page)
         perturbed = [s.results for s in group.sources if s.results.frames == "perturbed"]
         rows.append(

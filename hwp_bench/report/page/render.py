@@ -11,6 +11,7 @@ from typing import Any
 from markupsafe import Markup
 
 from hwp_bench.base.files import atomic_write
+from hwp_bench.report.avatar_pages import copy_avatar_pages
 from hwp_bench.report.figures import series_classes
 from hwp_bench.report.page.content import ReportPage, gather_report
 from hwp_bench.report.sources import ResultsSource
@@ -65,6 +66,7 @@ def write_report(
     *,
     base: str | None = None,
     title: str | None = None,
+    avatar_pages: bool = False,
 ) -> Path:
     """Write the report of some results; returns the page.
 
@@ -74,11 +76,14 @@ def write_report(
         captures: capture folders, for severities.
         base: method that shares of the gap are counted from.
         title: heading; None takes the methods' titles.
+        avatar_pages: also copy the pages of avatars that lie in results folders, and lead to them.
 
     Raises:
         UsageError: the results cannot stand on one page.
+        BadResult: what lies in the place of an avatar's page is none.
     """
-    report = gather_report(sources, captures, base=base)
+    pages = copy_avatar_pages(folder, sources) if avatar_pages else {}
+    report = gather_report(sources, captures, base=base, avatar_pages=pages)
     titles = dict.fromkeys(source.results.method.title for source in sources)
     heading = title or "HWP bench: " + ", ".join(titles)
     return atomic_write(folder / PAGE, render_report(report, heading))

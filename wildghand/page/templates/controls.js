@@ -27,7 +27,11 @@ function start() {
   function update() {
     const light = one("relight").checked && lightOf(), marks = one("unseen").checked;
     let first = 0;
-    for (const hand of hands) { hand.write(splats.data, first, light, marks); first += hand.count; }
+    const shown = one("shown").value;
+    for (const hand of hands) {
+      hand.write(splats.data, first, light, marks, shown);
+      first += hand.count;
+    }
     splats.upload();
     const places = hands.flatMap((hand) => hand.chain().places);
     eye.centre = [0, 1, 2].map((i) => {
@@ -228,6 +232,19 @@ function start() {
       if (name !== "relight") one("relight").checked = true;
       changed();
     });
+  const can = { biases: hands.some((h) => h.biases), weights: hands.some((h) => h.trusted) };
+  for (const [kind, there] of Object.entries(can)) {
+    const option = one("shown").querySelector(`[value=${kind}]`);
+    option.hidden = option.disabled = !there;
+  }
+  one("showing").hidden = !can.biases && !can.weights;
+  function setShown(kind) {
+    one("shown").value = kind;
+    one("biased").hidden = kind !== "biases";
+    one("weighed").hidden = kind !== "weights";
+    changed();
+  }
+  one("shown").addEventListener("input", () => setShown(one("shown").value));
   one("evidence").hidden = !hands.some((hand) => hand.seen);
   one("unseen").addEventListener("input", () => changed());
   one("background").addEventListener("input", () => changed(false));
@@ -242,7 +259,7 @@ function start() {
   changed();
   window.avatar = {
     // {side: [pose (16, 3) rad, transl (3) m]}.
-    setPose, setFrame, setNamed,
+    setPose, setFrame, setNamed, setShown,
     setBackground: (color) => { one("background").value = color; changed(false); },
     // viewmat (4, 4), K (3, 3), px; the canvas gets this size until the view is turned.
     setCamera(viewmat, K, width, height) {

@@ -2,6 +2,9 @@
 "use strict";
 // Colour of skin that no frame has shown; no skin has it.
 const UNSEEN = [0.55, 0.2, 0.85];
+// Colours of a weight from 0 to 1, and of a place without one.
+const RAMP = [[0.27, 0.0, 0.33], [0.23, 0.32, 0.55], [0.13, 0.57, 0.55], [0.37, 0.79, 0.38], [0.99, 0.91, 0.14]];
+const UNWEIGHED = [0.6, 0.6, 0.6];
 const PARENTS = [-1, 0, 1, 2, 0, 4, 5, 0, 7, 8, 0, 10, 11, 0, 13, 14];
 
 function unpack(text, Type) {
@@ -56,6 +59,31 @@ class LinearPart {
   }
 }
 
+// What the fit explained as the perturbation of each frame: sum over k of c_fk basis_k, 8 numbers a Gaussian.
+class FrameBiases {
+  constructor(data, count) {
+    this.basis = unpack(data.basis, Int8Array);
+    this.steps = data.steps;
+    this.coefficients = data.coefficients;
+    this.values = new Float32Array(8 * count);
+    this.frame = -1;
+  }
+  update(frame) {
+    if (frame === this.frame) return;
+    const size = this.values.length;
+    this.values.fill(0);
+    this.steps.forEach((steps, k) => {
+      const c = steps.map((step) => step * this.coefficients[frame][k]);
+      for (let i = 0, b = k * size; i < size; i++, b++) this.values[i] += c[i & 7] * this.basis[b];
+    });
+    this.frame = frame;
+  }
+}
+function ramp(share) {
+  const place = Math.min(Math.max(share, 0), 1) * (RAMP.length - 1), low = Math.min(place | 0, RAMP.length - 2);
+  return RAMP[low].map((v, i) => v + (place - low) * (RAMP[low + 1][i] - v));
+}
+
 class Hand {
   constructor(data) {
     Object.assign(this, { side: data.side, count: data.count, joints: data.joints });
@@ -71,7 +99,10 @@ class Hand {
     this.opacities = unpack(data.opacities, Float32Array);
     this.restNormals = unpack(data.normals, Int8Array);
     this.seen = data.seen && unpack(data.seen, Uint8Array);
+    this.biases = data.biases && new FrameBiases(data.biases, data.count);
+    this.trusted = data.trusted && unpack(data.trusted, Uint8Array);
     this.motion = unpack(data.motion, Float32Array);
+    this.frame = 0;
     this.start = { pose: data.start, transl: data.transl };
     this.normals = new Float32Array(3 * this.count);
     this.setPose(this.start.pose, this.start.transl);
@@ -83,6 +114,7 @@ class Hand {
     this.vector = [...pose[0]];
   }
   setFrame(frame) {
+    this.frame = frame;
     const row = this.motion.subarray(51 * frame, 51 * frame + 51);
     const pose = Array.from({ length: 16 }, (_, j) => [...row.subarray(3 * j, 3 * j + 3)]);
     this.setPose(pose, row.subarray(48));
@@ -120,10 +152,13 @@ class Hand {
     return { turns, shifts, places: places.map((p) => p.map((v, i) => v + this.transl[i])) };
   }
   // Write 16 floats a Gaussian: mean, opacity, covariance (6), 2 unused, colour, 1 unused.
-  write(out, first, light, marks) {
+  // shown: `clean`, `biases` of the frame or `weights` of the fit.
+  write(out, first, light, marks, shown) {
     const { turns, shifts } = this.chain();
     this.means.update(this.turns);
     this.colors.update(this.turns);
+    const add = shown === "biases" && this.biases && this.biases.values;
+    if (add) this.biases.update(this.frame);
     const A = new Float64Array(9), B = new Float64Array(9);
     const m = this.means.values, c = this.covariances, rgb = this.colors.values;
     for (let n = 0, o = 16 * first; n < this.count; n++, o += 16) {
@@ -137,13 +172,16 @@ class Hand {
         tx += w * shift[0]; ty += w * shift[1]; tz += w * shift[2]; total += w;
       }
       for (let i = 0; i < 9; i++) A[i] /= total;
-      const x = m[3 * n], y = m[3 * n + 1], z = m[3 * n + 2];
+      const e = 8 * n;
+      const x = m[3 * n] + (add ? add[e] : 0), y = m[3 * n + 1] + (add ? add[e + 1] : 0);
+      const z = m[3 * n + 2] + (add ? add[e + 2] : 0);
       out[o] = A[0] * x + A[1] * y + A[2] * z + tx / total;
       out[o + 1] = A[3] * x + A[4] * y + A[5] * z + ty / total;
       out[o + 2] = A[6] * x + A[7] * y + A[8] * z + tz / total;
-      out[o + 3] = this.opacities[n];
-      const s = 6 * n, xx = c[s], xy = c[s + 1], xz = c[s + 2];
-      const yy = c[s + 3], yz = c[s + 4], zz = c[s + 5];
+      out[o + 3] = Math.min(Math.max(this.opacities[n] + (add ? add[e + 6] : 0), 0), 1);
+      const s = 6 * n, wide = add ? Math.exp(2 * add[e + 7]) : 1;
+      const xx = wide * c[s], xy = wide * c[s + 1], xz = wide * c[s + 2];
+      const yy = wide * c[s + 3], yz = wide * c[s + 4], zz = wide * c[s + 5];
       for (let i = 0; i < 9; i += 3) {
         B[i] = A[i] * xx + A[i + 1] * xy + A[i + 2] * xz;
         B[i + 1] = A[i] * xy + A[i + 1] * yy + A[i + 2] * yz;
@@ -164,9 +202,12 @@ class Hand {
         const facing = (u * light.x + v * light.y + w * light.z) / (Math.hypot(u, v, w) || 1);
         gain = 1 - light.strength + light.strength * (0.35 + 1.1 * Math.max(0, facing));
       }
-      out[o + 12] = rgb[3 * n] * gain;
-      out[o + 13] = rgb[3 * n + 1] * gain;
-      out[o + 14] = rgb[3 * n + 2] * gain;
+      for (let i = 0; i < 3; i++)
+        out[o + 12 + i] = (rgb[3 * n + i] + (add ? add[e + 3 + i] : 0)) * gain;
+      if (shown === "weights" && this.trusted) {
+        const weight = this.trusted[n], color = weight > 254 ? UNWEIGHED : ramp(weight / 254);
+        for (let i = 0; i < 3; i++) out[o + 12 + i] = color[i];
+      }
       if (marks && this.seen) {
         const unseen = 1 - this.seen[n] / 255;
         for (let i = 0; i < 3; i++) out[o + 12 + i] += unseen * (UNSEEN[i] - out[o + 12 + i]);
