@@ -113,9 +113,9 @@ def evaluate_capture(
     if stored is not None:
         return stored
     began = time.perf_counter()
-    _refuse_changed(evaluation)
     targets = read_targets(evaluation.capture, evaluation.split.test.tolist())
     free_targets = read_free_targets(evaluation.capture)
+    _refuse_changed(evaluation)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     output = folder / "run"

@@ -73,12 +73,12 @@ FORGERIES: dict[str, tuple[Callable[[dict], object], str]] = {
         lambda v: [f["scores"].pop("psnr_box") for c in v["captures"] for f in c["frames"]],
         "metrics psnr_box",
     ),
-    "a metric in one frame": (_scores(mine=1.0), "has other metrics than the first frame"),
+    "a metric in one frame": (_scores(mine=1.0), "its metrics differ"),
     "a clip without frames": (
         lambda v: v["captures"][0].update(
             free_view={"digest": "f", "frames": [], "predictions_digest": "p"}
         ),
-        "free_view: has no frame",
+        "is not the key",
     ),
     "failure": (lambda v: _frame(v).update(failure="crashed"), "other scores than the penalties"),
     "failure of all": (lambda v: v["captures"][0].update(failure="crashed"), "3 have scores"),
