@@ -18,7 +18,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.results.schema import read_all
+from hwp_bench.results import read_all
 
 _ROLES = ("base", "method", "selection", "clean")
 

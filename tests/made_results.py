@@ -32,7 +32,7 @@ def made_results(
 
     Args:
         name: of the method.
-        score: gives every frame's PSNR; the oriented distance is 0.5 - PSNR / 100.
+        score: gives every frame's PSNR; the oriented distance is 1 - PSNR / 100.
         seed: of the run.
         captures: number of captures.
         frames: test frames of each.
@@ -47,7 +47,7 @@ def made_results(
         rows = []
         for frame in range(frames):
             value = score(number, frame, seed)
-            scores = {"psnr": value, "oriented_distance": 0.5 - value / 100}
+            scores = {"psnr": value, "oriented_distance": 1 - value / 100}
             rows.append(FrameResult(90 + frame, scores, None))
         made.append(
             replace(

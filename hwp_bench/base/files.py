@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import re
 import secrets
 import shutil
 import stat
@@ -23,6 +24,8 @@ MAX_JSON_BYTES = 256 * 1024 * 1024
 MAX_JSON_DEPTH = 100
 #: Largest integer that is read; above it other programs would round.
 MAX_JSON_INTEGER = 2**63
+# The file itself is UTF-8, so that only an escape can stand for half of a surrogate pair.
+_SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
 def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
@@ -166,7 +169,8 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
 
     Raises:
         BadInput: the file is missing, not a regular file, larger than `max_bytes`, not UTF-8, not
-            JSON, nested too deeply, or holds a number that is infinite or absurdly large.
+            JSON, nested too deeply, or holds a number that is infinite or absurdly large, or text
+            that is not Unicode.
     """
     path = Path(path)
     try:
@@ -186,7 +190,22 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
         raise BadInput(f"is not valid JSON ({error})", where=path) from error
     if _deeper_than(value, MAX_JSON_DEPTH):
         raise BadInput("is nested too deeply", where=path)
+    if _SURROGATE.search(text) and not _is_unicode(value):
+        raise BadInput(
+            "holds text that is not Unicode (half of a surrogate pair)",
+            where=path,
+            remedy="Look for an escape from \\ud800 to \\udfff that stands alone.",
+        )
     return value
+
+
+def _is_unicode(value: Any) -> bool:
+    """Whether every text in a JSON value can be written as UTF-8."""
+    try:
+        json.dumps(value, ensure_ascii=False).encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def _read_bounded(path: Path, max_bytes: int) -> bytes:

@@ -24,8 +24,12 @@ MAGIC = {
     "JPEG": b"\xff\xd8\xff",
     "BMP": b"BM",
 }
-#: Most parts of a PNG file that are searched for an animation; writers put it first.
+#: Most parts of a PNG file that are neither pixels nor its end.
 _MOST_CHUNKS = 1000
+#: Most bytes of a PNG file's compressed texts and profiles, which grow a thousandfold in memory.
+_MOST_COMPRESSED = 128 * 1024
+#: The parts that hold such.
+_COMPRESSED = (b"zTXt", b"iTXt", b"iCCP")
 
 
 def read_rgb(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
@@ -110,25 +114,31 @@ def _check_kind(path: Path) -> None:
             kind = next((name for name, magic in MAGIC.items() if head.startswith(magic)), None)
             if kind is None:
                 raise BadImage(f"is not a {' or '.join(MAGIC)} image", where=path)
-            if kind == "PNG" and _is_animated(stream):
-                raise BadImage(
-                    "is an animated PNG", where=path, remedy="Store each frame as a file."
-                )
+            if kind == "PNG":
+                _check_parts(stream, path)
     except OSError as error:
         raise BadImage(f"cannot be read ({error.strerror})", where=path) from error
 
 
-def _is_animated(stream: BinaryIO) -> bool:
-    """Whether a PNG has an animation's header (acTL) before its first pixels (IDAT)."""
-    for _ in range(_MOST_CHUNKS):
-        head = stream.read(8)
-        if len(head) < 8:
-            return False
+def _check_parts(stream: BinaryIO, path: Path) -> None:
+    """Look at the parts (chunks) of a PNG file by their heads, before a decoder unpacks them."""
+    parts = compressed = 0
+    pixels = False
+    while len(head := stream.read(8)) == 8:
         length, kind = struct.unpack(">I4s", head)
-        if kind in (b"acTL", b"IDAT"):
-            return kind == b"acTL"
+        if kind == b"acTL" and not pixels:
+            raise BadImage("is an animated PNG", where=path, remedy="Store each frame as a file.")
+        pixels |= kind == b"IDAT"
+        parts += kind not in (b"IDAT", b"IEND")
+        compressed += length if kind in _COMPRESSED else 0
+        if parts > _MOST_CHUNKS or compressed > _MOST_COMPRESSED:
+            raise BadImage(
+                f"holds more than {_MOST_CHUNKS} parts, or {_MOST_COMPRESSED} bytes of texts and "
+                "profiles next to its pixels",
+                where=path,
+                remedy="Store the pixels without metadata.",
+            )
         stream.seek(length + 4, os.SEEK_CUR)
-    return False
 
 
 def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:

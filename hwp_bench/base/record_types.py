@@ -60,8 +60,17 @@ def strict_twin(kind: type, rules: Rules) -> type[msgspec.Struct]:
         [*fields, *removed],
         kw_only=True,
         forbid_unknown_fields=not rules.ignore_unknown,
-        namespace={"__record__": kind, "__removed__": getattr(kind, "removed_fields", ())},
+        namespace={
+            "__record__": kind,
+            "__removed__": getattr(kind, "removed_fields", ()),
+            "__free__": [item.name for item in dataclasses.fields(kind) if _free(hints[item.name])],
+        },
     )
+
+
+def _free(hint: Any) -> bool:
+    """Whether a type leaves values open, so that `msgspec` does not look at them."""
+    return hint is Any or any(_free(part) for part in typing.get_args(hint))
 
 
 def _strict(hint: Any, metadata: Mapping[str, Any], rules: Rules) -> Any:

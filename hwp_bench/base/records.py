@@ -13,7 +13,7 @@ A format is a frozen dataclass; `parse_record` makes one out of a table that a f
     lamp = parse_record(Lamp, table, where="scene.toml", field="lamps[0]", error=BadInput)
 
 Fields are str, int, float, bool, Literal, `list[X]`, `dict[str, X]`, `tuple[...]`, other
-dataclasses, any of these `| None`, or `Any` (which is not checked; see `check_json_values`).
+dataclasses, any of these `| None`, or `Any` (whatever `check_json_values` lets through).
 `msgspec` does the checking, on a strict twin of the dataclass: a bool is not an int, an int is a
 float, NaN and infinity are refused, and so is text with control characters. Bounds are
 `msgspec.Meta` in an `Annotated` type, or the metadata of `number` and `choice`. A pattern in a
@@ -34,6 +34,7 @@ import dataclasses
 import math
 import os
 from collections.abc import Iterator, Mapping
+from functools import partial
 from typing import Annotated, Any, TypeVar, cast
 
 import msgspec
@@ -42,12 +43,21 @@ from msgspec import UNSET, Meta
 from hwp_bench.base.errors import BadResult, HwpError
 from hwp_bench.base.files import MAX_JSON_INTEGER
 from hwp_bench.base.record_types import Rules, brief, explain, join, strict_twin
-from hwp_bench.base.text import ODD_CHARACTERS, shown
+from hwp_bench.base.text import ODD_CHARACTERS, has_odd_characters, shown
 
 Record = TypeVar("Record")
 
 #: Deepest table in a table that `flattened` looks into.
 MAX_DEPTH = 8
+
+#: Most characters of a text that is not one line.
+MAX_TEXT = 10_000
+#: Longest time span, s.
+MAX_SECONDS = 1e9
+#: Largest count.
+MAX_COUNT = 2**53
+#: Largest seed.
+MAX_SEED = 2**63 - 1
 
 #: Longest piece of a name or value that a message repeats.
 _SHOWN = 100
@@ -62,7 +72,17 @@ Line = Annotated[
     ),
 ]
 #: A text that is not empty, of at most 10,000 characters.
-Text = Annotated[str, Meta(min_length=1, max_length=10_000)]
+Text = Annotated[str, Meta(min_length=1, max_length=MAX_TEXT)]
+#: A text that may be empty or have several lines, such as the reason of a failure.
+Message = Annotated[str, Meta(max_length=MAX_TEXT)]
+#: A time span, s: at most 31 years.
+Seconds = Annotated[float, Meta(ge=0.0, le=MAX_SECONDS)]
+#: A number of steps, frames or bytes: at most the largest that floats count exactly.
+Count = Annotated[int, Meta(ge=0, le=MAX_COUNT)]
+#: A SHA-256 in hexadecimal digits.
+Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", description="64 hexadecimal digits")]
+#: A seed of random numbers.
+Seed = Annotated[int, Meta(ge=0, le=MAX_SEED)]
 
 
 def number(default: Any, low: float = 0.0, high: float = math.inf) -> Any:
@@ -118,6 +138,10 @@ def parse_record(
             return item
         names = set(item.__struct_fields__) - set(item.__removed__)  # type: ignore[attr-defined]
         given = {name: getattr(item, name) for name in names}
+        for name in item.__free__:  # type: ignore[attr-defined]
+            if given[name] is not UNSET:
+                place = join(path, name)
+                check_json_values(given[name], where=where, field=place, error=error, null=True)
         made = {n: build(v, join(path, n)) for n, v in given.items() if v is not UNSET}
         try:
             return item.__record__(**made)  # type: ignore[attr-defined]
@@ -129,6 +153,8 @@ def parse_record(
         converted = msgspec.convert(value, twin)
     except msgspec.ValidationError as fault:
         raise refuse(*explain(twin, value, start)) from fault
+    except UnicodeEncodeError as fault:  # the name of a field, before `msgspec` looks it up
+        raise refuse("holds a name that is not Unicode", start) from fault
     return build(converted, start)
 
 
@@ -199,6 +225,7 @@ def check_json_values(
     field: str,
     error: type[HwpError] = BadResult,
     depth: int = 16,
+    null: bool = False,
 ) -> None:
     """Refuse what JSON cannot hold: for values of type `Any` that are kept or digested.
 
@@ -208,26 +235,34 @@ def check_json_values(
         field: path of `value` in the file.
         error: raised when something is wrong.
         depth: deepest nesting that is accepted.
+        null: accept None, which JSON has and TOML has not.
 
     Raises:
         error: there is a date or other object, a number that is not finite or is absurdly large,
-            or too deep a nesting; the field is named.
+            a text that is too long or holds a control character, or too deep a nesting; the field
+            is named.
     """
     problem = None
+    check = partial(check_json_values, where=where, error=error, depth=depth - 1, null=null)
     if depth == 0:
         problem = "is nested too deeply"
     elif isinstance(value, dict):
         for name, item in value.items():
             path = join(field, str(name))
-            check_json_values(item, where=where, field=path, error=error, depth=depth - 1)
-    elif isinstance(value, list):
+            check(str(name), field=path, depth=1)
+            check(item, field=path)
+    elif isinstance(value, list | tuple):
         for item in value:
-            check_json_values(item, where=where, field=field, error=error, depth=depth - 1)
+            check(item, field=field)
     elif isinstance(value, float) and not math.isfinite(value):
         problem = f"is {value}, not a finite number"
     elif isinstance(value, int) and abs(value) > MAX_JSON_INTEGER:
         problem = "is too large a number"
-    elif not isinstance(value, str | int | float):
+    elif isinstance(value, str) and len(value) > MAX_TEXT:
+        problem = f"is a text of more than {MAX_TEXT:,} characters"
+    elif isinstance(value, str) and has_odd_characters(value):
+        problem = "holds a control character"
+    elif not isinstance(value, str | int | float) and not (null and value is None):
         problem = f"is a {type(value).__name__}, not a number, text, list or table"
     if problem:
         raise error(problem, where=where, field=shown(field)[:_SHOWN])

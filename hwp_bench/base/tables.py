@@ -224,12 +224,22 @@ def _latex_text(text: str) -> str:
 
 
 def to_csv(table: Table) -> str:
-    """Return CSV with full precision; an empty cell was not measured."""
+    """Return CSV with full precision; an empty cell was not measured.
+
+    A text that a spreadsheet would take for a formula begins with an apostrophe.
+    """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([f"{c.group} {c.title}".strip() for c in table.columns])
-    writer.writerows([["" if cell is None else cell for cell in row] for row in table.rows])
+    writer.writerow([_csv_cell(f"{c.group} {c.title}".strip()) for c in table.columns])
+    writer.writerows([[_csv_cell(cell) for cell in row] for row in table.rows])
     return stream.getvalue()
+
+
+def _csv_cell(cell: Cell) -> str | float | int:
+    if cell is None:
+        return ""
+    formula = isinstance(cell, str) and cell.lstrip(" \t\n").startswith(("=", "+", "-", "@"))
+    return f"'{cell}" if formula else cell
 
 
 def to_json(table: Table) -> str:

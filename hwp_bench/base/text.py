@@ -1,13 +1,14 @@
-"""Text for a person: without characters that steer a terminal or reverse a line, and bounded."""
+"""Text for a person: real Unicode, without characters that steer a terminal, and bounded."""
 
 from __future__ import annotations
 
 import re
 from collections.abc import Sequence
 
-#: Control characters except tab and line feed, and the marks that reverse the direction of
-#: writing, as a set of characters in a regular expression (without its brackets).
-ODD_CHARACTERS = "\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069"
+#: Control characters except tab and line feed, the marks that reverse the direction of writing,
+#: and halves of surrogate pairs, which no file can hold as UTF-8; as a set of characters in a
+#: regular expression (without its brackets).
+ODD_CHARACTERS = r"\x00-\x08\x0b-\x1f\x7f-\x9f\u202a-\u202e\u2066-\u2069\ud800-\udfff"
 _ODD = re.compile(f"[{ODD_CHARACTERS}]")
 
 
@@ -18,10 +19,15 @@ def bounded(items: Sequence[object], most: int = 12) -> str:
 
 
 def has_odd_characters(text: str) -> bool:
-    """Whether a text holds control characters (tab and line feed apart) or direction marks."""
+    """Whether a text holds one of `ODD_CHARACTERS`."""
     return _ODD.search(text) is not None
 
 
 def shown(text: str) -> str:
     """Return a text that can be printed on a terminal: odd characters become `?`."""
     return _ODD.sub("?", text)
+
+
+def one_line(text: str, most: int = 1000) -> str:
+    """Return a text as a record keeps it: one line without odd characters, of bounded length."""
+    return shown(text[:most]).replace("\n", " ")

@@ -14,6 +14,7 @@ import numpy as np
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.images import pixel_digest
 from hwp_bench.base.text import bounded
+from hwp_bench.capture.content import image_reader
 from hwp_bench.capture.reader import Capture, open_capture
 from hwp_bench.capture.schema import IMAGE_FOLDERS, SIMULATED, CaptureInfo, image_path
 from hwp_bench.capture.tracks import arrays_digest, hand_arrays
@@ -151,13 +152,7 @@ def _images(capture: Capture) -> Iterator[Finding]:
 
 
 def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
-    read = {
-        "frames": capture.frame,
-        "masks": capture.mask,
-        "clean": capture.clean,
-        "true_masks": capture.true_mask,
-        "clean_masks": capture.clean_mask,
-    }[kind]
+    read = image_reader(capture, kind)
 
     def inspect(frame: int) -> tuple[str | None, Finding | None]:
         try:

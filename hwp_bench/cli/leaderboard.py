@@ -180,24 +180,31 @@ def run(args: argparse.Namespace) -> int:
 
 def _add(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.progress import notice
-    from hwp_bench.leaderboard.rules import add_entry
-    from hwp_bench.results import read_all
+    from hwp_bench.leaderboard.soundness import check_source
+    from hwp_bench.leaderboard.submit import add_entry
+    from hwp_bench.results import read_results, results_among
 
-    for results in read_all(args.results):
+    for file in results_among(args.results):
+        results = read_results(file)
+        check_source(file)
         notice(f"entry: {add_entry(folder, results)}")
     return 0
 
 
 def _submit(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.progress import notice
-    from hwp_bench.leaderboard.entries import read_entries
+    from hwp_bench.leaderboard.soundness import check_source, sound_entries
     from hwp_bench.leaderboard.submit import TEXT, submit
     from hwp_bench.report.sources import read_sources
+    from hwp_bench.results import results_among
 
+    sources = read_sources(args.results)
+    for file in results_among(args.results):
+        check_source(file)
     done = submit(
         Path(args.out),
-        read_sources(args.results),
-        read_entries(folder),
+        sources,
+        sound_entries(folder),
         _submission(args),
         Path(args.avatars) if args.avatars else None,
     )
@@ -226,10 +233,13 @@ def _submission(args: argparse.Namespace) -> Submission:
 def _check(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.entries import read_entries
     from hwp_bench.leaderboard.rules import check_complete, check_entries, check_unchanged
+    from hwp_bench.leaderboard.soundness import check_bound
 
+    _refuse_none(folder)
     entries = check_entries(read_entries(folder))
     for entry in entries:
         check_complete(entry)
+        check_bound(entry)
     new = check_unchanged(folder, Path(args.against)) if args.against else None
     _print_entries(entries, args.json)
     if not args.json:
@@ -240,11 +250,11 @@ def _check(args: argparse.Namespace, folder: Path) -> int:
 def _show(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.tables import print_table, to_object
-    from hwp_bench.leaderboard.entries import read_entries
-    from hwp_bench.leaderboard.rules import check_entries
+    from hwp_bench.leaderboard.soundness import sound_entries
     from hwp_bench.leaderboard.standings import board_tables
 
-    entries = check_entries(read_entries(folder))
+    _refuse_none(folder)
+    entries = sound_entries(folder)
     chosen = [entry for entry in entries if args.suite in (None, entry.results.suite)]
     if args.suite and not chosen:
         raise UsageError(f"no entry is of the suite {args.suite!r}", field="--suite")
@@ -263,12 +273,14 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.progress import notice
     from hwp_bench.cli.verify import captures_of
     from hwp_bench.leaderboard.confirm import confirm, entry_of
-    from hwp_bench.leaderboard.entries import read_entries, refuse_installed, write_check
+    from hwp_bench.leaderboard.entries import refuse_installed, write_check
+    from hwp_bench.leaderboard.soundness import readable_entries
     from hwp_bench.results import read_results, result_files
 
     refuse_installed(folder)
+    _refuse_none(folder)
     (file,) = result_files(args.results)
-    entries = read_entries(folder)
+    entries = readable_entries(folder)
     # Before a suite is rendered for it.
     entry_of(entries, read_results(file), args.entry)
     if not 0 <= args.tolerance <= 100:
@@ -296,18 +308,31 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
 
 def _build(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.progress import notice
-    from hwp_bench.leaderboard.entries import read_entries
     from hwp_bench.leaderboard.site import build_site
+    from hwp_bench.leaderboard.soundness import sound_entries
     from hwp_bench.report.sources import read_sources
 
+    _refuse_none(folder)
     page = build_site(
         Path(args.out),
-        read_entries(folder),
+        sound_entries(folder),
         read_sources(args.folders),
         avatar_pages=args.avatar_pages,
     )
     notice(f"site: {page}")
     return 0
+
+
+def _refuse_none(folder: Path) -> None:
+    """Refuse a folder without entries: a wrong path must not look like a sound board."""
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.leaderboard.entries import entry_files
+
+    if not entry_files(folder):
+        problem = "holds no entry" if folder.is_dir() else "is not a folder"
+        raise UsageError(
+            problem, where=folder, field="--entries", remedy="Name the folder of the entries."
+        )
 
 
 def _print_entries(entries: Sequence[Entry], as_json: bool) -> None:

@@ -10,14 +10,17 @@ from functools import partial
 from pathlib import Path
 
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
-from hwp_bench.base.files import read_json, sha256_json, write_json
+from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.packages import PACKAGES
-from hwp_bench.base.records import parse_record
+from hwp_bench.base.records import MAX_TEXT, parse_record
+from hwp_bench.base.text import one_line, shown
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.schema import EXTRA
+from hwp_bench.capture.content import refuse_changed
+from hwp_bench.capture.schema import EXTRA, IMAGE_FOLDERS
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.artifacts import keep_artifacts
 from hwp_bench.evaluation.colour_check import colour_warnings, keep_warnings
+from hwp_bench.evaluation.evaluation_key import evaluation_key
 from hwp_bench.evaluation.free_view import keep_free_view, read_free_targets, score_free_view
 from hwp_bench.evaluation.scoring import (
     mean_scores,
@@ -27,7 +30,7 @@ from hwp_bench.evaluation.scoring import (
     score_predictions,
 )
 from hwp_bench.methods.contents import exposed_digest
-from hwp_bench.methods.contract import RunSettings
+from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
 from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import PROTOCOLS
@@ -41,8 +44,6 @@ from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
 from hwp_bench.run.scratch import scratch_folder
 
-#: Version of the evaluation itself; a stored result of another version is not taken.
-RECIPE = 1
 #: The result of one capture, inside its folder.
 RESULT = "result.json"
 
@@ -67,24 +68,27 @@ class CaptureEvaluation:
     networks: Mapping[str, Network] = field(default_factory=dict)
 
     @property
+    def exposed(self) -> str | None:
+        """Digest (hex) of the files that the method is shown next to its request, if any."""
+        exposed = self.confinement.exposed
+        return exposed_digest(exposed) if exposed else None
+
+    @property
     def key(self) -> str:
         """Digest (hex) of everything that decides the scores."""
-        exposed, clip = self.confinement.exposed, self.capture.free_view
-        return sha256_json(
-            {
-                "recipe": RECIPE,
-                "method": [self.manifest.name, self.manifest.digest],
-                "capture": self.capture.digest,
-                "split": self.split.digest,
-                "settings": dict(self.run.settings),
-                "seed": self.run.seed,
-                "budget": asdict(self.run.budget),
-                "frames": self.run.frames,
-                "protocols": [protocol.as_dict() for protocol in PROTOCOLS],
-                "networks": sorted(self.networks),
-                **({"exposed": exposed_digest(exposed)} if exposed else {}),
-                **({"free_view": clip.digest} if clip is not None else {}),
-            }
+        clip = self.capture.free_view
+        return evaluation_key(
+            method=(self.manifest.name, self.manifest.digest),
+            capture=self.capture.digest,
+            split=self.split.digest,
+            settings=self.run.settings,
+            seed=self.run.seed,
+            budget=asdict(self.run.budget),
+            frames=self.run.frames,
+            protocols=[protocol.as_dict() for protocol in PROTOCOLS],
+            networks=self.networks,
+            exposed=self.exposed,
+            free_view=None if clip is None else clip.digest,
         )
 
 
@@ -103,7 +107,7 @@ def evaluate_capture(
         with the reason and penalties, not an error.
 
     Raises:
-        BadCapture, BadImage: the capture itself is damaged.
+        BadCapture, BadImage: the capture itself is damaged, or was changed after it was written.
     """
     stored = stored_result(evaluation, folder)
     if stored is not None:
@@ -111,6 +115,7 @@ def evaluate_capture(
     began = time.perf_counter()
     targets = read_targets(evaluation.capture, evaluation.split.test.tolist())
     free_targets = read_free_targets(evaluation.capture)
+    _refuse_changed(evaluation)
     shutil.rmtree(folder, ignore_errors=True)
     folder.mkdir(parents=True)
     output = folder / "run"
@@ -133,7 +138,7 @@ def evaluate_capture(
         exact_masks=all(target.exact for target in targets),
         key=evaluation.key,
         frames=scores,
-        failure=failure,
+        failure=None if failure is None else shown(failure)[:MAX_TEXT],
         predictions_digest=predictions_digest(predictions),
         fit_seconds=facts.fit_seconds,
         render_seconds=facts.render_seconds,
@@ -141,13 +146,14 @@ def evaluate_capture(
         wall_seconds=record.wall_seconds if record else 0.0,
         steps=facts.steps,
         peak_memory=facts.peak_memory,
-        device=facts.device[:100] if facts.device else None,
+        device=one_line(facts.device, 100) if facts.device else None,
         curve=_curve(evaluation, output, facts),
         curve_seconds=facts.curve_seconds,
         cpu_seconds=facts.cpu_seconds,
-        isolation=record.isolation if record else None,
+        isolation=one_line(record.isolation) if record and record.isolation else None,
         free_view=free.result if free else None,
         made_by=evaluation.capture.info.made_by,
+        exposed=evaluation.exposed,
     )
     if free is not None:
         keep_free_view(folder, free)
@@ -156,6 +162,23 @@ def evaluate_capture(
     result = replace(result, job_seconds=time.perf_counter() - began)
     write_json(folder / RESULT, asdict(result))
     return result
+
+
+def _refuse_changed(evaluation: CaptureEvaluation) -> None:
+    """Refuse a capture, or a clip in it, whose content is not that of the digests.
+
+    Raises:
+        BadCapture, BadImage: as `hwp_bench.capture.content.refuse_changed`.
+    """
+    clean = evaluation.run.frames != FRAME_CHOICES[0]
+    for capture in (evaluation.capture, evaluation.capture.free_view):
+        if capture is None:
+            continue
+        kinds = ["frames", "masks"]
+        kinds += ["true_masks"] if capture.has_true_masks else []
+        kinds += ["clean", "clean_masks"] if clean and capture.has_clean else []
+        there = [kind for kind in kinds if (capture.root / IMAGE_FOLDERS[kind]).is_dir()]
+        refuse_changed(capture, there)
 
 
 def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult | None:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import datetime
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
 from hwp_bench.base.errors import BadCapture, BadMethod
 from hwp_bench.base.locks import exclusive
-from hwp_bench.base.records import check_json_values, merged
+from hwp_bench.base.records import check_json_values, merged, parse_record
+from hwp_bench.base.text import one_line
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
@@ -147,7 +148,11 @@ class Plan:
         manifest, run = self.manifest, self.run
         return Results(
             method=MethodId(
-                manifest.name, manifest.title, manifest.digest, self.preset, dict(run.settings)
+                manifest.name,
+                one_line(manifest.title),
+                manifest.digest,
+                self.preset,
+                dict(run.settings),
             ),
             suite=self.suite,
             seed=run.seed,
@@ -177,7 +182,7 @@ def make_plan(
 
     Raises:
         BadMethod: there is no such preset, or an override is not a plain value or not a setting
-            of the method.
+            of the method, or the result could not be read again.
     """
     preset = manifest.preset(settings.preset, settings.suite)
     check_json_values(
@@ -194,7 +199,11 @@ def make_plan(
         for capture, split in captures
     )
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    return Plan(manifest, settings.suite, preset, run, evaluations, started)
+    plan = Plan(manifest, settings.suite, preset, run, evaluations, started)
+    # Before anything runs: what is to be written will have to be read.
+    head = asdict(plan.results([]))
+    parse_record(Results, head, where=manifest.name, error=BadMethod)
+    return plan
 
 
 def open_captures(

@@ -1,22 +1,35 @@
 """Recompute the digests and scores of a result from its stored predictions.
 
-PSNR and SSIM of some frames are computed a second time, by scikit-image.
+PSNR and SSIM of some frames are computed a second time, by scikit-image. What no pixel decides is
+bound otherwise (`hwp_bench/evaluation/bindings.py`).
 """
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import BadSplit, HwpError
-from hwp_bench.base.files import inside, sha256_json
+from hwp_bench.base.files import inside, read_json, sha256_json
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation import cross_check
+from hwp_bench.evaluation.bindings import (
+    Discrepancy,
+    copy_differences,
+    digest_differences,
+    failure_differences,
+    key_differences,
+    label_differences,
+    suite_differences,
+    table_differences,
+)
+from hwp_bench.evaluation.capture_evaluation import RESULT
 from hwp_bench.evaluation.free_view import PREDICTIONS as FREE_PREDICTIONS
 from hwp_bench.evaluation.scoring import (
     Prediction,
@@ -30,25 +43,11 @@ from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, FrameResult, Results, read_results
-from hwp_bench.results.environment import environment
+from hwp_bench.results.bounds import MAX_BYTES
+from hwp_bench.results.environment import code_digest, environment
 
 #: Largest difference of a score that rounding on another processor may make.
 TOLERANCE = 1e-6
-
-
-@dataclass(frozen=True)
-class Discrepancy:
-    """One part of a result that is not as the result says."""
-
-    #: Id of the capture; empty for the whole result.
-    capture: str
-    #: The part that was verified: `capture`, `split`, `frames`, `predictions`, `protocols`, or a
-    #: frame and metric.
-    what: str
-    #: Its value in the result.
-    recorded: str
-    #: Its value as it was found.
-    found: str
 
 
 @dataclass(frozen=True)
@@ -81,7 +80,10 @@ def capture_folders(places: Sequence[Path]) -> list[Path]:
 def verify_results(
     file: Path, captures: Sequence[Path], splits: Mapping[str, Split] | None = None
 ) -> Verification:
-    """Recompute the digests of captures, splits and predictions, and the scores, of a result.
+    """Recompute the digests of captures, splits and predictions, scores and tables of a result.
+
+    Labels are compared with the captures and the suite, each capture with its stored copy, and
+    the whole with the key and the digest that it states.
 
     Args:
         file: the result file; the predictions lie in `captures/ID/predictions` next to it.
@@ -91,21 +93,38 @@ def verify_results(
     Raises:
         BadInput, BadResult: the result file is missing or damaged.
     """
+    file = file / "results.json" if file.is_dir() else file
     results = read_results(file)
+    stored = read_json(file, max_bytes=MAX_BYTES)
     found: list[Discrepancy] = []
-    ours = {protocol.name: protocol.as_dict() for protocol in PROTOCOLS}
+    ours = json.loads(json.dumps({protocol.name: protocol.as_dict() for protocol in PROTOCOLS}))
     if results.protocols != ours:
         found.append(Discrepancy("", "protocols", _brief(results.protocols), _brief(ours)))
     known = _by_id(captures)
     networks = load_available()
     frames = scored = checked = 0
+    fitting = []
     for record in results.captures:
+        capture = next((c for c in known.get(record.id, []) if c.digest == record.digest), None)
+        fitting += [] if capture is None else [capture]
         differences, count, cross = _verify_capture(file.parent, record, known, splits, networks)
-        found += differences
+        clip = None if capture is None or capture.free_view is None else capture.free_view.digest
+        found += [*differences, *failure_differences(record)]
+        found += key_differences(results, record, clip)
         frames += count
         scored += count > 0
         checked += cross
+    found += suite_differences(results, fitting, own_splits=splits is not None)
+    found += copy_differences(file.parent, stored, RESULT)
+    own = results.environment.get("code") == code_digest()
+    if own:
+        found += table_differences(file.parent, results)
+    found += digest_differences(stored, expected=own)
     notes = _notes(results, networks)
+    if not own and (file.parent / "tables").is_dir():
+        notes.append("The tables next to it were not compared: other code made them.")
+    if stored.get("digest") is None and not own:
+        notes.append("It states no digest of its content: times and curves are as the file says.")
     return Verification(str(file), scored, frames, tuple(found), tuple(notes), checked)
 
 
@@ -152,6 +171,7 @@ def _verify_capture(
     if any(not 0 <= number < len(capture) for number in numbers):
         return found, 0, 0
     targets = read_targets(capture, numbers)
+    found += label_differences(record, capture, all(target.exact for target in targets))
     predictions = read_predictions(
         inside(root, f"captures/{name}/predictions"), numbers, capture.size
     )
@@ -173,7 +193,9 @@ def _verify_free_view(
     """As `_verify_capture`, of the free-view clip; nothing where the result has no scores of it."""
     stored, name = record.free_view, f"{record.id}, free view"
     if stored is None:
-        return [], 0, 0
+        drawn = inside(root, f"captures/{record.id}/{FREE_PREDICTIONS}")
+        left = capture.free_view is not None and drawn.is_dir()
+        return [Discrepancy(name, "scores", "none", "predictions")] if left else [], 0, 0
     clip = capture.free_view
     if clip is None or clip.digest != stored.digest:
         here = "no clip" if clip is None else clip.digest
@@ -226,6 +248,11 @@ def _compare_frame(name: str, old: FrameResult, new: FrameResult) -> list[Discre
         found.append(
             Discrepancy(name, f"{place}, failure", old.failure or "none", new.failure or "none")
         )
+    found += [
+        Discrepancy(name, f"{place}, {metric}", "not there", repr(value))
+        for metric, value in new.scores.items()
+        if metric not in old.scores and metric not in _with_weights()
+    ]
     for metric, value in old.scores.items():
         again = new.scores.get(metric)
         if again is None and metric not in _with_weights():

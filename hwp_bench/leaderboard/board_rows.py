@@ -6,9 +6,9 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from hwp_bench.analysis.statistics.pairing import same_but_seed
+from hwp_bench.evaluation.completeness import missing
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.records import BADGES, LEVELS
-from hwp_bench.leaderboard.rules import missing
 from hwp_bench.results import Results
 
 #: The badge of a row is the first of these that one of its entries has.

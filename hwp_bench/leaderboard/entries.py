@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import json
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.errors import BadResult, UsageError
+from hwp_bench.base.errors import BadResult, HwpError, UsageError
 from hwp_bench.base.files import atomic_write, read_json, sha256_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import parse_record, without_schema
@@ -164,9 +164,13 @@ def read_entries(folder: Path) -> list[Entry]:
         BadResult: a file breaks the schema, its digest is not that of its content, or a check is
             of no entry that is there.
     """
-    files = sorted(folder.glob("*.json")) if folder.is_dir() else []
-    checks = [_read_check(file) for file in sorted((folder / CHECKS).glob("*.json"))]
-    entries = [_read(file, checks) for file in files]
+    checks = []
+    for check, fault in read_checks(folder):
+        if fault is not None:
+            raise fault
+        if check is not None:
+            checks.append(check)
+    entries = [read_entry(file, checks) for file in entry_files(folder)]
     known = {(entry.name, entry.digest) for entry in entries}
     for check in checks:
         if (check.entry, check.entry_digest) not in known:
@@ -178,7 +182,30 @@ def read_entries(folder: Path) -> list[Entry]:
     return entries
 
 
-def _read(file: Path, checks: Sequence[Check]) -> Entry:
+def entry_files(folder: Path) -> list[Path]:
+    """Return the files of the entries of a folder, by name; none where there is no folder."""
+    return sorted(folder.glob("*.json")) if folder.is_dir() else []
+
+
+def read_checks(folder: Path) -> Iterator[tuple[Check | None, HwpError | None]]:
+    """Read every check below a folder of entries, by name: the check, or why it cannot be read."""
+    for file in sorted((folder / CHECKS).glob("*.json")):
+        try:
+            yield _read_check(file), None
+        except HwpError as error:
+            yield None, error
+
+
+def read_entry(file: Path, checks: Sequence[Check]) -> Entry:
+    """Read one entry.
+
+    Args:
+        file: the file.
+        checks: checks of any entries.
+
+    Raises:
+        BadInput, BadResult: as `read_entries`.
+    """
     value = without_schema(read_json(file, max_bytes=MAX_ENTRY_BYTES), ENTRY_SCHEMA, where=file)
     entry = parse_record(_File, value, where=file)
     results = entry.results
@@ -193,7 +220,7 @@ def _read(file: Path, checks: Sequence[Check]) -> Entry:
         )
     if file.stem != entry_name(results, content):
         raise BadResult(f"must be called {entry_name(results, content)}.json", where=file)
-    own = tuple(check for check in checks if check.entry == file.stem)
+    own = tuple(c for c in checks if (c.entry, c.entry_digest) == (file.stem, content))
     return Entry(file.stem, results, entry.submission or Submission(), content, own)
 
 

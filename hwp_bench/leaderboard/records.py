@@ -9,7 +9,8 @@ from typing import Annotated, Literal
 from msgspec import Meta
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.records import Line, number
+from hwp_bench.base.records import Count, Digest, Line, number
+from hwp_bench.results.bounds import MAX_CAPTURES, ScoreTable, check_scores
 
 #: Version of the entry files. `submission` was added within it and may be missing.
 ENTRY_SCHEMA = "hwp-leaderboard-entry/1"
@@ -33,8 +34,14 @@ BADGES = {
 #: What a link of a submission can lead to.
 LINKS = ("code", "paper", "predictions", "avatars")
 
-#: A SHA-256 in hexadecimal digits.
-Digest = Annotated[str, Meta(pattern=r"\A[0-9a-f]{64}\Z", description="64 hexadecimal digits")]
+#: A moment, ISO 8601 in UTC: checks are in the order of their dates.
+Moment = Annotated[
+    str,
+    Meta(
+        pattern=r"\A\d{4}-\d{2}-\d{2}T\d{2}:\d{2}:\d{2}\+00:00\Z",
+        description="a moment such as 2026-01-01T00:00:00+00:00",
+    ),
+]
 
 
 @dataclass(frozen=True)
@@ -48,9 +55,11 @@ class Submission:
     #: Why it was corrected; empty for a first entry.
     reason: Line = ""
     #: Addresses by what they lead to (`LINKS`); each begins with `https://`.
-    links: dict[str, Line] = field(default_factory=dict)
+    links: dict[Line, Line] = field(default_factory=dict)
     #: SHA-256 of the fitted avatar of each capture, by capture id.
-    avatars: dict[str, Digest] = field(default_factory=dict)
+    avatars: Annotated[dict[Line, Digest], Meta(max_length=MAX_CAPTURES)] = field(
+        default_factory=dict
+    )
 
     def __post_init__(self) -> None:
         if (self.revises is None) != (not self.reason):
@@ -76,7 +85,7 @@ class Check:
     #: Whether the numbers of the entry were found again.
     verdict: Literal["reproduces", "differs"]
     #: When, ISO 8601, UTC.
-    date: Line
+    date: Moment
     #: Who checked.
     by: Line
     #: Version of the toolkit that checked.
@@ -86,19 +95,28 @@ class Check:
     #: Processor, cores and system that it ran on.
     machine: Line
     #: Frames whose scores were computed again from predictions.
-    frames: int
+    frames: Count
     #: Of them, frames whose PSNR and SSIM scikit-image computed too.
-    cross_checked: int
+    cross_checked: Count
     #: Parts of the checked result that were not as it says.
-    differences: int
+    differences: Count
     #: Digest of the second run's results; None for `rescored`.
     rerun: Digest | None = None
     #: Macro means that the second run had, by metric.
-    scores: dict[str, float] = field(default_factory=dict)
+    scores: ScoreTable = field(default_factory=dict)
     #: Captures of the second run whose predictions are those of the entry, pixel by pixel.
-    same_predictions: int = 0
+    same_predictions: Count = 0
     #: Largest difference of the macro mean of PSNR that still reproduces, dB.
     tolerance: float = number(0.0, 0.0, 100.0)
+
+    def __post_init__(self) -> None:
+        check_scores(self.scores)
+        if self.cross_checked > self.frames:
+            raise UsageError("is more than the frames", field="cross_checked")
+        if self.kind == "rescored" and (self.rerun is not None or self.scores):
+            raise UsageError("belongs to a second run, and this is none", field="rerun")
+        if self.kind == "re-run" and (self.rerun is None or "psnr" not in self.scores):
+            raise UsageError("must have the digest and PSNR of the second run", field="rerun")
 
 
 def latest(checks: Iterable[Check]) -> dict[str, Check]:

@@ -8,32 +8,18 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import BadResult, UsageError
-from hwp_bench.capture.splits import split_for
-from hwp_bench.leaderboard.entries import Entry, make_entry, read_entries, write_entry
+from hwp_bench.evaluation.completeness import missing
+from hwp_bench.leaderboard.entries import Entry
+from hwp_bench.leaderboard.records import LEVELS
 from hwp_bench.metrics import HWP_V1, PROTOCOLS
 from hwp_bench.metrics.aggregate import aggregate
-from hwp_bench.results import Results
 from hwp_bench.results.schema import score_rows
-from hwp_bench.sim.produce.suites import suite
 from hwp_bench.taxonomy.suites import SUITES as ALL_SUITES
 
 #: Suites whose captures are the same everywhere. `wild-dev` is for tuning.
 SUITES = tuple(name for name in ALL_SUITES if name != "wild-dev")
 #: Metrics that every frame of an entry has.
 HEADLINE = ("psnr", "ssim", "oriented_distance")
-
-
-def add_entry(folder: Path, results: Results) -> Path:
-    """Write an entry of results without a submission; returns its file.
-
-    Raises:
-        BadResult, UsageError: the results are not fit for the leaderboard, or do not go together
-            with the entries that are there.
-    """
-    entry = make_entry(results)
-    check_current(entry)
-    check_entries([*read_entries(folder), entry])
-    return write_entry(folder, entry)
 
 
 def check_entries(entries: Iterable[Entry]) -> list[Entry]:
@@ -78,30 +64,6 @@ def history(entry: Entry, entries: Sequence[Entry]) -> list[Entry]:
         found.append(named[step])
         step = named[step].submission.revises
     return found
-
-
-def missing(results: Results) -> list[str]:
-    """Return what results lack of their suite, in words; empty where they are complete.
-
-    Every capture of the suite must be there under its name, with the suite's own split and every
-    test frame, whether it was predicted or failed.
-    """
-    problems = []
-    items = {item.scene.id: item for item in suite(results.suite)}
-    given = {capture.id: capture for capture in results.captures}
-    if absent := sorted(items.keys() - given.keys()):
-        problems.append(f"lacks {len(absent)} of {len(items)} captures: {', '.join(absent)}")
-    if foreign := sorted(given.keys() - items.keys()):
-        problems.append(f"has captures that are not of the suite: {', '.join(foreign)}")
-    if len(given) != len(results.captures):
-        problems.append("has a capture twice")
-    for name in sorted(items.keys() & given.keys()):
-        split = split_for(name, items[name].frame_count)
-        if given[name].split_digest != split.digest:
-            problems.append(f"{name}: is split otherwise than the suite")
-        elif [frame.frame for frame in given[name].frames] != split.test.tolist():
-            problems.append(f"{name}: lacks test frames")
-    return problems
 
 
 def check_complete(entry: Entry) -> None:
@@ -173,18 +135,42 @@ def _as_stored(value: Any) -> Any:
 
 
 def _check_same(entries: Sequence[Entry]) -> None:
-    seen: dict[str, tuple[tuple[Any, ...], str]] = {}
+    for entry, first in off_the_data(entries):
+        raise UsageError(
+            f"is on other captures, splits or test frames than {first}",
+            where=entry.name,
+            field="captures",
+            remedy="Evaluate both with the same version of the suite.",
+        )
+
+
+def off_the_data(entries: Sequence[Entry]) -> list[tuple[Entry, str]]:
+    """Return the entries of one table that are not on its data, each with one that is.
+
+    The data of a capture are those of the entries that were checked furthest; among these, of a
+    whole suite; among these, of the most entries; among these, of the first. So an entry that
+    nobody checked does not push out those that stand.
+    """
+    whole = {entry.name: not missing(entry.results) for entry in entries}
+    votes: dict[str, dict[tuple[Any, ...], list[Entry]]] = {}
     for entry in entries:
         for c in entry.results.captures:
             data = (c.digest, c.split_digest, tuple(frame.frame for frame in c.frames))
-            first = seen.setdefault(c.id, (data, entry.name))
-            if first[0] != data:
-                raise UsageError(
-                    f"is on other captures, splits or test frames than {first[1]}",
-                    where=entry.name,
-                    field="captures",
-                    remedy="Evaluate both with the same version of the suite.",
-                )
+            votes.setdefault(c.id, {}).setdefault(data, []).append(entry)
+    found: dict[str, tuple[Entry, str]] = {}
+    for groups in votes.values():
+        chosen = max(
+            groups.values(),
+            key=lambda group: (
+                max(LEVELS.index(entry.level) for entry in group),
+                any(whole[entry.name] for entry in group),
+                len(group),
+            ),
+        )
+        for group in groups.values():
+            for entry in group if group is not chosen else ():
+                found.setdefault(entry.name, (entry, chosen[0].name))
+    return list(found.values())
 
 
 def _check_revisions(entries: Sequence[Entry]) -> None:

@@ -1,4 +1,4 @@
-"""Makes the folder of a pull request: an entry for each result, and the text that goes with it."""
+"""Makes entries of results, and the folder of a pull request with the text that goes with it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from hwp_bench.evaluation.scoring import predictions_digest, read_predictions
 from hwp_bench.leaderboard.entries import Entry, make_entry, refuse_installed, write_entry
 from hwp_bench.leaderboard.records import Submission
 from hwp_bench.leaderboard.rules import check_complete, check_current, check_entries
+from hwp_bench.leaderboard.soundness import check_bound, sound_entries
 from hwp_bench.report.sources import ResultsSource
+from hwp_bench.results import Results
 from hwp_bench.sim.produce.suites import suite
 
 #: Where entries lie in the repository, and in a submission.
@@ -31,6 +33,20 @@ class Submitted:
     entries: tuple[Entry, ...]
     #: Captures whose predictions lay next to the results, of how many, by entry.
     predictions: Mapping[str, tuple[int, int]]
+
+
+def add_entry(folder: Path, results: Results) -> Path:
+    """Write an entry of results without a submission; returns its file.
+
+    Raises:
+        BadResult, UsageError: the results are not fit for the leaderboard, or do not go together
+            with the sound entries that are there.
+    """
+    entry = make_entry(results)
+    check_current(entry)
+    check_entries([*sound_entries(folder), entry])
+    check_bound(entry)
+    return write_entry(folder, entry)
 
 
 def submit(
@@ -73,6 +89,7 @@ def submit(
         # The rules of single entries come first: only a known suite can be complete.
         check_entries([*existing, *made, entry])
         check_complete(entry)
+        check_bound(entry)
         if entry.name in {other.name for other in [*existing, *made]}:
             raise UsageError("is on the leaderboard already", where=entry.name)
         checked[entry.name] = (_check_predictions(source), len(source.results.captures))

@@ -13,7 +13,8 @@ from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.base.records import Line
+from hwp_bench.base.record_types import brief
+from hwp_bench.base.records import MAX_COUNT, MAX_SECONDS, MAX_SEED, Line
 from hwp_bench.capture.schema import (
     CAMERAS,
     FREE_VIEW,
@@ -118,6 +119,12 @@ class Budget:
     #: Optimizer steps; None keeps the method's preset.
     steps: int | None = None
 
+    def __post_init__(self) -> None:
+        for name, most in (("seconds", MAX_SECONDS), ("steps", MAX_COUNT)):
+            value = getattr(self, name)
+            if value is not None and not 0 <= value <= most:
+                raise UsageError(f"{brief(value)} is not from 0 to {most:g}", field=name)
+
 
 @dataclass(frozen=True)
 class RunSettings:
@@ -131,6 +138,11 @@ class RunSettings:
     budget: Budget = field(default_factory=Budget)
     #: Which training frames are given, one of `FRAME_CHOICES`; all but the first are oracles.
     frames: str = FRAME_CHOICES[0]
+
+    def __post_init__(self) -> None:
+        # Every file that keeps a seed, and every generator that takes one, can hold these.
+        if not 0 <= self.seed <= MAX_SEED:
+            raise UsageError(f"{brief(self.seed)} is not from 0 to {MAX_SEED}", field="seed")
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
 from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import CaptureResult, Results
+from hwp_bench.results.bounds import per_second
 from hwp_bench.results.schema import differing_makers, differing_settings, score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
@@ -251,7 +252,7 @@ def _cost(result: Results) -> list[Cell]:
     seconds = sum(spent for _, spent in renders)
     return [
         sum(fits) / len(fits) if fits else None,
-        sum(count for count, _ in renders) / seconds if seconds else None,
+        per_second(sum(count for count, _ in renders), seconds),
         sum(capture.failed_frames for capture in result.captures),
     ]
 

@@ -6,8 +6,10 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from hwp_bench.analysis.statistics.pairing import same_but_seed
 from hwp_bench.base.errors import BadResult, HwpError
@@ -17,6 +19,7 @@ from hwp_bench.base.records import parse_record
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.results import Results, read_results, results_among
+from hwp_bench.results.bounds import MAX_FRAMES
 
 #: Largest file of temporal weights that is read, bytes.
 MAX_WEIGHT_BYTES = 16 * 1024 * 1024
@@ -47,9 +50,9 @@ class TemporalWeights:
     """The weight that a method gave to each frame: how perturbed it takes the frame to be."""
 
     #: Indices of training frames.
-    frames: list[int]
+    frames: Annotated[list[Annotated[int, Meta(lt=MAX_FRAMES)]], Meta(max_length=MAX_FRAMES)]
     #: One weight a frame, at least 0 once read.
-    weights: list[float]
+    weights: Annotated[list[Annotated[float, Meta(ge=-1e6, le=1e6)]], Meta(max_length=MAX_FRAMES)]
 
 
 def read_sources(
@@ -107,9 +110,21 @@ def temporal_weights(source: ResultsSource, capture: str) -> dict[str, TemporalW
     return found
 
 
+def sound_temporal_weights(source: ResultsSource, capture: str) -> dict[str, TemporalWeights]:
+    """Return the temporal weights as `temporal_weights`; none, and said so, where they are damaged.
+
+    A method writes them as it likes: they must not keep a table or a report from being made.
+    """
+    try:
+        return temporal_weights(source, capture)
+    except HwpError as error:
+        notice(f"left out: {error}")
+        return {}
+
+
 def mean_temporal_weight(source: ResultsSource, capture: str) -> float | None:
     """Return the mean temporal weight over sides and frames, or None where none was left."""
-    found = temporal_weights(source, capture)
+    found = sound_temporal_weights(source, capture)
     if not found:
         return None
     return float(np.mean([np.mean(item.weights) for item in found.values()]))

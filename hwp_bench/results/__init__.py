@@ -7,8 +7,11 @@ from hwp_bench.results.schema import (
     FreeViewResult,
     MethodId,
     Results,
+)
+from hwp_bench.results.store import (
     read_all,
     read_results,
+    read_unchanged,
     result_files,
     results_among,
     write_results,
@@ -23,6 +26,7 @@ __all__ = [
     "Results",
     "read_all",
     "read_results",
+    "read_unchanged",
     "result_files",
     "results_among",
     "write_results",

@@ -1,28 +1,31 @@
-"""The result file: its records, how it is found, and reading that checks what it is given.
+"""The records of a result file, and what is read off them.
 
 A field that was added within a version has a default, which says what files without it mean.
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, field
-from pathlib import Path
-from typing import Any
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
 
-from hwp_bench.base.errors import BadResult
-from hwp_bench.base.files import canonical_json, inside, read_json, write_json
-from hwp_bench.base.progress import notice
-from hwp_bench.base.records import parse_record, without_schema
+from msgspec import Meta
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import canonical_json
+from hwp_bench.base.records import Count, Line, Message, Seconds, Seed
 from hwp_bench.metrics.aggregate import CaptureScores, Scores, aggregate
+from hwp_bench.results.bounds import (
+    MAX_CAPTURES,
+    MAX_CURVE,
+    MAX_FRAMES,
+    FreeTable,
+    Limits,
+    ScoreTable,
+    check_scores,
+    check_table,
+)
 
-#: Version of the result file.
-SCHEMA = "hwp-results/1"
-#: Name of the file that makes a folder an ablation.
-ABLATION = "ablation.json"
-#: Version of that file.
-ABLATION_SCHEMA = "hwp-ablation/1"
 # Longest text of a setting's value.
 _SHOWN = 40
 
@@ -32,11 +35,14 @@ class FrameResult:
     """The scores of one test frame."""
 
     #: Index in the capture.
-    frame: int
+    frame: Annotated[int, Meta(ge=0, lt=MAX_FRAMES)]
     #: Score by metric; a failed frame has the declared penalties.
-    scores: dict[str, float]
+    scores: ScoreTable
     #: Why the frame could not be scored, or None.
-    failure: str | None
+    failure: Message | None
+
+    def __post_init__(self) -> None:
+        check_scores(self.scores)
 
 
 @dataclass(frozen=True)
@@ -44,13 +50,16 @@ class CurvePoint:
     """The state of a fit at one checkpoint."""
 
     #: Optimizer steps done.
-    step: int
+    step: Count
     #: Seconds on the method's clock.
-    seconds: float
+    seconds: Seconds
     #: Peak memory of the method's process until then, bytes.
-    peak_memory: int
+    peak_memory: Count
     #: Mean score over the validation frames that were rendered.
-    scores: dict[str, float]
+    scores: ScoreTable
+
+    def __post_init__(self) -> None:
+        check_scores(self.scores)
 
 
 @dataclass(frozen=True)
@@ -58,11 +67,11 @@ class FreeViewResult:
     """The scores of the free-view clip of a capture, apart from those of its test frames."""
 
     #: Digest of the clip.
-    digest: str
+    digest: Line
     #: Every frame of the clip, in order.
-    frames: list[FrameResult]
+    frames: Annotated[list[FrameResult], Meta(max_length=MAX_FRAMES)]
     #: SHA-256 over the decoded pixels of the predictions, in frame order.
-    predictions_digest: str
+    predictions_digest: Line
 
 
 @dataclass(frozen=True)
@@ -70,56 +79,63 @@ class CaptureResult:
     """One method on one capture."""
 
     #: Id of the capture.
-    id: str
+    id: Line
     #: Digest of the capture.
-    digest: str
+    digest: Line
     #: `right`, `left` or `both`.
-    hands: str
+    hands: str = field(metadata={"choices": ("right", "left", "both")})
     #: Names of the perturbations that it declares.
-    perturbations: list[str]
+    perturbations: Annotated[list[Line], Meta(max_length=20)]
     #: Digest of the split.
-    split_digest: str
+    split_digest: Line
     #: True where the scoring masks are exact coverage, False where they are estimates.
     exact_masks: bool
     #: Digest of everything that decides the scores; equal keys need no second run.
-    key: str
+    key: Line
     #: Every frame that the split lists, in order.
-    frames: list[FrameResult]
+    frames: Annotated[list[FrameResult], Meta(max_length=MAX_FRAMES)]
     #: Why the method failed on the whole capture, or None.
-    failure: str | None
+    failure: Message | None
     #: SHA-256 over the decoded pixels of the predictions, in frame order.
-    predictions_digest: str
+    predictions_digest: Line
     #: Seconds on the method's clock.
-    fit_seconds: float | None
+    fit_seconds: Seconds | None
     #: Seconds to render the test frames.
-    render_seconds: float | None
+    render_seconds: Seconds | None
     #: Seconds to score them.
-    score_seconds: float
+    score_seconds: Seconds
     #: Seconds of the method's process from start to end.
-    wall_seconds: float
+    wall_seconds: Seconds
     #: Optimizer steps.
-    steps: int | None
+    steps: Count | None
     #: Peak memory of the method's process, bytes.
-    peak_memory: int | None
+    peak_memory: Count | None
     #: Device that the method says it ran on.
-    device: str | None
+    device: Line | None
     #: Validation scores over time.
-    curve: list[CurvePoint]
+    curve: Annotated[list[CurvePoint], Meta(max_length=MAX_CURVE)]
     #: Seconds that the method's process spent on checkpoints, outside the method's clock.
-    curve_seconds: float | None = None
+    curve_seconds: Seconds | None = None
     #: Seconds of everything: reading, copying, the method's process, scoring, images.
-    job_seconds: float | None = None
+    job_seconds: Seconds | None = None
     #: CPU seconds of the method's process on its clock, all threads added up: the seconds that
     #: the fit would take on one core. None where it was not recorded.
-    cpu_seconds: float | None = None
+    cpu_seconds: Seconds | None = None
     #: How the method's process was isolated: `namespaces`, or `processes` with the reason why
     #: not more; None for predictions that came as files, and where it was not recorded.
-    isolation: str | None = None
+    isolation: Line | None = None
     #: Scores of the free-view clip; None where the capture has none, or the method drew none.
     free_view: FreeViewResult | None = None
     #: Importer and version that made the hand parameters and masks, such as `video 2`; None where
     #: the capture does not say so (simulated ones do not), and where it was not recorded.
-    made_by: str | None = None
+    made_by: Line | None = None
+    #: Digest of the files that the method was shown next to its request (`--expose`, settings that
+    #: name files), a part of `key`; None where there were none, and where it was not recorded.
+    exposed: Line | None = None
+
+    def __post_init__(self) -> None:
+        if len({frame.frame for frame in self.frames}) != len(self.frames):
+            raise UsageError("holds a frame twice", field="frames")
 
     @property
     def failed_frames(self) -> int:
@@ -132,15 +148,18 @@ class MethodId:
     """Which method, in which state."""
 
     #: Short name.
-    name: str
+    name: Line
     #: Name in tables.
-    title: str
+    title: Line
     #: Digest of the method directory's text files.
-    digest: str
+    digest: Line
     #: Preset that was asked for, `default` if none.
-    preset: str
+    preset: Line
     #: The settings that it was run with.
-    settings: dict[str, Any]
+    settings: FreeTable
+
+    def __post_init__(self) -> None:
+        check_table(self.settings, "settings")
 
 
 @dataclass(frozen=True, repr=False)
@@ -150,24 +169,28 @@ class Results:
     #: The method.
     method: MethodId
     #: Name of the suite, or `captures` when captures were named one by one.
-    suite: str
+    suite: Line
     #: Seed of everything random.
-    seed: int
+    seed: Seed
     #: Limits of the fit: `seconds`, `steps`, either may be None.
-    budget: dict[str, Any]
+    budget: Limits
     #: Training frames that the method was given: `perturbed`, or an oracle's choice. The oldest
     #: files do not say it: there was nothing to choose.
-    frames: str = field(default="perturbed", kw_only=True)
+    frames: Line = field(default="perturbed", kw_only=True)
     #: Settings of every protocol that was scored, by name.
-    protocols: dict[str, Any]
+    protocols: FreeTable
     #: Versions, processor, system.
-    environment: dict[str, Any]
+    environment: FreeTable
     #: When the evaluation started, ISO 8601, UTC.
-    started: str
+    started: Line
     #: One entry a capture.
-    captures: list[CaptureResult]
+    captures: Annotated[list[CaptureResult], Meta(max_length=MAX_CAPTURES)]
     #: Version of the toolkit.
-    toolkit: str
+    toolkit: Line
+
+    def __post_init__(self) -> None:
+        check_table(self.protocols, "protocols")
+        check_table(self.environment, "environment")
 
     def __repr__(self) -> str:
         count, failed = len(self.captures), sum(item.failed_frames for item in self.captures)
@@ -196,81 +219,6 @@ class Results:
             for frame in capture.frames:
                 return list(frame.scores)
         return []
-
-
-def write_results(path: str | os.PathLike[str], results: Results) -> Path:
-    """Write a result file atomically."""
-    return write_json(path, {"schema": SCHEMA, **asdict(results)})
-
-
-def read_results(path: str | os.PathLike[str]) -> Results:
-    """Read a result file, or the `results.json` of a results folder.
-
-    Raises:
-        BadInput: missing or no JSON.
-        BadResult: of another version, a field is missing, unknown, of the wrong type, or a
-            score is not finite; the field is named.
-    """
-    path = Path(path)
-    if path.is_dir():
-        path = path / "results.json"
-    value = read_json(path)
-    return parse_record(Results, without_schema(value, SCHEMA, where=path), where=path)
-
-
-def result_files(path: str | os.PathLike[str]) -> list[Path]:
-    """Return the result files that a path stands for.
-
-    Args:
-        path: a `results.json`, a results folder, an `ablation.json`, or an ablation's folder.
-
-    Raises:
-        BadInput: an `ablation.json` is damaged, or names a file outside its folder.
-        BadResult: it is of another version.
-    """
-    place = Path(path)
-    record = place / ABLATION if place.is_dir() else place
-    if record.name != ABLATION or not record.is_file():
-        return [place / "results.json" if place.is_dir() else place]
-    value = without_schema(read_json(record), ABLATION_SCHEMA, where=record)
-    try:
-        names = [name for variant in value["variants"] for name in variant["results"]]
-        return [inside(record.parent, name) for name in names]
-    except (KeyError, TypeError) as error:
-        raise BadResult("does not list its results", where=record, field="variants") from error
-
-
-def results_among(paths: Iterable[str | os.PathLike[str]]) -> list[Path]:
-    """Return the result files that several paths stand for, such as `runs/*`.
-
-    Folders and files that hold no results (figures, notes, other commands' folders) are left out
-    and said, as long as another path holds some.
-
-    Raises:
-        BadInput, BadResult: as `result_files`.
-    """
-    places = list(paths)
-    others = [path for path in places if _holds_none(Path(path))]
-    if len(others) == len(places):
-        others = []
-    for path in others:
-        notice(f"left out: {os.fspath(path)} holds no results")
-    return [file for path in places if path not in others for file in result_files(path)]
-
-
-def _holds_none(place: Path) -> bool:
-    if place.is_dir():
-        return not any((place / name).is_file() for name in ("results.json", ABLATION))
-    return place.is_file() and place.suffix != ".json"
-
-
-def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Results]:
-    """Read every evaluation that some paths stand for, in order.
-
-    Raises:
-        BadInput, BadResult: one is missing or damaged.
-    """
-    return [read_results(file) for file in results_among(paths)]
 
 
 def score_rows(results: Results) -> list[CaptureScores]:

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from hwp_bench.base.files import read_json
-from hwp_bench.base.records import parse_record
+from hwp_bench.base.records import Count, Line, Seconds, parse_record
 
 #: Folder of the predicted test frames inside the output folder.
 PREDICTIONS = "predictions"
@@ -38,11 +38,11 @@ class Checkpoint:
     """One recorded moment of a fit."""
 
     #: Optimizer steps done.
-    step: int
+    step: Count
     #: Seconds on the method's clock.
-    seconds: float
+    seconds: Seconds
     #: Peak memory of the process until then, bytes.
-    peak_memory: int
+    peak_memory: Count
 
 
 @dataclass(frozen=True)
@@ -50,21 +50,21 @@ class RunFacts:
     """Time, steps and memory of a run; None where the method does not say."""
 
     #: Seconds on the method's clock.
-    fit_seconds: float | None = None
+    fit_seconds: Seconds | None = None
     #: CPU seconds of the process and its children on that clock, all threads added up.
-    cpu_seconds: float | None = None
+    cpu_seconds: Seconds | None = None
     #: Seconds before that clock started, in which the method was made: what it compiles or loads.
-    ready_seconds: float | None = None
+    ready_seconds: Seconds | None = None
     #: Seconds to render the test frames.
-    render_seconds: float | None = None
+    render_seconds: Seconds | None = None
     #: Seconds spent on checkpoints, outside the method's clock.
-    curve_seconds: float | None = None
+    curve_seconds: Seconds | None = None
     #: Optimizer steps.
-    steps: int | None = None
+    steps: Count | None = None
     #: Peak memory of the process, bytes.
-    peak_memory: int | None = None
+    peak_memory: Count | None = None
     #: Device that the method ran on.
-    device: str | None = None
+    device: Line | None = None
     #: Validation frames that were rendered for every checkpoint.
     checkpoint_frames: list[int] = field(default_factory=list)
     #: The checkpoints, in time order; the last is the finished fit.

@@ -12,6 +12,7 @@ from hwp_bench.analysis.cost.curves import Curve, curve_of
 from hwp_bench.analysis.statistics.pairing import MethodRuns
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.results import CaptureResult
+from hwp_bench.results.bounds import per_second
 
 #: Fixed budgets, s.
 BUDGETS = (5.0, 15.0, 60.0, 300.0)
@@ -73,7 +74,7 @@ class MethodCost:
     @property
     def frames_per_second(self) -> float | None:
         """Frames rendered in a second."""
-        return 1 / self.render_seconds if self.render_seconds else None
+        return per_second(1, self.render_seconds)
 
 
 def method_curves(run: MethodRuns, metric: str) -> dict[str, list[Curve]]:

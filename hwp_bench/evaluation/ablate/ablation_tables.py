@@ -24,7 +24,8 @@ from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.aggregate import Scores, aggregate
 from hwp_bench.report.evaluation_tables import HEADLINE, PAPER
 from hwp_bench.results import Results
-from hwp_bench.results.schema import ABLATION, ABLATION_SCHEMA, score_rows
+from hwp_bench.results.schema import score_rows
+from hwp_bench.results.store import ABLATION, ABLATION_SCHEMA
 from hwp_bench.taxonomy import PERTURBATIONS
 
 #: Scopes of the effects table; perturbations have one of their own.

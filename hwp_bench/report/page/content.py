@@ -26,7 +26,7 @@ from hwp_bench.report.page.elements import inline_svg, to_html
 from hwp_bench.report.page.strips import StripMethod, strip_plot
 from hwp_bench.report.provenance import provenance
 from hwp_bench.report.ranking_tables import rank_table
-from hwp_bench.report.sources import ResultsSource, find_captures, temporal_weights
+from hwp_bench.report.sources import ResultsSource, find_captures, sound_temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
 from hwp_bench.results import Results
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
@@ -265,7 +265,7 @@ def _captures(
         methods, frames, views, masks, avatars = [], [], [], [], []
         for index, (label, source) in enumerate(shown):
             own = next(c for c in source.results.captures if c.id == capture.id)
-            weights = temporal_weights(source, capture.id)
+            weights = sound_temporal_weights(source, capture.id)
             methods.append(StripMethod(index, label, own, weights))
             if uri := frame_sheets(source, capture.id, album):
                 frames.append((label, uri))

@@ -165,3 +165,14 @@ def test_pipes_devices_and_folders_are_not_waited_for(tmp_path: Path) -> None:
             read_json(tmp_path / name)
     with pytest.raises(BadInput, match="cannot be read"):
         read_json(tmp_path)
+
+
+@pytest.mark.parametrize("text", ['{"a": "\\ud800"}', '{"\\uDCFF": 1}', '["\\ude00\\ud83d"]'])
+def test_halves_of_surrogate_pairs_are_refused(tmp_path: Path, text: str) -> None:
+    """Oracle: UTF-8 itself; Python's JSON lets them through, and every output fails on them."""
+    file = tmp_path / "file.json"
+    file.write_text(text)
+    with pytest.raises(BadInput, match="holds text that is not Unicode"):
+        read_json(file)
+    file.write_text('"\\ud83d\\ude00"')
+    assert read_json(file) == "\U0001f600"

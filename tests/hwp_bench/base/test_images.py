@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import struct
+import zlib
 from pathlib import Path
 
 import cv2
@@ -130,6 +132,35 @@ def test_an_animated_png_is_refused(tmp_path: Path, picture) -> None:
     path = _pillow(tmp_path / "moving.png", picture, "PNG", save_all=True, append_images=frames)
     with pytest.raises(BadImage, match="animated"):
         read_rgb(path)
+
+
+def _chunk(kind: bytes, content: bytes) -> bytes:
+    crc = zlib.crc32(kind + content)
+    return struct.pack(">I", len(content)) + kind + content + struct.pack(">I", crc)
+
+
+@pytest.mark.parametrize("kind", ["zTXt", "iTXt", "tEXt"])
+@pytest.mark.parametrize("after", [False, True])
+def test_texts_that_unpack_to_gigabytes_are_refused_unread(
+    tmp_path: Path, picture, kind: str, after: bool
+) -> None:
+    """900 texts of 8 MB each in a file of 7 MB had kept a decoder busy for a minute."""
+    path = _pillow(tmp_path / "texts.png", picture, "PNG")
+    data = path.read_bytes()
+    packed = zlib.compress(bytes(8_000_000), 9)
+    method = {"zTXt": b"\0", "iTXt": b"\1\0\0\0", "tEXt": b""}[kind]
+    size = 40 if kind != "tEXt" else 1100
+    texts = b"".join(
+        _chunk(kind.encode(), b"key%d\0" % i + method + (packed if method else b"text"))
+        for i in range(size)
+    )
+    cut = len(data) - 12 if after else 33
+    path.write_bytes(data[:cut] + texts + data[cut:])
+    with pytest.raises(BadImage, match="texts and profiles next to its pixels"):
+        read_rgb(path)
+    few = _chunk(b"tEXt", b"Author\0A person") * 20
+    path.write_bytes(data[:cut] + few + data[cut:])
+    assert np.array_equal(read_rgb(path), picture)
 
 
 @pytest.mark.parametrize("form", ["GIF", "TIFF", "WEBP", "TGA", "PPM", "ICO"])

@@ -169,12 +169,32 @@ def test_versions_are_checked() -> None:
         ({"a": {1, 2}}, r"s\.a: is a set, not a number, text, list or table"),
         ({"a": None}, r"s\.a: is a NoneType"),
         ([[[[1]]]], "nested too deeply"),
+        ({"a": "\ud800"}, r"s\.a: holds a control character"),
+        ({"a\x1b": 1}, r"s\.a\?: holds a control character"),
+        ({"a": "x" * 10_001}, r"s\.a: is a text of more than 10,000 characters"),
     ],
 )
 def test_values_that_json_cannot_hold_are_refused(value: Any, message: str) -> None:
     check_json_values({"a": [1, "b", True, 0.5]}, where="f", field="s")
     with pytest.raises(BadResult, match=message):
         check_json_values(value, where="f", field="s", depth=4)
+
+
+@pytest.mark.parametrize(
+    "value", ["\ud800", "a\x1b", "x" * 10_001, math.inf, [[[[]]]] * 2 + [{"k\udcff": 1}]]
+)
+def test_fields_of_any_type_are_looked_into(value: Any) -> None:
+    """They had been passed on unseen, a terminal's escapes among them."""
+    assert read(free={"null": {"is": None}}).free == {"null": {"is": None}}
+    with pytest.raises(BadResult, match=r"file\.json: free"):
+        read(free={"name": value})
+
+
+def test_a_name_that_is_no_unicode_is_refused() -> None:
+    with pytest.raises(BadResult, match="holds a name that is not Unicode"):
+        read(**{"\ud800": 1})
+    with pytest.raises(BadResult, match=r"line: is '\?'|line: holds a control character"):
+        read(line="\udcff")
 
 
 @pytest.mark.parametrize(

@@ -7,6 +7,8 @@ import io
 import json
 from dataclasses import replace
 
+import pytest
+
 from hwp_bench.base.tables import Column, Table, format_table, print_table, without_empty_columns
 
 TABLE = Table(
@@ -89,3 +91,12 @@ def test_columns_without_any_value_are_dropped() -> None:
     kept = without_empty_columns(replace(TABLE, rows=rows))
     assert [column.title for column in kept.columns] == ["Method", "PSNR", "Frames"]
     assert kept.rows[0] == ("plain_fit", 20.123456, 3)
+
+
+@pytest.mark.parametrize("text", ["=1+1", "+1", "-1", "@SUM(A1)", "\t=1", " =cmd|' /C calc'!A0"])
+def test_no_text_of_a_csv_is_a_formula(text: str) -> None:
+    """Oracle: OWASP's list of first characters; numbers stay numbers."""
+    table = Table("c", (Column(text), Column("Score")), ((text, -1.5),))
+    rows = list(csv.reader(io.StringIO(format_table(table, "csv"))))
+    assert rows[0][0] == "'" + text.strip()
+    assert rows[1] == ["'" + text, "-1.5"]

@@ -14,12 +14,13 @@ from hwp_bench.base.records import parse_record
 from hwp_bench.base.text import bounded, has_odd_characters, shown
 
 
-def test_exactly_controls_and_direction_marks_are_odd() -> None:
+def test_exactly_controls_direction_marks_and_surrogates_are_odd() -> None:
     directions = {"LRE", "RLE", "PDF", "LRO", "RLO", "LRI", "RLI", "FSI", "PDI"}
-    for code in range(0x3000):
+    for code in [*range(0x3000), *range(0xD700, 0xE100)]:
         char = chr(code)
         control = unicodedata.category(char) == "Cc" and char not in "\t\n"
-        odd = control or unicodedata.bidirectional(char) in directions
+        surrogate = unicodedata.category(char) == "Cs"
+        odd = control or surrogate or unicodedata.bidirectional(char) in directions
         assert has_odd_characters(f"a{char}b") == odd, hex(code)
         assert shown(char) == ("?" if odd else char)
 

@@ -252,6 +252,13 @@ def test_an_untouched_clip_holds(evaluated: Path, capture: Capture, capsys) -> N
     assert found["frames"] == 2 + VIEWS
     # A result without the block, as old ones are, holds too.
     _edit(evaluated, lambda value: value.pop("free_view"))
+    file = evaluated / "results.json"
+    old = json.loads(file.read_text())
+    del old["digest"]
+    old["environment"]["code"] = "older"
+    file.write_text(json.dumps(old))
+    shutil.rmtree(evaluated / "captures" / "tiny" / "free")
+    (evaluated / "captures" / "tiny" / "result.json").unlink()
     assert verify(evaluated, capture, capsys)[0] == 0
 
 
@@ -323,3 +330,18 @@ def test_a_clip_without_a_hand_is_named_before_the_method_runs(
     )
     with pytest.raises(BadCapture, match="leaves no pixel"):
         run(method(tmp_path / "m", fit="1 / 0"), capture, tmp_path / "out")
+
+
+def test_a_clip_whose_scores_were_taken_out_is_found_out(
+    capture: Capture, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Oracle: the predictions of the clip that are still there."""
+    out = tmp_path / "out"
+    run(submission(tmp_path / "entry", capture, range(VIEWS)), capture, out)
+    given = ["verify", str(out), "--captures", str(capture.root)]
+    assert main(given) == 0
+    value = json.loads((out / "results.json").read_text())
+    value["captures"][0]["free_view"] = None
+    (out / "results.json").write_text(json.dumps(value))
+    assert main(given) == 1
+    assert "tiny, free view" in capsys.readouterr().out

@@ -15,6 +15,7 @@ from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.cli.main import main
 from hwp_bench.metrics import score
+from hwp_bench.results import read_results, write_results
 
 
 @pytest.fixture
@@ -88,6 +89,91 @@ def test_an_edited_result_is_found_out(result, capture, capsys, change, what: st
     assert found["discrepancies"][0]["capture"] == "tiny"
 
 
+#: Each edit moves a number, a label or a rank, and the part that must be named.
+EDITS = {
+    "perturbations emptied": (lambda v: v["captures"][0]["perturbations"].clear(), "perturbations"),
+    "other hands": (lambda v: v["captures"][0].update(hands="both"), "hands"),
+    "masks of another kind": (lambda v: v["captures"][0].update(exact_masks=True), "exact_masks"),
+    "made by somebody": (lambda v: v["captures"][0].update(made_by="video 1"), "made_by"),
+    "a metric removed": (
+        lambda v: [frame["scores"].pop("ssim_full") for frame in v["captures"][0]["frames"]],
+        "frame 18, ssim_full",
+    ),
+    "a capture left out": (lambda v: v["captures"].clear(), "digest"),
+    "clean as perturbed": (lambda v: v.update(frames="clean"), "key"),
+    "another suite": (lambda v: v.update(suite="smoke"), "suite"),
+    "another budget": (lambda v: v["budget"].update(seconds=1.0), "key"),
+    "another seed": (lambda v: v.update(seed=1), "key"),
+    "another method": (lambda v: v["method"].update(name="other"), "key"),
+    "other code of the method": (lambda v: v["method"].update(digest="0"), "key"),
+    "another title": (lambda v: v["method"].update(title="Other"), "tables/overall.md"),
+    "another preset": (lambda v: v["method"].update(preset="other"), "digest"),
+    "other settings": (lambda v: v["method"]["settings"].update(fast=True), "key"),
+    "a faster fit": (
+        lambda v: v["captures"][0].update(fit_seconds=0.1),
+        "result.json, fit_seconds",
+    ),
+    "another start": (lambda v: v.update(started="2020-01-01T00:00:00+00:00"), "digest"),
+    "a better curve": (
+        lambda v: v["captures"][0]["curve"].append(
+            {"step": 1, "seconds": 1.0, "peak_memory": 1, "scores": {"psnr": 99.0}}
+        ),
+        "result.json, curve",
+    ),
+    "a method that failed": (lambda v: v["captures"][0].update(failure="crashed"), "failure"),
+    "no digest": (lambda v: v.pop("digest"), "digest"),
+}
+
+
+def test_every_edit_that_moves_a_number_or_label_is_found_out(
+    result: Path, capture: Capture, tmp_path: Path, capsys
+) -> None:
+    assert (result / "tables" / "overall.md").is_file()
+    for name, (change, what) in EDITS.items():
+        place = tmp_path / name
+        shutil.copytree(result, place)
+        edit(place, change)
+        status, found = verify(place, capture, capsys)
+        whats = {item["what"] for item in found["discrepancies"]}
+        assert status == 1, name
+        assert {what, "digest"} <= whats, (name, whats)
+
+
+def test_a_careful_forger_is_found_out_by_what_can_be_computed(
+    result: Path, capture: Capture, capsys
+) -> None:
+    """The digest, the tables and the copies of an edited result are made to fit."""
+    for change, what in (
+        (lambda v: v["captures"][0]["perturbations"].clear(), "perturbations"),
+        (lambda v: v["captures"][0]["frames"][0]["scores"].update(psnr=40.0), "frame 18, psnr"),
+        (lambda v: v["budget"].update(seconds=1.0), "key"),
+        (lambda v: v.update(suite="smoke"), "suite"),
+    ):
+        before = (result / "results.json").read_bytes()
+        edit(result, change)
+        forged = read_results(result)
+        write_results(result / "results.json", forged)
+        (result / "captures" / "tiny" / "result.json").unlink(missing_ok=True)
+        shutil.rmtree(result / "tables", ignore_errors=True)
+        status, found = verify(result, capture, capsys)
+        assert status == 1
+        assert what in {item["what"] for item in found["discrepancies"]}
+        (result / "results.json").write_bytes(before)
+
+
+def test_an_edited_table_or_copy_is_found_out(result: Path, capture: Capture, capsys) -> None:
+    table = result / "tables" / "captures.csv"
+    table.write_text(table.read_text().replace("Toy", "Best"))
+    copy = result / "captures" / "tiny" / "result.json"
+    copy.write_text(copy.read_text().replace('"steps": 100', '"steps": 7'))
+    status, found = verify(result, capture, capsys)
+    assert status == 1
+    whats = {item["what"] for item in found["discrepancies"]}
+    assert whats == {"tables/captures.csv", "result.json, steps"}
+    copy.write_text("[")
+    assert verify(result, capture, capsys)[0] == 1
+
+
 def test_edited_predictions_and_captures_are_found_out(result, capture, capsys) -> None:
     picture = result / "captures" / "tiny" / "predictions" / "000018.png"
     write_image(picture, np.zeros((32, 32, 3), np.uint8))
@@ -111,7 +197,8 @@ def test_other_code_protocols_and_missing_captures_are_named(result, capture, ca
     edit(result, lambda value: value["environment"]["packages"].update(numpy="0.1"))
     status, found = verify(result, capture, capsys)
     assert status == 1
-    assert [item["what"] for item in found["discrepancies"]] == ["protocols"]
+    # The key binds the protocols, the digest everything.
+    assert [item["what"] for item in found["discrepancies"]] == ["protocols", "key", "digest"]
     assert "other code" in found["notes"][0]
     assert "numpy 0.1" in found["notes"][1]
     assert main(["verify", str(result)]) == 2

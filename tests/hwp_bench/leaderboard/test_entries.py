@@ -10,20 +10,17 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from made_entries import complete_results
+from made_entries import OTHER_SCORES, complete_results, with_keys
 
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.packages import data_folder
 from hwp_bench.cli.main import main
+from hwp_bench.evaluation.completeness import missing
 from hwp_bench.leaderboard.entries import entry_name, read_entries
 from hwp_bench.leaderboard.entries import make_entry as entry_of
-from hwp_bench.leaderboard.rules import (
-    add_entry,
-    check_complete,
-    check_entries,
-    check_unchanged,
-    missing,
-)
+from hwp_bench.leaderboard.rules import check_complete, check_entries, check_unchanged
+from hwp_bench.leaderboard.soundness import check_bound
+from hwp_bench.leaderboard.submit import add_entry
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.results import FrameResult, Results, write_results
 
@@ -34,13 +31,12 @@ def make_entry(make_results):
 
     def make(name: str = "plain", psnr: float = 20.0, **changes: object) -> Results:
         result = make_results(name, psnr)
-        frames = [
-            FrameResult(18 + i, {"psnr": psnr + i, "ssim": 0.5, "oriented_distance": 0.01}, None)
-            for i in range(2)
-        ]
+        scores = {**OTHER_SCORES, "ssim": 0.5, "oriented_distance": 0.01}
+        frames = [FrameResult(18 + i, {**scores, "psnr": psnr + i}, None) for i in range(2)]
         protocols = json.loads(json.dumps({p.name: p.as_dict() for p in PROTOCOLS}))
         captures = [replace(result.captures[0], frames=frames)]
-        return replace(result, **{"captures": captures, "protocols": protocols, **changes})
+        given = {"captures": captures, "protocols": protocols, **changes}
+        return with_keys(replace(result, **given))
 
     return make
 
@@ -104,7 +100,7 @@ def test_other_data_in_one_suite_is_refused(make_entry, tmp_path) -> None:
     with pytest.raises(UsageError, match="other captures, splits or test frames"):
         add_entry(tmp_path, other)
     # In another suite there is nothing that it would have to be like.
-    add_entry(tmp_path, replace(other, suite="mini"))
+    add_entry(tmp_path, with_keys(replace(other, suite="wild-test")))
 
 
 def test_a_result_without_the_headline_metrics_is_refused(
@@ -118,6 +114,7 @@ def test_a_result_without_the_headline_metrics_is_refused(
 def test_the_entries_that_ship_are_sound() -> None:
     for entry in check_entries(read_entries(data_folder("leaderboard") / "entries")):
         check_complete(entry)
+        check_bound(entry)
 
 
 def test_no_entry_differs_from_the_branch_that_a_pull_request_goes_to(tmp_path: Path) -> None:

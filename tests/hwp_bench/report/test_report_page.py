@@ -107,6 +107,14 @@ def test_the_page_is_sound_and_needs_no_network(page: str) -> None:
     assert set(targets) <= identifiers
 
 
+def test_damaged_weights_keep_no_page_from_being_made(sources, tmp_path, capsys) -> None:
+    found, capture = sources
+    place = found[0].place("capture2", "diagnostics", "temporal.json")
+    place.write_text("{")
+    assert "Plain" in write_report(tmp_path / "page", found, [capture]).read_text("utf-8")
+    assert "left out: " in capsys.readouterr().err
+
+
 def test_what_comes_from_outside_is_escaped(page: str) -> None:
     assert EVIL not in page
     assert EVIL in "".join(Page(page).words)

@@ -11,7 +11,13 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import write_json
 from hwp_bench.capture import Capture
 from hwp_bench.report.requested_table import TableRequest, make_table
-from hwp_bench.report.sources import ResultsSource, find_captures, mean_severity, temporal_weights
+from hwp_bench.report.sources import (
+    ResultsSource,
+    find_captures,
+    mean_severity,
+    mean_temporal_weight,
+    temporal_weights,
+)
 from hwp_bench.report.study_tables import robustness_table
 from hwp_bench.results import Results, write_results
 
@@ -99,13 +105,18 @@ def test_bias_is_the_mean_weight(on_disk) -> None:
         {"frames": [-1], "weights": [1.0]},
         {"frames": [0], "weights": ["x"]},
         {"weights": [1.0]},
+        {"frames": [10**6], "weights": [1.0]},
+        {"frames": [0], "weights": [1e308]},
     ],
 )
-def test_unfit_weights_are_refused(on_disk, value) -> None:
+def test_unfit_weights_are_refused(on_disk, value, capsys) -> None:
     source, _ = on_disk
     write_json(source.place("capture2", "diagnostics") / "temporal.json", value)
     with pytest.raises(BadResult):
         temporal_weights(source, "capture2")
+    # What a method left about itself keeps no table from being made.
+    assert mean_temporal_weight(source, "capture2") is None
+    assert "left out: " in capsys.readouterr().err
 
 
 def test_the_spread_over_seeds(make_results: Results, tmp_path) -> None:

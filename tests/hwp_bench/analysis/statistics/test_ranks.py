@@ -51,7 +51,7 @@ def test_ties_are_said_and_share_their_interval() -> None:
 
 
 def test_where_smaller_is_better_the_smallest_wins() -> None:
-    """The oriented distance of `made_results` is 0.5 - PSNR / 100."""
+    """The oriented distance of `made_results` is 1 - PSNR / 100."""
     ranking = rank_methods(runs_of({"b": 25.0, "a": 30.0}), "oriented_distance", resamples=500)
     assert [r.standing.label for r in ranking.ranks] == ["A", "B"]
     assert [(r.best, r.worst) for r in ranking.ranks] == [(1, 1), (2, 2)]

@@ -1,0 +1,215 @@
+"""Edits of entries that keep the digest right. Oracle: what was edited; honest rows stay."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import pytest
+from made_entries import check_of, complete_results, with_keys
+
+from hwp_bench.base.errors import BadResult
+from hwp_bench.base.files import cache_root, sha256_json
+from hwp_bench.base.records import parse_record
+from hwp_bench.cli.main import main
+from hwp_bench.leaderboard.entries import entry_name, make_entry, read_entries, write_check
+from hwp_bench.leaderboard.rules import off_the_data
+from hwp_bench.leaderboard.soundness import sound_entries
+from hwp_bench.leaderboard.submit import add_entry
+from hwp_bench.leaderboard.suite_data import read_suite_data, rendered_data, write_suite_data
+from hwp_bench.results import Results, write_results
+
+
+def forged(folder: Path, change: Callable[[dict], object], *, keys: bool = False) -> Path:
+    """Write an entry that was edited as a whole; its digest and file name fit, and its keys may."""
+    value = json.loads(json.dumps(asdict(complete_results("forger"))))
+    change(value)
+    try:
+        results = parse_record(Results, value, where="forged")
+        if keys:
+            results = with_keys(results)
+            value = json.loads(json.dumps(asdict(results)))
+        name = entry_name(results, sha256_json(value))
+    except BadResult:
+        name = "forged"
+    content = {"digest": sha256_json(value), "results": value}
+    file = folder / f"{name}.json"
+    folder.mkdir(exist_ok=True)
+    file.write_text(json.dumps({"schema": "hwp-leaderboard-entry/1", **content}))
+    return file
+
+
+def _frame(value: dict) -> dict:
+    return value["captures"][0]["frames"][0]
+
+
+def _scores(**scores: float) -> Callable[[dict], None]:
+    return lambda value: _frame(value)["scores"].update(scores)
+
+
+#: Edits that a digest of the content cannot show, each with what must be said.
+FORGERIES: dict[str, tuple[Callable[[dict], object], str]] = {
+    "PSNR of 500": (_scores(psnr=500.0), "scores.psnr: is 500, but PSNR is from 0 to 100"),
+    "SSIM of 7": (_scores(ssim=7.0), "scores.ssim: is 7, but SSIM is from -1 to 1"),
+    "distance of -3": (_scores(oriented_distance=-3.0), "is -3, but Oriented distance is from 0"),
+    "a sum that overflows": (_scores(psnr=1e308), "scores.psnr: is 1e+308"),
+    "a score of its own": (_scores(mine=1e308), "scores.mine: is 1e+308"),
+    "perturbations": (lambda v: v["captures"][0]["perturbations"].clear(), "perturbations []"),
+    "a perturbation": (
+        lambda v: v["captures"][0]["perturbations"].append("motion_blur"),
+        "perturbations",
+    ),
+    "hands": (lambda v: v["captures"][0].update(hands="left"), "hands 'left'"),
+    "masks": (lambda v: v["captures"][0].update(exact_masks=False), "exact_masks False"),
+    "other data": (lambda v: v["captures"][0].update(digest="0" * 64), "not the data of the suite"),
+    "budget": (lambda v: v["budget"].update(seconds=1.0), "is not the key"),
+    "budget of text": (lambda v: v["budget"].update(seconds="much"), "budget.seconds: is 'much'"),
+    "seed": (lambda v: v.update(seed=5), "is not the key"),
+    "method": (lambda v: v["method"].update(name="wildghand"), "is not the key"),
+    "settings": (lambda v: v["method"]["settings"].update(steps=1), "is not the key"),
+    "a metric": (
+        lambda v: [f["scores"].pop("psnr_box") for c in v["captures"] for f in c["frames"]],
+        "metrics psnr_box",
+    ),
+    "a metric in one frame": (_scores(mine=1.0), "its metrics differ"),
+    "a clip without frames": (
+        lambda v: v["captures"][0].update(
+            free_view={"digest": "f", "frames": [], "predictions_digest": "p"}
+        ),
+        "is not the key",
+    ),
+    "failure": (lambda v: _frame(v).update(failure="crashed"), "other scores than the penalties"),
+    "failure of all": (lambda v: v["captures"][0].update(failure="crashed"), "3 have scores"),
+    "a fit longer than its process": (
+        lambda v: v["captures"][0].update(fit_seconds=9.0),
+        "longer than the 4 s",
+    ),
+    "negative time": (lambda v: v["captures"][0].update(wall_seconds=-1.0), "wall_seconds: is -1"),
+    "infinite time": (lambda v: v["captures"][0].update(wall_seconds=1.7e308), "wall_seconds: is"),
+    "a capture left out": (lambda v: v["captures"].pop(), "lacks 1 of 2 captures"),
+    "a frame left out": (lambda v: v["captures"][0]["frames"].pop(), "lacks test frames"),
+    "a frame twice": (
+        lambda v: v["captures"][0]["frames"].append(_frame(v)),
+        "holds a frame twice",
+    ),
+    "not Unicode": (lambda v: v["method"].update(title="\ud800"), "not Unicode"),
+    "a terminal's escape": (
+        lambda v: v["environment"].update(system="\x1b[2J"),
+        "environment.system: holds a control character",
+    ),
+    "a long title": (lambda v: v["method"].update(title="x" * 10**6), "at most 1,000 characters"),
+    "a large environment": (
+        lambda v: v["environment"].update({f"k{i}": "x" * 9999 for i in range(60)}),
+        "environment: holds more than 500,000 characters",
+    ),
+}
+
+
+@pytest.fixture(scope="module")
+def honest(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
+    """A folder with one honest entry, and its name; not to be changed."""
+    folder = tmp_path_factory.mktemp("honest")
+    return folder, add_entry(folder, complete_results("plain")).stem
+
+
+@pytest.mark.parametrize("name", FORGERIES)
+def test_a_forged_entry_is_refused_and_blocks_no_other(
+    honest: tuple[Path, str], tmp_path: Path, capsys: pytest.CaptureFixture[str], name: str
+) -> None:
+    change, problem = FORGERIES[name]
+    false = forged(tmp_path, change)
+    assert main(["leaderboard", "check", "--entries", str(tmp_path)]) in (1, 2)
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert problem in told
+    (tmp_path / f"{honest[1]}.json").write_bytes((honest[0] / f"{honest[1]}.json").read_bytes())
+    found = [entry.name for entry in sound_entries(tmp_path)]
+    # A row that lacks captures is shown without a rank, as it says itself.
+    assert found == sorted([honest[1], *([false.stem] if name == "a capture left out" else [])])
+    add_entry(tmp_path, complete_results("mine"))
+
+
+def test_keys_that_fit_do_not_hide_other_data(tmp_path: Path, capsys) -> None:
+    forged(tmp_path, lambda v: v["captures"][1].update(digest="0" * 64), keys=True)
+    assert main(["leaderboard", "check", "--entries", str(tmp_path)]) == 1
+    assert "capture4.digest: is not the data of the suite" in capsys.readouterr().err
+
+
+def test_a_check_says_what_its_numbers_say(tmp_path: Path, capsys) -> None:
+    entry = make_entry(complete_results())
+    add_entry(tmp_path, entry.results)
+    command = ["leaderboard", "check", "--entries", str(tmp_path)]
+    for check, wrong in (
+        (check_of(entry), {"verdict": "differs"}),
+        (check_of(entry), {"differences": 2}),
+        (check_of(entry), {"frames": 10**6}),
+        (check_of(entry, "re-run"), {"verdict": "differs"}),
+        (check_of(entry, "re-run", "differs"), {"verdict": "reproduces"}),
+        (check_of(entry, "re-run"), {"same_predictions": 3}),
+    ):
+        file = write_check(tmp_path, check)
+        assert main(command) == 0
+        file.unlink()
+        file = write_check(tmp_path, replace(check, **wrong))
+        assert main(command) == 1, wrong
+        assert "checks, " in capsys.readouterr().err
+        file.unlink()
+
+
+def test_the_data_of_a_table_are_those_that_were_checked_or_that_most_have() -> None:
+    """Suites whose digests are not known: the majority counts, and a check more than any."""
+
+    def row(name: str, data: str):
+        results = complete_results(name)
+        captures = [replace(c, digest=data * 64) for c in results.captures]
+        return make_entry(replace(results, captures=captures))
+
+    false, first, second = row("a", "0"), row("b", "1"), row("c", "1")
+    assert off_the_data([false, first, second]) == [(false, first.name)]
+    assert off_the_data([false, first]) == [(first, false.name)]
+    checked = replace(first, checks=(check_of(first),))
+    assert off_the_data([false, checked]) == [(false, first.name)]
+
+
+def test_a_folder_without_entries_is_not_sound(tmp_path: Path, capsys) -> None:
+    for place in (tmp_path, tmp_path / "nowhere"):
+        for words in (["check"], ["show"], ["build", "-o", str(tmp_path / "site")]):
+            assert main(["leaderboard", *words, "--entries", str(place)]) == 2
+            assert "--entries: " in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
+
+
+def test_a_result_that_was_changed_by_hand_is_not_added(tmp_path: Path, capsys) -> None:
+    run, entries = tmp_path / "run", tmp_path / "entries"
+    file = write_results(run / "results.json", complete_results())
+    text = file.read_text()
+    add = ["leaderboard", "add", str(run), "--entries", str(entries)]
+    submit = ["leaderboard", "submit", str(run), "-o", str(tmp_path / "s"), "--entries"]
+    file.write_text(text.replace('"fit_seconds": 2.0', '"fit_seconds": 1.0'))
+    for words in (add, [*submit, str(entries)]):
+        assert main(words) == 1
+        assert "digest: was changed by hand" in capsys.readouterr().err
+    file.write_text(text)
+    copy = run / "captures" / "capture0" / "result.json"
+    copy.parent.mkdir(parents=True)
+    record = json.loads(text)["captures"][0]
+    copy.write_text(json.dumps({**record, "steps": 11}))
+    assert main(add) == 1
+    assert "capture0, result.json, steps: was changed by hand" in capsys.readouterr().err
+    copy.write_text(json.dumps(record))
+    assert main(add) == 0
+    assert len(read_entries(entries)) == 1
+
+
+def test_the_digests_of_suites_are_those_of_rendered_captures(tmp_path: Path) -> None:
+    """Oracle: the renderer, as far as captures of suites are in the cache of this machine."""
+    known = read_suite_data()
+    assert {"smoke", "mini", "full-lite"} <= known.suites.keys()
+    here = rendered_data(cache_root() / "sim" / "captures")
+    for suite, captures in here.suites.items():
+        for name, data in captures.items():
+            if name in known.suites.get(suite, {}):
+                assert known.suites[suite][name].digest == data.digest, (suite, name)
+    assert read_suite_data(write_suite_data(tmp_path / "suites.json", known)) == known
