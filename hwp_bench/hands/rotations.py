@@ -12,14 +12,19 @@ def axis_angle_to_matrix(axis_angle: torch.Tensor) -> torch.Tensor:
     """Rodrigues' formula with finite value and gradients at every angle, zero included.
 
     Args:
-        axis_angle: (..., 3) rad; float32 or float64, any finite length.
+        axis_angle: (..., 3) rad, any finite length. Half precision is computed in float32. A length
+            beyond the fourth root of the largest number is taken as that: neighbouring numbers
+            are more than a turn apart there, so that only the axis means anything.
 
     Returns:
-        (..., 3, 3) rotation matrices.
+        (..., 3, 3) rotation matrices, in the type of `axis_angle`.
 
     Source: Rodrigues' rotation formula R = I + a K + b K^2 with a = sin(t) / t and
     b = (1 - cos(t)) / t^2, written in t^2 so that no square root meets zero.
     """
+    if axis_angle.dtype in (torch.float16, torch.bfloat16):
+        return axis_angle_to_matrix(axis_angle.float()).to(axis_angle.dtype)
+    axis_angle = _bounded(axis_angle)
     squared = (axis_angle * axis_angle).sum(dim=-1)
     small = squared < _SERIES_BELOW
     # `where` sends gradients through both branches: keep the unused one away from 0 / 0.
@@ -41,6 +46,13 @@ def axis_angle_to_matrix(axis_angle: torch.Tensor) -> torch.Tensor:
         + sine_ratio[..., None, None] * cross
         + cosine_ratio[..., None, None] * squared_cross
     )
+
+
+def _bounded(vector: torch.Tensor) -> torch.Tensor:
+    """Shorten vectors whose squares, or gradients of these, would overflow; others are as given."""
+    longest = vector.detach().abs().amax(dim=-1, keepdim=True)
+    # A zero divides to infinity, and keeps its length.
+    return vector * (torch.finfo(vector.dtype).max ** 0.25 / longest).clamp(max=1.0)
 
 
 def _sine_series(squared: torch.Tensor) -> torch.Tensor:

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import torch
 
-from hwp_bench.base.errors import ShapeMismatch
+from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.hands.rotations import axis_angle_to_matrix
 from hwp_bench.hands.skeleton import landmark_order
 from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, TemplateTensors
@@ -53,11 +53,13 @@ def pose_hand(
 
     Raises:
         ShapeMismatch: the arguments do not describe the same frames.
+        BadInput: an argument is of another type than the template.
 
     Source: Romero et al., "Embodied Hands" (MANO), equations 2-5; the root joint's rest place
     stays where it is when the hand turns, as in the authors' code.
     """
     frames = _frame_count(pose, betas, transl)
+    _check_type(template.vertices.dtype, pose=pose, betas=betas, transl=transl)
     if not flat_hand_mean:
         pose = torch.cat([pose[:, :1], pose[:, 1:] + template.mean_pose], dim=1)
     rotations = axis_angle_to_matrix(pose)
@@ -147,6 +149,16 @@ def _frame_count(pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) 
         if tuple(value.shape) != shape:
             raise ShapeMismatch(f"shape is {tuple(value.shape)}, expected {shape}", field=field)
     return frames
+
+
+def _check_type(expected: torch.dtype, **arguments: torch.Tensor) -> None:
+    for field, value in arguments.items():
+        if value.dtype != expected:
+            raise BadInput(
+                f"type is {value.dtype}, that of the template {expected}",
+                field=field,
+                remedy="Convert it, or make the template with `to_torch(dtype)`.",
+            )
 
 
 def _forward_kinematics(

@@ -46,10 +46,20 @@ class FrameTable:
         if not len(self._all):
             return self._make(rows)
         if self._made is None:
-            self._made = torch.cat([self._make(part) for part in self._all.split(_CHUNK)])
+            self._made = self._make_all()
         if len(rows) == 1:  # a view
             return self._made[int(rows[0])][None]
         return self._made[upload(rows, self._device)]
+
+    def _make_all(self) -> torch.Tensor:
+        """Fill the table part by part: joining finished parts would hold all of them twice."""
+        parts = self._all.split(_CHUNK)
+        first = self._make(parts[0])
+        made = first.new_empty(len(self._all), *first.shape[1:])
+        made[: len(first)] = first
+        for part in parts[1:]:
+            made[int(part[0]) : int(part[-1]) + 1] = self._make(part)
+        return made
 
 
 def soft_weights(masks: torch.Tensor, outside: float) -> torch.Tensor:

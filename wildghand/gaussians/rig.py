@@ -58,14 +58,16 @@ class HandRig:
             betas: (10,).
             transl: (F, 3) m.
         """
-        parts = [
-            self.follow(pose[start : start + CHUNK], betas, transl[start : start + CHUNK])
-            for start in range(0, len(pose), CHUNK)
-        ]
-        return AnchorPoses(
-            torch.cat([part.positions for part in parts]),
-            torch.cat([part.orientations for part in parts]),
+        # Filled part by part: joining finished parts would hold all of them twice.
+        posed = AnchorPoses(
+            pose.new_empty(len(pose), len(self), 3), pose.new_empty(len(pose), len(self), 4)
         )
+        for start in range(0, len(pose), CHUNK):
+            part = slice(start, start + CHUNK)
+            found = self.follow(pose[part], betas, transl[part])
+            posed.positions[part] = found.positions
+            posed.orientations[part] = found.orientations
+        return posed
 
     def follow(self, pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> AnchorPoses:
         """Pose the anchors of a few frames; the positions are differentiable.

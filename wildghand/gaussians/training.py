@@ -86,15 +86,19 @@ def load_frames(training: TrainingCapture) -> TrainingFrames:
         BadInput: no frame is left.
     """
     valid = np.all([hand.valid for hand in training.hands.values()], axis=0)
-    kept, images, masks = [], [], []
+    kept: list[int] = []
+    # Filled frame by frame: a list of frames that is stacked in the end would hold all of them
+    # twice. Memory of frames that are left out is never touched.
+    images = np.empty((len(training.train), training.height, training.width, 3), dtype=np.uint8)
+    masks = np.empty((len(training.train), training.height, training.width), dtype=np.uint8)
     for frame in training.train.tolist():
         if not valid[frame]:
             continue
         mask = training.mask(frame)
         if (mask > 127).any():
+            images[len(kept)] = training.frame(frame)
+            masks[len(kept)] = mask
             kept.append(frame)
-            images.append(training.frame(frame))
-            masks.append(mask)
     if not kept:
         raise BadInput(
             f"none of {len(training.train)} training frames has valid hand parameters and a mask",
@@ -103,8 +107,8 @@ def load_frames(training: TrainingCapture) -> TrainingFrames:
         )
     return TrainingFrames(
         indices=np.array(kept),
-        images=torch.from_numpy(np.stack(images)),
-        masks=torch.from_numpy(np.stack(masks)),
+        images=torch.from_numpy(images[: len(kept)]),
+        masks=torch.from_numpy(masks[: len(kept)]),
     )
 
 

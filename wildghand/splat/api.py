@@ -70,8 +70,9 @@ def rasterize(
         height: of the images, in pixels.
         backgrounds: (..., C, D) or (D,); black if left out.
         backend: "numba" (CPU, float32), "gsplat" (CUDA, float32), "reference" (plain PyTorch, any
-            device and dtype, brute force: for tests), or "auto": gsplat for CUDA tensors, else
-            numba. The float32 backends convert other dtypes and return float32.
+            device, float32 or float64, brute force: for tests), or "auto": gsplat for CUDA
+            tensors, else numba. Half precision is computed and returned in float32 by every
+            backend, float64 by the float32 backends too; gradients have the type of the argument.
         near_plane: nearest depth that is drawn, world units.
         far_plane: farthest depth that is drawn, world units.
         eps2d: low-pass filter: added to the variance on the image plane, px^2.
@@ -192,12 +193,10 @@ def _backend(name: str, device: torch.device) -> tuple[str, Callable[[FlatScene]
 def _one_dtype(scene: FlatScene, backend: str) -> FlatScene:
     """The scene in the dtype that the backend computes in."""
     tensors = {name: value for name, value in vars(scene).items() if torch.is_tensor(value)}
+    dtype = torch.float32
     if backend == "reference":
-        dtype = torch.float16
         for tensor in tensors.values():
             dtype = torch.promote_types(dtype, tensor.dtype)
-    else:
-        dtype = torch.float32
     converted: dict[str, Any] = {name: tensor.to(dtype) for name, tensor in tensors.items()}
     return replace(scene, **converted)
 

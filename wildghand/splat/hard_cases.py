@@ -56,7 +56,7 @@ _Entry = tuple[str, str, Callable[[Context], Measured]]
 
 
 def _catalogue() -> Iterator[_Entry]:
-    for entries in (_bad_values, _culled, _views, _shapes, _piles, _cameras, _extremes):
+    for entries in (_bad_values, _culled, _views, _shapes, _piles, _cameras, _calls, _extremes):
         yield from entries()
 
 
@@ -177,12 +177,28 @@ def _cameras() -> Iterator[_Entry]:
     yield _exact("no Gaussian on screen", half_off.changed(viewmats=aside))
     empty = {name: half_off.arguments[name][:0] for name in PER_GAUSSIAN}
     yield _exact("zero Gaussians", half_off.changed(**empty))
-    for width, height in ((1, 1), (1, 50), (17, 33), (16, 16)):
+    for width, height in ((1, 1), (1, 50), (50, 1), (17, 33), (16, 16), (1, 4096), (4096, 1)):
         yield _exact(f"image of {width} x {height}", hand_scene(width=width, height=height))
     unfiltered = hand_scene()
     yield _exact("no low-pass filter", HardScene(unfiltered.arguments, near_plane=0.0, eps2d=0.0))
     points = unfiltered.changed(scales=torch.zeros_like(unfiltered.arguments["scales"]))
     yield _exact("no low-pass filter and scale 0", HardScene(points.arguments, eps2d=0.0))
+
+
+def _calls() -> Iterator[_Entry]:
+    for dtype in (torch.float16, torch.bfloat16):
+        yield (
+            f"arguments in {str(dtype).removeprefix('torch.')}",
+            f"image to {IMAGE_TOLERANCE:g} of float64 of the same numbers; gradients to "
+            f"{GRADIENT_TOLERANCE:g} and the type's spacing",
+            functools.partial(_run_narrow, dtype),
+        )
+    yield "arguments that are not contiguous", "the bits of contiguous ones", _run_strided
+    yield (
+        "two equal Gaussians in one place",
+        f"alpha 1 - (1 - a)^2 with that of one Gaussian, to {IMAGE_TOLERANCE:g}",
+        _run_doubled,
+    )
 
 
 def _extremes() -> Iterator[_Entry]:
@@ -286,6 +302,59 @@ def _run_bad_view(scene: HardScene, context: Context) -> Measured:
     passed = drawing.finite and change <= NO_CHANGE and shown <= NO_CHANGE
     finite = "" if drawing.finite else "not finite, "
     return Measured(passed, f"{finite}off by {shown:.0e}, change of the other {change:.0e}")
+
+
+def _run_narrow(dtype: torch.dtype, context: Context) -> Measured:
+    scene = hand_scene()
+    narrow = {name: value.to(dtype) for name, value in scene.arguments.items()}
+    # The same numbers, so that what the type cannot hold does not count.
+    same = scene.changed(**{name: value.double() for name, value in narrow.items()})
+    clear = clear_pixels(same)
+    truth = draw(same, "reference", torch.float64, clear)
+    drawing = draw(same, context.backend, dtype, clear)
+    mask = clear.unsqueeze(-1)
+    off = difference(drawing.image * mask, truth.image * mask)
+    # Half an ulp of the type is added when a gradient is given back in it.
+    allowed = GRADIENT_TOLERANCE + torch.finfo(dtype).eps
+    gradients = gradient_differences(drawing.gradients, truth)
+    worst = max(gradients, key=lambda name: gradients[name])
+    passed = drawing.finite and off <= IMAGE_TOLERANCE and gradients[worst] <= allowed
+    return Measured(passed, f"image {off:.0e}, gradients {gradients[worst]:.0e} ({worst})")
+
+
+def _run_strided(context: Context) -> Measured:
+    scene = hand_scene(cameras=2)
+    strided = {
+        name: value.movedim(-1, 0).contiguous().movedim(0, -1)
+        if value.ndim > 1
+        else torch.stack([value, value], dim=-1)[:, 0]
+        for name, value in scene.arguments.items()
+    }
+    plain, other = _draw(scene, context), _draw(scene.changed(**strided), context)
+    same = torch.equal(plain.image, other.image) and all(
+        torch.equal(value, other.gradients[name]) for name, value in plain.gradients.items()
+    )
+    return Measured(same, f"image off by {difference(other.image, plain.image):.0e}")
+
+
+def _run_doubled(context: Context) -> Measured:
+    scene = hand_scene(count=1)
+    single = scene.changed(
+        means=torch.zeros(1, 3).double(),
+        scales=torch.full((1, 3), 0.02).float().double(),
+        opacities=torch.tensor([0.9]).double(),
+        backgrounds=torch.zeros(1, 3).double(),
+    )
+    pair = {name: single.arguments[name].repeat_interleave(2, dim=0) for name in PER_GAUSSIAN}
+    one, two = _draw(single, context), _draw(single.changed(**pair), context)
+    expected = 1.0 - (1.0 - one.alpha).square()
+    colors = single.arguments["colors"][0]
+    off = max(
+        difference(two.alpha, expected),
+        difference(two.image, expected * colors),
+    )
+    passed = two.finite and off <= IMAGE_TOLERANCE and float(one.alpha.max()) > 0.8
+    return Measured(passed, f"off by {off:.0e}, alpha of one up to {float(one.alpha.max()):.2f}")
 
 
 def _run_finite(scene: HardScene, context: Context) -> Measured:

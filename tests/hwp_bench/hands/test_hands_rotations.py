@@ -47,6 +47,29 @@ def test_gradient_is_finite_at_every_length(dtype: torch.dtype) -> None:
     assert torch.isfinite(vectors.grad).all()
 
 
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    vectors = torch.from_numpy(vectors_of((0.0, 0.05, 1.0, 40.0, 300.0))).to(dtype)
+    ours = axis_angle_to_matrix(vectors)
+    assert ours.dtype == dtype
+    expected = Rotation.from_rotvec(vectors.double().numpy()).as_matrix()
+    # Rounding to the type; the angle itself is off by 300 ulp of float32.
+    np.testing.assert_allclose(
+        ours.double(), expected, atol=0.5 * torch.finfo(dtype).eps + 300 * 2.0**-23
+    )
+
+
+@pytest.mark.parametrize(("dtype", "limit"), [(torch.float32, 4.2e9), (torch.float64, 1.1e77)])
+def test_only_the_axis_of_a_huge_vector_matters(dtype: torch.dtype, limit: float) -> None:
+    axes = torch.from_numpy(vectors_of((1.0,) * 4, 6)).to(dtype)
+    axes = axes / axes.abs().amax(dim=-1, keepdim=True)
+    first, second = (axis_angle_to_matrix(axes * limit * share) for share in (1e3, 1e9))
+    turned = torch.einsum("nij,nj->ni", first, axes)
+    tolerance = 32 * torch.finfo(dtype).eps
+    np.testing.assert_allclose(turned, axes, atol=tolerance)
+    np.testing.assert_allclose(torch.linalg.det(second), 1.0, atol=tolerance)
+
+
 @pytest.mark.parametrize("length", [0.0, 1e-9, 1e-3, 0.19, 0.21, 1.0, 2.5, 3.1415])
 def test_vectors_come_back_from_matrices(length: float) -> None:
     vectors = torch.from_numpy(np.concatenate([vectors_of((length,), seed) for seed in range(20)]))

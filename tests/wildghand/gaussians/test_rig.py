@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import tracemalloc
+
 import numpy as np
 import pytest
 import torch
@@ -49,6 +51,18 @@ def test_long_clips_are_posed_in_parts(template: HandTemplate) -> None:
     alone = rig.pose(pose[-1:], betas, transl[-1:])
     assert together.positions.shape == (CHUNK + 2, 20, 3)
     np.testing.assert_allclose(together.positions[-1], alone.positions[0], atol=1e-6)
+
+
+def test_a_long_clip_takes_the_memory_of_its_result_and_one_part(template: HandTemplate) -> None:
+    """What numpy allocates beyond the result, which is torch's, does not grow with the clip."""
+    rig, peaks = make_rig(template, 3000), []
+    for frames in (CHUNK, 2 * CHUNK, 8 * CHUNK):
+        clip = parameters(frames)
+        tracemalloc.start()
+        rig.pose(*clip)
+        peaks.append(tracemalloc.get_traced_memory()[1])
+        tracemalloc.stop()
+    assert peaks[2] < 1.1 * peaks[1]
 
 
 def test_spacing_is_that_of_a_square_grid_of_equal_area(template: HandTemplate) -> None:

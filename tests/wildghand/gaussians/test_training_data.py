@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
+import tracemalloc
+import types
 
 import numpy as np
 import pytest
@@ -74,6 +76,40 @@ def test_a_table_of_frames_is_the_same_with_and_without_memory() -> None:
         for rows in ([3], [49, 0, 7]):
             expected = 2.0 * np.repeat(rows, 3).reshape(-1, 3)
             np.testing.assert_array_equal(table(torch.tensor(rows)), expected)
+
+
+def test_a_table_of_a_long_clip_is_never_there_twice() -> None:
+    def make(rows: torch.Tensor) -> torch.Tensor:
+        return torch.from_numpy(np.full((len(rows), 512), 3.0))  # numpy's memory is counted
+
+    table = FrameTable(make, 2000, 4096, torch.device("cpu"))
+    tracemalloc.start()
+    made = table(torch.tensor([0, 1999]))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert (made == 3.0).all()
+    assert peak < 2000 * 4096 / 4
+
+
+def test_frames_of_a_long_clip_are_never_there_twice() -> None:
+    """2,000 frames that need no disk; oracle: the bytes of what is returned."""
+    image = np.zeros((24, 32, 3), np.uint8)
+    mask = np.full((24, 32), 255, np.uint8)
+    clip = types.SimpleNamespace(
+        hands={"right": types.SimpleNamespace(valid=np.ones(2000, bool))},
+        train=np.arange(2000),
+        height=24,
+        width=32,
+        mask=lambda frame: mask.copy(),
+        frame=lambda frame: image.copy(),
+    )
+    tracemalloc.start()
+    frames = load_frames(clip)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    kept = frames.images.numel() + frames.masks.numel()
+    assert len(frames) == 2000
+    assert kept <= peak < 1.25 * kept
 
 
 def test_mean_color_is_over_the_mask_alone() -> None:
