@@ -9,11 +9,13 @@ below, because a crafted `numpy.dtype` state can make numpy take bytes for point
 
 from __future__ import annotations
 
+import itertools
 import os
 import pickle
 import pickletools
 from collections import OrderedDict
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,19 @@ from hwp_bench.base.errors import BadInput, HwpError, UnsafePickle
 #: Largest pickle that is read, in bytes; MANO has 4 MB, a released HWP capture some 100 MB.
 MAX_PICKLE_BYTES = 1024 * 1024 * 1024
 
+#: Most steps of a pickle: each can make an object of some 200 bytes.
+MAX_STEPS = 10_000_000
+#: Most numbers and characters that containers and arrays come to when whatever they share is
+#: counted as often as it is there, on top of the file's size.
+MAX_EXPANDED = 10_000_000
+#: Deepest nesting of containers and objects.
+MAX_DEPTH = 64
+
+# Most values that are keys of a table but no text: equal hashes can be chosen for complex numbers
+# and frozen sets, and a table of n equal hashes takes n^2 steps.
+_MOST_ODD_KEYS = 1000
+# The hash of larger integers repeats.
+_LARGEST_INTEGER = 2**63
 _BYTE_ORDERS = "<>|="
 _KINDS = "biufcSU"
 
@@ -51,11 +66,16 @@ class StandIn:
         self.state = state
 
 
+# What has parts.
+_HOLDERS = (dict, list, tuple, set, frozenset, StandIn)
+
+
 def load_pickle(
     path: str | os.PathLike[str],
     *,
     stand_ins: Collection[str] = (),
     max_bytes: int = MAX_PICKLE_BYTES,
+    max_steps: int = MAX_STEPS,
 ) -> Any:
     """Read one object from a pickle file, whatever the file asks for.
 
@@ -66,6 +86,7 @@ def load_pickle(
         stand_ins: names that become `StandIn` objects: "module.name" for one class, "package.*"
             for every class of a package.
         max_bytes: larger files are refused.
+        max_steps: pickles of more steps are refused.
 
     Returns:
         Builtin containers, numbers, strings, stand-ins and numpy arrays of plain numbers. The
@@ -73,7 +94,8 @@ def load_pickle(
 
     Raises:
         UnsafePickle: the file names anything else; the error's field is that name.
-        BadInput: the file is missing, too large, truncated or damaged.
+        BadInput: the file is missing, too large, truncated or damaged, or would be far larger in
+            memory: by what it shares, by keys of equal hashes, or by its depth.
     """
     path = Path(path)
     if not path.is_file():
@@ -83,9 +105,11 @@ def load_pickle(
         raise BadInput(f"holds {size} bytes, more than the {max_bytes} that are read", where=path)
     try:
         with path.open("rb") as stream:
-            _check_memo(stream)
+            _check_steps(stream, max_steps)
             stream.seek(0)
-            return _Unpickler(stream, path, stand_ins).load()
+            loaded = _Unpickler(stream, path, stand_ins).load()
+            _check_expanded(loaded, MAX_EXPANDED + size)
+            return loaded
     except HwpError:
         raise
     # A damaged pickle can raise any exception.
@@ -93,11 +117,71 @@ def load_pickle(
         raise BadInput(f"is not a readable pickle ({error})", where=path) from error
 
 
-def _check_memo(stream: Any) -> None:
-    """Refuse memo numbers that no pickler writes: the reader makes room for the largest one."""
+def _check_steps(stream: Any, most: int) -> None:
+    """Refuse steps that no pickler writes, before any is taken."""
+    odd_keys = 0
     for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
+        if count >= most:
+            raise ValueError(f"more than {most:,} steps")
+        # The reader makes room for the largest memo number.
         if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > count + 1:
             raise ValueError(f"memo number {argument} after {count} steps")
+        if isinstance(argument, int) and abs(argument) > _LARGEST_INTEGER:
+            raise ValueError("an absurdly large integer")
+        odd_keys += opcode.name == "FROZENSET"
+        if odd_keys > _MOST_ODD_KEYS:
+            raise ValueError(f"more than {_MOST_ODD_KEYS:,} frozen sets")
+
+
+def _check_expanded(loaded: Any, most: int) -> None:
+    """Refuse what numpy would copy into far more memory than the pickle takes.
+
+    Args:
+        loaded: the object.
+        most: largest sum of numbers and characters; what is shared counts each time.
+
+    Raises:
+        ValueError: it is larger, contains itself, or is nested too deeply.
+    """
+    # Size and depth of each container, from the inside out; None while its parts are looked at,
+    # so that a part without one contains the container that it is in.
+    known: dict[int, tuple[int, int] | None] = {}
+    stack: list[Any] = [loaded] if isinstance(loaded, _HOLDERS) else []
+    while stack:
+        item = stack[-1]
+        if known.get(id(item)) is not None:
+            stack.pop()
+            continue
+        inner = [part for part in _parts_of(item) if isinstance(part, _HOLDERS)]
+        if id(item) not in known:
+            known[id(item)] = None
+            if any(known.get(id(part), ()) is None for part in inner):
+                raise ValueError("a container contains itself")
+            stack += [part for part in inner if id(part) not in known]
+            continue
+        facts = [fact for part in inner if (fact := known[id(part)]) is not None]
+        leaves = sum(_leaf(part) for part in _parts_of(item) if not isinstance(part, _HOLDERS))
+        size = 1 + leaves + sum(fact[0] for fact in facts)
+        depth = 1 + max((fact[1] for fact in facts), default=0)
+        if size > most:
+            raise ValueError(f"it comes to more than {most:,} numbers and characters")
+        if depth > MAX_DEPTH:
+            raise ValueError("it is nested too deeply")
+        known[id(item)] = (size, depth)
+        stack.pop()
+
+
+def _parts_of(item: Any) -> Iterator[Any]:
+    """The parts of a container or an inert object."""
+    if isinstance(item, StandIn):
+        return iter(vars(item).values())
+    return itertools.chain(item.keys(), item.values()) if isinstance(item, dict) else iter(item)
+
+
+def _leaf(item: Any) -> int:
+    if isinstance(item, np.ndarray):
+        return item.size * max(1, item.itemsize // 8)
+    return len(item) if isinstance(item, str | bytes | bytearray) else 1
 
 
 class _Unpickler(pickle.Unpickler):
@@ -106,11 +190,14 @@ class _Unpickler(pickle.Unpickler):
         self._path = path
         self._stand_ins = frozenset(stand_ins)
         self._classes: dict[str, type[StandIn]] = {}
+        self._counted = 0
 
     def find_class(self, module: str, name: str) -> Any:
         full = f"{module}.{name}"
         if full in _ADMITTED:
             return _ADMITTED[full]
+        if full in _COUNTED:
+            return _Function(partial(self._make_counted, _COUNTED[full]))
         if self._is_stand_in(module, full):
             if full not in self._classes:
                 self._classes[full] = type("StandIn", (StandIn,), {"origin": full})
@@ -121,6 +208,12 @@ class _Unpickler(pickle.Unpickler):
             field=full,
             remedy="Do not open this file with ordinary tools: it may run code.",
         )
+
+    def _make_counted(self, kind: type, *arguments: Any) -> Any:
+        self._counted += 1
+        if self._counted > _MOST_ODD_KEYS:
+            raise ValueError(f"more than {_MOST_ODD_KEYS:,} complex numbers and frozen sets")
+        return kind(*arguments)
 
     def persistent_load(self, pid: Any) -> Any:
         raise UnsafePickle(
@@ -260,7 +353,7 @@ def _admitted() -> dict[str, Any]:
         names[f"{core}.multiarray.scalar"] = _Function(_scalar)
         names[f"{core}.numeric._frombuffer"] = _Function(_from_buffer)
     for builtins in ("builtins", "__builtin__"):  # Python 3 and 2
-        names |= {f"{builtins}.{made.__name__}": made for made in (set, frozenset, complex)}
+        names[f"{builtins}.set"] = set
         names[f"{builtins}.bytes"] = _Function(_bytes)
         names[f"{builtins}.bytearray"] = _Function(_bytearray)
         names[f"{builtins}.object"] = _OBJECT
@@ -270,3 +363,9 @@ def _admitted() -> dict[str, Any]:
 
 
 _ADMITTED = _admitted()
+# What is made at most a number of times: see `_MOST_ODD_KEYS`.
+_COUNTED: dict[str, type] = {
+    f"{builtins}.{made.__name__}": made
+    for builtins in ("builtins", "__builtin__")
+    for made in (frozenset, complex)
+}

@@ -27,6 +27,8 @@ FACE_COUNT = 1538
 FINGERTIPS = (744, 320, 443, 554, 671)
 #: The file has 4 MB.
 MAX_FILE_BYTES = 64 * 1024 * 1024
+#: The file has some 500 steps; lists of numbers in place of arrays have one each.
+MAX_FILE_STEPS = 2_000_000
 _STAND_INS = (
     "chumpy.*",
     "scipy.sparse.csc.csc_matrix",
@@ -145,7 +147,7 @@ def _find(path: Path, side: str) -> Path:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    content = load_pickle(file, stand_ins=_STAND_INS, max_bytes=MAX_FILE_BYTES)
+    content = load_pickle(file, stand_ins=_STAND_INS, max_bytes=MAX_FILE_BYTES, max_steps=MAX_FILE_STEPS)
     if not isinstance(content, dict):
         raise BadHandModel("does not contain a table of named arrays", where=file, remedy=_REMEDY)
     return content
@@ -179,7 +181,8 @@ def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Pa
         array = np.asarray(_unwrap(content[field]), dtype=np.float64)
         # chumpy selections are stored flat.
         array = array.reshape(shape) if array.ndim == 1 else _of_shape(array, shape)
-    except (TypeError, ValueError, KeyError, IndexError, RecursionError) as error:
+    # An integer beyond the floats overflows.
+    except (TypeError, ValueError, ArithmeticError, LookupError, RecursionError) as error:
         raise BadHandModel(
             f"cannot be read as an array of shape {shape} ({error})",
             where=file,
@@ -205,7 +208,8 @@ def _unwrap(value: Any) -> Any:
     if value.origin.endswith("csc_matrix"):
         return _densify(state)
     if "idxs" in state:
-        return np.asarray(_unwrap(state["a"])).ravel()[np.asarray(state["idxs"])]
+        chosen = np.asarray(state["idxs"], dtype=np.int64)
+        return np.asarray(_unwrap(state["a"]), dtype=np.float64).ravel()[chosen]
     return state["x"]
 
 
@@ -216,7 +220,9 @@ def _densify(state: dict[str, Any]) -> np.ndarray:
     rows, columns = (int(length) for length in shape)
     if rows > JOINT_COUNT or columns > VERTEX_COUNT:
         raise ValueError(f"its shape is {shape}")
-    data, indices, indptr = (np.asarray(state[key]) for key in ("data", "indices", "indptr"))
+    # With their types: text among numbers would make numpy give every number room for the text.
+    data = np.asarray(state["data"], dtype=np.float64)
+    indices, indptr = (np.asarray(state[key], dtype=np.int64) for key in ("indices", "indptr"))
     matrix = csc_matrix((data, indices, indptr), shape=(rows, columns))
     matrix.check_format(full_check=True)
     return matrix.toarray()

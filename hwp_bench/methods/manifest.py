@@ -5,7 +5,6 @@ from __future__ import annotations
 import difflib
 import itertools
 import os
-import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -24,6 +23,7 @@ from hwp_bench.base.records import (
     parse_record,
     without_schema,
 )
+from hwp_bench.base.toml_text import parse_toml
 from hwp_bench.methods.contents import method_digest
 from hwp_bench.taxonomy import SIZED_LIKE
 
@@ -263,12 +263,12 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
     if where.stat().st_size > MAX_BYTES:
         raise BadMethod(f"is larger than {MAX_BYTES} bytes", where=where)
     try:
-        value = tomllib.loads(where.read_text(encoding="utf-8"))
-    # Not only TOMLDecodeError: numbers of thousands of digits raise ValueError.
-    except (ValueError, RecursionError) as error:
+        text = where.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
         raise BadMethod(f"is not valid TOML ({error})", where=where) from error
     except OSError as error:
         raise BadMethod(f"cannot be read ({error.strerror})", where=where) from error
+    value = parse_toml(text, where=where, error=BadMethod)
     fields = without_schema(value, SCHEMA, where=where, error=BadMethod)
     authors = fields.get("authors")
     if isinstance(authors, list) and all(isinstance(name, str) for name in authors):

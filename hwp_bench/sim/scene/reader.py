@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Iterable
 from dataclasses import dataclass, field, fields
 from functools import cache
@@ -13,6 +12,7 @@ from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import number, parse_record
+from hwp_bench.base.toml_text import MAX_CHARACTERS, parse_toml
 from hwp_bench.sim.props.backdrop import check_backdrop
 from hwp_bench.sim.scene.behind import NOTHING, Behind
 from hwp_bench.sim.scene.effect_settings import check_settings, keys_by_side
@@ -36,6 +36,10 @@ from hwp_bench.sim.scene.schema import (
 from hwp_bench.sim.scene.tracking import Estimator
 from hwp_bench.taxonomy import MAX_SEVERITY, PERTURBATIONS
 
+#: Largest strength of an effect; those that calibration finds stay below 2.5.
+MAX_STRENGTH = 10.0
+
+_Strength = Annotated[float, Meta(ge=0.0, le=MAX_STRENGTH)]
 _SCENES = Path(__file__).with_name("scenes")
 
 
@@ -97,7 +101,8 @@ def load_scene(name_or_path: str | Path) -> Scene:
             remedy=f"Known: {', '.join(known_scenes())}; or the path of a scene file.",
         )
     try:
-        text = path.read_text(encoding="utf-8")
+        with path.open(encoding="utf-8") as stream:
+            text = stream.read(MAX_CHARACTERS + 1)
     except (OSError, UnicodeDecodeError) as error:
         raise BadInput("cannot be read as text", where=path) from error
     return parse_scene(text, where=str(path))
@@ -109,10 +114,7 @@ def parse_scene(text: str, *, where: str) -> Scene:
     Raises:
         BadInput: see `load_scene`.
     """
-    try:
-        content = tomllib.loads(text)
-    except (tomllib.TOMLDecodeError, RecursionError) as error:
-        raise BadInput(f"is not valid TOML ({error})", where=where) from error
+    content = parse_toml(text, where=where)
     file = parse_record(_SceneFile, content, where=where, error=BadInput)
     scene = Scene(
         id=file.id,
@@ -184,8 +186,8 @@ class _EffectTable:
     """Fields that every table of `effects` has; the others are settings of its kind."""
 
     kind: Words
-    episodes: list[tuple[float, float, float]]
-    strengths: tuple[float, float, float, float, float] | None = None
+    episodes: Annotated[list[tuple[float, float, float]], Meta(max_length=1000)]
+    strengths: tuple[_Strength, _Strength, _Strength, _Strength, _Strength] | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in PERTURBATIONS:

@@ -230,3 +230,66 @@ def test_damage_is_a_named_error_or_plain_data(
     file.write_bytes(damaged)
     with contextlib.suppress(HwpError):  # any other exception fails the test
         load_pickle(file)
+
+
+def _shared(item: Any, times: int) -> Any:
+    for _ in range(times):
+        item = [item] * 10
+    return item
+
+
+def _deep(depth: int) -> Any:
+    item: Any = 0.0
+    for _ in range(depth):
+        item = [item]
+    return item
+
+
+def _circle() -> Any:
+    item: list[Any] = [1.0]
+    item.append({"self": item})
+    return item
+
+
+@pytest.mark.parametrize(
+    ("value", "problem"),
+    [
+        (_shared(0.0, 12), "more than"),
+        ({"v_template": _shared(0.0, 9)}, "more than"),
+        (_shared("x" * 1000, 6), "more than"),
+        (_shared(np.zeros(1000), 6), "more than"),
+        ({"a": ((_shared(b"y" * 1000, 6),),)}, "more than"),
+        (_deep(100), "nested too deeply"),
+        (_circle(), "contains itself"),
+        ({i * (2**61 - 1): 0 for i in range(100)}, "absurdly large integer"),
+        ({complex(-1000003 * i, i): 0 for i in range(2000)}, "more than 1,000"),
+        ([frozenset([i]) for i in range(2000)], "more than 1,000"),
+        (1 << 20_000, "absurdly large integer"),
+    ],
+    ids=[
+        "lists", "a table of lists", "texts", "arrays", "tuples", "deep", "circle", "integer keys",
+        "complex keys", "frozen sets", "integer",
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("protocol", [2, 4], ids=["protocol 2", "protocol 4"])
+def test_small_pickles_of_large_things_are_refused(
+    file: Path, value: Any, problem: str, protocol: int
+) -> None:
+    file.write_bytes(pickle.dumps(value, protocol=protocol))
+    with pytest.raises(BadInput, match=problem):
+        load_pickle(file)
+
+
+def test_what_is_shared_a_little_is_read(file: Path) -> None:
+    value = {"a": _shared(1.5, 3), "b": [np.arange(4.0)] * 5}
+    file.write_bytes(pickle.dumps(value))
+    read = load_pickle(file)
+    assert read["a"] == value["a"]
+    assert [list(item) for item in read["b"]] == [[0.0, 1.0, 2.0, 3.0]] * 5
+
+
+def test_steps_are_bounded(file: Path) -> None:
+    file.write_bytes(pickle.dumps([0.5 * i for i in range(1000)]))
+    assert len(load_pickle(file, max_steps=2000)) == 1000
+    with pytest.raises(BadInput, match="more than 500 steps"):
+        load_pickle(file, max_steps=500)

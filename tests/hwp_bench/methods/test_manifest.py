@@ -91,7 +91,7 @@ def test_authors_terms_and_page_are_kept(tmp_path: Path) -> None:
         ("steps = 5", "steps = [1, -inf]", "presets.smoke.steps: is -inf, not a finite number"),
         ("steps = 5", "steps = 1979-05-27", "presets.smoke.steps: is a date, not a"),
         ("steps = 5", f"steps = {'9' * 30}", "presets.smoke.steps: is too large a number"),
-        ("steps = 5", f"steps = {'9' * 5000}", "not valid TOML"),
+        ("steps = 5", f"steps = {'9' * 5000}", "absurdly large number"),
         ("steps = 5", f"steps = {'[' * 20}{']' * 20}", "presets.smoke.steps: is nested too deeply"),
         ("steps = 5", f"steps = {'[' * 3000}{']' * 3000}", "method.toml: is"),
     ],
