@@ -23,8 +23,8 @@ from hwp_bench.importers.video.video_settings import FitSettings
 #: Likely focal length where none is given, as a share of the image's longer
 #: side: a horizontal field of view of 64 degrees, between a webcam and a phone's main camera.
 LIKELY_FOCAL = 0.8
-# Variables that are the same in all frames; they are held until every frame has found its pose.
-_CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
+#: Variables that are the same in all frames; they are held until every frame has found its pose.
+CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
 # Variables that the outline does not determine reliably.
 _HELD_BY_LANDMARKS = ("log_focal", "log_size")
 #: First step of each variable, in its own unit; constants move slower than poses.
@@ -133,7 +133,7 @@ def fit_landmarks(
         landmarks, model, settings, footage.fps, focal if footage.focal is None else None
     )
     hold = () if footage.focal is None else ("log_focal",)
-    descend(model, energy.from_afar, settings.start_steps, hold=_CONSTANTS, update=update)
+    descend(model, energy.from_afar, settings.start_steps, hold=CONSTANTS, update=update)
 
     def later(step: int) -> None:
         if update is not None:

@@ -11,7 +11,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.progress import progress
 from hwp_bench.capture.schema import MAX_FRAMES, check_id
 from hwp_bench.hands import load_template
-from hwp_bench.importers.shared.hand_tracks import warn_of_other_side
+from hwp_bench.importers.shared.hand_tracks import tracked_votes
 from hwp_bench.importers.shared.landmarks import check_against_video, read_landmarks
 from hwp_bench.importers.shared.windows import follow_hand
 from hwp_bench.importers.shared.writing import refuse_existing
@@ -27,6 +27,7 @@ from hwp_bench.importers.video.fit_clip import (
 from hwp_bench.importers.video.fit_terms import hand_size
 from hwp_bench.importers.video.imported_clip import ImportedClip, VideoSource, store_clip
 from hwp_bench.importers.video.segmentation import NARROW, WIDE
+from hwp_bench.importers.video.side_check import side_scores, warn_of_contradiction
 from hwp_bench.importers.video.texture_energy import TextureEnergy
 from hwp_bench.importers.video.video_settings import VideoImport
 from hwp_bench.taxonomy import perturbation
@@ -58,7 +59,9 @@ def import_video(
     """
     options = options or VideoImport()
     _check_output(Path(out), options)
-    clip = fit_video(read_source(video, landmarks, options), options)
+    source = read_source(video, landmarks, options)
+    _check_side(source, options)
+    clip = fit_video(source, options)
     store_clip(clip, out, options)
     return clip
 
@@ -69,7 +72,6 @@ def read_source(
     """Read and check everything that the import needs from outside."""
     info = probe(video)
     every = read_landmarks(landmarks, min_score=options.min_score, side=options.hand)
-    warn_of_other_side(landmarks, options.hand)
     # Containers may state a wrong number of frames. A whole video is counted as it is decoded.
     # The end of a part is never read, so the header is trusted.
     part = options.frames.stop is not None
@@ -98,8 +100,7 @@ def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
     Landmarks, masks, outline, masks, outline and texture, masks.
     """
     landmarks, windows, settings = source.landmarks, source.windows, options.fit
-    video = source.video
-    footage = Footage(video.width, video.height, video.fps / options.frames.stride, options.focal)
+    footage = _footage(source, options)
     steps = settings.start_steps + settings.landmark_steps
     with progress("fitting landmarks", steps) as update:
         template = load_template(options.hand_model, options.hand)
@@ -145,6 +146,18 @@ def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
         error_landmarks_only=first_error,
         overlap_landmarks_only=overlaps[0],
     )
+
+
+def _footage(source: VideoSource, options: VideoImport) -> Footage:
+    video = source.video
+    return Footage(video.width, video.height, video.fps / options.frames.stride, options.focal)
+
+
+def _check_side(source: VideoSource, options: VideoImport) -> None:
+    """Warn where the pictures contradict the side; they are asked before minutes of work."""
+    scores = side_scores(source.landmarks, options.hand_model, _footage(source, options))
+    votes = tracked_votes(source.landmarks_path, options.hand)
+    warn_of_contradiction(options.hand, scores, votes)
 
 
 def _check_output(out: Path, options: VideoImport) -> None:

@@ -17,7 +17,7 @@ from hwp_bench.cli.main import main
 from hwp_bench.importers.shared.hand_tracks import (
     read_hand_tracks,
     tracked_side,
-    warn_of_other_side,
+    tracked_votes,
 )
 from hwp_bench.importers.shared.landmarks import read_landmarks
 from hwp_bench.tracking import track_video
@@ -59,22 +59,17 @@ def test_the_importer_reads_each_hand(video: Path, tmp_path: Path) -> None:
         np.testing.assert_array_equal(getattr(read, name), getattr(tracked.hands, name))
 
 
-def test_a_side_that_the_pictures_contradict_is_a_warning(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_votes_of_the_hand_that_is_read(tmp_path: Path) -> None:
     video = write_video(tmp_path / "one.avi", [{"right": (60, 60)}] * 5)
     track_video(video, tmp_path / "one.npz", networks=FakeNetworks())
-    capsys.readouterr()
-    warn_of_other_side(tmp_path / "one.npz", "right")
-    assert capsys.readouterr().err == ""
-    warn_of_other_side(tmp_path / "one.npz", "left")
-    said = capsys.readouterr().err
-    assert "in 5 frames the tracker votes right 0.95, left 0.05" in said
+    for side in ("right", "left"):
+        assert tracked_votes(tmp_path / "one.npz", side) == pytest.approx(
+            {"right": 0.95, "left": 0.05}
+        )
     # Files of version 1 say nothing of sides.
     arrays = {"image": np.ones((1, 21, 3)), "world": np.ones((1, 21, 3)), "score": np.ones(1)}
     old = write_npz(tmp_path / "old.npz", arrays)
-    warn_of_other_side(old, "left")
-    assert capsys.readouterr().err == ""
+    assert tracked_votes(old, "left") is None
     assert tracked_side(old) == "right"
     newer = write_npz(tmp_path / "newer.npz", {**arrays, "version": np.array([3])})
     with pytest.raises(BadInput, match="newer version"):
