@@ -9,11 +9,12 @@ votes decide, and where single votes err the motion does.
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hwp_bench.importers.shared.hand_tracks import HandTracks
+from hwp_bench.importers.shared.hand_tracks import SIDES, HandTracks, read_hand_tracks
 
 #: Landmarks that move with the palm; fingers move too fast to be expected anywhere.
 _PALM = (0, 1, 5, 9, 13, 17)
@@ -27,6 +28,8 @@ _MEMORY = 3
 _VOTE = 0.3
 #: No single vote is surer than this.
 _SUREST = 0.95
+#: A second hand is seen in at least this share of the frames that show the first.
+_SECOND_HAND = 0.1
 #: Two hands are one that is seen twice if their landmarks are nearer than this share of its size.
 _SAME_HAND = 0.15
 
@@ -110,7 +113,9 @@ def _crossed(tracks: HandTracks, seen: np.ndarray, size: float) -> np.ndarray:
         for state in (0, 1):
             # In state 0 the first row is the right hand.
             sides = [row ^ state for row in rows]
-            vote = sum(float(votes[row, frame, side]) for row, side in zip(rows, sides, strict=True))
+            vote = sum(
+                float(votes[row, frame, side]) for row, side in zip(rows, sides, strict=True)
+            )
             shown = [(side, places[row, frame]) for row, side in zip(rows, sides, strict=True)]
             costs = [path.cost + vote + _motion(path, shown, frame, size) for path in paths]
             # Of equal ways the one without an exchange is taken.
@@ -165,3 +170,47 @@ def _exchanged(tracks: HandTracks, crossed: np.ndarray) -> HandTracks:
         right=rows(tracks.right),
         track=rows(tracks.track),
     )
+
+
+def hand_of(tracks: HandTracks, side: str) -> int | None:
+    """Return the row of a side in associated hands, None where none is of it."""
+    return SIDES.index(side) if len(tracks.score) == 2 else tracks.hand_of(side)
+
+
+def read_association(path: str | os.PathLike[str]) -> Association | None:
+    """Read the hands of a file and associate them; None for a file that says nothing of sides.
+
+    Raises:
+        BadInput: as `read_hand_tracks` does.
+    """
+    tracks = read_hand_tracks(path)
+    return None if tracks is None else associate(tracks)
+
+
+def sides_of(tracks: HandTracks) -> tuple[str, ...]:
+    """Return the sides of associated hands, the one that is seen most first.
+
+    A second hand that is hardly ever seen is left out.
+    """
+    counts = [int(tracks.seen(hand).sum()) for hand in range(len(tracks.score))]
+    if len(counts) == 1:
+        return (tracks.side(0),)
+    first = int(counts[1] > counts[0])
+    if counts[1 - first] < _SECOND_HAND * counts[first]:
+        return (SIDES[first],)
+    return SIDES[first], SIDES[1 - first]
+
+
+def tracked_sides(path: str | os.PathLike[str]) -> tuple[str, ...]:
+    """Return the sides of a file's hands as `sides_of` does; none if it says nothing of sides."""
+    found = read_association(path)
+    return () if found is None else sides_of(found.tracks)
+
+
+def tracked_votes(path: str | os.PathLike[str], side: str) -> dict[str, float] | None:
+    """Return the votes of the hand that `read_landmarks` reads for a side.
+
+    None for a file that says nothing of sides.
+    """
+    found = read_association(path)
+    return None if found is None else found.tracks.votes(hand_of(found.tracks, side) or 0)

@@ -129,18 +129,3 @@ def tracks_of(arrays: Mapping[str, np.ndarray], where: str | os.PathLike[str]) -
             raise BadInput("has values outside [0, 1]", where=where, field=name)
     width, height = take(arrays, "size", (2,), where=where, dtype=np.int64)
     return HandTracks(image, world, score, right, track, (int(width), int(height)))
-
-
-def tracked_side(path: str | os.PathLike[str]) -> str:
-    """Return the side of the hand that is seen most; `right` for a file that says nothing of it."""
-    tracks = read_hand_tracks(path)
-    return "right" if tracks is None else tracks.side(0)
-
-
-def tracked_votes(path: str | os.PathLike[str], side: str) -> dict[str, float] | None:
-    """Return the votes of the hand that `read_landmarks` reads for a side.
-
-    None for a file that says nothing of sides.
-    """
-    tracks = read_hand_tracks(path)
-    return None if tracks is None else tracks.votes(tracks.hand_of(side) or 0)

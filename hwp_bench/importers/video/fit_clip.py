@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 
@@ -141,6 +141,32 @@ def fit_landmarks(
 
     descend(model, energy, settings.landmark_steps, hold=hold, update=later)
     return FittedClip(model, energy, settings)
+
+
+def share_camera(hands: Sequence[FittedClip], *, steps: int) -> None:
+    """Give hands that one camera sees one focal length, in place, and fit their poses to it.
+
+    It is the mean of the logarithms of those that were fitted, weighted by frames. Places move
+    along their rays and stay in the image.
+
+    Args:
+        hands: fitted to the landmarks of one video.
+        steps: of Adam after that.
+    """
+    weights = [float(hand.energy.weight.sum()) for hand in hands]
+    logs = [float(hand.model.variables.log_focal.detach()) for hand in hands]
+    shared = float(np.average(logs, weights=weights))
+    for hand, own in zip(hands, logs, strict=True):
+        with torch.no_grad():
+            hand.model.variables.log_focal.fill_(shared)
+            hand.model.variables.log_depth.add_(shared - own)
+        descend(
+            hand.model,
+            hand.energy,
+            steps,
+            rate=hand.settings.contour_rate,
+            hold=("log_focal",),
+        )
 
 
 def fit_outline(

@@ -1,4 +1,4 @@
-"""Which side a hand is of, by fitting the hand model to its landmarks as a right and as a left hand.
+"""Which side a hand is of, by fitting the model to its landmarks as a right and as a left hand.
 
 A hand and its mirror image look alike in outline. But fingers bend to one side only, and the
 tracker's landmarks in space say to which: of the wrong side, the model with its joint limits
@@ -78,25 +78,32 @@ def side_scores(landmarks: Landmarks, hand_model: str, footage: Footage) -> Side
 
 
 def warn_of_contradiction(
-    stated: str, scores: SideScores, votes: Mapping[str, float] | None
+    side: str, scores: SideScores, votes: Mapping[str, float] | None, *, stated: bool = True
 ) -> bool:
-    """Warn where a person states a side and the pictures show the other one.
+    """Warn where a hand is imported as one of a side, and the pictures show the other one.
 
     Args:
-        stated: `right` or `left`.
+        side: `right` or `left`.
         scores: of the fits.
         votes: the network's mean probability of each side, None where the landmarks have none.
+        stated: whether a person has stated the side; else it is what the votes say.
 
     Returns:
         Whether there was a warning. The fit decides where it is clear, else the votes.
     """
     voted = None if votes is None else max(SIDES, key=lambda side: votes[side])
     shown = scores.better if scores.is_clear else voted
-    if shown is None or shown == stated:
+    if shown is None or shown == side:
         return False
-    said = "" if votes is None else f"the tracker votes {_votes(votes)}, and "
+    voted_for = "" if votes is None else f"the tracker votes {_votes(votes)}"
+    if stated:
+        said = (
+            f"the hand is said to be a {side} one, but {voted_for}{', and ' if voted_for else ''}"
+        )
+    else:
+        said = f"{voted_for} for a hand that is taken for a {side} one, but "
     notice(
-        f"warning: the hand is said to be a {stated} one, but {said}the hand model misses the "
+        f"warning: {said}the hand model misses the "
         f"landmarks by {_misses(scores)} ({scores.frames} frames). With the wrong side, palm and "
         "back are swapped. A mirrored video also looks like this."
     )

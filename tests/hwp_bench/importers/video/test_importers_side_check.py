@@ -99,7 +99,7 @@ def test_a_video_with_the_wrong_side_given(
     write_video(tmp_path / "hand.avi", [clip.picture(frame) for frame in range(4)])
     write_landmarks(tmp_path / "hand.npz", clip.landmarks)
     for side, warned in (("left", True), ("right", False)):
-        options = VideoImport(hand=side, size=64, fit=FEW)
+        options = VideoImport(side=side, size=64, fit=FEW)
         import_video(tmp_path / "hand.avi", tmp_path / "hand.npz", tmp_path / side, options)
         assert ("is said to be a left one" in capsys.readouterr().err) is warned
 
