@@ -87,7 +87,7 @@ def import_errors(folder: Path, clip: str, settings: FitSettings) -> tuple[HandE
     number = clip.removeprefix("clip")
     source = read_source(folder / f"{clip}.avi", folder / f"landmarks{number}.npz", options)
     start = time.process_time()
-    hand = fit_video(source, options).hand
+    hand = fit_video(source, options).first.parameters
     taken = time.process_time() - start
     truth = (capture.true_hands or {})["right"]
     return hand_errors(hand, truth, focal, load_template("anny", "right")), taken

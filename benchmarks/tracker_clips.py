@@ -81,13 +81,19 @@ def real_clip(video: Path, landmarks: Path, keep: Path) -> RealClip:
     """Fit the hand of a real clip; the fit is kept in a folder and read from there."""
     file = keep / "real.npz"
     if not file.exists():
-        options = VideoImport()
+        options = VideoImport(side="right")
         clip = fit_video(read_source(video, landmarks, options), options)
-        model, source = clip.fitted.model, clip.source.landmarks
+        model, source = clip.first.fitted.model, clip.source.landmarks
         with torch.no_grad():
             posed = model.posed()
             pixels = model.pixels(posed.landmarks).numpy()
-        arrays = (source.image, source.world, pixels, posed.landmarks.numpy(), clip.hand.pose)
+        arrays = (
+            source.image,
+            source.world,
+            pixels,
+            posed.landmarks.numpy(),
+            clip.first.parameters.pose,
+        )
         np.savez(file, *[np.asarray(array, dtype=np.float64) for array in arrays])
     with np.load(file) as stored:
         return RealClip(*(stored[f"arr_{index}"] for index in range(5)))
@@ -159,8 +165,8 @@ def _import_simulated(seed: int, errors: LandmarkErrors, keep: Path, file: Path)
     writer.release()
     centred = points - points.mean(axis=1, keepdims=True)
     np.savez(landmarks, image=pixels[..., :2] + image, world=centred + world, score=np.ones(FRAMES))
-    options = VideoImport(focal=float(K[0, 0]), size=SIZE)
-    hand = fit_video(read_source(video, landmarks, options), options).hand
+    options = VideoImport(side="right", focal=float(K[0, 0]), size=SIZE)
+    hand = fit_video(read_source(video, landmarks, options), options).first.parameters
     np.savez(
         file,
         **{f"estimate_{part}": getattr(hand, part) for part in _PARTS},

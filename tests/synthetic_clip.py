@@ -45,6 +45,11 @@ class SyntheticClip:
         """(HEIGHT, WIDTH, 3) uint8: a skin-coloured hand with its forearm before a wall."""
         noise = np.random.default_rng(frame).normal(0, 4, (HEIGHT, WIDTH, 3))
         picture = np.tile(np.array(WALL, float), (HEIGHT, WIDTH, 1))
+        self.paint(picture, frame)
+        return np.clip(picture + noise, 0, 255).astype(np.uint8)
+
+    def paint(self, picture: np.ndarray, frame: int) -> None:
+        """Draw hand and forearm into a picture, in place."""
         ring = self.vertex_pixels[frame][boundary_vertices(self.template.faces)]
         wrist, knuckle = ring.mean(axis=0), self.landmarks.image[frame, 9]
         along = (wrist - knuckle) / np.linalg.norm(wrist - knuckle)
@@ -52,11 +57,15 @@ class SyntheticClip:
         hull = cv2.convexHull(arm).astype(np.int32)
         cv2.fillConvexPoly(picture, hull, SKIN)
         picture[self.silhouette(frame) > 0] = SKIN
-        return np.clip(picture + noise, 0, 255).astype(np.uint8)
 
 
-def make_clip(frames: int = 30, *, side: str = "right", bend: float = 0.5) -> SyntheticClip:
-    """A hand, fingers up and palm to the camera, that opens, closes and turns a little."""
+def make_clip(
+    frames: int = 30, *, side: str = "right", bend: float = 0.5, shift: np.ndarray | None = None
+) -> SyntheticClip:
+    """A hand, fingers up and palm to the camera, that opens, closes and turns a little.
+
+    `shift` (F, 3) m is added to its place.
+    """
     model = template(side)
     time = np.linspace(0, 2 * np.pi, frames)
     mirror = 1.0 if side == "right" else -1.0
@@ -71,6 +80,7 @@ def make_clip(frames: int = 30, *, side: str = "right", bend: float = 0.5) -> Sy
     amount = bend * (0.5 - 0.5 * np.cos(time))
     pose[:, 1:] = amount[:, None, None] * flexion
     transl = np.stack([0.03 * np.sin(time), 0.05 + 0.02 * np.cos(time), 0.42 + 0.0 * time], axis=1)
+    transl = transl if shift is None else transl + shift
     hand = HandParameters(pose, np.full(10, 0.3), transl, np.ones(frames, dtype=bool))
     posed = pose_hand(
         model.to_torch(torch.float64),

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 _EXAMPLES = """examples:
   hwp-bench data track hand.mp4
   hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture
-  hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture --focal 1020 --hand left
+  hwp-bench data import-video hand.mp4 --landmarks hand.npz my_capture --focal 1020 --side left
   hwp-bench data import-video hand.mp4 --landmarks hand.npz part --frames 100:400 --stride 2
 
 LANDMARKS.npz comes from `hwp-bench data track` or another hand tracker and contains, for every
@@ -25,7 +25,7 @@ frame of the video, image (F, 21, 2 or 3) in pixels, world (F, 21, 3) in metres 
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.description = "Make a capture of a video of one hand and the landmarks tracked in it."
+    parser.description = "Make a capture of a video of hands and the landmarks tracked in it."
     parser.epilog = _EXAMPLES
     parser.add_argument("video", type=Path, metavar="VIDEO", help="video file")
     parser.add_argument("out", type=Path, metavar="OUT", help="capture folder to make")
@@ -33,10 +33,18 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--landmarks", type=Path, required=True, metavar="LANDMARKS.npz", help="tracked landmarks"
     )
     parser.add_argument(
+        "--side",
+        choices=("auto", "right", "left", "both"),
+        default="auto",
+        help="which hands (default: auto, one or both, as the landmarks and a fit to them show)",
+    )
+    # The name of the option until it took two hands.
+    parser.add_argument(
         "--hand",
+        dest="side",
         choices=("right", "left"),
-        help="which hand (default: the one that is seen most, if the landmarks say its side; else "
-        "right)",
+        default=argparse.SUPPRESS,
+        help=argparse.SUPPRESS,
     )
     parser.add_argument(
         "--focal", type=float, metavar="PX", help="focal length of the whole frame; else estimated"
@@ -82,11 +90,10 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     # FFmpeg would print its own messages about a damaged video next to our one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    from hwp_bench.importers.shared.hand_tracks import tracked_side
     from hwp_bench.importers.video import VideoImport, import_video, parse_frame_range
 
     options = VideoImport(
-        hand=args.hand or tracked_side(args.landmarks),
+        side=args.side,
         focal=args.focal,
         masks=args.masks,
         size=args.size,
@@ -115,25 +122,33 @@ def _print(clip: ImportedClip, args: argparse.Namespace) -> None:
     from hwp_bench.importers.shared.writing import SHEET_NAME
 
     facts = clip.facts()
-    error, before = clip.error, clip.error_landmarks_only
-    count, detected, valid = (facts[key] for key in ("frames", "frames_detected", "frames_valid"))
     video = clip.source.video
-    print(f"capture: {args.out}, {count} frames, hand detected in {detected}, fitted in {valid}")
-    print(
-        f"mean reprojection error of the 21 joints: {error.mean:.2f} px at "
-        f"{video.width}x{video.height} (median {error.median:.2f}, 95th percentile "
-        f"{error.percentile_95:.2f}, worst joint {error.worst_landmark} "
-        f"{error.worst_landmark_mean:.2f}; without the tracker's constant offsets "
-        f"{error.without_offsets:.2f}; before the outline fit {before.mean:.2f})"
+    detected = " and ".join(
+        f"{side} hand detected in {hand.landmarks.detected.sum()}, fitted in "
+        f"{hand.parameters.valid.sum()}"
+        for side, hand in clip.hands.items()
     )
+    print(f"capture: {args.out}, {facts['frames']} frames, {detected}")
+    if len(clip.hands) == 2:
+        print(f"exchanged by the tracker and put right: {clip.source.swaps} times")
+    for side, hand in clip.hands.items():
+        error, before = hand.error, hand.error_landmarks_only
+        print(
+            f"mean reprojection error of the 21 joints of the {side} hand: {error.mean:.2f} px at "
+            f"{video.width}x{video.height} (median {error.median:.2f}, 95th percentile "
+            f"{error.percentile_95:.2f}, worst joint {error.worst_landmark} "
+            f"{error.worst_landmark_mean:.2f}; without the tracker's constant offsets "
+            f"{error.without_offsets:.2f}; before the outline fit {before.mean:.2f})"
+        )
     print(
         f"overlap of mesh and mask: {facts['overlap']:.3f} "
         f"(5th percentile {facts['overlap_percentile_5']:.3f}; "
         f"before the outline fit {facts['overlap_landmarks_only']:.3f})"
     )
     origin = "given" if args.focal is not None else "estimated"
-    near, far = np.percentile(clip.hand.transl[:, 2], (0, 100))
-    print(f"focal length: {clip.focal:.0f} px ({origin}); hand at {near:.2f} to {far:.2f} m")
+    depths = np.concatenate([hand.parameters.transl[:, 2] for hand in clip.hands.values()])
+    near, far = np.percentile(depths, (0, 100))
+    print(f"focal length: {clip.focal:.0f} px ({origin}); at {near:.2f} to {far:.2f} m")
     print(f"crop: {clip.source.windows.side} px squares, stored at {args.size} px")
     sheet = args.sheet or args.out / "extra" / SHEET_NAME
     print(f"look at: {sheet}")

@@ -23,7 +23,7 @@ _EXAMPLES = """examples:
   torchrun --nproc-per-node 4 -m wildghand.cli.main fit my_capture -o my_avatar \\
       --set schedule.batch=4
 
-A video of one hand becomes an avatar folder with turntable.mp4 and sheet.jpg; what leads to them
+A video of hands becomes an avatar folder with turntable.mp4 and sheet.jpg; what leads to them
 is in its folder `work`. Tracking needs ai-edge-litert: pip install 'hwp-bench[track]'. A capture
 is a folder (`hwp-bench data import-video`, `hwp-bench sim render`). A stopped fit goes on when
 the same command is given again. With torchrun each process draws its part of every batch, on a
@@ -44,7 +44,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--side",
         choices=("auto", "right", "left"),
-        help="the hand in a video (default: auto, the one that is seen most)",
+        help="the hands in a video (default: auto, one or both, as it shows)",
     )
     parser.add_argument(
         "--landmarks", type=Path, metavar="NPZ", help="landmarks of a video (default: track them)"

@@ -8,7 +8,8 @@ import numpy as np
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import canonical_json, sha256_of
-from hwp_bench.importers.shared.hand_tracks import tracked_side
+from hwp_bench.base.progress import notice
+from hwp_bench.importers.shared.association import tracked_sides
 from hwp_bench.importers.shared.landmarks import read_landmarks
 from hwp_bench.importers.video import FrameRange, VideoImport, import_video
 from hwp_bench.importers.video.imported_clip import IMPORTER_VERSION
@@ -27,29 +28,48 @@ def stride(count: int, most: int) -> int:
     return max(1, round(count / most))
 
 
-def _options(job: Job) -> VideoImport:
-    side = job.options.side
-    hand = tracked_side(job.landmarks) if side == "auto" else side
+def import_options(job: Job) -> VideoImport:
+    """Choose the frames and hands of an import.
+
+    Raises:
+        BadInput: too few frames show a hand.
+    """
     choices = VideoImport(
-        hand=hand,
+        side=job.options.side,
         id=job.capture_id,
         hand_model=job.options.hand_model,
         overwrite=True,
         fit=job.options.importer,
     )
-    # Of two hands, that which is seen most counts.
-    one = hand if hand in ("right", "left") else None
-    landmarks = read_landmarks(job.landmarks, min_score=choices.min_score, side=one)
-    step = stride(len(landmarks.score), job.options.most_frames)
-    seen = int(np.count_nonzero(landmarks.detected[::step]))
-    if seen < FEWEST:
+    sides = _wanted(job)
+    hands = {
+        side: read_landmarks(job.landmarks, min_score=choices.min_score, side=side)
+        for side in sides
+    }
+    total = len(next(iter(hands.values())).score)
+    step = stride(total, job.options.most_frames)
+    seen = {side: int(np.count_nonzero(hand.detected[::step])) for side, hand in hands.items()}
+    few = [side for side, count in seen.items() if count < FEWEST]
+    if few and (len(few) == len(seen) or job.options.side == "both"):
+        named = f"a {few[0]} hand" if few[0] else "a hand"
         raise BadInput(
-            f"shows a {hand} hand in {seen} of {len(landmarks.score)} frames, an avatar needs "
-            f"{FEWEST} or more",
+            f"shows {named} in {seen[few[0]]} of {total} frames, an avatar needs {FEWEST} or more",
             where=job.video,
             remedy="Record some seconds in which the whole hand is visible and turns.",
         )
-    return replace(choices, frames=FrameRange(stride=step))
+    frames = FrameRange(stride=step)
+    if few:
+        notice(f"The {few[0]} hand is in {seen[few[0]]} of {total} frames only and is left out.")
+        return replace(choices, frames=frames, side=next(side for side in seen if side not in few))
+    return replace(choices, frames=frames)
+
+
+def _wanted(job: Job) -> tuple[str | None, ...]:
+    """Sides of the hands to import; None where only the import's own fit can tell."""
+    side = job.options.side
+    if side in ("right", "left"):
+        return (side,)
+    return tracked_sides(job.landmarks) or (None,)
 
 
 def _facts(job: Job) -> dict[str, str]:
@@ -65,7 +85,7 @@ def _facts(job: Job) -> dict[str, str]:
 
 
 def _run(job: Job) -> None:
-    import_video(job.video, job.landmarks, job.capture, _options(job))
+    import_video(job.video, job.landmarks, job.capture, import_options(job))
 
 
 def _expected(job: Job) -> float:

@@ -13,9 +13,8 @@ from hwp_bench.base.records import merged
 from hwp_bench.importers.video import FitSettings
 from wildghand.model.former_settings import current_names
 
-#: The hands that can be asked for; `auto` is the one that is seen most, of the side that the
-#: tracker found.
-SIDES = ("auto", "right", "left")
+#: The hands that can be asked for; `auto` is one or both, as the video shows.
+SIDES = ("auto", "right", "left", "both")
 #: Most frames that are imported, spread over the video, by default and with `quick`: 20 s at 30
 #: frames a second, and a third of that.
 FRAMES, QUICK_FRAMES = 600, 200
@@ -31,7 +30,7 @@ class VideoFit:
         UsageError: a choice makes no sense; it names the option.
     """
 
-    #: Which hand: one of `SIDES`, as the person sees it.
+    #: Which hands: one of `SIDES`, as the person sees it.
     side: str = "auto"
     #: The hand model, as `load_template` takes it.
     hand_model: str = "anny"

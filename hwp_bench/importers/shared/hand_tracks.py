@@ -15,7 +15,6 @@ import numpy as np
 
 from hwp_bench.base.arrays import read_npz, take, write_npz
 from hwp_bench.base.errors import BadInput
-from hwp_bench.base.progress import notice
 
 #: Version of the file that is written.
 VERSION = 2
@@ -130,23 +129,3 @@ def tracks_of(arrays: Mapping[str, np.ndarray], where: str | os.PathLike[str]) -
             raise BadInput("has values outside [0, 1]", where=where, field=name)
     width, height = take(arrays, "size", (2,), where=where, dtype=np.int64)
     return HandTracks(image, world, score, right, track, (int(width), int(height)))
-
-
-def tracked_side(path: str | os.PathLike[str]) -> str:
-    """Return the side of the hand that is seen most; `right` for a file that says nothing of it."""
-    tracks = read_hand_tracks(path)
-    return "right" if tracks is None else tracks.side(0)
-
-
-def warn_of_other_side(path: str | os.PathLike[str], stated: str) -> None:
-    """Warn where a person states a side and every tracked hand is of the other one."""
-    tracks = read_hand_tracks(path)
-    if tracks is None or tracks.hand_of(stated) is not None:
-        return
-    votes = tracks.votes(0)
-    count = int(tracks.seen(0).sum())
-    notice(
-        f"warning: the hand is said to be a {stated} one, but in {count} frames the tracker votes "
-        f"right {votes['right']:.2f}, left {votes['left']:.2f}. With the wrong side, palm and back "
-        "are swapped. A mirrored video also looks like this."
-    )

@@ -10,6 +10,7 @@ import numpy as np
 
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.errors import BadInput
+from hwp_bench.importers.shared.association import associate, hand_of
 from hwp_bench.importers.shared.hand_tracks import tracks_of
 
 #: MediaPipe (= OpenPose) order, the order of every landmark array in this package.
@@ -60,7 +61,8 @@ def read_landmarks(
             which the tracker saw nothing has score 0; its landmarks may be NaN.
         min_score: frames below this score count as not detected.
         side: `right` or `left`: the hand that is read where the file has several (version 2) and
-            one is of this side; else that which is seen most.
+            one is of this side; else that which is seen most. Hands that the tracker exchanged
+            are put right (`associate`).
 
     Returns:
         The landmarks; values of frames that are not detected are zero.
@@ -160,7 +162,8 @@ def check_against_video(
 def _load(path: Path, side: str | None) -> dict[str, np.ndarray]:
     arrays = read_npz(path)
     tracks = None if side is None else tracks_of(arrays, path)
-    hand = None if tracks is None or side is None else tracks.hand_of(side)
+    tracks = None if tracks is None else associate(tracks).tracks
+    hand = None if tracks is None or side is None else hand_of(tracks, side)
     if tracks is not None and hand is not None:
         return {
             "image": tracks.image[hand],

@@ -22,6 +22,7 @@ FITTED = (255, 160, 0)
 #: Landmarks of the tracker.
 TRACKED = (255, 255, 255)
 _SHIFT = 4
+_LANDMARKS = 21
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +119,8 @@ class OverlayFrame:
         mask: (S, S) uint8, visible hand.
         vertices: (V, 3) m, camera axes.
         pixels: (V, 2) px of this image.
-        fitted: (21, 2) px, landmarks of the model.
-        tracked: (21, 2) px, landmarks of the tracker, or None where it saw nothing.
+        fitted: (21, 2) px, landmarks of the model; 21 for each hand.
+        tracked: (N, 2) px, landmarks of the tracker, or None where it saw nothing.
     """
 
     caption: str
@@ -185,8 +186,10 @@ def _draw_landmarks(
     canvas = image.copy()
     scale = 2**_SHIFT
     spots = np.clip((fitted - 0.5) * scale, -(2**20), 2**20).round().astype(int).tolist()
-    for first, last in LANDMARK_EDGES:
-        cv2.line(canvas, spots[first], spots[last], FITTED, 1, cv2.LINE_AA, _SHIFT)
+    for hand in range(0, len(spots), _LANDMARKS):
+        for first, last in LANDMARK_EDGES:
+            ends = spots[hand + first], spots[hand + last]
+            cv2.line(canvas, *ends, FITTED, 1, cv2.LINE_AA, _SHIFT)
     if tracked is not None:
         for x, y in np.clip((tracked - 0.5) * scale, -(2**20), 2**20).round().astype(int).tolist():
             cv2.circle(canvas, (x, y), int(1.5 * scale), TRACKED, -1, cv2.LINE_AA, _SHIFT)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -66,17 +67,40 @@ def follow_hand(landmarks: Landmarks, fps: float, size: int) -> CropWindows:
         fps: frames per second, for the smoothing.
         size: px of the resampled crop.
     """
+    return follow_hands([landmarks], fps, size)
+
+
+def follow_hands(hands: Sequence[Landmarks], fps: float, size: int) -> CropWindows:
+    """Choose windows that hold all landmarks of every hand; `follow_hand` describes the rest.
+
+    A hand that is not detected in a frame is expected between the places where it is, so that the
+    window does not jump to the other hand and back.
+    """
     from scipy.ndimage import gaussian_filter1d
 
-    seen = np.flatnonzero(landmarks.detected)
-    low, high = landmarks.image[seen].min(axis=1), landmarks.image[seen].max(axis=1)
+    frames = np.arange(len(hands[0].score))
+    detected = np.any([hand.detected for hand in hands], axis=0)
+    seen = np.flatnonzero(detected)
+    boxes = [_boxes(hand, seen) for hand in hands]
+    low = np.min([box[0] for box in boxes], axis=0)
+    high = np.max([box[1] for box in boxes], axis=0)
     middle = (low + high) / 2.0
-    frames = np.arange(len(landmarks.score))
     path = np.stack([np.interp(frames, seen, middle[:, axis]) for axis in (0, 1)], axis=1)
     path = gaussian_filter1d(path, sigma=CENTRE_SECONDS * fps, axis=0, mode="nearest")
     reach = np.maximum(high - path[seen], path[seen] - low).max()
     side = max(int(np.ceil(2.0 * reach * (1.0 + MARGIN))), 2)
     return CropWindows(np.round(path - side / 2.0).astype(np.int64), side, size)
+
+
+def _boxes(hand: Landmarks, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Corners of a hand's box in some frames, px, interpolated where it is not detected."""
+    own = np.flatnonzero(hand.detected)
+    points = hand.image[own]
+    low, high = (
+        np.stack([np.interp(frames, own, corner[:, axis]) for axis in (0, 1)], axis=1)
+        for corner in (points.min(axis=1), points.max(axis=1))
+    )
+    return low, high
 
 
 def cut(image: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:

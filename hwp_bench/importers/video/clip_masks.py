@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -32,6 +33,14 @@ class ClipMasks:
     overlap: np.ndarray
 
 
+class Prompts(Protocol):
+    """The fit as it is now, of one hand or of two."""
+
+    def prompt(self, frame: int, edge: int, detected: bool) -> Prompt:
+        """Draw what prompts the cut of a frame at `edge` px."""
+        ...
+
+
 class Masking:
     """Makes the masks of one clip.
 
@@ -56,7 +65,7 @@ class Masking:
 
     def masks(
         self,
-        projected: ProjectedClip,
+        projected: Prompts,
         settings: MaskSettings,
         *,
         reduction: int = 1,
@@ -82,7 +91,7 @@ class Masking:
         return ClipMasks(np.stack(coverage), np.stack(fields), np.array(overlaps))
 
     def _segmentations(
-        self, projected: ProjectedClip, settings: MaskSettings, reduction: int
+        self, projected: Prompts, settings: MaskSettings, reduction: int
     ) -> Iterator[tuple[Prompt, Segmentation]]:
         working = self._images.working
         edge = working.shape[1] // reduction
@@ -112,6 +121,7 @@ class ProjectedClip:
         vertices: (F, V, 3) float32 m, camera axes.
         pixels: (F, V, 2) float32, px of the whole frame.
         landmarks: (F, 21, 2) float32, px of the whole frame, the tracker's offsets included.
+        depths: (F, 21) float32 m, of the landmarks.
         faces: (T, 3) int64.
         ring: vertices of the open wrist.
         windows: where the crops lie.
@@ -120,6 +130,7 @@ class ProjectedClip:
     vertices: np.ndarray
     pixels: np.ndarray
     landmarks: np.ndarray
+    depths: np.ndarray
     faces: np.ndarray
     ring: np.ndarray
     windows: CropWindows
@@ -143,9 +154,11 @@ def project_clip(model: ClipModel, windows: CropWindows) -> ProjectedClip:
     vertices = posed_vertices(model)
     with torch.no_grad():
         pixels = model.pixels(torch.as_tensor(vertices)).numpy()
-        landmarks = model.pixels(model.posed().landmarks).numpy()
+        points = model.posed().landmarks
+        landmarks, depths = model.pixels(points).numpy(), points[..., 2].numpy()
     faces = model.template.faces
-    return ProjectedClip(vertices, pixels, landmarks, faces, boundary_vertices(faces), windows)
+    ring = boundary_vertices(faces)
+    return ProjectedClip(vertices, pixels, landmarks, depths, faces, ring, windows)
 
 
 def beyond_wrist(

@@ -41,6 +41,8 @@ class ContourEnergy:
         windows: where the fields lie in the whole frame.
         settings: weights and scales.
         hand_size: size of the hand in the whole frame, px.
+        ignored: (F, FIELD_SIZE, FIELD_SIZE) bool, where the mask's outline is not this hand's: skin
+            meets skin there; None where nothing is.
     """
 
     def __init__(
@@ -50,8 +52,10 @@ class ContourEnergy:
         windows: CropWindows,
         settings: FitSettings,
         hand_size: float,
+        ignored: np.ndarray | None = None,
     ) -> None:
         self.fields = fields
+        self.ignored = ignored
         self.usable = np.asarray(usable) & (np.abs(fields).max(axis=(1, 2)) > 0)
         self.ratio = FIELD_SIZE / windows.side
         self.corners = torch.as_tensor(windows.corners, dtype=torch.float32)[:, None]
@@ -70,7 +74,10 @@ class ContourEnergy:
         def match(frame: int) -> Outline:
             if not self.usable[frame]:
                 return Outline.nothing()
-            return match_outline(pixels[frame], faces, candidates, self.fields[frame], self.reach)
+            usable = candidates
+            if self.ignored is not None:
+                usable = candidates[~_marked(self.ignored[frame], pixels[frame][candidates])]
+            return match_outline(pixels[frame], faces, usable, self.fields[frame], self.reach)
 
         matches = []
         for found in each_frame(match, range(len(self.usable))):
@@ -184,6 +191,14 @@ def match_outline(
     outline.normal[:count] = np.where(matched[:, None], normals, 0.0)
     outline.target[:count] = np.where(matched, (normals * places).sum(axis=1) + offset, 0.0)
     return outline
+
+
+def _marked(area: np.ndarray, places: np.ndarray) -> np.ndarray:
+    """Whether places (P, 2) px lie in a (S, S) bool area; outside of the image none does."""
+    cell = np.floor(places)
+    inside = ((cell >= 0) & (cell < len(area))).all(axis=1)
+    column, row = np.clip(cell, 0, len(area) - 1).astype(np.int64).T
+    return np.asarray(inside & area[row, column])
 
 
 def _on_outline(pixels: np.ndarray, own: np.ndarray, candidates: np.ndarray) -> np.ndarray:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, fields
 
@@ -23,8 +23,8 @@ from hwp_bench.importers.video.video_settings import FitSettings
 #: Likely focal length where none is given, as a share of the image's longer
 #: side: a horizontal field of view of 64 degrees, between a webcam and a phone's main camera.
 LIKELY_FOCAL = 0.8
-# Variables that are the same in all frames; they are held until every frame has found its pose.
-_CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
+#: Variables that are the same in all frames; they are held until every frame has found its pose.
+CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
 # Variables that the outline does not determine reliably.
 _HELD_BY_LANDMARKS = ("log_focal", "log_size")
 #: First step of each variable, in its own unit; constants move slower than poses.
@@ -133,7 +133,7 @@ def fit_landmarks(
         landmarks, model, settings, footage.fps, focal if footage.focal is None else None
     )
     hold = () if footage.focal is None else ("log_focal",)
-    descend(model, energy.from_afar, settings.start_steps, hold=_CONSTANTS, update=update)
+    descend(model, energy.from_afar, settings.start_steps, hold=CONSTANTS, update=update)
 
     def later(step: int) -> None:
         if update is not None:
@@ -141,6 +141,32 @@ def fit_landmarks(
 
     descend(model, energy, settings.landmark_steps, hold=hold, update=later)
     return FittedClip(model, energy, settings)
+
+
+def share_camera(hands: Sequence[FittedClip], *, steps: int) -> None:
+    """Give hands that one camera sees one focal length, in place, and fit their poses to it.
+
+    It is the mean of the logarithms of those that were fitted, weighted by frames. Places move
+    along their rays and stay in the image.
+
+    Args:
+        hands: fitted to the landmarks of one video.
+        steps: of Adam after that.
+    """
+    weights = [float(hand.energy.weight.sum()) for hand in hands]
+    logs = [float(hand.model.variables.log_focal.detach()) for hand in hands]
+    shared = float(np.average(logs, weights=weights))
+    for hand, own in zip(hands, logs, strict=True):
+        with torch.no_grad():
+            hand.model.variables.log_focal.fill_(shared)
+            hand.model.variables.log_depth.add_(shared - own)
+        descend(
+            hand.model,
+            hand.energy,
+            steps,
+            rate=hand.settings.contour_rate,
+            hold=("log_focal",),
+        )
 
 
 def fit_outline(

@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import UsageError
 from hwp_bench.base.progress import progress
-from hwp_bench.capture.schema import MAX_FRAMES, check_id
+from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import load_template
-from hwp_bench.importers.shared.hand_tracks import warn_of_other_side
-from hwp_bench.importers.shared.landmarks import check_against_video, read_landmarks
-from hwp_bench.importers.shared.windows import follow_hand
+from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.writing import refuse_existing
-from hwp_bench.importers.video.clip_masks import Masking, project_clip
-from hwp_bench.importers.video.contour import ContourEnergy
-from hwp_bench.importers.video.decode import check_memory, probe, read_images, read_masks
+from hwp_bench.importers.video.clip_masks import ClipMasks, Masking, project_clip
+from hwp_bench.importers.video.contour import FIELD_SIZE, ContourEnergy
 from hwp_bench.importers.video.fit_clip import (
+    FittedClip,
     Footage,
     fit_landmarks,
     fit_outline,
     reprojection_error,
+    share_camera,
 )
 from hwp_bench.importers.video.fit_terms import hand_size
-from hwp_bench.importers.video.imported_clip import ImportedClip, VideoSource, store_clip
+from hwp_bench.importers.video.imported_clip import ImportedClip, ImportedHand, store_clip
 from hwp_bench.importers.video.segmentation import NARROW, WIDE
+from hwp_bench.importers.video.source import VideoSource, read_source
 from hwp_bench.importers.video.texture_energy import TextureEnergy
+from hwp_bench.importers.video.two_hands import ProjectedHands, project_hands
 from hwp_bench.importers.video.video_settings import VideoImport
 from hwp_bench.taxonomy import perturbation
 
@@ -41,7 +42,7 @@ def import_video(
     out: str | os.PathLike[str],
     options: VideoImport | None = None,
 ) -> ImportedClip:
-    """Make a capture of a video of one hand.
+    """Make a capture of a video of one hand or two.
 
     Args:
         video: any file that OpenCV decodes.
@@ -63,88 +64,112 @@ def import_video(
     return clip
 
 
-def read_source(
-    video: str | os.PathLike[str], landmarks: str | os.PathLike[str], options: VideoImport
-) -> VideoSource:
-    """Read and check everything that the import needs from outside."""
-    info = probe(video)
-    every = read_landmarks(landmarks, min_score=options.min_score, side=options.hand)
-    warn_of_other_side(landmarks, options.hand)
-    # Containers may state a wrong number of frames. A whole video is counted as it is decoded.
-    # The end of a part is never read, so the header is trusted.
-    part = options.frames.stop is not None
-    total = info.stated_frames if part and info.stated_frames else len(every.score)
-    tracked = check_against_video(every, total, info.width, info.height, landmarks)
-    indices = options.frames.indices(total)
-    if not 3 <= len(indices) <= MAX_FRAMES:
-        raise UsageError(
-            f"{len(indices)} of {total} frames are selected, a capture has 3 to {MAX_FRAMES}",
-            field="--frames",
-        )
-    tracked = tracked.select(indices)
-    if not tracked.detected.any():
-        raise UsageError("no hand is detected in the selected frames", field="--frames")
-    windows = follow_hand(tracked, info.fps / options.frames.stride, options.size)
-    check_memory(windows)
-    own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
-    with progress("reading frames", len(indices)) as update:
-        images = read_images(info, options.frames, windows, update)
-    return VideoSource(info, Path(landmarks), indices, tracked, windows, images, own)
-
-
 def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
-    """Fit the hand and cut the masks in turns.
+    """Fit the hands and cut the masks in turns.
 
-    Landmarks, masks, outline, masks, outline and texture, masks.
+    Landmarks, masks, outline, masks, outline and texture, masks. Two hands are fitted one after
+    the other and share their camera and their masks.
     """
-    landmarks, windows, settings = source.landmarks, source.windows, options.fit
-    video = source.video
-    footage = Footage(video.width, video.height, video.fps / options.frames.stride, options.focal)
-    steps = settings.start_steps + settings.landmark_steps
-    with progress("fitting landmarks", steps) as update:
-        template = load_template(options.hand_model, options.hand)
-        fitted = fit_landmarks(landmarks, template, footage, settings, update)
-    first_error = reprojection_error(fitted, landmarks)
-    size = hand_size(landmarks)
+    windows, settings = source.windows, options.fit
+    hands = list(source.hands.values())
+    fits = _fit_hands(source, options)
+    first_errors = [
+        reprojection_error(fitted, hand) for fitted, hand in zip(fits, hands, strict=True)
+    ]
+    sizes = [hand_size(hand) for hand in hands]
     scale = source.images.working.shape[1] / windows.side
-    masking = Masking(source.images, landmarks.detected, size * scale, source.own_masks)
+    size = sum(sizes) / len(sizes)
+    masking = Masking(source.images, source.detected, size * scale, source.own_masks)
     overlaps = []
     frames = len(source.indices)
     steps = settings.contour_rounds * settings.contour_steps
     for turn, trust, reduction in ((1, WIDE, 2), (2, NARROW, 1)):
         with progress(f"cutting masks ({turn} of 3)", frames) as update:
-            projected = project_clip(fitted.model, windows)
+            pair = _pair(source, fits)
+            projected = pair or project_clip(fits[0].model, windows)
             masks = masking.masks(projected, trust, reduction=reduction, update=update)
-        overlaps.append(float(masks.overlap[landmarks.detected].mean()))
-        with progress(f"fitting outlines ({turn} of 2)", steps) as update:
-            contour = ContourEnergy(masks.fields, landmarks.detected, windows, settings, size)
-            texture = None
-            if settings.texture_weight > 0 and turn == 2:
-                texture = TextureEnergy(
-                    source.images.frames,
-                    masks.coverage,
-                    landmarks.detected,
-                    windows,
-                    settings,
-                    size,
-                    fitted.model,
-                )
-            fit_outline(fitted, contour, update, texture)
-    projected = project_clip(fitted.model, windows)
+        overlaps.append(float(masks.overlap[source.detected].mean()))
+        coverages = [masks.coverage] if pair is None else pair.coverage(masks.coverage)
+        if pair is not None and turn == 1:
+            for hand, fitted in enumerate(fits):
+                fitted.energy.trust(pair.trust(hand))
+        with progress(f"fitting outlines ({turn} of 2)", steps * len(hands)) as update:
+            for hand, (fitted, landmarks) in enumerate(zip(fits, hands, strict=True)):
+                contour = _contour(source, options, hand, masks, pair)
+                texture = None
+                if settings.texture_weight > 0 and turn == 2:
+                    texture = TextureEnergy(
+                        source.images.frames,
+                        coverages[hand],
+                        landmarks.detected,
+                        windows,
+                        settings,
+                        sizes[hand],
+                        fitted.model,
+                    )
+                fit_outline(fitted, contour, _after(update, hand * steps), texture)
+    clips = [project_clip(fitted.model, windows) for fitted in fits]
     with progress("cutting masks (3 of 3)", frames) as update:
-        masks = masking.masks(projected, NARROW, update=update)
-    error = reprojection_error(fitted, landmarks)
-    missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * size
-    return ImportedClip(
-        source=source,
-        hand=fitted.model.parameters(landmarks.detected & ~missed),
-        fitted=fitted,
-        projected=projected,
-        masks=masks,
-        error=error,
-        error_landmarks_only=first_error,
-        overlap_landmarks_only=overlaps[0],
-    )
+        masks = masking.masks(_pair(source, fits) or clips[0], NARROW, update=update)
+    imported = {}
+    for hand, (side, landmarks) in enumerate(source.hands.items()):
+        error = reprojection_error(fits[hand], landmarks)
+        missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * sizes[hand]
+        imported[side] = ImportedHand(
+            landmarks=landmarks,
+            parameters=fits[hand].model.parameters(landmarks.detected & ~missed),
+            fitted=fits[hand],
+            projected=clips[hand],
+            error=error,
+            error_landmarks_only=first_errors[hand],
+        )
+    return ImportedClip(source, imported, masks, overlaps[0])
+
+
+def _fit_hands(source: VideoSource, options: VideoImport) -> list[FittedClip]:
+    """Fit the landmarks of each hand, then both to one camera."""
+    settings, video = options.fit, source.video
+    footage = Footage(video.width, video.height, video.fps / options.frames.stride, options.focal)
+    steps = settings.start_steps + settings.landmark_steps
+    fits: list[FittedClip] = []
+    with progress("fitting landmarks", steps * len(source.hands)) as update:
+        for side, landmarks in source.hands.items():
+            template = load_template(options.hand_model, side)
+            later = _after(update, steps * len(fits))
+            fits.append(fit_landmarks(landmarks, template, footage, settings, later))
+    if len(fits) == 2 and options.focal is None:
+        share_camera(fits, steps=settings.landmark_steps // 3)
+    return fits
+
+
+def _pair(source: VideoSource, fits: list[FittedClip]) -> ProjectedHands | None:
+    """Two projected hands, None where there is one."""
+    if len(fits) == 1:
+        return None
+    clips = [project_clip(fitted.model, source.windows) for fitted in fits]
+    return project_hands(clips, list(source.hands.values()))
+
+
+def _contour(
+    source: VideoSource,
+    options: VideoImport,
+    hand: int,
+    masks: ClipMasks,
+    pair: ProjectedHands | None,
+) -> ContourEnergy:
+    """The outline of one hand; where the other one is, the masks' outline is not this one's."""
+    landmarks: Landmarks = list(source.hands.values())[hand]
+    size, settings = hand_size(landmarks), options.fit
+    ignored = None
+    if pair is not None:
+        reach = settings.contour_reach * size * FIELD_SIZE / source.windows.side
+        ignored = pair.covered(hand, reach)
+    return ContourEnergy(masks.fields, landmarks.detected, source.windows, settings, size, ignored)
+
+
+def _after(update: Callable[[int], None], done: int) -> Callable[[int], None]:
+    """A report of progress that counts on."""
+    return lambda more: update(done + more)
 
 
 def _check_output(out: Path, options: VideoImport) -> None:

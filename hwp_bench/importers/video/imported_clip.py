@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 
 import numpy as np
 
@@ -14,11 +14,10 @@ from hwp_bench.capture import Cameras, CaptureInfo, HandModelId
 from hwp_bench.hands import HandParameters
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.overlay import OverlayFrame, overlay_sheet, sheet_frames
-from hwp_bench.importers.shared.windows import CropWindows
 from hwp_bench.importers.shared.writing import write_capture
 from hwp_bench.importers.video.clip_masks import ClipMasks, ProjectedClip
-from hwp_bench.importers.video.decode import ClipImages, VideoInfo
 from hwp_bench.importers.video.fit_clip import FittedClip, ReprojectionError
+from hwp_bench.importers.video.source import BOTH, VideoSource
 from hwp_bench.importers.video.video_settings import VideoImport
 
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
@@ -29,26 +28,43 @@ SHEET_FRAMES = 24
 
 
 @dataclass(frozen=True, eq=False)
-class VideoSource:
-    """The inputs of an import.
+class ImportedHand:
+    """One hand of an import.
 
     Attributes:
-        video: the probed video.
-        landmarks_path: the tracker's file.
-        indices: (F,) frame numbers in the video.
-        landmarks: of those frames.
-        windows: where the hand is.
-        images: the frames.
-        own_masks: (F, S, S) uint8 or None.
+        landmarks: the tracker's.
+        parameters: pose, shape and place.
+        fitted: the fit.
+        projected: the fit in the images.
+        error: reprojection error of the final fit.
+        error_landmarks_only: the same before the outline was fitted.
     """
 
-    video: VideoInfo
-    landmarks_path: Path
-    indices: np.ndarray
     landmarks: Landmarks
-    windows: CropWindows
-    images: ClipImages
-    own_masks: np.ndarray | None
+    parameters: HandParameters
+    fitted: FittedClip
+    projected: ProjectedClip
+    error: ReprojectionError
+    error_landmarks_only: ReprojectionError
+
+    def facts(self) -> dict[str, object]:
+        """Return the numbers that measure the fit of this hand, as JSON."""
+
+        def pixels(error: ReprojectionError) -> dict[str, object]:
+            values = {key: value for key, value in asdict(error).items() if key != "by_frame"}
+            return {k: round(v, 3) if isinstance(v, float) else v for k, v in values.items()}
+
+        size = self.fitted.model.variables.log_size.detach().exp()
+        return {
+            "frames_detected": int(self.landmarks.detected.sum()),
+            "frames_valid": int(self.parameters.valid.sum()),
+            "reprojection_px": pixels(self.error),
+            "reprojection_px_landmarks_only": pixels(self.error_landmarks_only),
+            "depth_m": [
+                round(float(z), 3) for z in np.percentile(self.parameters.transl[:, 2], (0, 100))
+            ],
+            "world_scale": round(float(size), 4),
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,53 +73,46 @@ class ImportedClip:
 
     Attributes:
         source: the inputs.
-        hand: parameters of the hand.
-        fitted: the fit.
-        projected: the fit in the images.
-        masks: final masks.
-        error: reprojection error of the final fit.
-        error_landmarks_only: the same before the outline was fitted.
+        hands: by side, the hand that is detected most first.
+        masks: final masks, of all hands.
         overlap_landmarks_only: mean overlap of mesh and mask before the outline was fitted.
     """
 
     source: VideoSource
-    hand: HandParameters
-    fitted: FittedClip
-    projected: ProjectedClip
+    hands: Mapping[str, ImportedHand]
     masks: ClipMasks
-    error: ReprojectionError
-    error_landmarks_only: ReprojectionError
     overlap_landmarks_only: float
 
     @property
+    def first(self) -> ImportedHand:
+        """The hand that is detected most."""
+        return next(iter(self.hands.values()))
+
+    @property
+    def shown(self) -> str:
+        """The hands as a capture names them: `right`, `left` or `both`."""
+        return "both" if len(self.hands) == 2 else next(iter(self.hands))
+
+    @property
     def focal(self) -> float:
-        """Focal length, px of the whole frame."""
-        return float(self.fitted.model.focal.detach())
+        """Focal length, px of the whole frame; the same for all hands."""
+        return float(self.first.fitted.model.focal.detach())
 
     def facts(self) -> dict[str, object]:
-        """Return the numbers that measure the import, as JSON."""
-        seen = self.source.landmarks.detected
+        """Return the numbers that measure the import, as JSON; of two hands each has its own."""
+        seen = self.source.detected
         overlaps = self.masks.overlap[seen]
-
-        def pixels(error: ReprojectionError) -> dict[str, object]:
-            values = {key: value for key, value in asdict(error).items() if key != "by_frame"}
-            return {k: round(v, 3) if isinstance(v, float) else v for k, v in values.items()}
-
-        return {
+        common = {
             "frames": len(seen),
-            "frames_detected": int(seen.sum()),
-            "frames_valid": int(self.hand.valid.sum()),
-            "reprojection_px": pixels(self.error),
-            "reprojection_px_landmarks_only": pixels(self.error_landmarks_only),
             "overlap": round(float(overlaps.mean()), 4),
             "overlap_percentile_5": round(float(np.percentile(overlaps, 5)), 4),
             "overlap_landmarks_only": round(self.overlap_landmarks_only, 4),
             "focal_px": round(self.focal, 2),
-            "depth_m": [
-                round(float(z), 3) for z in np.percentile(self.hand.transl[:, 2], (0, 100))
-            ],
-            "world_scale": round(float(self.fitted.model.variables.log_size.detach().exp()), 4),
         }
+        if len(self.hands) == 1:
+            return {**common, **self.first.facts()}
+        each = {side: hand.facts() for side, hand in self.hands.items()}
+        return {**common, "swaps_repaired": self.source.swaps, "hands": each}
 
 
 def store_clip(clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport) -> None:
@@ -116,7 +125,7 @@ def store_clip(clip: ImportedClip, out: str | os.PathLike[str], options: VideoIm
     write_capture(
         out,
         capture_info(clip, out, options),
-        {options.hand: clip.hand},
+        {side: clip.hands[side].parameters for side in BOTH if side in clip.hands},
         cameras,
         zip(source.images.frames, clip.masks.coverage, strict=True),
         lambda: drawn,
@@ -133,10 +142,10 @@ def capture_info(
     """Return the capture's description."""
     source = clip.source
     video, windows = source.video, source.windows
-    template = clip.fitted.model.template
+    template = clip.first.fitted.model.template
     return CaptureInfo(
         id=options.capture_id(out),
-        hands=options.hand,
+        hands=clip.shown,
         action=options.action,
         device=options.device,
         fps=video.fps / options.frames.stride,
@@ -174,26 +183,48 @@ def capture_info(
 
 def draw_sheet(clip: ImportedClip) -> np.ndarray:
     """Draw evenly spaced frames with masks, mesh and joints, (H, W, 3) uint8."""
-    source, projected = clip.source, clip.projected
+    source, hands = clip.source, list(clip.hands.values())
     count = len(source.indices)
     size = source.windows.size
+    faces, offset = [], 0
+    for hand in hands:
+        faces.append(hand.projected.faces + offset)
+        offset += hand.projected.vertices.shape[1]
     frames = []
     for frame in sheet_frames(count, SHEET_FRAMES):
-        seen = bool(source.landmarks.detected[frame])
         caption = f"frame {source.indices[frame]}: overlap {clip.masks.overlap[frame]:.2f}"
-        caption += f", {clip.error.by_frame[frame]:.1f} px" if seen else ", not detected"
-        if seen and not clip.hand.valid[frame]:
-            caption += ", not valid"
-        tracked = projected.in_crop(source.landmarks.image[frame], frame, size) if seen else None
+        caption += "".join(_said(hand, frame) for hand in hands)
+        tracked = [
+            hand.projected.in_crop(hand.landmarks.image[frame], frame, size)
+            for hand in hands
+            if hand.landmarks.detected[frame]
+        ]
+        drawn = [hand.projected for hand in hands]
         frames.append(
             OverlayFrame(
                 caption=caption,
                 image=source.images.frames[frame],
                 mask=clip.masks.coverage[frame],
-                vertices=projected.vertices[frame],
-                pixels=projected.in_crop(projected.pixels[frame], frame, size),
-                fitted=projected.in_crop(projected.landmarks[frame], frame, size),
-                tracked=tracked,
+                vertices=np.concatenate([one.vertices[frame] for one in drawn]),
+                pixels=_in_crop(drawn, [one.pixels for one in drawn], frame, size),
+                fitted=_in_crop(drawn, [one.landmarks for one in drawn], frame, size),
+                tracked=np.concatenate(tracked) if tracked else None,
             )
         )
-    return overlay_sheet(frames, projected.faces)
+    return overlay_sheet(frames, np.concatenate(faces))
+
+
+def _in_crop(
+    clips: Sequence[ProjectedClip], pixels: Sequence[np.ndarray], frame: int, size: int
+) -> np.ndarray:
+    """Pixels of all hands in a frame's crop."""
+    moved = [clip.in_crop(one[frame], frame, size) for clip, one in zip(clips, pixels, strict=True)]
+    return np.concatenate(moved)
+
+
+def _said(hand: ImportedHand, frame: int) -> str:
+    """The end of a caption that one hand has."""
+    if not hand.landmarks.detected[frame]:
+        return ", not detected"
+    error = f", {hand.error.by_frame[frame]:.1f} px"
+    return error if hand.parameters.valid[frame] else f"{error}, not valid"

@@ -104,6 +104,10 @@ class FitSettings:
     light_breadth: float = 0.05
 
 
+#: The hands that can be asked for, as the person sees them; `auto` is what the landmarks show.
+CHOICES = ("auto", "right", "left", "both")
+
+
 @dataclass(frozen=True)
 class VideoImport:
     """Choices of a video import; checked when made.
@@ -112,8 +116,8 @@ class VideoImport:
         UsageError: a choice makes no sense; it names the option.
     """
 
-    #: Which hand is in the image: `right` or `left`.
-    hand: str = "right"
+    #: Which hands are imported: one of `CHOICES`.
+    side: str = "auto"
     #: Focal length in px of the whole frame, or None to estimate it.
     focal: float | None = None
     #: Folder with masks of the user's own, or None to compute them.
@@ -145,7 +149,7 @@ class VideoImport:
 
     def __post_init__(self) -> None:
         rules = (
-            ("--hand", self.hand in ("right", "left"), "must be right or left"),
+            ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
             ("--focal", self.focal is None or 1 <= self.focal <= 1e6, "must be 1 to 1e6 px"),
             ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
             ("--min-score", 0 <= self.min_score <= 1, "must be in [0, 1]"),

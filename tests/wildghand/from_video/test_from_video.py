@@ -10,6 +10,7 @@ import json
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -19,17 +20,20 @@ import pytest
 import torch
 from painted import QUICK
 from synthetic_clip import make_clip, write_landmarks, write_video
+from two_hand_clip import make_two_hands, write_two_hands
 
 import wildghand
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import open_capture
+from hwp_bench.importers.shared.hand_tracks import read_hand_tracks, write_hand_tracks
 from hwp_bench.importers.video import FitSettings
 from hwp_bench.tracking.model_files import HAND, PALM, models_folder
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
 from wildghand.from_video import VideoFit, make_avatar
-from wildghand.from_video.capture import stride
+from wildghand.from_video.capture import import_options, stride
+from wildghand.from_video.job import Job
 from wildghand.from_video.settings import QUICK as QUICK_CHANGES
 from wildghand.from_video.settings import QUICK_FRAMES, with_quick
 from wildghand.from_video.stages import STAGES
@@ -276,11 +280,32 @@ def test_wrong_calls_are_one_line(
     assert (folder / "taken" / "thesis.tex").exists()
 
 
+def test_two_hands_by_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Oracle: the synthetic clip has a right and a left hand."""
+    video, landmarks = write_two_hands(tmp_path, make_two_hands(COUNT), (5,), range(7, 9))
+    options = choices(tmp_path, landmarks=landmarks)
+    result = make_avatar(video, tmp_path / "mine", options)
+    assert result.facts()["hands"] == ["right", "left"]
+    assert open_capture(result.job.capture).info.hands == "both"
+    for path in (result.job.turntable, result.job.sheet, result.job.page):
+        assert path.is_file()
+    # A second hand of few frames is left out, unless it is asked for.
+    tracks = read_hand_tracks(landmarks)
+    assert tracks is not None
+    score = np.where((np.arange(COUNT) < 10) | (tracks.right > 0.5), tracks.score, 0.0)
+    write_hand_tracks(landmarks, replace(tracks, score=score.astype(np.float32)))
+    capsys.readouterr()
+    assert import_options(Job(video, tmp_path / "other", options)).side == "right"
+    assert "The left hand is in 8 of 16 frames only" in capsys.readouterr().err
+    with pytest.raises(BadInput, match="shows a left hand in 8 of 16 frames"):
+        make_avatar(video, tmp_path / "other", replace(options, side="both"))
+
+
 def test_too_few_frames_with_a_hand(folder: Path) -> None:
     clip = make_clip(COUNT)
     score = np.where(np.arange(COUNT) < 5, 0.9, 0.0)
     write_landmarks(folder / "hand.npz", clip.landmarks, score=score)
-    with pytest.raises(BadInput, match="shows a right hand in 5 of 16 frames"):
+    with pytest.raises(BadInput, match="shows a hand in 5 of 16 frames"):
         make_avatar(folder / "hand.avi", folder / "other", choices(folder))
 
 

@@ -132,7 +132,7 @@ def test_the_command_prints_the_numbers_and_saves_the_sheet(
     words += ["--stride", "2", "--sheet", str(sheet), "--perturbations", "motion_blur"]
     assert main(words) == 0
     out = capsys.readouterr().out
-    assert "mean reprojection error of the 21 joints:" in out
+    assert "mean reprojection error of the 21 joints of the right hand:" in out
     assert "px at 320x240" in out
     assert "overlap of mesh and mask: 0.9" in out
     assert read_rgb(sheet).shape[0] > 96
@@ -210,7 +210,7 @@ def test_a_mask_of_another_size_is_named(folder: Path, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("field", "value"),
-    [("hand", "both"), ("focal", 0.0), ("focal", float("nan")), ("size", 8), ("min_score", 2.0)],
+    [("side", "neither"), ("focal", 0.0), ("focal", float("nan")), ("size", 8), ("min_score", 2.0)],
 )
 def test_options_that_make_no_sense_are_refused(field: str, value: object) -> None:
     with pytest.raises(UsageError):
@@ -228,8 +228,8 @@ def test_a_part_of_the_real_video(tmp_path: Path) -> None:
     result = import_video(
         REAL / "human_hand_video.mp4", REAL / "landmarks.npz", tmp_path / "real", options
     )
-    assert result.error.mean < 5.0
-    assert result.hand.valid.all()
+    assert result.first.error.mean < 5.0
+    assert result.first.parameters.valid.all()
     assert result.masks.overlap.mean() > 0.9
     assert result.masks.overlap.mean() > result.overlap_landmarks_only + 0.02
     assert check_capture(tmp_path / "real").ok
