@@ -93,13 +93,13 @@ def read_source(
             field="--frames",
         )
     selected = {side: hand.select(indices) for side, hand in tracked.items()}
-    hands = {side: hand for side, hand in selected.items() if hand.detected.any()}
-    if not hands:
+    seen = {side: hand for side, hand in selected.items() if hand.detected.any()}
+    if not seen:
         raise UsageError("no hand is detected in the selected frames", field="--frames")
-    for side in selected.keys() - hands.keys():
+    for side in selected.keys() - seen.keys():
         notice(f"The {side} hand is in none of the selected frames and is left out.")
     footage = Footage(info.width, info.height, info.fps / options.frames.stride, options.focal)
-    hands = _checked_sides(hands, landmarks, options, footage)
+    hands = _checked_sides(seen, landmarks, options, footage)
     windows = follow_hands(list(hands.values()), footage.fps, options.size)
     check_memory(windows)
     own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
