@@ -44,6 +44,7 @@ class VideoSource:
         images: the frames.
         own_masks: (F, S, S) uint8 or None.
         swaps: how often the tracker had exchanged two hands, over the whole video.
+        doubles: number of frames in which it had put both on one hand.
     """
 
     video: VideoInfo
@@ -54,6 +55,7 @@ class VideoSource:
     images: ClipImages
     own_masks: np.ndarray | None
     swaps: int = 0
+    doubles: int = 0
 
     @property
     def landmarks(self) -> Landmarks:
@@ -106,8 +108,8 @@ def read_source(
     with progress("reading frames", len(indices)) as update:
         images = read_images(info, options.frames, windows, update)
     found = read_association(landmarks) if len(hands) == 2 else None
-    swaps = 0 if found is None else found.swaps
-    return VideoSource(info, Path(landmarks), indices, hands, windows, images, own, swaps)
+    repaired = (0, 0) if found is None else (found.swaps, found.doubles)
+    return VideoSource(info, Path(landmarks), indices, hands, windows, images, own, *repaired)
 
 
 def _read_hands(path: str | os.PathLike[str], options: VideoImport) -> dict[str | None, Landmarks]:
