@@ -60,7 +60,9 @@ def import_options(job: Job) -> VideoImport:
     frames = FrameRange(stride=step)
     if few:
         notice(f"The {few[0]} hand is in {seen[few[0]]} of {total} frames only and is left out.")
-        return replace(choices, frames=frames, side=next(side for side in seen if side not in few))
+        return replace(
+            choices, frames=frames, side=next(side for side in seen if side not in few) or "auto"
+        )
     return replace(choices, frames=frames)
 
 

@@ -59,22 +59,16 @@ class CropWindows:
         return matrices
 
 
-def follow_hand(landmarks: Landmarks, fps: float, size: int) -> CropWindows:
-    """Choose windows that hold all landmarks of every detected frame.
-
-    Args:
-        landmarks: of the selected frames; at least one is detected.
-        fps: frames per second, for the smoothing.
-        size: px of the resampled crop.
-    """
-    return follow_hands([landmarks], fps, size)
-
-
 def follow_hands(hands: Sequence[Landmarks], fps: float, size: int) -> CropWindows:
-    """Choose windows that hold all landmarks of every hand; `follow_hand` describes the rest.
+    """Choose windows that hold all landmarks of one hand or two in every detected frame.
 
     A hand that is not detected in a frame is expected between the places where it is, so that the
     window does not jump to the other hand and back.
+
+    Args:
+        hands: landmarks of the selected frames; each hand is detected in at least one.
+        fps: frames per second, for the smoothing.
+        size: px of the resampled crop.
     """
     from scipy.ndimage import gaussian_filter1d
 

@@ -257,7 +257,7 @@ def descend(
     optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
 
     def schedule(step: int) -> float:
-        fall = 0.5 * (1.0 + math.cos(math.pi * step / steps))
+        fall = 0.5 * (1.0 + math.cos(math.pi * step / max(steps, 1)))
         return min(1.0, (step + 1) / _WARM_UP) * (_LAST_RATE + (1.0 - _LAST_RATE) * fall)
 
     scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, schedule)

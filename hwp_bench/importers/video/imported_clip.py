@@ -112,7 +112,8 @@ class ImportedClip:
         if len(self.hands) == 1:
             return {**common, **self.first.facts()}
         each = {side: hand.facts() for side, hand in self.hands.items()}
-        return {**common, "swaps_repaired": self.source.swaps, "hands": each}
+        repaired = {"swaps_repaired": self.source.swaps, "doubles_left_out": self.source.doubles}
+        return {**common, **repaired, "hands": each}
 
 
 def store_clip(clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport) -> None:

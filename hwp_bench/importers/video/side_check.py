@@ -47,10 +47,6 @@ class SideScores:
     left: float
     frames: int
 
-    def of(self, side: str) -> float:
-        """Return the distance of `right` or `left`."""
-        return self.right if side == "right" else self.left
-
     @property
     def better(self) -> str:
         """The side that fits better, `right` if both fit equally."""

@@ -44,6 +44,7 @@ class VideoSource:
         images: the frames.
         own_masks: (F, S, S) uint8 or None.
         swaps: how often the tracker had exchanged two hands, over the whole video.
+        doubles: number of frames in which it had put both on one hand.
     """
 
     video: VideoInfo
@@ -54,6 +55,7 @@ class VideoSource:
     images: ClipImages
     own_masks: np.ndarray | None
     swaps: int = 0
+    doubles: int = 0
 
     @property
     def landmarks(self) -> Landmarks:
@@ -93,21 +95,21 @@ def read_source(
             field="--frames",
         )
     selected = {side: hand.select(indices) for side, hand in tracked.items()}
-    hands = {side: hand for side, hand in selected.items() if hand.detected.any()}
-    if not hands:
+    seen = {side: hand for side, hand in selected.items() if hand.detected.any()}
+    if not seen:
         raise UsageError("no hand is detected in the selected frames", field="--frames")
-    for side in selected.keys() - hands.keys():
+    for side in selected.keys() - seen.keys():
         notice(f"The {side} hand is in none of the selected frames and is left out.")
     footage = Footage(info.width, info.height, info.fps / options.frames.stride, options.focal)
-    hands = _checked_sides(hands, landmarks, options, footage)
+    hands = _checked_sides(seen, landmarks, options, footage)
     windows = follow_hands(list(hands.values()), footage.fps, options.size)
     check_memory(windows)
     own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
     with progress("reading frames", len(indices)) as update:
         images = read_images(info, options.frames, windows, update)
     found = read_association(landmarks) if len(hands) == 2 else None
-    swaps = 0 if found is None else found.swaps
-    return VideoSource(info, Path(landmarks), indices, hands, windows, images, own, swaps)
+    repaired = (0, 0) if found is None else (found.swaps, found.doubles)
+    return VideoSource(info, Path(landmarks), indices, hands, windows, images, own, *repaired)
 
 
 def _read_hands(path: str | os.PathLike[str], options: VideoImport) -> dict[str | None, Landmarks]:

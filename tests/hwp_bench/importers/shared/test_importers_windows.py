@@ -8,12 +8,12 @@ from hypothesis import strategies as st
 from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip
 
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hand, resample
+from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hands, resample
 
 
 def test_the_cropped_camera_sees_what_the_crop_shows() -> None:
     clip = make_clip(8)
-    windows = follow_hand(clip.landmarks, 30.0, 100)
+    windows = follow_hands([clip.landmarks], 30.0, 100)
     Ks = windows.intrinsics(FOCAL, WIDTH, HEIGHT)
     for frame in range(8):
         rays = clip.joints[frame] / clip.joints[frame, :, 2:]
@@ -49,7 +49,7 @@ def test_windows_hold_every_landmark_of_every_detected_frame(seed: int, frames: 
     detected[rng.integers(frames)] = True
     image[~detected] = 0.0
     landmarks = Landmarks(image, np.zeros((frames, 21, 3)), np.ones(frames), detected)
-    windows = follow_hand(landmarks, 30.0, 256)
+    windows = follow_hands([landmarks], 30.0, 256)
     inside = (image - windows.corners[:, None])[detected]
     assert inside.min() >= 0
     assert inside.max() <= windows.side
@@ -60,5 +60,5 @@ def test_the_window_does_not_tremble() -> None:
     rng = np.random.default_rng(1)
     image = np.random.default_rng(2).uniform(100, 200, (1, 21, 2)) + rng.normal(0, 3, (90, 1, 2))
     landmarks = Landmarks(image, np.zeros((90, 21, 3)), np.ones(90), np.ones(90, dtype=bool))
-    steps = np.diff(follow_hand(landmarks, 30.0, 256).corners, axis=0)
+    steps = np.diff(follow_hands([landmarks], 30.0, 256).corners, axis=0)
     assert np.abs(steps).max() <= 1

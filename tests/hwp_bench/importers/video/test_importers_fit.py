@@ -14,7 +14,7 @@ from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.hands import pose_hand
 from hwp_bench.hands.template import rebuilt
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.windows import cut, follow_hand
+from hwp_bench.importers.shared.windows import cut, follow_hands
 from hwp_bench.importers.video.clip_model import continuous_rotation_vectors, posed_vertices
 from hwp_bench.importers.video.contour import ContourEnergy, signed_distance
 from hwp_bench.importers.video.fit_clip import (
@@ -185,7 +185,7 @@ def test_outline_vertices_are_those_of_the_hand_model(correctives: bool) -> None
     footage = Footage(WIDTH, HEIGHT, FPS, FOCAL)
     quick = FitSettings(start_steps=20, landmark_steps=1)
     fitted = fit_landmarks(clip.landmarks, hand, footage, quick)
-    windows = follow_hand(clip.landmarks, FPS, 96)
+    windows = follow_hands([clip.landmarks], FPS, 96)
     masks = [
         cut(clip.silhouette(frame), windows.corners[frame], windows.side) for frame in range(4)
     ]
@@ -208,7 +208,7 @@ def test_the_outline_pulls_a_displaced_hand_back() -> None:
         clip.landmarks.detected,
     )
     fitted = fit(clip, shifted)
-    windows = follow_hand(clip.landmarks, FPS, 96)
+    windows = follow_hands([clip.landmarks], FPS, 96)
     fields = np.stack(
         [
             signed_distance(cut(clip.silhouette(f), windows.corners[f], windows.side))

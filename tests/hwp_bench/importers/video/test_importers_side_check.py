@@ -44,8 +44,8 @@ def test_simulated_hands_of_both_sides(side: str) -> None:
     assert scores.frames == 10
     assert scores.better == side
     # Noise alone leaves 4 mm in each of three directions, 7 mm; the wrong side adds bends.
-    assert scores.of(side) < 0.008
-    assert scores.of(other) > 1.3 * scores.of(side)
+    assert getattr(scores, side) < 0.008
+    assert getattr(scores, other) > 1.3 * getattr(scores, side)
 
 
 def test_frames_without_a_hand_do_not_count() -> None:

@@ -12,7 +12,7 @@ from synthetic_clip import FOCAL, FPS, HEIGHT, WIDTH, SyntheticClip, make_clip
 
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hand
+from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hands
 from hwp_bench.importers.video.clip_model import posed_vertices
 from hwp_bench.importers.video.contour import ContourEnergy, signed_distance
 from hwp_bench.importers.video.fit_clip import FittedClip, Footage, fit_landmarks, fit_outline
@@ -51,7 +51,7 @@ def picture(clip: SyntheticClip, frame: int) -> np.ndarray:
 @functools.cache
 def footage() -> tuple[SyntheticClip, CropWindows, np.ndarray, np.ndarray]:
     clip = make_clip(FRAMES)
-    windows = follow_hand(clip.landmarks, FPS, SIZE)
+    windows = follow_hands([clip.landmarks], FPS, SIZE)
 
     def cropped(image: np.ndarray, frame: int) -> np.ndarray:
         return cv2.resize(
