@@ -43,7 +43,9 @@ class Ended:
     seconds: float
 
 
-def run_forked(program: Callable[[Sequence[str]], int], words: Sequence[str], folder: Path) -> Ended:
+def run_forked(
+    program: Callable[[Sequence[str]], int], words: Sequence[str], folder: Path
+) -> Ended:
     """Run a command in a child of this process, which has every module loaded already.
 
     Args:
@@ -152,7 +154,7 @@ def _left_behind(
         hidden = path.name.startswith(".") or path.name.endswith((".lock", ".old"))
         if hidden and path.name != ".lock":
             faults.append(f"left {path.relative_to(folder)!s:.100} behind")
-        elif path.is_file() and path.stat().st_size == 0 and path.suffix not in (".log", ".txt"):
+        elif not hidden and _is_empty(path):
             faults.append(f"left {path.relative_to(folder)!s:.100} empty")
         elif status == 0 and path.suffix == ".json" and path.is_file():
             try:
@@ -162,3 +164,8 @@ def _left_behind(
     if status != 0:
         faults += [f"failed and wrote {path.name}" for path in whole if path.exists()]
     return [fault.encode("utf-8", "backslashreplace").decode() for fault in faults]
+
+
+def _is_empty(path: Path) -> bool:
+    """Whether a file has no content where one is expected: a method may print nothing."""
+    return path.is_file() and path.stat().st_size == 0 and path.suffix not in (".log", ".txt")

@@ -25,7 +25,6 @@ from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.splat.threads import denormals_flushed
 
-
 _Frame = Annotated[int, Meta(ge=0, lt=MAX_FRAMES)]
 # A capture has no more frames, so that a fit has none.
 _PER_FRAME = Meta(max_length=MAX_FRAMES)

@@ -73,7 +73,9 @@ def test_hands_of_impossible_size_are_refused(
         arrays = {key: file[key] for key in file.files}
     arrays[f"right_{name}"][0] = value
     np.savez(root / "hands.npz", **arrays)
-    with pytest.raises(BadInput, match=re.escape(f"right_{name}: holds a number beyond {LARGEST:g}")):
+    with pytest.raises(
+        BadInput, match=re.escape(f"right_{name}: holds a number beyond {LARGEST:g}")
+    ):
         open_capture(root)
     assert main(["data", "show", str(root), "-o", str(root / "sheet.png")]) == 1
     assert capsys.readouterr().err.count("\n") == 1
