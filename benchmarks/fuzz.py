@@ -63,7 +63,8 @@ _BENCH, _HAND = "hwp-bench", "wildghand"
 
 TARGETS = (
     Target((_BENCH, "data", "check", "capture"), (*_CAPTURE, *_TRUTH), weight=3.0),
-    Target((_BENCH, "data", "show", "capture", "-o", "@out.png"), _CAPTURE, ("--count", "--edge"), 2),
+    Target((_BENCH, "data", "show", "capture", "-o", "@out.png"), _CAPTURE,
+           ("--count", "--edge"), 2),
     Target((_BENCH, "data", "audit", "capture", "--splits", "split.json"),
            ("split.json", *_CAPTURE), ("--guard",)),
     Target((_BENCH, "data", "inputs", "--capture", "capture", "-o", OUT),
@@ -94,8 +95,10 @@ TARGETS = (
     Target((_BENCH, "leaderboard", "show", "--entries", "entries"), ("entries/*.json",)),
     Target((_BENCH, "leaderboard", "build", "--entries", "entries", "-o", OUT),
            ("entries/*.json",), weight=2),
-    Target((_BENCH, "leaderboard", "add", "results", "--entries", "entries"), _RESULTS, whole=False),
-    Target((_BENCH, "leaderboard", "submit", "results", "-o", OUT), _RESULTS, ("--by", "--link")),
+    Target((_BENCH, "leaderboard", "add", "results", "--entries", "entries"), _RESULTS,
+           whole=False),
+    Target((_BENCH, "leaderboard", "submit", "results", "-o", OUT, "--entries", "entries"),
+           _RESULTS, ("--by", "--link")),
     Target((_BENCH, "leaderboard", "confirm", "results", "--by", "x", "--entries", "entries"),
            (*_RESULTS, "entries/*.json"), ("--tolerance", "--entry"), whole=False),
     Target((_BENCH, "sim", "render", "scene.toml", "-o", OUT, "--frames", "10", "--size", "16",
@@ -107,7 +110,8 @@ TARGETS = (
            ("submission/method.toml", "submission/predictions/*/*", *_CAPTURE, *_TRUTH),
            ("--set", "--splits", "--steps", "--budget", "--seed"), 2, False),
     Target((_BENCH, "evaluate", "gray", "--capture", "capture", "-o", OUT, "--isolation", "none"),
-           ("gray/method.toml",), ("--set", "--preset", "--time-limit", "--memory-limit"), 1, False),
+           ("gray/method.toml",), ("--set", "--preset", "--time-limit", "--memory-limit"),
+           1, False),
     Target((_BENCH, "ablate", "gray", "--capture", "capture", "-o", OUT, "--seeds", "1",
             "--isolation", "none"), ("gray/method.toml",), ("--set", "--without"), 0.3, False),
     Target((_BENCH, "budget", "gray", "--capture", "capture", "-o", OUT), ("gray/method.toml",),
@@ -119,7 +123,8 @@ TARGETS = (
            (*_CAPTURE, "prior/*"), ("--set", "--seed", "--steps", "--seconds"), 2),
     Target((_HAND, "fit", "seed.avi", "-o", OUT, *FIT, "--landmarks", "landmarks.npz"),
            ("seed.avi", "landmarks.npz"), ("--set", "--seed"), 0.5, False),
-    Target((_HAND, "pretrain", "capture", "-o", OUT, *FIT), _CAPTURE, ("--set", "--seed"), 0.5, False),
+    Target((_HAND, "pretrain", "capture", "-o", OUT, *FIT), _CAPTURE, ("--set", "--seed"),
+           0.5, False),
     Target((_HAND, "render", "avatar", "--poses", "capture", "-o", OUT, "--frames", "0:2"),
            (*_AVATAR, *_AVATAR, *_CAPTURE[:2]), ("--frames", "--background", "--hand-model"), 3),
     Target((_HAND, "export", "avatar", "-o", "@out.ply"), _AVATAR, ("--scale", "--frame"), 2),
@@ -265,7 +270,16 @@ def _change(target: Target, folder: Path, chance: random.Random) -> tuple[list[s
         value = chance.choice(WORDS)
         if option == "--set":
             name = chance.choice(
-                ("level", "gaussians", "schedule.batch", "network.size", "mode", "device", "x", "a.b")
+                (
+                    "level",
+                    "gaussians",
+                    "schedule.batch",
+                    "network.size",
+                    "mode",
+                    "device",
+                    "x",
+                    "a.b",
+                )
             )
             value = f"{name}={value}"
         # A word longer than the system's limit can reach no program.
@@ -298,8 +312,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--cases", type=int, default=0, help="how many, instead of how long")
     parser.add_argument("--first", type=int, default=0, help="number of the first case")
     parser.add_argument("--seed", type=int, default=0, help="of all choices (default 0)")
-    parser.add_argument("--only", nargs="+", metavar="WORD", help="commands with one of these words")
-    parser.add_argument("--seeds", type=Path, help="folder of valid inputs, made if it is not there")
+    parser.add_argument(
+        "--only", nargs="+", metavar="WORD", help="commands with one of these words"
+    )
+    parser.add_argument(
+        "--seeds", type=Path, help="folder of valid inputs, made if it is not there"
+    )
     parser.add_argument(
         "--keep", type=Path, default=Path("fuzz-found"), help="folder for what is found"
     )

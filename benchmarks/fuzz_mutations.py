@@ -43,8 +43,8 @@ TOML_VALUES = (
 WORDS = (
     *TOML_VALUES,
     "", "x", "auto", "nan", "inf", "-5", "1e999", "\ud800", "a\udcff", "\x1b[2J", "a\nb", "none",
-    ".." , "/", "/dev/null", "/dev/zero", "a" * 300, "é", "=", "0:0", "5:2", "0:99999999999", "-1:3",
-    "1" * 400,
+    "..", "/", "/dev/null", "/dev/zero", "a" * 300, "é", "=", "0:0", "5:2",
+    "0:99999999999", "-1:3", "1" * 400,
 )  # fmt: skip
 #: Names of folders and files that a person may have.
 NAMES = (
@@ -303,13 +303,17 @@ def _chunk(kind: bytes, content: bytes) -> bytes:
 def _image(data: bytes, chance: random.Random) -> tuple[bytes, str]:
     import zlib
 
-    size = chance.choice(((1, 1), (100_000, 100_000), (2**31 - 1, 1), (0, 0), (31, 32), (8000, 8000)))
+    size = chance.choice(
+        ((1, 1), (100_000, 100_000), (2**31 - 1, 1), (0, 0), (31, 32), (8000, 8000))
+    )
     depth, kind = chance.choice(((8, 2), (16, 2), (1, 0), (8, 3), (8, 6), (16, 6), (4, 3), (8, 9)))
     head = struct.pack(">II5B", *size, depth, kind, 0, 0, chance.choice((0, 0, 1)))
     if not data.startswith(b"\x89PNG"):
         return _bytes(data, chance)
     ways = {
-        f"a head of {size}, {depth} bits, type {kind}": data[:8] + _chunk(b"IHDR", head) + data[33:],
+        f"a head of {size}, {depth} bits, type {kind}": data[:8]
+        + _chunk(b"IHDR", head)
+        + data[33:],
         "900 texts": data[:33]
         + b"".join(
             _chunk(b"zTXt", b"k%d\0\0" % i + zlib.compress(bytes(200_000))) for i in range(900)
@@ -317,7 +321,9 @@ def _image(data: bytes, chance: random.Random) -> tuple[bytes, str]:
         + data[33:],
         "an animation": data[:33] + _chunk(b"acTL", struct.pack(">II", 5, 0)) + data[33:],
         "a text that steers": data[:33] + _chunk(b"tEXt", b"a\x1b[2J\0\x1b]0;x\x07") + data[33:],
-        "a profile": data[:33] + _chunk(b"iCCP", b"x\0\0" + zlib.compress(bytes(10**7))) + data[33:],
+        "a profile": data[:33]
+        + _chunk(b"iCCP", b"x\0\0" + zlib.compress(bytes(10**7)))
+        + data[33:],
         "a playlist": b"ffconcat version 1.0\nfile /etc/passwd\n",
         "an SVG": b"<svg xmlns='http://www.w3.org/2000/svg'/>",
         "a GIF": b"GIF89a\x01\0\x01\0\0\0\0;",
@@ -331,7 +337,7 @@ def _image(data: bytes, chance: random.Random) -> tuple[bytes, str]:
 def _video(data: bytes, chance: random.Random) -> tuple[bytes, str]:
     ways = {
         "an ffconcat playlist": b"ffconcat version 1.0\nfile seed.avi\nduration 1\n",
-        "an HLS playlist": b"#EXTM3U\n#EXT-X-TARGETDURATION:1\n#EXTINF:1,\nseed.avi\n#EXT-X-ENDLIST\n",
+        "an HLS playlist": b"#EXTM3U\n#EXTINF:1,\nseed.avi\n#EXT-X-ENDLIST\n",
         "an SDP description": b"v=0\no=- 0 0 IN IP4 127.0.0.1\nm=video 5004 RTP/AVP 96\n",
         "a PNG": b"\x89PNG\r\n\x1a\n" + data[:500],
         "a name of a codec that steers": data.replace(b"MJPG", b"\x1b[2J"),

@@ -75,7 +75,11 @@ def make_seeds(folder: Path) -> None:
 
 def _make(module: str, *words: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-m", module, *words], cwd=ROOT, capture_output=True, text=True, check=False
+        [sys.executable, "-m", module, *words],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     if done.returncode:
         raise SystemExit(f"{module} {' '.join(words)} failed: {done.stderr[-2000:]}")

@@ -39,11 +39,13 @@ class Ended:
     out: bytes
     #: What it said on standard error.
     err: bytes
-    #: Most memory that it held, bytes.
-    memory: int
+    #: Seconds of processor time.
+    seconds: float
 
 
-def run_forked(program: Callable[[Sequence[str]], int], words: Sequence[str], folder: Path) -> Ended:
+def run_forked(
+    program: Callable[[Sequence[str]], int], words: Sequence[str], folder: Path
+) -> Ended:
     """Run a command in a child of this process, which has every module loaded already.
 
     Args:
@@ -67,7 +69,7 @@ def run_forked(program: Callable[[Sequence[str]], int], words: Sequence[str], fo
     texts = [(folder / name).read_bytes() for name in (".out", ".err")]
     for name in (".out", ".err"):
         (folder / name).unlink()
-    return Ended(code, *texts, usage.ru_maxrss * 1024)
+    return Ended(code, *texts, usage.ru_utime + usage.ru_stime)
 
 
 def _kill_group(child: int) -> None:
@@ -82,7 +84,7 @@ def _live(program: Callable[[Sequence[str]], int], words: Sequence[str], folder:
         os.setsid()
         os.chdir(folder)
         for number, name in ((1, ".out"), (2, ".err")):
-            handle = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND)
+            handle = os.open(name, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_APPEND, 0o600)
             os.dup2(handle, number)
         os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
         sys.stdout = os.fdopen(1, "w", encoding="utf-8", closefd=False)
@@ -104,7 +106,9 @@ def _live(program: Callable[[Sequence[str]], int], words: Sequence[str], folder:
     os._exit(status)
 
 
-def faults_of(ended: Ended, folder: Path, before: frozenset[Path], whole: Sequence[Path]) -> list[str]:
+def faults_of(
+    ended: Ended, folder: Path, before: frozenset[Path], whole: Sequence[Path]
+) -> list[str]:
     """Say what a command did that none may do, a line each; empty for an end as promised.
 
     Args:
@@ -116,13 +120,15 @@ def faults_of(ended: Ended, folder: Path, before: frozenset[Path], whole: Sequen
     faults = []
     out = ended.out.decode("utf-8", "surrogateescape")
     err = ended.err.decode("utf-8", "surrogateescape")
-    if ended.status == -signal.SIGXCPU or (ended.status == -signal.SIGKILL):
-        faults.append(f"took more than {CPU_SECONDS} s, or was killed for memory")
+    if ended.status in (-signal.SIGXCPU, -signal.SIGKILL):
+        faults.append(f"was killed after {ended.seconds:.0f} s of processor time")
     elif ended.status not in (0, 1, 2):
         faults.append(f"ended with status {ended.status}")
     if _TRACE in err or _TRACE in out:
-        last = [line for line in (out + err).splitlines() if re.match(r"[\w.]+(Error|Exception|Overflow|Interrupt)?\b.*", line)]
-        faults.append(f"a traceback: {(last or ['?'])[-1][:200]}")
+        # The exception's line is the first that is not indented after a trace.
+        rest = (out + err).rsplit(_TRACE, 1)[1].splitlines()[1:]
+        last = next((line for line in rest if line and not line.startswith(" ")), "?")
+        faults.append(f"a traceback: {last[:200]}")
     if ended.status in (1, 2):
         messages = len(_ERROR.findall(err))
         if messages > 1:
@@ -144,11 +150,11 @@ def _left_behind(
     faults = []
     new = sorted(set(folder.rglob("*")) - before)
     for path in new:
-        hidden = path.name.startswith(".") and path.name != ".lock"
-        if hidden or path.name.endswith((".lock", ".old")):
-            if path.name != ".lock":
-                faults.append(f"left {path.relative_to(folder)!s:.100} behind")
-        elif path.is_file() and path.stat().st_size == 0 and path.suffix not in (".log", ".txt"):
+        # A folder of results keeps its lock file; nothing else that is hidden is an output.
+        hidden = path.name.startswith(".") or path.name.endswith((".lock", ".old"))
+        if hidden and path.name != ".lock":
+            faults.append(f"left {path.relative_to(folder)!s:.100} behind")
+        elif not hidden and _is_empty(path):
             faults.append(f"left {path.relative_to(folder)!s:.100} empty")
         elif status == 0 and path.suffix == ".json" and path.is_file():
             try:
@@ -158,3 +164,8 @@ def _left_behind(
     if status != 0:
         faults += [f"failed and wrote {path.name}" for path in whole if path.exists()]
     return [fault.encode("utf-8", "backslashreplace").decode() for fault in faults]
+
+
+def _is_empty(path: Path) -> bool:
+    """Whether a file has no content where one is expected: a method may print nothing."""
+    return path.is_file() and path.stat().st_size == 0 and path.suffix not in (".log", ".txt")

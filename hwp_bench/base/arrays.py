@@ -83,6 +83,7 @@ def take(
     *,
     where: str | os.PathLike[str],
     dtype: type = np.float64,
+    most: float = math.inf,
 ) -> np.ndarray:
     """Take one array out of a file and check it.
 
@@ -92,12 +93,14 @@ def take(
         shape: expected shape; None accepts any length.
         where: the file, for the message.
         dtype: type to return; floats must be finite.
+        most: largest absolute value.
 
     Returns:
         The array as `dtype`.
 
     Raises:
-        BadInput: absent, of another shape or kind, or not finite; the first bad row is named.
+        BadInput: absent, of another shape or kind, not finite or too large; the first bad
+            row is named.
     """
     if name not in arrays:
         raise BadInput("is missing", where=where, field=name)
@@ -117,4 +120,7 @@ def take(
         rows = ~np.isfinite(array.reshape(len(array), -1)).all(axis=1) if array.ndim else []
         first = int(np.argmax(rows)) if array.ndim else 0
         raise BadInput(f"holds NaN or infinity (first in row {first})", where=where, field=name)
+    if array.size and dtype is not bool and np.abs(array).max() > most:
+        row = int(np.unravel_index(np.abs(array).argmax(), array.shape)[0]) if array.ndim else 0
+        raise BadInput(f"holds a number beyond {most:g} (row {row})", where=where, field=name)
     return array

@@ -12,6 +12,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch
+from hwp_bench.base.text import check_name
 
 #: Largest image that is decoded, in pixels: a 300 byte PNG can ask for gigabytes.
 MAX_PIXELS = 64 * 1024 * 1024
@@ -66,6 +67,7 @@ def read_gray(path: str | os.PathLike[str], size: tuple[int, int] | None = None)
 
 
 def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
+    check_name(path)
     _check_kind(path)
     config = oiio.ImageSpec()
     # Otherwise colours come multiplied by alpha, and a submission's alpha would act as a mask.
@@ -150,6 +152,7 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
 
     Raises:
         ShapeMismatch: the array is not such an image.
+        UsageError: the path is not UTF-8.
         HwpError: the place cannot be written.
     """
     path = Path(path)
@@ -159,6 +162,7 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
             f"cannot store an array of shape {pixels.shape} and type {pixels.dtype} as an image",
             where=path,
         )
+    check_name(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
     output = oiio.ImageOutput.create(os.fspath(temporary))

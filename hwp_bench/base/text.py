@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
 import re
 from collections.abc import Sequence
+
+from hwp_bench.base.errors import UsageError
 
 #: Control characters except tab and line feed, the marks that reverse the direction of writing,
 #: and halves of surrogate pairs, which no file can hold as UTF-8; as a set of characters in a
@@ -21,6 +24,23 @@ def bounded(items: Sequence[object], most: int = 12) -> str:
 def has_odd_characters(text: str) -> bool:
     """Whether a text holds one of `ODD_CHARACTERS`."""
     return _ODD.search(text) is not None
+
+
+def check_name(path: str | os.PathLike[str]) -> None:
+    """Refuse the name of a file or folder that is not UTF-8.
+
+    Libraries that read and write files in C++ take such a name for another one.
+
+    Raises:
+        UsageError: the name holds bytes that are not UTF-8.
+    """
+    text = os.fspath(path)
+    try:
+        text.encode()
+    except UnicodeEncodeError as error:
+        raise UsageError(
+            "is not UTF-8", where=shown(text), remedy="Rename the file or folder."
+        ) from error
 
 
 def shown(text: str) -> str:

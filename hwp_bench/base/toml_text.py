@@ -34,7 +34,8 @@ def parse_toml(
 
     Raises:
         error: the text is too long, no Unicode or not TOML, nested too deeply, or holds an integer
-            of more than `MAX_BITS`. A text that is merely not TOML has a `tomllib.TOMLDecodeError` as cause.
+            of more than `MAX_BITS`. Its cause is a `tomllib.TOMLDecodeError` where the text is
+            merely not TOML.
     """
 
     def refuse(problem: str) -> HwpError:

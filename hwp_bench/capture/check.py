@@ -13,7 +13,7 @@ import numpy as np
 
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.images import pixel_digest
-from hwp_bench.base.text import bounded
+from hwp_bench.base.text import bounded, shown
 from hwp_bench.capture.content import image_reader
 from hwp_bench.capture.reader import Capture, open_capture
 from hwp_bench.capture.schema import IMAGE_FOLDERS, SIMULATED, CaptureInfo, image_path
@@ -181,7 +181,7 @@ def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
             "warning",
             os.fspath(folder),
             None,
-            f"holds {len(others)} further files: {bounded(others)}",
+            f"holds {len(others)} further files: {shown(bounded(others))}",
             "They are ignored.",
         )
     digests = [digest for digest, _ in results]

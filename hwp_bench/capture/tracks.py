@@ -13,14 +13,18 @@ from hwp_bench.base.arrays import read_npz, take, write_npz
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.parameters import Camera, HandParameters
 
+#: Largest number of a capture's hands and cameras: rad, m, px. Squares of it are exact enough in
+#: float32, and what is drawn with it has a place.
+LARGEST = 1e6
+
 
 @dataclass(frozen=True)
 class Cameras:
     """One pinhole camera a frame, OpenCV axes (x right, y down, z forward).
 
     Raises:
-        BadInput: shapes differ, a value is not finite, a focal length is not positive, or a
-            view matrix is not a rigid motion.
+        BadInput: shapes differ, a value is not finite or beyond `LARGEST`, a focal length is not
+            positive, or a view matrix is not a rigid motion.
     """
 
     #: (F, 3, 3) intrinsics in pixels; pixel centres lie at +0.5.
@@ -52,8 +56,8 @@ def check_cameras(Ks: np.ndarray, viewmats: np.ndarray, *, where: str) -> None:
     """
     arrays = {"Ks": np.asarray(Ks), "viewmats": np.asarray(viewmats)}
     count = len(arrays["Ks"])
-    K = take(arrays, "Ks", (count, 3, 3), where=where)
-    V = take(arrays, "viewmats", (count, 4, 4), where=where)
+    K = take(arrays, "Ks", (count, 3, 3), where=where, most=LARGEST)
+    V = take(arrays, "viewmats", (count, 4, 4), where=where, most=LARGEST)
     rotation = V[:, :3, :3]
     rules = (
         ("Ks", (K[:, 0, 0] > 0) & (K[:, 1, 1] > 0), "a focal length that is not above 0"),
@@ -106,14 +110,15 @@ def read_hands(
         Parameters by side, in the order of `sides`.
 
     Raises:
-        BadInput: missing, damaged, of another length, or not finite; the array is named.
+        BadInput: missing, damaged, of another length, not finite or beyond `LARGEST`; the array is
+            named.
     """
     arrays = read_npz(path)
     return {
         side: HandParameters(
-            pose=take(arrays, f"{side}_pose", (frame_count, 16, 3), where=path),
-            betas=take(arrays, f"{side}_betas", (10,), where=path),
-            transl=take(arrays, f"{side}_transl", (frame_count, 3), where=path),
+            pose=take(arrays, f"{side}_pose", (frame_count, 16, 3), where=path, most=LARGEST),
+            betas=take(arrays, f"{side}_betas", (10,), where=path, most=LARGEST),
+            transl=take(arrays, f"{side}_transl", (frame_count, 3), where=path, most=LARGEST),
             valid=take(arrays, f"{side}_valid", (frame_count,), where=path, dtype=bool),
         )
         for side in sides

@@ -43,18 +43,20 @@ def run(args: argparse.Namespace) -> int:
 
 def _print(report: CheckReport) -> None:
     from hwp_bench.base.tables import Column, Table, print_table
+    from hwp_bench.base.text import shown
 
+    title = shown(report.path)
     verdict = "sound" if report.ok else "NOT SOUND"
     rows = tuple((name, _fact(value)) for name, value in report.facts.items())
     if rows:
         columns = (Column("fact"), Column("value"))
-        print_table(Table(f"{report.path}: {verdict}", columns, rows))
+        print_table(Table(f"{title}: {verdict}", columns, rows))
     else:
-        print(f"{report.path}: {verdict}")
+        print(f"{title}: {verdict}")
     for finding in report.findings:
         place = ": ".join(part for part in (finding.where, finding.field) if part)
         remedy = f" {finding.remedy}" if finding.remedy else ""
-        print(f"{finding.level}: {place}: {finding.problem}.{remedy}")
+        print(shown(f"{finding.level}: {place}: {finding.problem}.{remedy}").replace("\n", " "))
 
 
 def _fact(value: object) -> str:

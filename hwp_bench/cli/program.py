@@ -15,6 +15,7 @@ from typing import Any
 
 from hwp_bench.base.denormals import flushed_process
 from hwp_bench.base.errors import HwpError
+from hwp_bench.base.text import check_name
 from hwp_bench.base.version import __version__
 
 
@@ -47,6 +48,8 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
         # As by Ctrl-C, so that child processes are stopped and temporary files removed.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
+        for word in words:
+            check_name(word)
         status = _dispatch(program, tree, words)
         sys.stdout.flush()
         return status

@@ -147,7 +147,9 @@ def _find(path: Path, side: str) -> Path:
 
 
 def _read(file: Path) -> dict[str, Any]:
-    content = load_pickle(file, stand_ins=_STAND_INS, max_bytes=MAX_FILE_BYTES, max_steps=MAX_FILE_STEPS)
+    content = load_pickle(
+        file, stand_ins=_STAND_INS, max_bytes=MAX_FILE_BYTES, max_steps=MAX_FILE_STEPS
+    )
     if not isinstance(content, dict):
         raise BadHandModel("does not contain a table of named arrays", where=file, remedy=_REMEDY)
     return content

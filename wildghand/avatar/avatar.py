@@ -6,14 +6,15 @@ import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Annotated, Any, ClassVar
 
 import numpy as np
 import torch
+from msgspec import Meta
 
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
-from hwp_bench.capture.schema import HandModelId
+from hwp_bench.capture.schema import MAX_FRAMES, HandModelId
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.avatar import inline
@@ -24,6 +25,10 @@ from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.splat.threads import denormals_flushed
 
+_Frame = Annotated[int, Meta(ge=0, lt=MAX_FRAMES)]
+# A capture has no more frames, so that a fit has none.
+_PER_FRAME = Meta(max_length=MAX_FRAMES)
+
 
 @dataclass(frozen=True)
 class FitRecord:
@@ -33,13 +38,13 @@ class FitRecord:
     removed_fields: ClassVar[tuple[str, ...]] = ("loss",)
 
     #: Frames of the capture that were fitted.
-    frames: list[int] = field(default_factory=list)
+    frames: Annotated[list[_Frame], _PER_FRAME] = field(default_factory=list)
     #: Temporal weight of each of them by side; empty without DPD.
-    temporal: dict[str, list[float]] = field(default_factory=dict)
+    temporal: dict[str, Annotated[list[float], _PER_FRAME]] = field(default_factory=dict)
     #: Probability that each is clean, as the pre-pass judged; empty without it.
-    clean: list[float] = field(default_factory=list)
+    clean: Annotated[list[float], _PER_FRAME] = field(default_factory=list)
     #: Weight of each in the fit.
-    frame_weights: list[float] = field(default_factory=list)
+    frame_weights: Annotated[list[float], _PER_FRAME] = field(default_factory=list)
     #: Optimizer steps.
     steps: int = 0
     #: Seconds of fitting.

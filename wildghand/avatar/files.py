@@ -11,17 +11,19 @@ import dataclasses
 import functools
 import os
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
-from hwp_bench.base.records import parse_record
+from hwp_bench.base.records import Seed, parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
+from wildghand.avatar.tensors import read_tensors
 from wildghand.avatar.weight_masks import read_weight_masks, write_weight_masks
 from wildghand.evidence import Evidence
 from wildghand.light import KnownLight
@@ -37,8 +39,8 @@ VERSION_1 = "wildghand-avatar/1"
 DESCRIPTION = "avatar.json"
 MODEL = "model.safetensors"
 WEIGHTS = "weights"
-#: Largest model that is read, bytes.
-MAX_MODEL_BYTES = 4 << 30
+#: Largest description that is read, bytes: that of a fit of 100,000 frames has 10 million.
+MAX_DESCRIPTION_BYTES = 32 << 20
 
 
 @dataclasses.dataclass(frozen=True)
@@ -47,9 +49,9 @@ class _Description:
 
     schema: str
     hand_model: HandModelId
-    sides: list[str]
-    seed: int
-    mean_color: list[float]
+    sides: Annotated[list[str], Meta(max_length=2)]
+    seed: Seed
+    mean_color: Annotated[list[float], Meta(max_length=3)]
     betas: dict[str, list[float]]
     settings: dict[str, Any]
     fit: FitRecord
@@ -103,9 +105,6 @@ def load_avatar(
     Raises:
         BadInput: no avatar, damaged, or made with another hand model; the field is named.
     """
-    from safetensors import SafetensorError
-    from safetensors.torch import load_file
-
     root = Path(path)
     if not (root / DESCRIPTION).is_file():
         raise BadInput(
@@ -114,7 +113,7 @@ def load_avatar(
             remedy="Make one with `wildghand fit CAPTURE -o AVATAR`.",
         )
     where = str(root / DESCRIPTION)
-    description = read_json(root / DESCRIPTION)
+    description = read_json(root / DESCRIPTION, max_bytes=MAX_DESCRIPTION_BYTES)
     value = parse_record(_Description, description, where=where, error=BadInput)
     try:
         if value.schema == VERSION_1:
@@ -130,10 +129,8 @@ def load_avatar(
     mean_color, frame_count = torch.tensor(value.mean_color), max(1, len(value.fit.frames))
     device = torch.device(device)
     file = root / MODEL
-    if not file.is_file() or file.stat().st_size > MAX_MODEL_BYTES:
-        raise BadInput(f"is missing or larger than {MAX_MODEL_BYTES} bytes", where=file)
+    tensors = read_tensors(file, settings, value.sides, frame_count)
     try:
-        tensors = load_file(file)
         subject = SubjectShape.from_tensors(tensors, next(iter(templates.values())), str(file))
         model = make_model(
             templates, settings, mean_color, frame_count, value.seed, device, subject
@@ -146,12 +143,9 @@ def load_avatar(
         if evidence is not None:
             model.keep(evidence)
         model.load_state_dict(tensors, strict=True)
-    except (SafetensorError, RuntimeError, OSError) as error:
+    except RuntimeError as error:
         problem = str(error).splitlines()[0][:300]
         raise BadInput(f"does not hold this avatar's tensors ({problem})", where=file) from error
-    for name, tensor in model.state_dict().items():
-        if not bool(torch.isfinite(tensor).all()):
-            raise BadInput("holds NaN or infinity", where=file, field=name)
     betas = {side: np.array(given) for side, given in value.betas.items()}
     avatar = WildGHandAvatar(
         model.eval(),
@@ -187,6 +181,16 @@ def _templates(
             f"was made with the hand model {hand_model.name}, not {name}",
             where=where,
             field="hand_model",
-            remedy=f"Give the model it was made with: --hand {hand_model.source}.",
+            remedy=f"Give the model it was made with: --hand-model {hand_model.source}.",
+        )
+    # The same surface from another file is the same model; of another edition every vertex differs.
+    digest = next(iter(templates.values())).digest
+    if digest != hand_model.digest:
+        raise BadInput(
+            f"was made with another edition of the hand model {name} "
+            f"({hand_model.digest[:12]}) than the one here ({digest[:12]})",
+            where=where,
+            field="hand_model",
+            remedy="Give the edition it was made with (--hand-model), or fit the avatar again.",
         )
     return templates

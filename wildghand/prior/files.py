@@ -223,6 +223,15 @@ def _check_fit(
             field="hand_model",
             remedy="Make one with `wildghand pretrain` on captures of this hand model.",
         )
+    digest = record.hand_model.get("digest", "")
+    if digest != hand_model.digest:
+        raise BadInput(
+            f"was made with another edition of the hand model {hand_model.name} "
+            f"({digest[:12]}) than the capture ({hand_model.digest[:12]})",
+            where=where,
+            field="hand_model",
+            remedy="Make one with `wildghand pretrain` on captures of this edition.",
+        )
 
 
 def _read_prior(

@@ -14,10 +14,23 @@ import numpy as np
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import MAX_PIXELS, read_gray
-from hwp_bench.base.text import bounded
+from hwp_bench.base.text import bounded, check_name
 from hwp_bench.importers.shared.windows import CropWindows, cut, resample
 from hwp_bench.importers.video.contour import FIELD_SIZE
 from hwp_bench.importers.video.video_settings import FrameRange
+
+#: Containers that are read, each with how its files begin.
+CONTAINERS = {
+    "MP4 or MOV": rb".{4}(ftyp|moov|mdat|wide|free|skip|pnot)",
+    "Matroska or WebM": rb"\x1aE\xdf\xa3",
+    "AVI": rb"RIFF.{4}AVI ",
+    "MPEG transport stream": rb"(?:.{4})?G.{187}(?:.{4})?G",
+    "MPEG": rb"\0\0\x01[\xba\xb3]",
+    "Flash video": rb"FLV\x01",
+    "Ogg": rb"OggS\0",
+    "ASF or WMV": rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11",
+}
+_HEAD = 512
 
 
 @dataclass(frozen=True)
@@ -226,6 +239,25 @@ def read_frames(info: VideoInfo, selection: FrameRange) -> Iterator[tuple[int, n
         )
 
 
+def _check_container(path: Path) -> None:
+    """Refuse what is no video file by its first bytes, before FFmpeg chooses a reader.
+
+    FFmpeg also reads playlists, lists of files and descriptions of streams, which make it open
+    other files or addresses of their author's choice.
+    """
+    try:
+        with path.open("rb") as stream:
+            head = stream.read(_HEAD)
+    except OSError as error:
+        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+    if not any(re.match(pattern, head, re.DOTALL) for pattern in CONTAINERS.values()):
+        raise BadInput(
+            f"is no video file of a kind that is read ({', '.join(CONTAINERS)})",
+            where=path,
+            remedy="Convert it, such as with: ffmpeg -i VIDEO video.mp4",
+        )
+
+
 @contextlib.contextmanager
 def _opened(path: Path) -> Iterator[Any]:
     import cv2
@@ -234,7 +266,11 @@ def _opened(path: Path) -> Iterator[Any]:
         raise BadInput("does not exist", where=path, remedy="Give a video file.")
     if path.stat().st_size == 0:
         raise BadInput("is empty (0 bytes)", where=path)
-    capture = cv2.VideoCapture(os.fspath(path))
+    _check_container(path)
+    check_name(path)
+    # FFmpeg would print what the file's headers say, terminal escapes too.
+    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    capture = cv2.VideoCapture(os.fspath(path), cv2.CAP_FFMPEG)
     try:
         if not capture.isOpened():
             raise BadInput("is not a video that can be read", where=path)

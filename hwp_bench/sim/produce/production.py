@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import shutil
@@ -122,12 +123,18 @@ def render_capture(
             waiting.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise HwpError(f"cannot be made ({error.strerror})", where=waiting) from error
-        start = time.perf_counter()
-        _render_missing(scene, count, edge, waiting, workers, exr)
-        seconds = time.perf_counter() - start
-        _assemble(scene, count, edge, waiting, out, overwrite, seconds, free_view)
-        shutil.rmtree(waiting, ignore_errors=True)
-    waiting.with_name(f"{waiting.name}.lock").unlink(missing_ok=True)
+        try:
+            start = time.perf_counter()
+            _render_missing(scene, count, edge, waiting, workers, exr)
+            seconds = time.perf_counter() - start
+            _assemble(scene, count, edge, waiting, out, overwrite, seconds, free_view)
+            shutil.rmtree(waiting, ignore_errors=True)
+        finally:
+            # Frames of a render that failed stay for the next start; nothing else does.
+            with contextlib.suppress(OSError):
+                waiting.rmdir()
+            with contextlib.suppress(OSError):
+                waiting.with_name(f"{waiting.name}.lock").unlink()
     return open_capture(out)
 
 

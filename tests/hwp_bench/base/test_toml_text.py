@@ -49,7 +49,7 @@ def test_a_setting_out_of_bounds_is_one_message(value: str) -> None:
 
 @pytest.mark.parametrize("value", ["\udcff", "a\x1b[2J", "\u202e"])
 def test_a_setting_that_steers_a_terminal_is_refused(value: str) -> None:
-    with pytest.raises(UsageError, match="control character|no Unicode"):
+    with pytest.raises(UsageError, match=r"control character|no Unicode"):
         overrides([f"level={value}"])
 
 

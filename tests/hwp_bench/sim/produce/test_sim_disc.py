@@ -42,6 +42,7 @@ def test_a_disc_that_fills(
         render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     assert str(caught.value).count("\n") == 0
     assert not out.exists()
+    assert not list(tmp_path.glob("*.lock")) + list(tmp_path.glob(".*.lock"))
     with pytest.raises(BadInput):
         open_capture(out)
     monkeypatch.setattr(os, "replace", honest)
