@@ -228,9 +228,6 @@ def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
         value = getattr(args, name)
         if value is not None and not 0 < value < float("inf"):
             raise UsageError(f"{value} is not above 0", field=f"--{name.replace('_', '-')}")
-    for path in args.expose:
-        if not Path(path).exists():
-            raise UsageError("does not exist", where=path, field="--expose")
     return EvaluationSettings(
         suite="captures" if args.capture else args.suite,
         preset=args.preset,

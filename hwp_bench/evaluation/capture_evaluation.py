@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -42,7 +43,6 @@ from hwp_bench.run.engine.job import OnProgress, ignore
 from hwp_bench.run.output import CHECKPOINTS, LOG, RunFacts
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
-from hwp_bench.run.scratch import scratch_folder
 
 #: The result of one capture, inside its folder.
 RESULT = "result.json"
@@ -207,8 +207,8 @@ def _run(
     evaluation: CaptureEvaluation, output: Path, on_progress: OnProgress
 ) -> tuple[RunRecord | None, str | None]:
     """Run the method on a copy of what it may see; returns the record, or why it failed."""
-    with scratch_folder("hwp-request-") as temporary:
-        request = temporary / "request"
+    with tempfile.TemporaryDirectory(prefix="hwp-request-") as temporary:
+        request = Path(temporary) / "request"
         try:
             if evaluation.manifest.kind != "predictions":
                 write_request(request, evaluation.capture, evaluation.split, evaluation.run)

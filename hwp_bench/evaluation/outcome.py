@@ -33,14 +33,14 @@ def free_view_text(capture: CaptureResult) -> str:
 
 
 def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
-    """Return a line for each level of isolation, failure, log and doubt of an evaluation.
+    """Return a line for each failure, log and doubt of an evaluation.
 
     Args:
         out: its results folder, with `captures/ID/`.
         results: its results.
         head: what the captures' names begin with, such as a variant and a seed.
     """
-    lines = [f"isolation: {head}{level}" for level in _levels(results)]
+    lines = []
     for capture in results.captures:
         folder = out / "captures" / capture.id
         texts = [text for text in (failure_text(capture), free_view_text(capture)) if text]
@@ -49,18 +49,6 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
             lines.append(f"log: {folder / LOG}")
         lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
     return lines
-
-
-def _levels(results: Results) -> list[str]:
-    """How the method was kept from what it must not see, one text for each level."""
-    found = dict.fromkeys(capture.isolation for capture in results.captures if capture.isolation)
-    return [
-        level
-        if not level.startswith("processes")
-        else f"WITHOUT WALLS, {level}: the method could "
-        "read whatever its user can, test frames included"
-        for level in found
-    ]
 
 
 def _frames_text(name: str, frames: Sequence[FrameResult]) -> str:

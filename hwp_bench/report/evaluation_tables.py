@@ -40,7 +40,7 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
     same_data(results)
     means = [aggregate(score_rows(result)) for result in results]
     groups = _groups(means)
-    tables = {
+    return {
         "overall": overall_table(results, groups, HEADLINE),
         "captures": capture_table(results, means),
         "perturbations": perturbation_table(results, means),
@@ -48,10 +48,6 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
         "micro": mean_table(results, {"All frames": [m.overall.micro for m in means]}, HEADLINE),
         "paper": mean_table(results, groups, PAPER, _PAPER_NOTE),
     }
-    walls = walls_note(results)
-    if not walls:
-        return tables
-    return {name: replace(table, notes=(*table.notes, walls)) for name, table in tables.items()}
 
 
 def overall_table(
@@ -190,23 +186,6 @@ def makers_note(results: Sequence[Results]) -> str:
             makers.setdefault(maker, []).append(identifier)
     parts = [f"{', '.join(found)} by {maker}" for maker, found in makers.items()]
     return f"Hands and masks were made by an importer: {'; '.join(parts)}." if parts else ""
-
-
-def walls_note(results: Sequence[Results]) -> str:
-    """Return which methods ran without walls, for a line under a table; empty if none did.
-
-    Without walls a method could have read the test frames.
-    """
-    bare: dict[str, str] = {}
-    for result in results:
-        for capture in result.captures:
-            level, _, reason = (capture.isolation or "").partition(" ")
-            if level == "processes":
-                bare.setdefault(result.method.title, reason.strip("()") or "not asked for")
-    if not bare:
-        return ""
-    reasons = "; ".join(f"{title}: {reason}" for title, reason in bare.items())
-    return f"Ran without walls, and could have read the test frames: {reasons}."
 
 
 def _present(results: Sequence[Results], metrics: Sequence[str]) -> list[str]:

@@ -7,6 +7,7 @@ import os
 import shutil
 import signal
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -41,7 +42,6 @@ from hwp_bench.run.sandbox.supervise import (
     remove_odd_files,
     run_confined,
 )
-from hwp_bench.run.scratch import scratch_folder
 
 #: Seconds a method may take on one capture unless told otherwise.
 DEFAULT_TIME_LIMIT = 3600.0
@@ -180,8 +180,8 @@ def rehearse_method(
         return
     confinement = confinement or Confinement()
     limits = Limits(time_limit, confinement.memory_bytes)
-    with scratch_folder("hwp-rehearsal-") as folder:
-        request, output = folder / "request", folder / "output"
+    with tempfile.TemporaryDirectory(prefix="hwp-rehearsal-") as name:
+        request, output = Path(name) / "request", Path(name) / "output"
         output.mkdir()
         asked = {"settings": dict(settings.settings), "seed": settings.seed}
         write_json(request / REHEARSAL, asked)

@@ -17,8 +17,8 @@ from hwp_bench.hands import (
     load_template,
     pose_from_joint_angles,
 )
-from hwp_bench.hands.gestures import finger_pose, gestures, mirrored
 from hwp_bench.hands.skeleton import JOINT_NAMES, palm_directions, unit
+from hwp_bench.sim.scene.gestures import finger_pose, gestures, mirrored
 
 #: The three angles of a joint.
 ANGLES = ("flexion", "abduction", "twist")

@@ -14,7 +14,6 @@ from pathlib import Path
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.run.sandbox.kept_apart import runs_below, withheld_packages
 from hwp_bench.run.sandbox.root import Place
 
 #: `auto` takes namespaces where the system allows them and says so where it does not; `required`
@@ -142,7 +141,7 @@ def sandbox_environment(
     places = visible_places(
         read=[method, request, weights, kernels, *_absolute(libraries), *confinement.exposed],
         write=[output, cache],
-        hidden=[*confinement.hidden, *withheld_packages(), *runs_below(method)],
+        hidden=confinement.hidden,
         program=command[0],
     )
     return environment, places

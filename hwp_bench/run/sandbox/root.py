@@ -17,13 +17,6 @@ from hwp_bench.run.sandbox import syscalls
 #: Size of a scratch folder, bytes; it counts as memory.
 SCRATCH_BYTES = 1 << 30
 
-#: Files of the process table that tell about the kernel, and that no program needs.
-MASKED = frozenset(
-    {
-        *("kallsyms", "kcore", "key-users", "keys", "kmsg", "latency_stats", "sched_debug"),
-        *("kpagecgroup", "kpagecount", "kpageflags", "timer_list", "vmallocinfo"),
-    }
-)
 # A folder that exists everywhere; its content is bound out of the old root.
 _STAGE = "/tmp"
 _OLD, _NEW = "/old", "/new"
@@ -87,7 +80,6 @@ def _show(place: Place) -> str | None:
     elif kind == "proc":
         os.makedirs(here, exist_ok=True)
         syscalls.mount("proc", here, "proc", syscalls.MS_NOSUID | syscalls.MS_NODEV)
-        _guard(here)
     elif kind == "scratch":
         os.makedirs(here, exist_ok=True)
         _tmpfs(here, f"size={SCRATCH_BYTES},mode=1777")
@@ -95,20 +87,6 @@ def _show(place: Place) -> str | None:
         _tmpfs(here, "size=1m,mode=755")
         return here
     return None
-
-
-def _guard(proc: str) -> None:
-    """Mount whatever a process table holds besides processes read-only.
-
-    Its files belong to root. A process whose user is the machine's own root could write to them
-    without any privilege, and `/proc/sys/kernel/core_pattern` for one is of the whole machine.
-    """
-    for entry in os.scandir(proc):
-        if entry.name.isdigit() or entry.is_symlink():
-            continue
-        source = f"{_OLD}/dev/null" if entry.name in MASKED else entry.path
-        syscalls.mount(source, entry.path, "", syscalls.MS_BIND | syscalls.MS_REC)
-        syscalls.set_attributes(entry.path, syscalls.MOUNT_ATTR_RDONLY)
 
 
 def _mount_point(path: str, *, folder: bool) -> None:

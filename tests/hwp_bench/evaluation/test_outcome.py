@@ -36,12 +36,3 @@ def test_many_bad_frames_are_bounded_and_counted() -> None:
 
 def test_sound_captures_say_nothing(tmp_path: Path) -> None:
     assert outcome_lines(tmp_path, results_example()) == []
-
-
-def test_the_level_of_isolation_is_said(tmp_path: Path) -> None:
-    results = results_example()
-    captures = [replace(capture, isolation="namespaces") for capture in results.captures]
-    assert outcome_lines(tmp_path, replace(results, captures=captures)) == ["isolation: namespaces"]
-    captures = [replace(captures[0], isolation="processes (no user namespaces)"), *captures[1:]]
-    (line, *_) = outcome_lines(tmp_path, replace(results, captures=captures))
-    assert "WITHOUT WALLS, processes (no user namespaces)" in line

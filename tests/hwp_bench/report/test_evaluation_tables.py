@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import replace
 
 import pytest
-from small_captures import results_example
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import write_tables
@@ -118,17 +117,3 @@ def test_every_table_is_written_in_every_spelling(two, tmp_path) -> None:
     names = {path.name for path in tmp_path.iterdir()}
     stems = ("overall", "captures", "perturbations", "details", "micro", "paper")
     assert names == {f"{stem}.{form}" for stem in stems for form in ("md", "tex", "csv", "json")}
-
-
-def test_every_table_says_what_ran_without_walls() -> None:
-    walled = results_example("walled")
-    bare = results_example("bare")
-    captures = [replace(capture, isolation="namespaces") for capture in walled.captures]
-    walled = replace(walled, captures=captures)
-    bare = replace(bare, captures=[replace(c, isolation="processes (refused)") for c in captures])
-    assert not any(
-        "walls" in note for table in all_tables([walled]).values() for note in table.notes
-    )
-    for table in all_tables([walled, bare]).values():
-        (note,) = [note for note in table.notes if "walls" in note]
-        assert f"{bare.method.title}: refused" in note
