@@ -62,6 +62,8 @@ _ETC = (
     "nsswitch.conf",
     "passwd",
 )
+# Of /sys what tells processors, memory and accelerators; not firmware, nor the kernel's tracing.
+_SYS = ("bus", "class", "dev", "devices", "fs/cgroup", "kernel/mm", "module")
 _DEVICES = ("null", "zero", "full", "random", "urandom", "nvidia*", "dri", "kfd")
 _SCRATCH = ("/tmp", "/var/tmp", "/dev/shm")
 _ENVIRONMENT_MARKS = ("pyvenv.cfg", "conda-meta")
@@ -255,7 +257,8 @@ def _linked(sites: Iterable[str]) -> list[str]:
 
 def _system() -> list[str]:
     devices = [path for name in _DEVICES for path in glob(f"/dev/{name}")]
-    return [f"/{name}" for name in _SYSTEM] + [f"/etc/{name}" for name in _ETC] + ["/sys", *devices]
+    named = {"/": _SYSTEM, "/etc/": _ETC, "/sys/": _SYS}
+    return [f"{top}{name}" for top, names in named.items() for name in names] + devices
 
 
 def _environment(program: str | None) -> list[str]:
