@@ -216,7 +216,8 @@ def test_no_setting_of_the_machine_can_be_written(attack) -> None:
     script = """
 print(json.dumps({"proc": writable("/proc")[:5], "sys": writable("/sys")[:5],
     "own": os.access("/proc/self/oom_score_adj", os.W_OK), "seen": os.listdir("/proc/sys"),
-    "cores": os.path.isdir("/sys/devices/system/cpu"), "tracing": os.path.exists("/sys/kernel/tracing"),
+    "cores": os.path.isdir("/sys/devices/system/cpu"),
+    "tracing": os.path.exists("/sys/kernel/tracing"),
     "firmware": os.path.exists("/sys/firmware")}))
 """
     _, said = attack(WRITABLE + script)
