@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -14,6 +13,7 @@ from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
 from hwp_bench.base.files import read_json, sha256_json, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import parse_record
+from hwp_bench.base.scratch import scratch_folder
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import EXTRA
 from hwp_bench.capture.splits import Split
@@ -184,8 +184,8 @@ def _run(
     evaluation: CaptureEvaluation, output: Path, on_progress: OnProgress
 ) -> tuple[RunRecord | None, str | None]:
     """Run the method on a copy of what it may see; returns the record, or why it failed."""
-    with tempfile.TemporaryDirectory(prefix="hwp-request-") as temporary:
-        request = Path(temporary) / "request"
+    with scratch_folder("hwp-request-") as temporary:
+        request = temporary / "request"
         try:
             if evaluation.manifest.kind != "predictions":
                 write_request(request, evaluation.capture, evaluation.split, evaluation.run)

@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,6 +14,7 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed
 from hwp_bench.base.files import inside, read_json, write_json
+from hwp_bench.base.scratch import scratch_folder
 from hwp_bench.base.text import shown
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
@@ -180,8 +180,8 @@ def rehearse_method(
         return
     confinement = confinement or Confinement()
     limits = Limits(time_limit, confinement.memory_bytes)
-    with tempfile.TemporaryDirectory(prefix="hwp-rehearsal-") as name:
-        request, output = Path(name) / "request", Path(name) / "output"
+    with scratch_folder("hwp-rehearsal-") as scratch:
+        request, output = scratch / "request", scratch / "output"
         output.mkdir()
         asked = {"settings": dict(settings.settings), "seed": settings.seed}
         write_json(request / REHEARSAL, asked)

@@ -15,14 +15,12 @@ from pathlib import Path
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.locks import LOCK
 
-#: Parts of `hwp_bench` that a method may import: all that methods which ship are built from.
+#: Parts of `hwp_bench` that a method may import: all that methods which ship are built from. Any
+#: other stays out of sight; those render, seal, score or rank test frames.
 SHOWN_ROOMS = frozenset(
     {"_data", "analysis", "base", "capture", "cli", "hands", "importers", "methods", "metrics"}
     | {"report", "results", "run", "taxonomy", "tracking"}
 )
-#: Parts that a method never sees: they render, seal or score test frames. A part that is in
-#: neither list is not shown.
-HIDDEN_ROOMS = frozenset({"evaluation", "leaderboard", "publish", "sim"})
 
 #: Files that say that a folder is a capture or a result of the toolkit, by their first words.
 _MARKED_FILES = ("capture.json", "results.json")
