@@ -35,6 +35,7 @@ from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, CurvePoint
+from hwp_bench.results.walls import WALLED
 from hwp_bench.run.engine import Folder, Job, Needs
 from hwp_bench.run.engine.job import OnProgress, ignore
 from hwp_bench.run.output import CHECKPOINTS, LOG, RunFacts
@@ -159,13 +160,18 @@ def evaluate_capture(
 
 
 def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult | None:
-    """Return the stored result of the same key, if there is one and the method did not fail."""
+    """Return the stored result of the same key, if there is one and the method did not fail.
+
+    Where walls are required, a result that was made without them is none.
+    """
     # Submitted predictions may change without their method.toml, so they are always scored.
     if not (folder / RESULT).is_file() or evaluation.manifest.kind == "predictions":
         return None
     try:
         result = read_result(folder)
     except HwpError:
+        return None
+    if evaluation.confinement.mode == "required" and result.isolation != WALLED:
         return None
     return result if result.key == evaluation.key and result.failure is None else None
 

@@ -18,6 +18,7 @@ from hwp_bench.base.scratch import scratch_folder
 from hwp_bench.base.text import shown
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
+from hwp_bench.results.walls import WALLED
 from hwp_bench.run.output import (
     FAILURE,
     FREE_VIEW,
@@ -217,7 +218,7 @@ def _run(
         walled = Program(command, output, environment, places, output / LOG)
         outcome = run_confined(walled, limits, poll)
         if outcome.refused is None:
-            return outcome, "namespaces"
+            return outcome, WALLED
         if confinement.mode == "required":
             raise MethodFailed(
                 f"namespaces are required, but the system refuses them ({outcome.refused})",
