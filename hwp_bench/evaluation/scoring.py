@@ -5,8 +5,8 @@ Predictions are checked before they are scored; only the frames of a submission 
 
 from __future__ import annotations
 
-import hashlib
 import contextlib
+import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -101,7 +101,8 @@ def read_prediction(
 
     Returns:
         The pixels, or a named failure: missing, a link, empty, larger than
-        `MAX_PREDICTION_BYTES`, damaged, not 8-bit, of another size. An alpha channel is dropped: the data set owns the mask.
+        `MAX_PREDICTION_BYTES`, damaged, not 8-bit, of another size. An alpha channel is
+        dropped: the data set owns the mask.
     """
     path = Path(folder) / frame_name(frame)
     # A link could lead to the very frame that is to be predicted.

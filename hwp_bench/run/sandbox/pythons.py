@@ -28,7 +28,7 @@ def _sites() -> list[str]:
 def of_packages(folder: str) -> list[str]:
     """Return what is shown of a folder on the path: of a checkout of the toolkit, its packages.
 
-    The rest of a checkout, such as tests, runs and history, is no business of a method.
+    Methods need nothing else of it, such as tests, runs and history.
     """
     real = os.path.realpath(folder)
     if not _is_checkout(real):

@@ -1,7 +1,7 @@
 """What stays out of a method's sight although it lies in a folder that is shown.
 
 The simulator, the scenes and the seeds of the suites are public, so a method that could import them
-would render the test frames anew. Runs and captures below a method's own folder hold true frames.
+would render the test frames again. Runs and captures below a method's own folder hold true frames.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ def secluded_rooms(folders: Iterable[str]) -> list[str]:
         ]
         for place in above:
             package = os.path.join(place, "hwp_bench")
-            # A name alone would hide a stranger's folder of that name.
+            # A name alone would hide somebody else's folder of that name.
             if os.path.isfile(os.path.join(package, "__init__.py")):
                 found += _parts(package)
     return list(dict.fromkeys(found))
@@ -62,7 +62,7 @@ def _parts(package: str) -> list[str]:
 
 
 def foreign_folders(method: Path) -> list[str]:
-    """Return the folders below a method's that are no part of it: captures and outputs of runs.
+    """Return the folders below a method's that do not belong to it: captures and outputs of runs.
 
     A capture and a results file are known by what they begin with, an output that is not finished
     by its lock file or its temporary name. Links are not followed; inside walls they lead nowhere.
