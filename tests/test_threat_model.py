@@ -73,3 +73,8 @@ def test_a_thief_who_knows_the_way_gets_no_test_frame(
     stolen = evaluate(str(method), [capture.root], tmp_path / "bare", bare).captures[0]
     assert stolen.isolation == "processes"
     assert stolen.failed_frames == 0
+    # What was made without walls is no result where they are required.
+    strict = EvaluationSettings(confinement=Confinement("required"))
+    again = evaluate(str(method), [capture.root], tmp_path / "bare", strict).captures[0]
+    assert again.isolation == "namespaces"
+    assert again.failed_frames == len(again.frames)

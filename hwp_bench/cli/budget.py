@@ -93,9 +93,11 @@ def _report(runs: BudgetRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.evaluation.budget.budget import budget_tables, make_budget, next_work
     from hwp_bench.evaluation.budget.picture import budget_sheet
     from hwp_bench.evaluation.outcome import outcome_lines
+    from hwp_bench.results.walls import noted
 
     budget = make_budget(runs)
-    tables = budget_tables(budget)
+    evaluations = list(runs.results.values())
+    tables = {name: noted(table, evaluations) for name, table in budget_tables(budget).items()}
     write_tables(out / "tables", tables)
     record = write_json(out / "budget.json", budget.to_json())
     picture = write_image(out / "budget.png", budget_sheet(runs, budget))

@@ -52,9 +52,11 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.tables import format_table, print_table
     from hwp_bench.report.evaluation_tables import HEADLINE
     from hwp_bench.results import read_all
+    from hwp_bench.results.walls import noted
 
+    results = read_all(args.results)
     comparison = compare_results(
-        read_all(args.results),
+        results,
         args.metric or HEADLINE,
         all_metrics=bool(args.metric),
         resamples=args.resamples,
@@ -64,7 +66,8 @@ def run(args: argparse.Namespace) -> int:
         json.dump(comparison.as_dict(), sys.stdout, indent=1)
         print()
         return 0
-    for table in comparison.tables():
+    for plain in comparison.tables():
+        table = noted(plain, results)
         if args.format == "terminal":
             print_table(table)
         else:

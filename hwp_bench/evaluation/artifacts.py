@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
@@ -9,14 +10,16 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.drawing import error_map, fitted, labelled, sheet
+from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.evaluation.scoring import Prediction
+from hwp_bench.evaluation.scoring import MAX_PREDICTION_BYTES, Prediction
 from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.results import FrameResult
 from hwp_bench.run.output import DIAGNOSTICS, LOG
+from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
 
 #: Most bytes of temporal weights and weight masks that are kept of a capture.
 MAX_DIAGNOSTICS = 64 << 20
@@ -44,19 +47,38 @@ def keep_artifacts(
     """
     keep_predictions(folder / "predictions", source, [item.frame for item in predictions])
     if (output / LOG).is_file():
-        shutil.copyfile(output / LOG, folder / LOG)
+        keep_log(output / LOG, folder / LOG)
     keep_diagnostics(output / DIAGNOSTICS, folder / DIAGNOSTICS)
     shutil.rmtree(output, ignore_errors=True)
     if any(frame.failure is None for frame in scores):
         write_pictures(folder / "pictures", capture, scores, predictions)
 
 
+def keep_log(source: Path, target: Path) -> None:
+    """Copy a log, at most as much of it as the toolkit itself keeps of a method's output.
+
+    A method may have put another file in its place.
+    """
+    with open(source, "rb") as stream:
+        # What is kept of both ends, and the line between them.
+        atomic_write(target, stream.read(MAX_LOG_BYTES + 1024))
+
+
 def keep_predictions(folder: Path, source: Path, frames: Sequence[int]) -> None:
-    """Copy the predicted frames that exist into a results folder; nothing else is copied."""
+    """Copy the predicted frames that exist into a results folder; nothing else is copied.
+
+    Of one that is too large to be read only the size is kept, in a file of holes that takes no
+    room: it fails in a verification as it did here.
+    """
     folder.mkdir(parents=True, exist_ok=True)
     for frame in frames:
         path = source / frame_name(frame)
-        if path.is_file() and not path.is_symlink():
+        if not path.is_file() or path.is_symlink():
+            continue
+        if path.stat().st_size > MAX_PREDICTION_BYTES:
+            (folder / path.name).touch()
+            os.truncate(folder / path.name, MAX_PREDICTION_BYTES + 1)
+        else:
             shutil.copyfile(path, folder / path.name)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-import tempfile
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -14,6 +13,7 @@ from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import MAX_TEXT, parse_record
+from hwp_bench.base.scratch import scratch_folder
 from hwp_bench.base.text import one_line, shown
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.content import refuse_changed
@@ -38,6 +38,7 @@ from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, CurvePoint
+from hwp_bench.results.walls import WALLED
 from hwp_bench.run.engine import Folder, Job, Needs
 from hwp_bench.run.engine.job import OnProgress, ignore
 from hwp_bench.run.output import CHECKPOINTS, LOG, RunFacts
@@ -182,13 +183,18 @@ def _refuse_changed(evaluation: CaptureEvaluation) -> None:
 
 
 def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult | None:
-    """Return the stored result of the same key, if there is one and the method did not fail."""
+    """Return the stored result of the same key, if there is one and the method did not fail.
+
+    Where walls are required, a result that was made without them is none.
+    """
     # Submitted predictions may change without their method.toml, so they are always scored.
     if not (folder / RESULT).is_file() or evaluation.manifest.kind == "predictions":
         return None
     try:
         result = read_result(folder)
     except HwpError:
+        return None
+    if evaluation.confinement.mode == "required" and result.isolation != WALLED:
         return None
     return result if result.key == evaluation.key and result.failure is None else None
 
@@ -207,8 +213,8 @@ def _run(
     evaluation: CaptureEvaluation, output: Path, on_progress: OnProgress
 ) -> tuple[RunRecord | None, str | None]:
     """Run the method on a copy of what it may see; returns the record, or why it failed."""
-    with tempfile.TemporaryDirectory(prefix="hwp-request-") as temporary:
-        request = Path(temporary) / "request"
+    with scratch_folder("hwp-request-") as temporary:
+        request = temporary / "request"
         try:
             if evaluation.manifest.kind != "predictions":
                 write_request(request, evaluation.capture, evaluation.split, evaluation.run)

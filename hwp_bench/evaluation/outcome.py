@@ -7,6 +7,7 @@ from pathlib import Path
 
 from hwp_bench.evaluation.colour_check import read_warnings
 from hwp_bench.results import CaptureResult, FrameResult, Results
+from hwp_bench.results.walls import walls_text
 from hwp_bench.run.output import LOG
 
 #: Most frames that are named of a capture; the others are counted.
@@ -33,7 +34,7 @@ def free_view_text(capture: CaptureResult) -> str:
 
 
 def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
-    """Return a line for each failure, log and doubt of an evaluation.
+    """Return a line for each failure, log and doubt of an evaluation, and one for its isolation.
 
     Args:
         out: its results folder, with `captures/ID/`.
@@ -48,7 +49,8 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
         if capture.failure and (folder / LOG).is_file():
             lines.append(f"log: {folder / LOG}")
         lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
-    return lines
+    walls = walls_text(results, head)
+    return [*lines, walls] if walls else lines
 
 
 def _frames_text(name: str, frames: Sequence[FrameResult]) -> str:

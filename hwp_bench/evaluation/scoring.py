@@ -5,6 +5,7 @@ Predictions are checked before they are scored; only the frames of a submission 
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
@@ -14,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.errors import BadCapture, BadImage, BadPrediction
-from hwp_bench.base.images import pixel_digest, read_rgb
+from hwp_bench.base.images import MAX_PIXELS, pixel_digest, read_rgb
 from hwp_bench.base.text import bounded
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
@@ -23,6 +24,9 @@ from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import FrameResult
+
+#: Bytes of a predicted frame: the largest image that is read, four channels, not packed.
+MAX_PREDICTION_BYTES = 4 * MAX_PIXELS
 
 
 @dataclass(frozen=True, eq=False)
@@ -96,13 +100,17 @@ def read_prediction(
         size: the capture's (height, width).
 
     Returns:
-        The pixels, or a named failure: missing, a link, empty, damaged, not 8-bit, of another
-        size. An alpha channel is dropped: the data set owns the mask.
+        The pixels, or a named failure: missing, a link, empty, larger than
+        `MAX_PREDICTION_BYTES`, damaged, not 8-bit, of another size. An alpha channel is
+        dropped: the data set owns the mask.
     """
     path = Path(folder) / frame_name(frame)
     # A link could lead to the very frame that is to be predicted.
     if path.is_symlink():
         return Prediction(frame, None, f"{path.name}: is a link")
+    with contextlib.suppress(OSError):  # the reader says what is wrong with it
+        if path.stat().st_size > MAX_PREDICTION_BYTES:
+            return Prediction(frame, None, f"{path.name}: is larger than any image may be")
     try:
         return Prediction(frame, read_rgb(path, size), None)
     except BadImage as error:

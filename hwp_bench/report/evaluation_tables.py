@@ -12,6 +12,7 @@ from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.bounds import per_second
 from hwp_bench.results.schema import differing_makers, differing_settings, score_rows
+from hwp_bench.results.walls import noted
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: Metrics of the headline tables, where an evaluation has them.
@@ -40,7 +41,7 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
     same_data(results)
     means = [aggregate(score_rows(result)) for result in results]
     groups = _groups(means)
-    return {
+    tables = {
         "overall": overall_table(results, groups, HEADLINE),
         "captures": capture_table(results, means),
         "perturbations": perturbation_table(results, means),
@@ -48,6 +49,7 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
         "micro": mean_table(results, {"All frames": [m.overall.micro for m in means]}, HEADLINE),
         "paper": mean_table(results, groups, PAPER, _PAPER_NOTE),
     }
+    return {name: noted(table, results) for name, table in tables.items()}
 
 
 def overall_table(

@@ -7,7 +7,6 @@ import os
 import shutil
 import signal
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,9 +14,11 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed
 from hwp_bench.base.files import inside, read_json, write_json
+from hwp_bench.base.scratch import scratch_folder
 from hwp_bench.base.text import shown
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
+from hwp_bench.results.walls import WALLED
 from hwp_bench.run.output import (
     FAILURE,
     FREE_VIEW,
@@ -180,8 +181,8 @@ def rehearse_method(
         return
     confinement = confinement or Confinement()
     limits = Limits(time_limit, confinement.memory_bytes)
-    with tempfile.TemporaryDirectory(prefix="hwp-rehearsal-") as name:
-        request, output = Path(name) / "request", Path(name) / "output"
+    with scratch_folder("hwp-rehearsal-") as scratch:
+        request, output = scratch / "request", scratch / "output"
         output.mkdir()
         asked = {"settings": dict(settings.settings), "seed": settings.seed}
         write_json(request / REHEARSAL, asked)
@@ -217,7 +218,7 @@ def _run(
         walled = Program(command, output, environment, places, output / LOG)
         outcome = run_confined(walled, limits, poll)
         if outcome.refused is None:
-            return outcome, "namespaces"
+            return outcome, WALLED
         if confinement.mode == "required":
             raise MethodFailed(
                 f"namespaces are required, but the system refuses them ({outcome.refused})",

@@ -17,8 +17,8 @@ from hwp_bench.hands import (
     load_template,
     pose_from_joint_angles,
 )
+from hwp_bench.hands.gestures import finger_pose, gestures, mirrored
 from hwp_bench.hands.skeleton import JOINT_NAMES, palm_directions, unit
-from hwp_bench.sim.scene.gestures import finger_pose, gestures, mirrored
 
 #: The three angles of a joint.
 ANGLES = ("flexion", "abduction", "twist")
@@ -95,7 +95,7 @@ class HandAngles:
         return np.degrees(joint_angles(padded, self._axes)[0].numpy())
 
     def named_poses(self) -> dict[str, np.ndarray]:
-        """Return the angles of every named pose: rest, and the gestures of the simulator.
+        """Return the angles of every named pose: rest, and the named hand shapes.
 
         They lie within the ranges. The palm faces the camera in all of them.
         """

@@ -10,6 +10,7 @@ from hwp_bench.analysis.statistics.pairing import MethodRuns
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.results import CaptureResult, Results
+from hwp_bench.results.walls import walls_note
 
 #: The parts of a run, in the order of time, with what they hold.
 PARTS: Mapping[str, str] = {
@@ -150,7 +151,7 @@ def _front_table(front: Sequence[FrontPart], metric: str) -> Table:
 
 
 def machine_notes(results: Sequence[Results]) -> list[str]:
-    """Return a warning where seconds were taken on different machines or devices."""
+    """Return the machines, with warnings: several of them, or methods that ran without walls."""
     machines = {
         f"{result.environment.get('processor', 'unknown')}, "
         f"{result.environment.get('cores', '?')} cores"
@@ -160,7 +161,8 @@ def machine_notes(results: Sequence[Results]) -> list[str]:
     notes = [f"Machine: {'; '.join(sorted(machines))}."]
     if len(machines) > 1 or len(devices - {None}) > 1:
         notes.append("Taken on different machines or devices: the seconds do not compare.")
-    return notes
+    walls = walls_note(results)
+    return [*notes, walls] if walls else notes
 
 
 def run_seconds(capture: CaptureResult) -> dict[str, float] | None:

@@ -29,6 +29,7 @@ from hwp_bench.report.ranking_tables import rank_table
 from hwp_bench.report.sources import ResultsSource, find_captures, sound_temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
 from hwp_bench.results import Results
+from hwp_bench.results.walls import noted
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: The metric of the plots and of the summary sentence.
@@ -135,11 +136,13 @@ def gather_report(
     return ReportPage(
         summary=summary_sentence(runs),
         methods=list(order),
-        tables=[to_html(table) for table in shown if len(table.columns) > 1],
+        tables=[to_html(noted(table, results)) for table in shown if len(table.columns) > 1],
         pareto=_pareto(cost, order) if cost else None,
-        cost_tables=[to_html(table) for table in cost.tables.values()] if cost else [],
+        cost_tables=[to_html(noted(table, results)) for table in cost.tables.values()]
+        if cost
+        else [],
         bars=_bars(runs),
-        differences=[to_html(table) for table in _differences(runs)],
+        differences=[to_html(noted(table, results)) for table in _differences(runs)],
         captures=_captures(
             chosen, runs, infos, album, _by_label(avatar_pages or {}, sources, runs)
         ),

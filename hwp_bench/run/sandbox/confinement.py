@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import site
-import sys
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from glob import glob
@@ -14,7 +12,9 @@ from pathlib import Path
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.packages import PACKAGES, data_folder
+from hwp_bench.run.sandbox.pythons import checkout, environment_of, of_packages, python_places
 from hwp_bench.run.sandbox.root import Place
+from hwp_bench.run.sandbox.secluded import foreign_folders, secluded_rooms
 
 #: `auto` takes namespaces where the system allows them and says so where it does not; `required`
 #: refuses to run without; `none` leaves the program its user's files and network.
@@ -62,9 +62,10 @@ _ETC = (
     "nsswitch.conf",
     "passwd",
 )
+# Of /sys what tells processors, memory and accelerators; not firmware, nor the kernel's tracing.
+_SYS = ("bus", "class", "dev", "devices", "fs/cgroup", "kernel/mm", "module")
 _DEVICES = ("null", "zero", "full", "random", "urandom", "nvidia*", "dri", "kfd")
 _SCRATCH = ("/tmp", "/var/tmp", "/dev/shm")
-_ENVIRONMENT_MARKS = ("pyvenv.cfg", "conda-meta")
 _MOST_LINKS = 40
 
 
@@ -114,7 +115,8 @@ def sandbox_environment(
 
     It may write to its output folder, and to a cache that it shares only with other runs of the
     same method: compiled code must survive a run, and must never reach another program. It may
-    read the machine code that the toolkit itself has compiled.
+    read the machine code that the toolkit itself has compiled. It does not see the simulator, nor
+    captures and runs that lie below its own folder (`secluded`), unless `exposed` names them.
 
     Args:
         method: its directory.
@@ -122,7 +124,13 @@ def sandbox_environment(
         request: the folder that it is given.
         output: its work folder.
         confinement: what else is shown or hidden.
+
+    Raises:
+        UsageError: a path that is to be exposed does not exist.
     """
+    for path in confinement.exposed:
+        if not path.exists():
+            raise UsageError("does not exist", where=path, field="--expose")
     home = output / "home"
     home.mkdir()
     cache = _own_cache(method, output)
@@ -137,11 +145,12 @@ def sandbox_environment(
     weights = _torch_home()
     if weights.is_dir():
         environment["TORCH_HOME"] = str(weights)
-    libraries = [Path(entry) for entry in os.environ.get("PYTHONPATH", "").split(os.pathsep)]
+    shown = {os.path.realpath(path) for path in confinement.exposed}
+    foreign = [path for path in foreign_folders(method.resolve()) if path not in shown]
     places = visible_places(
-        read=[method, request, weights, kernels, *_absolute(libraries), *confinement.exposed],
+        read=[method, request, weights, kernels, *_libraries(), *confinement.exposed],
         write=[output, cache],
-        hidden=confinement.hidden,
+        hidden=[*map(Path, foreign), *_unless(shown, cache_root()), *confinement.hidden],
         program=command[0],
     )
     return environment, places
@@ -168,8 +177,15 @@ def _taken(names: Sequence[str]) -> dict[str, str]:
     return {name: os.environ[name] for name in names if name in os.environ}
 
 
-def _absolute(paths: Sequence[Path]) -> list[Path]:
-    return [path for path in paths if path.is_absolute()]
+def _unless(shown: set[str], folder: Path) -> list[Path]:
+    return [] if os.path.realpath(folder) in shown else [folder.absolute()]
+
+
+def _libraries() -> list[Path]:
+    """Folders of `PYTHONPATH`."""
+    entries = os.environ.get("PYTHONPATH", "").split(os.pathsep)
+    absolute = [entry for entry in entries if os.path.isabs(entry)]
+    return [Path(path) for entry in absolute for path in of_packages(entry)]
 
 
 def _torch_home() -> Path:
@@ -220,9 +236,11 @@ def visible_places(
         "/dev/fd": ("link", "/proc/self/fd"),
     }
     chosen |= dict.fromkeys(_SCRATCH, ("scratch", ""))
+    shown = [*_system(), *python_places(), *environment_of(program), *map(os.fspath, read)]
+    rooms = secluded_rooms([*shown, "/usr/local", *glob("/opt/*")])
     groups: Sequence[tuple[str, Iterable[str | Path]]] = (
-        ("read", [*_system(), *python_places(), *_environment(program), *read]),
-        ("hidden", hidden),
+        ("read", shown),
+        ("hidden", [*checkout(), *rooms, *hidden]),
         ("write", write),
     )
     for kind, paths in groups:
@@ -236,39 +254,10 @@ def visible_places(
     return [(chosen[path][0], path, chosen[path][1]) for path in order]
 
 
-def python_places() -> list[str]:
-    """Return the folders of this interpreter, its packages and the toolkit."""
-    root = os.fspath(PACKAGES)
-    # In a checkout the packages are shown, not the runs and captures that may lie next to them.
-    packages = [os.path.dirname(path) for path in glob(f"{root}/*/__init__.py")]
-    sites = [*site.getsitepackages(), site.getusersitepackages()]
-    linked = [path for path in _linked(sites) if os.path.realpath(path) != root]
-    return [sys.prefix, sys.base_prefix, *packages, *sites, *linked]
-
-
-def _linked(sites: Iterable[str]) -> list[str]:
-    """Return the folders that `.pth` files add, as editable installs do."""
-    files = [path for folder in sites for path in glob(f"{folder}/*.pth")]
-    lines = [line for path in files for line in Path(path).read_text(errors="replace").splitlines()]
-    return [line.strip() for line in lines if os.path.isabs(line) and os.path.isdir(line.strip())]
-
-
 def _system() -> list[str]:
     devices = [path for name in _DEVICES for path in glob(f"/dev/{name}")]
-    return [f"/{name}" for name in _SYSTEM] + [f"/etc/{name}" for name in _ETC] + ["/sys", *devices]
-
-
-def _environment(program: str | None) -> list[str]:
-    """Return the Python environment that a program lies in, and the one that it was made from.
-
-    Nothing for other programs: an untrusted command must not choose what is shown.
-    """
-    if program is None or not os.path.isabs(program):
-        return []
-    prefix = os.path.dirname(os.path.dirname(program))
-    if not any(os.path.exists(f"{prefix}/{mark}") for mark in _ENVIRONMENT_MARKS):
-        return []
-    return [prefix, os.path.dirname(os.path.dirname(os.path.realpath(program)))]
+    named = {"/": _SYSTEM, "/etc/": _ETC, "/sys/": _SYS}
+    return [f"{top}{name}" for top, names in named.items() for name in names] + devices
 
 
 def _resolved(path: str) -> tuple[list[tuple[str, str]], str]:

@@ -23,7 +23,7 @@ _OLD, _NEW = "/old", "/new"
 
 #: One place: kind, path, and the target of a link (empty for the others). The kinds are `read` and
 #: `write` (the place as it is, read-only or writable), `hidden` (an empty folder), `scratch` (a
-#: private writable folder), `link` (a symbolic link) and `proc` (the process table).
+#: private writable folder), `link` (a symbolic link) and `proc` (the process table, read-only).
 Place = tuple[str, str, str]
 
 
@@ -80,6 +80,10 @@ def _show(place: Place) -> str | None:
     elif kind == "proc":
         os.makedirs(here, exist_ok=True)
         syscalls.mount("proc", here, "proc", syscalls.MS_NOSUID | syscalls.MS_NODEV)
+        # Its files decide by the user's number alone, whatever rights are left: started by root,
+        # the program could write the whole machine's settings. A read-only one in sight also keeps
+        # a user namespace made inside from mounting another that is writable.
+        syscalls.set_attributes(here, syscalls.MOUNT_ATTR_RDONLY)
     elif kind == "scratch":
         os.makedirs(here, exist_ok=True)
         _tmpfs(here, f"size={SCRATCH_BYTES},mode=1777")

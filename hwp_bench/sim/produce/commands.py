@@ -17,11 +17,11 @@ if TYPE_CHECKING:
 
 def list_scenes(args: argparse.Namespace) -> int:
     """Print the scenes, and what scenes can be made of."""
+    from hwp_bench.hands.gestures import gestures
     from hwp_bench.sim.effects.base import ORDER
     from hwp_bench.sim.produce.suites import suite, suite_names
     from hwp_bench.sim.props.backdrop import backdrop_names
     from hwp_bench.sim.props.objects import object_names
-    from hwp_bench.sim.scene.gestures import gestures
 
     scenes = [load_scene(name) for name in known_scenes()]
     suites = {name: [item.scene.id for item in suite(name)] for name in suite_names()}

@@ -6,8 +6,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hwp_bench.hands.gestures import finger_pose, gesture, mirrored, within_limits
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.scene.gestures import finger_pose, gesture, mirrored, within_limits
 from hwp_bench.sim.scene.schema import HandKey, Scene
 
 # Share of the way from key to key in which the hand rests at the key.

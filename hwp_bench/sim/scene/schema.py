@@ -17,9 +17,9 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import number
 from hwp_bench.base.text import ODD_CHARACTERS
+from hwp_bench.hands.gestures import gesture
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.behind import NOTHING, Behind
-from hwp_bench.sim.scene.gestures import gesture
 from hwp_bench.sim.scene.lighting import Lamp, Room
 from hwp_bench.sim.scene.looks import PLAIN, Looks
 from hwp_bench.sim.scene.recorder import AutoControl, without_defaults

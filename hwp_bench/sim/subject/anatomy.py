@@ -11,9 +11,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT, finger_back
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import fractal_noise
-from hwp_bench.sim.scene.gestures import FINGERS, FIRST_JOINT, finger_back
 
 # Palm lines as rows of (along, across): 0-1 from the wrist to the middle knuckle, and from the
 # little finger's knuckle to the index finger's.

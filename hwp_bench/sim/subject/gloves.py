@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
-from hwp_bench.sim.scene.gestures import FINGERS, FIRST_JOINT
 from hwp_bench.sim.scene.looks import Glove
 from hwp_bench.sim.subject.anatomy import Anatomy
 from hwp_bench.sim.subject.skin import SkinSample

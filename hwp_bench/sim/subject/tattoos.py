@@ -6,9 +6,9 @@ from functools import lru_cache
 
 import numpy as np
 
+from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT, finger_back
 from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.scene.gestures import FINGERS, FIRST_JOINT, finger_back
 from hwp_bench.sim.scene.looks import Tattoo
 from hwp_bench.sim.subject.anatomy import Anatomy
 

@@ -8,11 +8,11 @@ from functools import lru_cache
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.hands.gestures import FIRST_JOINT, finger_back
 from hwp_bench.sim.geometry.mesh import surface_normals, unit
 from hwp_bench.sim.geometry.surface import Surface, join, plain, transformed
 from hwp_bench.sim.props.jewellery import angles, band, beads, metal, stone
 from hwp_bench.sim.props.worn import wrist_watch
-from hwp_bench.sim.scene.gestures import FIRST_JOINT, finger_back
 from hwp_bench.sim.scene.looks import Ring, WristWear
 from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.forearm import near_wrist, rest_arm, wrist_loop

@@ -15,12 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput
+from hwp_bench.hands.gestures import FIRST_JOINT
 from hwp_bench.sim.effects.plan import hands_at, plan
 from hwp_bench.sim.geometry.mesh import surface_normals
 from hwp_bench.sim.geometry.raycast import RenderCost
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.gestures import FIRST_JOINT
 from hwp_bench.sim.scene.looks import PLAIN, Glove, Looks, Polish, Ring, Tattoo, WristWear
 from hwp_bench.sim.scene.schema import Scene, Subject
 from hwp_bench.sim.subject.anatomy import Anatomy

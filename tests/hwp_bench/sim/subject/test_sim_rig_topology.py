@@ -286,8 +286,8 @@ def test_a_rest_pose_of_its_own_becomes_the_hand_models(tmp_path: Path, free: Ha
     import torch
 
     from hwp_bench.hands import pose_hand
+    from hwp_bench.hands.gestures import finger_pose, gesture
     from hwp_bench.hands.template import rebuilt
-    from hwp_bench.sim.scene.gestures import finger_pose, gesture
 
     pose = np.vstack([np.zeros(3), 0.4 * finger_pose(gesture("fist"), free.joints)])
     zeros = torch.zeros(10, dtype=torch.float64), torch.zeros(1, 3, dtype=torch.float64)

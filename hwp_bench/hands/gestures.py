@@ -31,7 +31,7 @@ CLOSED = np.array([140.0, 153.0, 150.0, 135.0])
 @cache
 def gestures() -> Mapping[str, np.ndarray]:
     """Return the named hand shapes: (5, 4) degrees each, rows in the order of `FINGERS`."""
-    text = resources.files("hwp_bench.sim.scene").joinpath("gestures.toml").read_text("utf-8")
+    text = resources.files("hwp_bench.hands").joinpath("data", "gestures.toml").read_text("utf-8")
     return MappingProxyType(
         {
             name: np.array([shape[finger] for finger in FINGERS], dtype=np.float64)

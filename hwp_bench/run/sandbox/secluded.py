@@ -1,0 +1,100 @@
+"""What stays out of a method's sight although it lies in a folder that is shown.
+
+The simulator, the scenes and the seeds of the suites are public, so a method that could import them
+would render the test frames again. Runs and captures below a method's own folder hold true frames.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterable
+from glob import escape, glob
+from pathlib import Path
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.locks import LOCK
+
+#: Parts of `hwp_bench` that a method may import: all that methods which ship are built from. Any
+#: other stays out of sight; those render, seal, score or rank test frames.
+SHOWN_ROOMS = frozenset(
+    {"_data", "analysis", "base", "capture", "cli", "hands", "importers", "methods", "metrics"}
+    | {"report", "results", "run", "taxonomy", "tracking"}
+)
+
+#: Files that say that a folder is a capture or a result of the toolkit, by their first words.
+_MARKED_FILES = ("capture.json", "results.json")
+_MARK, _HEAD_BYTES = b'"hwp-', 256
+#: How `base.files.temporary_name` calls what a killed run leaves half written.
+_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}(\.old)?")
+#: Most folders of a method that are looked into.
+MAX_FOLDERS = 20_000
+
+
+def secluded_rooms(folders: Iterable[str]) -> list[str]:
+    """Return the parts of every installed `hwp_bench` that methods do not see.
+
+    Args:
+        folders: places that are shown: packages, folders of packages, prefixes of environments.
+    """
+    found = []
+    for folder in folders:
+        above = [
+            folder,
+            os.path.dirname(folder),
+            *glob(f"{escape(folder)}/lib*/python*/*-packages"),
+        ]
+        for place in above:
+            package = os.path.join(place, "hwp_bench")
+            # A name alone would hide somebody else's folder of that name.
+            if os.path.isfile(os.path.join(package, "__init__.py")):
+                found += _parts(package)
+    return list(dict.fromkeys(found))
+
+
+def _parts(package: str) -> list[str]:
+    with os.scandir(package) as entries:
+        return [
+            entry.path
+            for entry in entries
+            if entry.is_dir() and entry.name not in SHOWN_ROOMS | {"__pycache__"}
+        ]
+
+
+def foreign_folders(method: Path) -> list[str]:
+    """Return the folders below a method's that do not belong to it: captures and outputs of runs.
+
+    A capture and a results file are known by what they begin with, an output that is not finished
+    by its lock file or its temporary name. Links are not followed; inside walls they lead nowhere.
+
+    Raises:
+        UsageError: there are more than `MAX_FOLDERS` folders.
+    """
+    found = []
+    for seen, (folder, folders, files) in enumerate(os.walk(method)):
+        if seen == MAX_FOLDERS:
+            raise UsageError(
+                f"holds more than {MAX_FOLDERS} folders, too many to tell what is the method's",
+                where=method,
+                remedy="Keep the method in a folder of its own.",
+            )
+        own = folder == os.fspath(method)
+        if not own and _is_foreign(folder, files):
+            found.append(folder)
+            folders.clear()
+    return found
+
+
+def _is_foreign(folder: str, files: list[str]) -> bool:
+    if _TEMPORARY.fullmatch(os.path.basename(folder)) or LOCK in files:
+        return True
+    return any(name in files and _marked(os.path.join(folder, name)) for name in _MARKED_FILES)
+
+
+def _marked(path: str) -> bool:
+    try:
+        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as stream:
+            return _MARK in stream.read(_HEAD_BYTES)
+    except OSError:
+        # What cannot be read cannot be told apart from a capture.
+        return True
