@@ -132,7 +132,7 @@ def _crossed(tracks: HandTracks, seen: np.ndarray, size: float) -> np.ndarray:
 
 
 def _motion(path: _Path, shown: list[tuple[int, np.ndarray]], frame: int, size: float) -> float:
-    """What it costs that hands are seen at places, after a path."""
+    """Cost of seeing hands at places, after a path."""
     cost = 0.0
     for side, place in shown:
         if path.frame[side] < 0:
