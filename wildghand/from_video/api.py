@@ -54,7 +54,7 @@ def fit(
         all_frames: fit the validation and test frames too: for an avatar, not for a score. None:
             those of a video, not those of a capture.
         overwrite: replace an avatar that is there.
-        side: of a video: `right`, `left` or `auto` (the default).
+        side: of a video: `right`, `left`, `both` or `auto` (the default: one or both, as it shows).
         landmarks: of a video: its landmarks; None tracks them.
 
     Returns:

@@ -35,7 +35,7 @@ from hwp_bench.importers.shared.overlay import (
     project_hand,
     sheet_frames,
 )
-from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hand, resample
+from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hands, resample
 from hwp_bench.importers.shared.writing import refuse_existing, write_capture
 
 #: Terms of the data set.
@@ -201,7 +201,8 @@ def _windows(
         points.append(np.where(valid, clip.pixels, others[0]))
     image = np.concatenate(points, axis=1)
     world = np.zeros((count, 21, 3))
-    return follow_hand(Landmarks(image, world, seen.astype(float), seen), options.fps, options.size)
+    hand = Landmarks(image, world, seen.astype(float), seen)
+    return follow_hands([hand], options.fps, options.size)
 
 
 def _shifted(K: np.ndarray, windows: CropWindows, frame: int) -> np.ndarray:

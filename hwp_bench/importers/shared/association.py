@@ -22,6 +22,9 @@ _PALM = (0, 1, 5, 9, 13, 17)
 _MOTION = 0.1
 #: Most that a jump costs: a hand that comes back may be anywhere.
 _MOST_MOTION = 10.0
+#: Cost of a hand that was never seen before. Without it, one that is seen alone with a wrong vote
+#: would become the other hand, and be seen for the first time in the next frame.
+_FIRST_SEEN = 5.0
 #: The speed of a hand is known for this many frames after it was seen.
 _MEMORY = 3
 #: Weight of a vote: those of frames next to each other err together.
@@ -132,10 +135,11 @@ def _crossed(tracks: HandTracks, seen: np.ndarray, size: float) -> np.ndarray:
 
 
 def _motion(path: _Path, shown: list[tuple[int, np.ndarray]], frame: int, size: float) -> float:
-    """What it costs that hands are seen at places, after a path."""
+    """Cost of seeing hands at places, after a path."""
     cost = 0.0
     for side, place in shown:
         if path.frame[side] < 0:
+            cost += _FIRST_SEEN
             continue
         gap = frame - path.frame[side]
         expected = path.place[side] + path.speed[side] * min(gap, _MEMORY)

@@ -1,4 +1,4 @@
-"""A video of one hand and its tracked landmarks: frames, fit, masks, capture."""
+"""A video of one hand or two and the tracked landmarks: frames, fit, masks, capture."""
 
 from hwp_bench.importers.video.from_video import import_video
 from hwp_bench.importers.video.imported_clip import ImportedClip

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.importers.shared.association import associate
@@ -56,6 +56,7 @@ def votes() -> np.ndarray:
     wrong=st.sets(st.integers(0, FRAMES - 1), max_size=3),
     seed=st.integers(0, 99),
 )
+@example(swaps=[], gaps=[(0, 0)], wrong={0}, seed=0)
 def test_swaps_gaps_and_wrong_votes_are_repaired(
     swaps: list[int], gaps: list[tuple[int, int]], wrong: set[int], seed: int
 ) -> None:
