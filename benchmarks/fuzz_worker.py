@@ -23,7 +23,7 @@ PATIENCE = 240.0
 MEMORY = 2 << 30
 
 _TRACE = "Traceback (most recent call last)"
-# A line break, a tab and what redraws a line of progress are no way to steer a terminal.
+# A line break, a tab and what redraws a line of progress do not steer a terminal.
 _CONTROL = re.compile("[\x00-\x08\x0b\x0c\x0e-\x1f\x7f-\x9f]")
 # FFmpeg and libpng write on their own; their lines are not our messages.
 _ERROR = re.compile(r"^(hwp-bench|wildghand)[a-z -]*: error: ", re.MULTILINE)
@@ -160,7 +160,7 @@ def _left_behind(
             try:
                 json.loads(path.read_text("utf-8"))
             except ValueError as error:
-                faults.append(f"wrote {path.relative_to(folder)!s:.100}, which is no JSON: {error}")
+                faults.append(f"wrote {path.relative_to(folder)!s:.100}, not valid JSON: {error}")
     if status != 0:
         faults += [f"failed and wrote {path.name}" for path in whole if path.exists()]
     return [fault.encode("utf-8", "backslashreplace").decode() for fault in faults]

@@ -73,7 +73,7 @@ def _honest(words: Sequence[str]) -> int:
         (_half, "failed and wrote out"),
         (_half, "left out/.partial behind"),
         (_twice, "2 messages"),
-        (_nan, "which is no JSON"),
+        (_nan, "not valid JSON"),
         (lambda words: 3, "ended with status 3"),
         (lambda words: 1, "failed without a word"),
         (_honest, ""),

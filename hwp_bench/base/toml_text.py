@@ -47,7 +47,7 @@ def parse_toml(
         text.encode()
         content = tomllib.loads(text)
     except UnicodeEncodeError as fault:
-        raise refuse("holds text that is no Unicode") from fault
+        raise refuse("holds text that cannot be Unicode") from fault
     except RecursionError as fault:
         raise refuse("is nested too deeply") from fault
     except tomllib.TOMLDecodeError as fault:

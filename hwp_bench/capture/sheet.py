@@ -80,7 +80,7 @@ def draw_hands(image: np.ndarray, points: dict[str, np.ndarray]) -> np.ndarray:
     canvas = image.copy()
     for side, landmarks in points.items():
         # OpenCV counts pixel centres from 0, in fixed point with 3 fractional bits here.
-        # Beyond 1e6 it draws nothing anyway; a place that is no number is far off too.
+        # Beyond 1e6 it draws nothing anyway; NaN is far off too.
         places = np.nan_to_num((landmarks - 0.5) * 8, nan=1e6)
         spots = np.clip(places, -1e6, 1e6).round().astype(int)
         for first, last in BONES:

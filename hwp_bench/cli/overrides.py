@@ -41,7 +41,7 @@ def overrides(texts: Iterable[str]) -> dict[str, Any]:
             if not isinstance(error.__cause__, tomllib.TOMLDecodeError):
                 raise
             if has_odd_characters(value):
-                problem = "holds a control character, or is no Unicode"
+                problem = "holds a control character, or cannot be Unicode"
                 raise UsageError(problem, where="--set", field=place) from error
             found[name] = value
     return found

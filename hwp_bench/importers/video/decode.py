@@ -240,7 +240,7 @@ def read_frames(info: VideoInfo, selection: FrameRange) -> Iterator[tuple[int, n
 
 
 def _check_container(path: Path) -> None:
-    """Refuse what is no video file by its first bytes, before FFmpeg chooses a reader.
+    """Refuse by its first bytes what is not a video file, before FFmpeg chooses a reader.
 
     FFmpeg also reads playlists, lists of files and descriptions of streams, which make it open
     other files or addresses of their author's choice.
@@ -252,7 +252,7 @@ def _check_container(path: Path) -> None:
         raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
     if not any(re.match(pattern, head, re.DOTALL) for pattern in CONTAINERS.values()):
         raise BadInput(
-            f"is no video file of a kind that is read ({', '.join(CONTAINERS)})",
+            f"is not a video file of a kind that is read ({', '.join(CONTAINERS)})",
             where=path,
             remedy="Convert it, such as with: ffmpeg -i VIDEO video.mp4",
         )

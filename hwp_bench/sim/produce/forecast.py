@@ -14,6 +14,7 @@ from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.sim.effects.base import ORDER
 from hwp_bench.sim.effects.plan import FramePlan, plan
 from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.produce.extent import check_extent
 from hwp_bench.sim.produce.free_view import free_views, render_free
 from hwp_bench.sim.produce.video_encoding import through_h264
 from hwp_bench.sim.render.frame import carry_out
@@ -94,9 +95,13 @@ def forecast(
         frame_count: frames over which it is spread; its own if None.
         size: edge of the image in pixels; 256 if None.
         probe: render the probes; without them nothing is predicted.
+
+    Raises:
+        UsageError: a number is out of range.
     """
     count = scene.frame_count if frame_count is None else frame_count
     edge = 256 if size is None else size
+    check_extent(count, edge)
     plans = [plan(scene, frame, count, edge) for frame in range(count)]
     groups: dict[str, list[FramePlan]] = {}
     for item in plans:

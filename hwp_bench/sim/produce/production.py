@@ -29,6 +29,7 @@ from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.sim.effects.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.produce.estimates import estimate_hands, estimate_mask
+from hwp_bench.sim.produce.extent import check_extent
 from hwp_bench.sim.produce.frames import (
     RenderFrames,
     eight_bit_coverage,
@@ -54,8 +55,6 @@ from hwp_bench.sim.subject.rigs import rig_path
 
 #: Version of the pixels that the renderer makes; part of every render key.
 RENDERER = 9
-#: Smallest and largest edge of an image.
-SIZES = (32, 1024)
 #: Edge of an image where no other is given.
 DEFAULT_SIZE = 256
 #: Terms under which simulated captures may be used.
@@ -108,7 +107,7 @@ def render_capture(
         scene = replace(scene, seed=seed)
     count = scene.frame_count if frame_count is None else frame_count
     edge = DEFAULT_SIZE if size is None else size
-    _check(count, edge, workers)
+    check_extent(count, edge, workers)
     if scene.sensor.h264:
         check_encoder(scene.id)
     out = Path(out)
@@ -136,16 +135,6 @@ def render_capture(
             with contextlib.suppress(OSError):
                 waiting.with_name(f"{waiting.name}.lock").unlink()
     return open_capture(out)
-
-
-def _check(frame_count: int, size: int, workers: int | None) -> None:
-    for name, value, low, high in (
-        ("frame_count", frame_count, 10, 100_000),
-        ("size", size, *SIZES),
-        ("workers", 1 if workers is None else workers, 1, 1024),
-    ):
-        if not low <= value <= high:
-            raise UsageError(f"{value} is not in {low}..{high}", field=name)
 
 
 def _render_missing(

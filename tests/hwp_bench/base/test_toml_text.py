@@ -25,7 +25,7 @@ DEEP = "[" * 5000 + "]" * 5000
         (DEEP, "nested too deeply"),
         ("[" * (MAX_DEPTH + 1) + "]" * (MAX_DEPTH + 1), "nested too deeply"),
         ("{a = " * 400 + "1" + "}" * 400, "nested too deeply"),
-        ("'\ud800'", "no Unicode"),
+        ("'\ud800'", "cannot be Unicode"),
         ("'" + "x" * MAX_CHARACTERS + "'", "more than"),
         ("1 2", "not valid TOML"),
         ('"\\ud800"', "not valid TOML"),
@@ -49,7 +49,7 @@ def test_a_setting_out_of_bounds_is_one_message(value: str) -> None:
 
 @pytest.mark.parametrize("value", ["\udcff", "a\x1b[2J", "\u202e"])
 def test_a_setting_that_steers_a_terminal_is_refused(value: str) -> None:
-    with pytest.raises(UsageError, match=r"control character|no Unicode"):
+    with pytest.raises(UsageError, match=r"control character|not UTF-8|cannot be Unicode"):
         overrides([f"level={value}"])
 
 

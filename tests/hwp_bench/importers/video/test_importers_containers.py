@@ -65,7 +65,7 @@ def test_lists_and_descriptions_are_refused(
 ) -> None:
     path = tmp_path / f"list.{ending}"
     path.write_text(content)
-    with pytest.raises(BadInput, match="no video file of a kind that is read"):
+    with pytest.raises(BadInput, match="not a video file of a kind that is read"):
         probe(path)
 
 
