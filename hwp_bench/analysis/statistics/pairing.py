@@ -32,13 +32,15 @@ class MethodRuns:
         return self.seeds[min(self.seeds)]
 
     def values(self, capture: str, metric: str, seeds: Sequence[int]) -> np.ndarray:
-        """Return the scores of one capture: (S, F) float, frames in the split's order."""
-        return np.array(
-            [
-                [frame.scores[metric] for frame in _capture(self.seeds[seed], capture).frames]
-                for seed in seeds
-            ]
-        )
+        """Return the scores of one capture: (S, F) float, frames in the split's order.
+
+        Raises:
+            UsageError: a frame lacks the metric, which others of the result have.
+        """
+        rows = [[f.scores for f in _capture(self.seeds[seed], capture).frames] for seed in seeds]
+        if any(metric not in scores for row in rows for scores in row):
+            raise UsageError(f"has frames without {metric}", where=self.label, field=capture)
+        return np.array([[scores[metric] for scores in row] for row in rows])
 
 
 def _capture(results: Results, identifier: str) -> CaptureResult:
