@@ -23,13 +23,11 @@ from hwp_bench.base.records import parse_record
 from hwp_bench.capture.schema import HandModelId
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import NetworkSettings, PredictionNetwork, network_settings
+from wildghand.network.weight_shapes import MAPS, shapes_of, shapes_of_settings
 from wildghand.prior.prior import (
-    MAPS,
     Prior,
     PriorRecord,
     check_tensors,
-    shapes_of,
-    shapes_of_settings,
 )
 
 #: Version of the folder.

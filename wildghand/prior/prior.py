@@ -10,11 +10,8 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import BadInput
-from wildghand.network import NetworkSettings, PredictionNetwork
-from wildghand.network.parameters import blank_network
-
-#: Start of the names of identity maps in a network's state.
-MAPS = "identity.maps."
+from wildghand.network import PredictionNetwork
+from wildghand.network.weight_shapes import MAPS
 
 
 @dataclass(frozen=True)
@@ -84,18 +81,6 @@ def mean_weights(networks: Iterable[PredictionNetwork]) -> dict[str, Tensor]:
             else:
                 shared[name] = value
     return {**shared, **{name: torch.stack(values).mean(dim=0) for name, values in maps.items()}}
-
-
-def shapes_of(network: PredictionNetwork) -> dict[str, torch.Size]:
-    """Shapes of all weights of a network, and of the identity maps of both hands."""
-    shapes = {name: value.shape for name, value in network.state_dict().items()}
-    of_map = next(shape for name, shape in shapes.items() if name.startswith(MAPS))
-    return shapes | {f"{MAPS}{side}": of_map for side in ("right", "left")}
-
-
-def shapes_of_settings(settings: NetworkSettings) -> dict[str, torch.Size]:
-    """The same where there is no network yet; the first time takes a second."""
-    return shapes_of(blank_network(settings))
 
 
 def check_tensors(
