@@ -12,10 +12,15 @@ import numpy as np
 import OpenImageIO as oiio
 
 from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch
+from hwp_bench.base.files import atomic_write
 from hwp_bench.base.text import check_name
 
 #: Largest image that is decoded, in pixels: a 300 byte PNG can ask for gigabytes.
 MAX_PIXELS = 64 * 1024 * 1024
+# Last bytes of a whole file.
+_ENDS = {".png": b"IEND\xaeB`\x82"}
+# Of written JPEG files.
+_JPEG_QUALITY = 98
 #: zlib level of written PNG files: within 10 % of the smallest at a third of the time.
 PNG_LEVEL = 3
 #: First bytes by format. OpenImageIO reads dozens of others, among them film and raw formats,
@@ -163,6 +168,8 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
             where=path,
         )
     check_name(path)
+    if path.suffix.lower() in (".jpg", ".jpeg"):
+        return _write_jpeg(path, array)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
     output = oiio.ImageOutput.create(os.fspath(temporary))
@@ -175,12 +182,37 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
     written = output.open(os.fspath(temporary), spec) and output.write_image(
         np.ascontiguousarray(array)
     )
-    problem = output.geterror().strip()
-    if not (output.close() and written):
+    problem = " ".join(output.geterror().split())
+    if not (output.close() and written and _is_whole(temporary)):
         temporary.unlink(missing_ok=True)
         raise HwpError(f"cannot be written ({problem or 'no space or permission'})", where=path)
     os.replace(temporary, path)
     return path
+
+
+def _write_jpeg(path: Path, pixels: np.ndarray) -> Path:
+    """Write a JPEG made in memory: on a full disc the library that writes files ends the program."""
+    import cv2
+
+    turned = pixels[:, :, 0] if pixels.shape[2] == 1 else pixels[:, :, 2::-1]
+    quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
+    return atomic_write(
+        path, cv2.imencode(".jpg", np.ascontiguousarray(turned), quality)[1].tobytes()
+    )
+
+
+def _is_whole(file: Path) -> bool:
+    """Whether an image that was just written has its end: its library misses a full disc."""
+    try:
+        with file.open("rb") as stream:
+            head, size = stream.read(6), stream.seek(0, os.SEEK_END)
+            if file.suffix.lower() == ".bmp":
+                return size > 0 and int.from_bytes(head[2:6], "little") == size
+            end = _ENDS.get(file.suffix.lower(), b"")
+            stream.seek(max(0, size - len(end)))
+            return size > 0 and stream.read().endswith(end)
+    except OSError:
+        return False
 
 
 def as_uint8(image: np.ndarray) -> np.ndarray:

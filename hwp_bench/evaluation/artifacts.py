@@ -12,6 +12,7 @@ import numpy as np
 from hwp_bench.base.drawing import error_map, fitted, labelled, sheet
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import write_image
+from hwp_bench.base.trees import remove_tree
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.evaluation.scoring import MAX_PREDICTION_BYTES, Prediction
@@ -49,7 +50,7 @@ def keep_artifacts(
     if (output / LOG).is_file():
         keep_log(output / LOG, folder / LOG)
     keep_diagnostics(output / DIAGNOSTICS, folder / DIAGNOSTICS)
-    shutil.rmtree(output, ignore_errors=True)
+    remove_tree(output)
     if any(frame.failure is None for frame in scores):
         write_pictures(folder / "pictures", capture, scores, predictions)
 
@@ -84,7 +85,7 @@ def keep_predictions(folder: Path, source: Path, frames: Sequence[int]) -> None:
 
 def keep_diagnostics(source: Path, target: Path) -> None:
     """Copy temporal weights and weight masks, nothing else, up to `MAX_DIAGNOSTICS` bytes."""
-    shutil.rmtree(target, ignore_errors=True)
+    remove_tree(target)
     total = 0
     for path in sorted([*source.glob("*temporal.json"), *source.glob("weights/*.png")]):
         if path.is_symlink() or path.parent.is_symlink() or not path.is_file():

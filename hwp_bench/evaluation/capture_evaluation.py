@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
 import time
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, replace
@@ -15,6 +14,7 @@ from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import MAX_TEXT, parse_record
 from hwp_bench.base.scratch import scratch_folder
 from hwp_bench.base.text import one_line, shown
+from hwp_bench.base.trees import remove_tree
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.content import refuse_changed
 from hwp_bench.capture.schema import EXTRA, IMAGE_FOLDERS
@@ -117,7 +117,7 @@ def evaluate_capture(
     targets = read_targets(evaluation.capture, evaluation.split.test.tolist())
     free_targets = read_free_targets(evaluation.capture)
     _refuse_changed(evaluation)
-    shutil.rmtree(folder, ignore_errors=True)
+    remove_tree(folder)
     folder.mkdir(parents=True)
     output = folder / "run"
     record, failure = _run(evaluation, output, on_progress)
@@ -258,7 +258,7 @@ def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
 
 def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list[CurvePoint]:
     validation = set(evaluation.split.validation.tolist())
-    frames = [frame for frame in facts.checkpoint_frames if frame in validation]
+    frames = [frame for frame in dict.fromkeys(facts.checkpoint_frames) if frame in validation]
     if not frames:
         return []
     targets = read_targets(evaluation.capture, frames)

@@ -49,8 +49,24 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
         if capture.failure and (folder / LOG).is_file():
             lines.append(f"log: {folder / LOG}")
         lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
-    walls = walls_text(results, head)
-    return [*lines, walls] if walls else lines
+    facts = times_text(results, head), walls_text(results, head)
+    return lines + [text for text in facts if text]
+
+
+def times_text(results: Results, head: str = "") -> str:
+    """Say how long a method fitted by its own clock, and how long its processes ran by ours.
+
+    The first is what tables show, because it leaves out imports, checkpoints and test frames. It is
+    the method's word. The second is not. Empty where no process ran.
+    """
+    ran = [one for one in results.captures if one.isolation and one.fit_seconds is not None]
+    if not ran:
+        return ""
+    said = sum(one.fit_seconds or 0.0 for one in ran)
+    wall = sum(one.wall_seconds for one in ran)
+    return (
+        f"times: {head}{said:.1f} s of fitting, by the method's clock; processes ran {wall:.1f} s"
+    )
 
 
 def _frames_text(name: str, frames: Sequence[FrameResult]) -> str:

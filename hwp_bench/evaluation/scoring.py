@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import BadCapture, BadImage, BadPrediction
+from hwp_bench.base.errors import BadCapture, BadPrediction, HwpError
 from hwp_bench.base.images import MAX_PIXELS, pixel_digest, read_rgb
 from hwp_bench.base.text import bounded
 from hwp_bench.capture import Capture
@@ -113,7 +113,7 @@ def read_prediction(
             return Prediction(frame, None, f"{path.name}: is larger than any image may be")
     try:
         return Prediction(frame, read_rgb(path, size), None)
-    except BadImage as error:
+    except HwpError as error:
         return Prediction(frame, None, f"{path.name}: {error.problem}")
 
 

@@ -7,6 +7,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
 
 from hwp_bench.base.files import read_json
 from hwp_bench.base.records import Count, Line, Seconds, parse_record
@@ -29,8 +32,9 @@ FAILURE = "failure.json"
 LOG = "log.txt"
 #: Settings and seed of a method that is only made, in the place of a request.
 REHEARSAL = "rehearsal.json"
-#: Largest `run.json` that is read, bytes.
-MAX_BYTES = 10 * 1024 * 1024
+#: Largest `run.json` that is read, bytes; most frames and checkpoints in it.
+MAX_BYTES = 1024 * 1024
+MAX_FRAMES, MAX_CHECKPOINTS = 64, 1000
 
 
 @dataclass(frozen=True)
@@ -66,9 +70,13 @@ class RunFacts:
     #: Device that the method ran on.
     device: Line | None = None
     #: Validation frames that were rendered for every checkpoint.
-    checkpoint_frames: list[int] = field(default_factory=list)
+    checkpoint_frames: Annotated[list[Count], Meta(max_length=MAX_FRAMES)] = field(
+        default_factory=list
+    )
     #: The checkpoints, in time order; the last is the finished fit.
-    checkpoints: list[Checkpoint] = field(default_factory=list)
+    checkpoints: Annotated[list[Checkpoint], Meta(max_length=MAX_CHECKPOINTS)] = field(
+        default_factory=list
+    )
 
 
 def read_facts(path: Path) -> RunFacts:

@@ -16,6 +16,7 @@ from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed
 from hwp_bench.base.files import inside, read_json, write_json
 from hwp_bench.base.scratch import scratch_folder
 from hwp_bench.base.text import shown
+from hwp_bench.base.trees import remove_tree
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.results.walls import WALLED
@@ -113,7 +114,7 @@ def run_method(
         clip = inside(manifest.root, f"{manifest.entry}/{capture_id}/{FREE_VIEW}")
         return RunRecord(folder, RunFacts(), 0.0, free_view=clip if clip.is_dir() else None)
     confinement = confinement or Confinement()
-    shutil.rmtree(output, ignore_errors=True)
+    remove_tree(output)
     output.mkdir(parents=True)
     limits = Limits(time_limit, confinement.memory_bytes)
     started = time.perf_counter()

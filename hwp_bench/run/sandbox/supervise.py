@@ -6,7 +6,6 @@ import contextlib
 import json
 import os
 import signal
-import stat
 import subprocess
 import sys
 import threading
@@ -18,6 +17,7 @@ from typing import IO, TYPE_CHECKING, Any
 
 from hwp_bench.base.errors import MethodFailed
 from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.trees import open_up
 from hwp_bench.run.sandbox.root import Place
 
 if TYPE_CHECKING:
@@ -130,18 +130,12 @@ def run_confined(
 
 
 def remove_odd_files(folder: Path) -> None:
-    """Remove links, pipes, sockets and devices from a folder and all folders in it.
+    """Remove links, pipes, sockets and devices from a folder and all folders in it, and open it.
 
     A link that leads nowhere inside a sandbox leads to real files outside it: the toolkit would
     read a test frame for a prediction. To be called when no process of the program is left.
     """
-    for root, folders, files in os.walk(folder, followlinks=False):
-        for name in (*folders, *files):
-            path = os.path.join(root, name)
-            with contextlib.suppress(OSError):
-                mode = os.lstat(path).st_mode
-                if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
-                    os.unlink(path)
+    open_up(folder)
 
 
 def _order(program: Program) -> bytes:

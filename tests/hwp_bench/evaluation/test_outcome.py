@@ -36,3 +36,15 @@ def test_many_bad_frames_are_bounded_and_counted() -> None:
 
 def test_sound_captures_say_nothing(tmp_path: Path) -> None:
     assert outcome_lines(tmp_path, results_example()) == []
+
+
+def test_seconds_by_the_methods_clock_stand_next_to_ours(tmp_path: Path) -> None:
+    results = results_example()
+    captures = [
+        replace(one, isolation="namespaces", fit_seconds=0.001, wall_seconds=8.3)
+        for one in results.captures
+    ]
+    lines = outcome_lines(tmp_path, replace(results, captures=captures))
+    said, ran = 0.001 * len(captures), 8.3 * len(captures)
+    expected = f"times: {said:.1f} s of fitting, by the method's clock; processes ran {ran:.1f} s"
+    assert expected in lines

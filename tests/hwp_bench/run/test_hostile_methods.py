@@ -395,3 +395,42 @@ def test_an_archive_is_no_method(tmp_path: Path, form: str) -> None:
     archive = shutil.make_archive(str(tmp_path / "archive"), form, method)
     with pytest.raises(BadMethod, match="is not a method directory"):
         read_manifest(find_method(archive))
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        {"checkpoint_frames": [7] * 100_000},
+        {"checkpoints": [{"step": 1, "seconds": 1.0, "peak_memory": 1}] * 5_000},
+        {"checkpoint_frames": [-1]},
+        {"fit_seconds": -1.0},
+        {"fit_seconds": 1e308},
+        {"device": "x" * 1_000_000},
+    ],
+    ids=["frames", "checkpoints", "negative frame", "negative", "huge", "device"],
+)
+def test_a_forged_run_costs_nothing(attack, forged: dict) -> None:
+    script = f"pathlib.Path(sys.argv[2], 'run.json').write_text({json.dumps(json.dumps(forged))})\n"
+    with pytest.raises(MethodFailed, match=r"run\.json that cannot be read") as caught:
+        attack(script, "none")
+    assert len(str(caught.value)) < 1_000
+
+
+def test_nothing_that_a_method_leaves_stops_the_next_run(attack, tmp_path: Path) -> None:
+    script = """
+here = os.open(sys.argv[2], os.O_RDONLY)
+for _ in range(3000):
+    os.mkdir("d", dir_fd=here)
+    inner = os.open("d", os.O_RDONLY, dir_fd=here)
+    os.close(here)
+    here = inner
+closed = pathlib.Path(sys.argv[2], "predictions")
+closed.mkdir()
+(closed / "000000.png").touch()
+closed.chmod(0)
+print(json.dumps({"done": True}))
+"""
+    for _ in range(2):
+        record, said = attack(script, "none")
+        assert said["done"]
+        assert [path.name for path in record.predictions.iterdir()] == ["000000.png"]

@@ -1,0 +1,65 @@
+"""Folders that a stranger's program has filled: looked through and removed, whatever is in them.
+
+`shutil.rmtree` and `os.walk` call themselves for every level (before Python 3.12), so that a folder
+nested a thousand deep ends them; and neither gets into a folder whose owner has closed it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import stat
+import subprocess
+from pathlib import Path
+
+#: Deepest folder that a run has a reason to write, below its output.
+DEEPEST = 32
+
+
+def remove_tree(folder: str | os.PathLike[str]) -> None:
+    """Remove a folder and everything in it; what is not there, or cannot be removed, is left."""
+    if not os.path.lexists(folder):
+        return
+    with contextlib.suppress(OSError):
+        open_up(Path(folder))
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+def open_up(folder: Path) -> None:
+    """Make everything in a folder readable for its owner, and leave only plain files and folders.
+
+    Links, pipes, sockets and devices are removed, and so is whatever lies deeper than `DEEPEST`.
+    To be called when no process that writes there is left.
+
+    Args:
+        folder: of this user.
+    """
+    waiting = [(os.fspath(folder), 0)]
+    while waiting:
+        place, depth = waiting.pop()
+        with contextlib.suppress(OSError):
+            os.chmod(place, 0o700)
+        try:
+            entries = list(os.scandir(place))
+        except OSError:
+            continue
+        for entry in entries:
+            with contextlib.suppress(OSError):
+                mode = entry.stat(follow_symlinks=False).st_mode
+                if stat.S_ISDIR(mode) and depth < DEEPEST:
+                    waiting.append((entry.path, depth + 1))
+                elif stat.S_ISDIR(mode):
+                    _remove_deep(entry.path)
+                elif not stat.S_ISREG(mode):
+                    os.unlink(entry.path)
+                elif not mode & stat.S_IRUSR:
+                    os.chmod(entry.path, 0o600)
+
+
+def _remove_deep(folder: str) -> None:
+    """Remove a folder of any depth; `rm` goes down by descriptors, and not by paths."""
+    if remover := shutil.which("rm"):
+        subprocess.run(
+            [remover, "-rf", "--", folder], check=False, stderr=subprocess.DEVNULL, timeout=600
+        )
