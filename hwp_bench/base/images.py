@@ -191,14 +191,13 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
 
 
 def _write_jpeg(path: Path, pixels: np.ndarray) -> Path:
-    """Write a JPEG made in memory: on a full disc the library that writes files ends the program."""
+    """Write a JPEG from memory: on a full disc the library that writes files ends the program."""
     import cv2
 
     turned = pixels[:, :, 0] if pixels.shape[2] == 1 else pixels[:, :, 2::-1]
     quality = [cv2.IMWRITE_JPEG_QUALITY, _JPEG_QUALITY]
-    return atomic_write(
-        path, cv2.imencode(".jpg", np.ascontiguousarray(turned), quality)[1].tobytes()
-    )
+    _, data = cv2.imencode(".jpg", np.ascontiguousarray(turned), quality)
+    return atomic_write(path, data.tobytes())
 
 
 def _is_whole(file: Path) -> bool:

@@ -1,4 +1,4 @@
-"""Folders that a stranger's program has filled: looked through and removed, whatever is in them.
+"""Folders that an untrusted program has filled: looked through and removed, whatever is in them.
 
 `shutil.rmtree` and `os.walk` call themselves for every level (before Python 3.12), so that a folder
 nested a thousand deep ends them; and neither gets into a folder whose owner has closed it.

@@ -64,9 +64,8 @@ def times_text(results: Results, head: str = "") -> str:
         return ""
     said = sum(one.fit_seconds or 0.0 for one in ran)
     wall = sum(one.wall_seconds for one in ran)
-    return (
-        f"times: {head}{said:.1f} s of fitting, by the method's clock; processes ran {wall:.1f} s"
-    )
+    clocks = f"{said:.1f} s of fitting, by the method's clock; processes ran {wall:.1f} s"
+    return f"times: {head}{clocks}"
 
 
 def _frames_text(name: str, frames: Sequence[FrameResult]) -> str:

@@ -1,4 +1,4 @@
-"""Folders that strangers have filled. Oracle: the file system."""
+"""Folders that untrusted programs have filled. Oracle: the file system."""
 
 from __future__ import annotations
 
