@@ -148,7 +148,9 @@ def results_digest(out: Path) -> str:
     """Digest of every result file and kept prediction below a folder, times left out."""
     total = hashlib.sha256()
     for path in sorted(out.rglob("results.json")):
-        text = json.dumps(_firm(json.loads(path.read_text())), sort_keys=True)
+        content = json.loads(path.read_text())
+        del content["digest"]  # of everything, times too
+        text = json.dumps(_firm(content), sort_keys=True)
         total.update(f"{path.relative_to(out)}{text}".encode())
     for path in sorted(out.rglob("predictions/*.png")):
         total.update(str(path.relative_to(out)).encode() + path.read_bytes())

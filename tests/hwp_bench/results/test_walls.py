@@ -23,8 +23,12 @@ def _made(isolation: str | None, name: str = "plain") -> Results:
 
 
 def test_the_console_says_the_level_on_every_run(tmp_path: Path) -> None:
-    assert outcome_lines(tmp_path, _made("namespaces")) == ["isolation: namespaces"]
-    (line,) = outcome_lines(tmp_path, _made("processes (new namespaces: No space)"), "v, seed 0, ")
+    clock = "2.0 s of fitting, by the method's clock; processes ran 4.0 s"
+    lines = outcome_lines(tmp_path, _made("namespaces"))
+    assert lines == [f"times: {clock}", "isolation: namespaces"]
+    refused = _made("processes (new namespaces: No space)")
+    times, line = outcome_lines(tmp_path, refused, "v, seed 0, ")
+    assert times == f"times: v, seed 0, {clock}"
     assert line.startswith(
         "warning: v, seed 0, no isolation on capture2 (the system refuses them: "
         "new namespaces: No space). "

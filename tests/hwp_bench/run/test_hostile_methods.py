@@ -14,65 +14,16 @@ import sys
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
+from hostile import folder_of, hostile_method
 
 from hwp_bench.base.errors import MethodFailed
-from hwp_bench.evaluation.scoring import read_prediction
 from hwp_bench.methods.manifest import read_manifest
-from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
+from hwp_bench.run.runner import run_method
 from hwp_bench.run.sandbox.confinement import Confinement
 
 MODES = ("required", "none")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="process control is Linux's")
-
-
-@pytest.fixture
-def attack(tmp_path: Path, namespaces: bool):
-    """Return a function that runs a script as a method and returns its record and what it said."""
-
-    def run(script: str, mode: str = "required", **limits) -> tuple[RunRecord, dict]:
-        if mode == "required" and not namespaces:
-            pytest.skip("no user namespaces on this machine")
-        method = _method(tmp_path / "method", script)
-        time_limit = limits.pop("time_limit", DEFAULT_TIME_LIMIT)
-        confinement = Confinement(mode, **limits)
-        record = run_method(
-            read_manifest(method),
-            "tiny",
-            _folder(tmp_path / "request"),
-            tmp_path / "output",
-            time_limit=time_limit,
-            confinement=confinement,
-        )
-        said = (tmp_path / "output" / "log.txt").read_text()
-        return record, json.loads(said) if said.strip() else {}
-
-    return run
-
-
-def _folder(path: Path) -> Path:
-    path.mkdir(exist_ok=True)
-    return path
-
-
-def _method(folder: Path, script: str) -> Path:
-    _folder(folder)
-    (folder / "run.py").write_text("import json, os, pathlib, subprocess, sys, time\n" + script)
-    (folder / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "hostile"\n[entry]\n'
-        'command = ["{python}", "{method}/run.py", "{request}", "{output}"]\n'
-    )
-    return folder
-
-
-@pytest.fixture(scope="module")
-def namespaces(tmp_path_factory: pytest.TempPathFactory) -> bool:
-    """Whether this machine allows them."""
-    root = tmp_path_factory.mktemp("probe")
-    method = read_manifest(_method(root / "method", ""))
-    record = run_method(method, "tiny", _folder(root / "request"), root / "output")
-    return record.isolation == "namespaces"
 
 
 @pytest.mark.parametrize("mode", MODES)
@@ -80,7 +31,7 @@ def test_no_secret_comes_through_the_environment_or_descriptors(
     attack, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mode: str
 ) -> None:
     frame = tmp_path / "capture" / "000018.png"
-    _folder(frame.parent)
+    folder_of(frame.parent)
     frame.write_text("a test frame")
     monkeypatch.setenv("SECRET_TOKEN", "s3cret")
     monkeypatch.setenv("CAPTURE", str(frame))
@@ -101,7 +52,7 @@ print(json.dumps({"environment": dict(os.environ), "held": held, "input": sys.st
 
 
 def test_nothing_but_what_is_shown_can_be_seen(attack, tmp_path: Path) -> None:
-    secret = _folder(tmp_path / "capture") / "000018.png"
+    secret = folder_of(tmp_path / "capture") / "000018.png"
     secret.write_text("a test frame")
     script = f"""
 def sees(path):
@@ -233,13 +184,13 @@ def test_a_killed_toolkit_takes_the_method_along(
     if mode == "required" and not namespaces:
         pytest.skip("no user namespaces on this machine")
     tag = f"tag-{tmp_path.name}"
-    method = _method(tmp_path / "method", GRANDCHILD.replace("TAG", tag) + "time.sleep(600)")
+    method = hostile_method(tmp_path / "method", GRANDCHILD.replace("TAG", tag) + "time.sleep(600)")
     program = f"""
 from pathlib import Path
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.run.runner import run_method
 from hwp_bench.run.sandbox.confinement import Confinement
-run_method(read_manifest({str(method)!r}), "tiny", Path({str(_folder(tmp_path / "request"))!r}),
+run_method(read_manifest({str(method)!r}), "tiny", Path({str(folder_of(tmp_path / "request"))!r}),
            Path({str(tmp_path / "output")!r}), confinement=Confinement({mode!r}))
 """
     toolkit = subprocess.Popen([sys.executable, "-c", program], cwd=Path(__file__).parents[3])
@@ -303,8 +254,8 @@ def test_a_system_that_refuses_is_named_and_the_run_goes_on(
         "hwp_bench.run.sandbox.confinement.visible_places",
         lambda **_: [("read", "/no/such/place", "")],
     )
-    method = read_manifest(_method(tmp_path / "method", ""))
-    places = (method, "tiny", _folder(tmp_path / "request"), tmp_path / "output")
+    method = read_manifest(hostile_method(tmp_path / "method", ""))
+    places = (method, "tiny", folder_of(tmp_path / "request"), tmp_path / "output")
     record = run_method(*places)
     assert record.isolation is not None
     assert record.isolation.startswith("processes (")
@@ -314,123 +265,14 @@ def test_a_system_that_refuses_is_named_and_the_run_goes_on(
 
 @pytest.mark.parametrize("mode", ["auto", "none"])
 def test_a_command_that_is_not_there_is_one_message(tmp_path: Path, mode: str) -> None:
-    method = _method(tmp_path / "method", "")
+    method = hostile_method(tmp_path / "method", "")
     manifest = (method / "method.toml").read_text().replace("{python}", "no-such-program")
     (method / "method.toml").write_text(manifest)
     with pytest.raises(MethodFailed, match=r"no-such-program: .*cannot be started \(No such file"):
         run_method(
             read_manifest(method),
             "tiny",
-            _folder(tmp_path / "request"),
+            folder_of(tmp_path / "request"),
             tmp_path / "output",
             confinement=Confinement(mode),
         )
-
-
-@pytest.mark.parametrize("mode", MODES)
-def test_links_and_pipes_in_the_output_are_not_followed(attack, tmp_path: Path, mode: str) -> None:
-    frame = _folder(tmp_path / "capture") / "000018.png"
-    frame.write_bytes(b"a test frame")
-    script = f"""
-output = pathlib.Path(sys.argv[2])
-(output / "predictions").mkdir()
-(output / "predictions/000018.png").symlink_to({str(frame)!r})
-(output / "checkpoints").symlink_to({str(frame.parent)!r})
-(output / "run.json").symlink_to("/dev/zero")
-os.mkfifo(output / "progress.json")
-time.sleep(0.5)
-"""
-    record, _ = attack(script, mode)
-    assert record.facts.fit_seconds is None
-    left = sorted(path.name for path in (tmp_path / "output").rglob("*"))
-    assert [name for name in left if name != "home"] == ["log.txt", "predictions"]
-    assert frame.read_bytes() == b"a test frame"
-
-
-def test_a_log_that_became_a_link_is_not_passed_on(attack, tmp_path: Path) -> None:
-    secret = _folder(tmp_path / "home") / "secret"
-    secret.write_text("s3cret")
-    script = f"""
-log = pathlib.Path(sys.argv[2]) / "log.txt"
-log.unlink()
-log.symlink_to({str(secret)!r})
-"""
-    with pytest.raises(FileNotFoundError):  # by the test's own look at the log
-        attack(script, "none")
-    assert secret.read_text() == "s3cret"
-
-
-@pytest.mark.parametrize("which", ["frame", "folder"])
-def test_a_submission_of_links_is_refused(tmp_path: Path, which: str) -> None:
-    from hwp_bench.base.errors import BadInput
-    from hwp_bench.base.images import write_image
-
-    sealed = _folder(tmp_path / "sealed")
-    write_image(sealed / "000018.png", np.full((8, 8, 3), 9, np.uint8))
-    method = _folder(tmp_path / "entry")
-    (method / "method.toml").write_text(
-        'schema = "hwp-method/1"\nname = "links"\n[entry]\npredictions = "predictions"\n'
-    )
-    folder = method / "predictions" / "tiny"
-    folder.parent.mkdir()
-    if which == "folder":
-        folder.symlink_to(sealed)
-        with pytest.raises(BadInput, match="leads out of the folder"):
-            run_method(read_manifest(method), "tiny", tmp_path, tmp_path / "output")
-    else:
-        folder.mkdir()
-        (folder / "000018.png").symlink_to(sealed / "000018.png")
-        record = run_method(read_manifest(method), "tiny", tmp_path, tmp_path / "output")
-        assert read_prediction(record.predictions, 18, (8, 8)).failure == "000018.png: is a link"
-
-
-@pytest.mark.parametrize("form", ["zip", "tar"])
-def test_an_archive_is_no_method(tmp_path: Path, form: str) -> None:
-    import shutil
-
-    from hwp_bench.base.errors import BadMethod
-    from hwp_bench.methods.manifest import find_method
-
-    method = _method(tmp_path / "method", "")
-    archive = shutil.make_archive(str(tmp_path / "archive"), form, method)
-    with pytest.raises(BadMethod, match="is not a method directory"):
-        read_manifest(find_method(archive))
-
-
-@pytest.mark.parametrize(
-    "forged",
-    [
-        {"checkpoint_frames": [7] * 100_000},
-        {"checkpoints": [{"step": 1, "seconds": 1.0, "peak_memory": 1}] * 5_000},
-        {"checkpoint_frames": [-1]},
-        {"fit_seconds": -1.0},
-        {"fit_seconds": 1e308},
-        {"device": "x" * 1_000_000},
-    ],
-    ids=["frames", "checkpoints", "negative frame", "negative", "huge", "device"],
-)
-def test_a_forged_run_costs_nothing(attack, forged: dict) -> None:
-    script = f"pathlib.Path(sys.argv[2], 'run.json').write_text({json.dumps(json.dumps(forged))})\n"
-    with pytest.raises(MethodFailed, match=r"run\.json that cannot be read") as caught:
-        attack(script, "none")
-    assert len(str(caught.value)) < 1_000
-
-
-def test_nothing_that_a_method_leaves_stops_the_next_run(attack, tmp_path: Path) -> None:
-    script = """
-here = os.open(sys.argv[2], os.O_RDONLY)
-for _ in range(3000):
-    os.mkdir("d", dir_fd=here)
-    inner = os.open("d", os.O_RDONLY, dir_fd=here)
-    os.close(here)
-    here = inner
-closed = pathlib.Path(sys.argv[2], "predictions")
-closed.mkdir()
-(closed / "000000.png").touch()
-closed.chmod(0)
-print(json.dumps({"done": True}))
-"""
-    for _ in range(2):
-        record, said = attack(script, "none")
-        assert said["done"]
-        assert [path.name for path in record.predictions.iterdir()] == ["000000.png"]

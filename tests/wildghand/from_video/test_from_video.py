@@ -252,7 +252,7 @@ def test_from_python(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     ("words", "status", "message"),
     [
         (["absent.mp4"], 1, "does not exist"),
-        (["text.mp4"], 1, "is not a video that can be read"),
+        (["text.mp4"], 1, "is not a video file of a kind that is read"),
         (["empty.mp4"], 1, "is empty"),
         (["hand.avi", "-o", "taken"], 2, "exists and is not the folder of an avatar"),
         (["hand.avi", "-o", "hand.npz"], 2, "is a file"),

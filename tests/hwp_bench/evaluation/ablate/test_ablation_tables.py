@@ -55,10 +55,10 @@ GOLDEN = r"""**Ablation**
 
 | DPD | PAO | Single PSNR \[dB\] ↑ | Single Oriented distance ↓ | Interacting PSNR \[dB\] ↑ | Interacting Oriented distance ↓ | Macro PSNR \[dB\] ↑ | Macro Oriented distance ↓ | Time Step \[ms\] | Time Fit \[s\] | Failed frames |
 | --- | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |
-| – | – | 21.50 | 0.2850 | 22.50 | 0.2750 | 22.00 | 0.2800 | 100.0 | 10.0 | 0 |
-| – | yes | <u>23.50</u> | <u>0.2650</u> | <u>24.50</u> | <u>0.2550</u> | <u>24.00</u> | <u>0.2600</u> | 110.0 | 11.0 | 0 |
-| yes | – | 22.50 | 0.2750 | 23.50 | 0.2650 | 23.00 | 0.2700 | 150.0 | 15.0 | 0 |
-| yes | yes | **25.50** | **0.2450** | **26.50** | **0.2350** | **26.00** | **0.2400** | 165.0 | 16.5 | 0 |
+| – | – | 21.50 | 0.7850 | 22.50 | 0.7750 | 22.00 | 0.7800 | 100.0 | 10.0 | 0 |
+| – | yes | <u>23.50</u> | <u>0.7650</u> | <u>24.50</u> | <u>0.7550</u> | <u>24.00</u> | <u>0.7600</u> | 110.0 | 11.0 | 0 |
+| yes | – | 22.50 | 0.7750 | 23.50 | 0.7650 | 23.00 | 0.7700 | 150.0 | 15.0 | 0 |
+| yes | yes | **25.50** | **0.7450** | **26.50** | **0.7350** | **26.00** | **0.7400** | 165.0 | 16.5 | 0 |
 
 smoke: 4 captures, seeds 0, 1; protocol hwp-v1; means over captures of means over test frames, then over seeds. Step and fit: means over captures and seeds, on the method's own clock.
 """  # noqa: E501
