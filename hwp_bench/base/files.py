@@ -25,6 +25,11 @@ MAX_JSON_BYTES = 256 * 1024 * 1024
 MAX_JSON_DEPTH = 100
 #: Largest integer that is read; above it other programs would round.
 MAX_JSON_INTEGER = 2**63
+# What the system says of a disc that takes no more: full, over a quota or the largest size of a
+# file, closed for this user or for everybody, broken.
+_DISC = frozenset(
+    {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO}
+)
 # Folders of one name that other processes make while one is replaced, before it gives up.
 _MOST_RETIRED = 100
 # The file itself is UTF-8, so that only an escape can stand for half of a surrogate pair.
@@ -64,6 +69,32 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
             remedy="Check the free space and the permissions of the folder.",
         ) from error
     return path
+
+
+@contextlib.contextmanager
+def disc_errors(where: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what the system says of a full or closed disc into one error that names the place.
+
+    For work whose finished parts stay, so that the same call goes on.
+
+    Args:
+        where: the folder that the block writes to.
+
+    Raises:
+        HwpError: the disc took no more. Every other `OSError`, such as that of a closed pipe,
+            passes.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _DISC:
+            raise
+        raise HwpError(
+            f"cannot be written ({error.strerror or error})",
+            where=where,
+            remedy="Make room or check the permissions, and start again with the same arguments: "
+            "what is finished stays.",
+        ) from error
 
 
 def refuse_existing(
