@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -244,6 +245,19 @@ class TrainingCapture:
     def train(self) -> np.ndarray:
         """Indices of the training frames."""
         return self._train
+
+    def thinned(self, most: int) -> TrainingCapture:
+        """Return the same capture with fewer training frames, evenly spread over those there are.
+
+        Args:
+            most: training frames that are kept, at least 1.
+        """
+        if len(self._train) <= most:
+            return self
+        picks = np.unique(np.linspace(0, len(self._train) - 1, max(1, most)).round().astype(int))
+        fewer = copy.copy(self)
+        fewer._train = self._train[picks]
+        return fewer
 
     @property
     def validation(self) -> np.ndarray:

@@ -7,6 +7,7 @@ from typing import Any
 
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.fitting.affordable import affordable
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import optimize
 from wildghand.fitting.ready import ready_fit
@@ -45,4 +46,5 @@ class WildGHandMethod:
             BadInput: no training frame can be used.
             DidNotConverge: the fit diverged at once.
         """
+        training = affordable(training, self.settings, budget)
         return optimize(Fit(training, self.settings, self.seed, self.device), budget, report)

@@ -21,6 +21,7 @@ from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import save_avatar
+from wildghand.fitting.affordable import affordable
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Watch, Watchers, optimize
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
@@ -155,7 +156,7 @@ def _fit_in(
     save: bool = True,
 ) -> WildGHandAvatar:
     """Fit, from the state that is saved in the work folder if there is one."""
-    training = open_request(work / "request")
+    training = affordable(open_request(work / "request"), chosen, run.budget)
     digest = sha256_json(
         [sha256_file(work / "request" / REQUEST), capture.info.to_json().get("digests")]
     )

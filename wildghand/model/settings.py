@@ -86,6 +86,9 @@ class ScheduleSettings:
     final_rate: float = number(0.05, 1e-6, 1.0)
     #: How often `halving` halves.
     halvings: int = number(10, 0, 100)
+    #: Most training frames for each second of a budget in seconds, evenly spread; 0: all. Every
+    #: frame is judged before the first step, at a cost.
+    frames_per_second: float = number(4.0, 0.0, 1e6)
     #: Stop when the loss has not fallen by 0.1 % over this many steps; 0 never stops early.
     plateau_steps: int = number(0, 0, 10_000_000)
     #: Adam's steps.
