@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
 import json
 import math
@@ -24,6 +25,13 @@ MAX_JSON_BYTES = 256 * 1024 * 1024
 MAX_JSON_DEPTH = 100
 #: Largest integer that is read; above it other programs would round.
 MAX_JSON_INTEGER = 2**63
+# What the system says of a disc that takes no more: full, over a quota or the largest size of a
+# file, closed for this user or for everybody, broken.
+_DISC = frozenset(
+    {errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EACCES, errno.EPERM, errno.EROFS, errno.EIO}
+)
+# Folders of one name that other processes make while one is replaced, before it gives up.
+_MOST_RETIRED = 100
 # The file itself is UTF-8, so that only an escape can stand for half of a surrogate pair.
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
@@ -63,6 +71,32 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
     return path
 
 
+@contextlib.contextmanager
+def disc_errors(where: str | os.PathLike[str]) -> Iterator[None]:
+    """Turn what the system says of a full or closed disc into one error that names the place.
+
+    For work whose finished parts stay, so that the same call goes on.
+
+    Args:
+        where: the folder that the block writes to.
+
+    Raises:
+        HwpError: the disc took no more. Every other `OSError`, such as that of a closed pipe,
+            passes.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in _DISC:
+            raise
+        raise HwpError(
+            f"cannot be written ({error.strerror or error})",
+            where=where,
+            remedy="Make room or check the permissions, and start again with the same arguments: "
+            "what is finished stays.",
+        ) from error
+
+
 def refuse_existing(
     path: str | os.PathLike[str], *, overwrite: bool = False, flag: str = ""
 ) -> None:
@@ -78,8 +112,12 @@ def refuse_existing(
     """
     path = Path(path)
     if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
-        another = f", or replace it with {flag}" if flag else ""
-        raise UsageError("exists already", where=path, remedy=f"Choose another place{another}.")
+        raise _exists(path, flag)
+
+
+def _exists(path: Path, flag: str) -> UsageError:
+    another = f", or replace it with {flag}" if flag else ""
+    return UsageError("exists already", where=path, remedy=f"Choose another place{another}.")
 
 
 @contextlib.contextmanager
@@ -90,7 +128,8 @@ def atomic_folder(
 
     Args:
         path: the folder to make.
-        overwrite: replace an existing folder; without it an existing non-empty one is refused.
+        overwrite: replace an existing folder; without it an existing non-empty one is refused,
+            also where another process made it during the block.
         flag: the option by which a person asks for that, for the message; empty where none is.
 
     Yields:
@@ -101,6 +140,9 @@ def atomic_folder(
         HwpError: the place cannot be written.
     """
     path = Path(path).absolute()
+    if path.is_symlink():
+        # What it leads to takes the content; the link stays.
+        path = path.resolve()
     refuse_existing(path, overwrite=overwrite, flag=flag)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -110,17 +152,54 @@ def atomic_folder(
         raise HwpError(f"cannot be made ({error.strerror})", where=path) from error
     try:
         yield temporary
-        retired = temporary.with_name(temporary.name + ".old")
-        if path.exists():
-            os.replace(path, retired)
-        os.replace(temporary, path)
-        shutil.rmtree(retired, ignore_errors=True)
+        _take_name(temporary, path, overwrite, flag)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
-        raise HwpError(f"cannot be written ({error.strerror})", where=path) from error
+        raise HwpError(
+            f"cannot be written ({error.strerror})",
+            where=path,
+            remedy="Check the free space and the permissions of the folder.",
+        ) from error
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
         raise
+
+
+def _take_name(temporary: Path, path: Path, overwrite: bool, flag: str) -> None:
+    """Give a filled folder its name; the system decides in one step whether the name is free.
+
+    Renaming a folder replaces an empty folder, and is refused where a file or a filled folder is.
+    To look first and to rename then would lose what another process makes in between.
+
+    Raises:
+        UsageError: something is there that may not be replaced.
+        OSError: the folder cannot be renamed for another reason.
+    """
+    retired: list[Path] = []
+    try:
+        while True:
+            try:
+                os.rename(temporary, path)
+                return
+            except OSError as error:
+                if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOTDIR):
+                    raise
+                if not overwrite or not path.is_dir() or len(retired) >= _MOST_RETIRED:
+                    raise _exists(path, flag) from error
+            aside = temporary.with_name(f"{temporary.name}.{len(retired)}.old")
+            # Another process that replaces it too may have been faster.
+            with contextlib.suppress(FileNotFoundError):
+                os.rename(path, aside)
+                retired.append(aside)
+    except BaseException:
+        # The last that had the name gets it back, or stays aside where somebody else has taken it.
+        if retired:
+            with contextlib.suppress(OSError):
+                os.rename(retired.pop(), path)
+        raise
+    finally:
+        for folder in retired:
+            shutil.rmtree(folder, ignore_errors=True)
 
 
 def temporary_name(path: Path) -> Path:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import errno
 import importlib
 import os
 import signal
@@ -65,10 +66,11 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
         return 1
     except OSError as error:
         # A full disc or a read-only folder: the message names the place.
-        where = f"{error.filename}: " if error.filename else ""
-        print(
-            f"{program}: error: {_one_line(f'{where}{error.strerror or error}')}", file=sys.stderr
-        )
+        where = f"{error.filename2 or error.filename}: " if error.filename else ""
+        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
+        remedy = ". Make room and start again with the same arguments." if full else ""
+        text = _one_line(f"{where}{error.strerror or error}{remedy}")
+        print(f"{program}: error: {text}", file=sys.stderr)
         return 1
 
 

@@ -9,7 +9,7 @@ from functools import partial
 from pathlib import Path
 
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
-from hwp_bench.base.files import read_json, write_json
+from hwp_bench.base.files import disc_errors, read_json, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import MAX_TEXT, parse_record
 from hwp_bench.base.scratch import scratch_folder
@@ -26,6 +26,7 @@ from hwp_bench.evaluation.free_view import keep_free_view, read_free_targets, sc
 from hwp_bench.evaluation.scoring import (
     mean_scores,
     predictions_digest,
+    read_prediction,
     read_predictions,
     read_targets,
     score_predictions,
@@ -41,7 +42,7 @@ from hwp_bench.results import CaptureResult, CurvePoint
 from hwp_bench.results.walls import WALLED
 from hwp_bench.run.engine import Folder, Job, Needs
 from hwp_bench.run.engine.job import OnProgress, ignore
-from hwp_bench.run.output import CHECKPOINTS, LOG, RunFacts
+from hwp_bench.run.output import LOG, RunFacts, checkpoint_folder
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
 
@@ -109,10 +110,19 @@ def evaluate_capture(
 
     Raises:
         BadCapture, BadImage: the capture itself is damaged, or was changed after it was written.
+        HwpError: `folder` cannot be written to.
     """
     stored = stored_result(evaluation, folder)
     if stored is not None:
         return stored
+    with disc_errors(folder):
+        return _evaluate(evaluation, folder, on_progress)
+
+
+def _evaluate(
+    evaluation: CaptureEvaluation, folder: Path, on_progress: OnProgress
+) -> CaptureResult:
+    """Run and score, with no regard to a stored result; see `evaluate_capture`."""
     began = time.perf_counter()
     targets = read_targets(evaluation.capture, evaluation.split.test.tolist())
     free_targets = read_free_targets(evaluation.capture)
@@ -229,7 +239,30 @@ def _run(
             )
         except (MethodFailed, BadMethod) as error:
             return None, _lasting(error, output)
+    if record.shortage is not None and _lacks_images(evaluation, record, output):
+        # A method is not to be marked down for it, nor is the next start to keep it.
+        return None, (
+            f"images are missing or damaged, and {record.shortage}. Make room and start again "
+            "with the same arguments: this capture is then evaluated anew"
+        )
     return record, None
+
+
+def _lacks_images(evaluation: CaptureEvaluation, record: RunRecord, output: Path) -> bool:
+    """Whether an image that a run should have left is missing or damaged."""
+    capture, facts = evaluation.capture, record.facts
+    wanted = [(record.predictions, evaluation.split.test.tolist(), capture.size)]
+    clip = capture.free_view
+    if clip is not None and record.free_view is not None:
+        wanted.append((record.free_view, list(range(len(clip))), clip.size))
+    for index in range(len(facts.checkpoints)):
+        folder = checkpoint_folder(output, index)
+        wanted.append((folder, facts.checkpoint_frames, capture.size))
+    return any(
+        read_prediction(folder, frame, size).failure is not None
+        for folder, frames, size in wanted
+        for frame in frames
+    )
 
 
 def _lasting(error: HwpError, output: Path) -> str:
@@ -264,7 +297,7 @@ def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list
     targets = read_targets(evaluation.capture, frames)
     curve = []
     for index, checkpoint in enumerate(facts.checkpoints):
-        folder = output / CHECKPOINTS / f"{index:03d}"
+        folder = checkpoint_folder(output, index)
         predictions = read_predictions(folder, frames, evaluation.capture.size)
         scores = mean_scores(score_predictions(targets, predictions))
         curve.append(CurvePoint(**asdict(checkpoint), scores=scores))

@@ -79,6 +79,11 @@ class RunFacts:
     )
 
 
+def checkpoint_folder(output: Path, index: int) -> Path:
+    """Return the folder of the validation frames of a checkpoint."""
+    return output / CHECKPOINTS / f"{index:03d}"
+
+
 def read_facts(path: Path) -> RunFacts:
     """Read `run.json`; a run need not write one.
 

@@ -44,6 +44,7 @@ from hwp_bench.run.sandbox.supervise import (
     remove_odd_files,
     run_confined,
 )
+from hwp_bench.run.space import SpaceWatch
 
 #: Seconds a method may take on one capture unless told otherwise.
 DEFAULT_TIME_LIMIT = 3600.0
@@ -71,6 +72,8 @@ class RunRecord:
     #: Folder of the predicted frames of the free-view clip; None where a submission or command
     #: has none.
     free_view: Path | None = None
+    #: That the disc of the output had no room meanwhile, as a sentence; None where it always had.
+    shortage: str | None = None
 
 
 def run_method(
@@ -120,33 +123,39 @@ def run_method(
     started = time.perf_counter()
     # In a sandbox the working folder is another one, and a relative path would lead nowhere.
     folders = request.absolute(), output.absolute()
-    outcome, isolation = _run(manifest, *folders, confinement, limits, on_progress)
+    space = SpaceWatch(folders[1])
+    outcome, isolation = _run(manifest, *folders, confinement, limits, on_progress, space=space)
     wall = time.perf_counter() - started
     remove_odd_files(output)
+    shortage = space.finish(outcome.log_problem)
+    reason = f"; {shortage}" if shortage else ""
     log = output / LOG
     if outcome.stopped is not None:
         raise MethodFailed(
-            f"{manifest.name} {_broken(outcome.stopped, capture_id, limits)}",
+            f"{manifest.name} {_broken(outcome.stopped, capture_id, limits)}{reason}",
             where=log,
             remedy=_REMEDIES[outcome.stopped],
         )
     if outcome.status != 0:
         raise MethodFailed(
-            f"{manifest.name} failed on {capture_id}: {_reason(output, outcome.status)}",
+            f"{manifest.name} failed on {capture_id}: {_reason(output, outcome.status)}{reason}",
             where=log,
         )
     if manifest.kind == "python" and not (output / RUN).is_file():
         raise MethodFailed(
-            f"{manifest.name} ended before it had rendered every frame of {capture_id}", where=log
+            f"{manifest.name} ended before it had rendered every frame of {capture_id}{reason}",
+            where=log,
         )
     try:
         facts = read_facts(output / RUN)
     except BadInput as error:
-        problem = f"{manifest.name} wrote a {RUN} that cannot be read ({error.problem})"
+        problem = f"{manifest.name} wrote a {RUN} that cannot be read ({error.problem}){reason}"
         raise MethodFailed(problem, where=log, field=error.field) from error
     clip = output / FREE_VIEW
     offered = manifest.kind == "python" or clip.is_dir()
-    return RunRecord(output / PREDICTIONS, facts, wall, isolation, clip if offered else None)
+    return RunRecord(
+        output / PREDICTIONS, facts, wall, isolation, clip if offered else None, shortage
+    )
 
 
 def rehearse_method(
@@ -204,11 +213,15 @@ def _run(
     limits: Limits,
     on_progress: Callable[[int, int], None] | None,
     options: Sequence[str] = (),
+    *,
+    space: SpaceWatch | None = None,
 ) -> tuple[ProcessOutcome, str]:
     """Run in the best sandbox that is asked for and possible; says which it was."""
     command = [*_command(manifest, request, output), *options]
 
     def poll() -> None:
+        if space is not None:
+            space.look()
         if on_progress is not None:
             _show_progress(output / PROGRESS, on_progress)
 

@@ -6,6 +6,7 @@ It is given a request folder and an output folder, and does not know where the c
 from __future__ import annotations
 
 import argparse
+import contextlib
 import importlib
 import resource
 import sys
@@ -26,7 +27,6 @@ from hwp_bench.hands.parameters import Camera, HandPose
 from hwp_bench.methods.contract import Avatar, Budget, MethodFactory, TrainingCapture
 from hwp_bench.methods.request import open_request
 from hwp_bench.run.output import (
-    CHECKPOINTS,
     DIAGNOSTICS,
     FAILURE,
     FREE_VIEW,
@@ -36,6 +36,7 @@ from hwp_bench.run.output import (
     RUN,
     Checkpoint,
     RunFacts,
+    checkpoint_folder,
 )
 
 #: Most validation frames that are rendered for a checkpoint.
@@ -62,15 +63,21 @@ def main(arguments: list[str] | None = None) -> int:
         else:
             run(open_request(args.request), factory, args.output)
     except HwpError as error:
-        write_json(args.output / FAILURE, {"problem": str(error)})
         print(f"error: {error}", file=sys.stderr)
+        _leave_reason(args.output, str(error))
         return 1
     except Exception as error:
         traceback.print_exc()
         problem = f"{type(error).__name__}: {error}"[:500]
-        write_json(args.output / FAILURE, {"problem": problem})
+        _leave_reason(args.output, problem)
         return 1
     return 0
+
+
+def _leave_reason(output: Path, problem: str) -> None:
+    """Leave the reason of a failure for the runner; a full disc takes it from nobody else."""
+    with contextlib.suppress(HwpError, ValueError):
+        write_json(output / FAILURE, {"problem": problem})
 
 
 def load_entry(method: Path, entry: str) -> MethodFactory:
@@ -103,7 +110,7 @@ def run(training: TrainingCapture, factory: MethodFactory, output: Path) -> None
 
     def record(index: int, avatar: Avatar) -> None:
         for frame in frames:
-            folder = output / CHECKPOINTS / f"{index:03d}"
+            folder = checkpoint_folder(output, index)
             write_image(folder / frame_name(frame), render(avatar, training, frame))
 
     entered = time.perf_counter()
@@ -275,7 +282,9 @@ class ReportClock:
         now = time.perf_counter()
         if now - self._last_progress >= PROGRESS_INTERVAL or done >= total:
             self._last_progress = now
-            write_json(self._progress_file, {"done": int(done), "total": int(total)})
+            # A bar that stands still is no reason to end a fit.
+            with contextlib.suppress(HwpError):
+                write_json(self._progress_file, {"done": int(done), "total": int(total)})
             self._paused += time.perf_counter() - now
 
 

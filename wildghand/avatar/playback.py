@@ -62,8 +62,9 @@ def render_clip(
             write_image(folder / f"{frame:06d}.png", image)
             if video is not None:
                 images.append(image)
-    if video is not None:
-        write_movie(video, images, capture.info.fps)
+        if video is not None:
+            # Within the block: where the video cannot be written, no folder refuses the next start.
+            write_movie(video, images, capture.info.fps)
     return {"frames": len(frames), "frames_per_second": len(frames) / max(seconds, 1e-9)}
 
 

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import HwpError, UsageError
-from hwp_bench.base.files import sha256_file, sha256_json
+from hwp_bench.base.files import disc_errors, sha256_file, sha256_json
 from hwp_bench.base.locks import exclusive
 from hwp_bench.base.progress import notice, progress
 from hwp_bench.capture import Capture, open_capture
@@ -111,8 +111,8 @@ def fit_capture(
             and no `out`.
         BadInput: no training frame can be used, or the saved state is of another fit.
         DidNotConverge: the fit diverged at once.
-        HwpError: another fit is writing to `out`, or `out` cannot be written to, or another
-            process has ended.
+        HwpError: another fit is writing to `out`, or `out` cannot be written to (steps up to the
+            last saved state are not lost), or another process has ended.
     """
     chosen = read_settings(settings or {})
     world.shard(chosen.schedule.batch)
@@ -133,7 +133,7 @@ def fit_capture(
     capture = open_capture(source)
     split = every_frame(capture) if all_frames else _split(capture)
     work = unfinished(out)
-    with exclusive(work) if world.is_main else contextlib.nullcontext():
+    with disc_errors(work), exclusive(work) if world.is_main else contextlib.nullcontext():
         if world.is_main:
             write_request(work / "request", capture, split, run)
         world.wait_for_main()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import json
 import os
 import signal
@@ -73,6 +74,8 @@ class ProcessOutcome:
     stopped: str | None = None
     #: Why there was no sandbox, or None.
     refused: str | None = None
+    #: Why not all of the log could be written, or None.
+    log_problem: str | None = None
 
 
 def run_confined(
@@ -103,7 +106,10 @@ def run_confined(
     os.close(write)
     assert process.stdin is not None
     assert process.stdout is not None
-    drain = threading.Thread(target=_drain, args=(process.stdout, program.log), daemon=True)
+    log_problems: list[str] = []
+    drain = threading.Thread(
+        target=_drain, args=(process.stdout, program.log, log_problems), daemon=True
+    )
     drain.start()
     with os.fdopen(read, "rb") as report:
         try:
@@ -115,8 +121,9 @@ def run_confined(
             _end(process)
             drain.join(timeout=5)
         text = report.read()
+    lost = log_problems[0] if log_problems else None
     if stopped is not None:
-        return ProcessOutcome(None, stopped)
+        return ProcessOutcome(None, stopped, log_problem=lost)
     answer: dict[str, Any] = json.loads(text) if text else {"status": process.returncode}
     if answer.get("stage") == "sandbox":
         return ProcessOutcome(None, refused=answer["problem"])
@@ -126,7 +133,7 @@ def run_confined(
             where=program.command[0],
             field="entry.command",
         )
-    return ProcessOutcome(answer["status"])
+    return ProcessOutcome(answer["status"], log_problem=lost)
 
 
 def remove_odd_files(folder: Path) -> None:
@@ -185,26 +192,51 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _drain(stream: IO[bytes], log: Path) -> None:
-    """Keep both ends of what a program prints: what it is, and what it died of."""
+def _drain(stream: IO[bytes], log: Path, problems: list[str]) -> None:
+    """Keep both ends of what a program prints: what it is, and what it died of.
+
+    Where the log cannot be written, on a full disc for instance, the rest is read all the same:
+    a program whose output nobody reads stands still as soon as the pipe is full.
+
+    Args:
+        stream: what the program prints.
+        log: the file.
+        problems: takes the reason why the log is not whole.
+    """
+    try:
+        _keep_ends(stream, log)
+    except OSError as error:
+        problems.append(error.strerror or type(error).__name__)
+        while os.read(stream.fileno(), 65536):
+            pass
+
+
+def _keep_ends(stream: IO[bytes], log: Path) -> None:
     half = MAX_LOG_BYTES // 2
     kept = 0
     dropped = 0
     tail = bytearray()
-    with open(log, "wb") as target:
+    # Unbuffered: what comes can be followed, and no rest waits for a disc that is full.
+    with open(log, "wb", buffering=0) as target:
         # Whatever has come, and not whole blocks: the log can be followed while the program runs.
         while chunk := os.read(stream.fileno(), 65536):
             head = chunk[: half - kept]
-            target.write(head)
-            target.flush()
+            _write_all(target, head)
             kept += len(head)
             tail += chunk[len(head) :]
             surplus = max(0, len(tail) - half)
             del tail[:surplus]
             dropped += surplus
         if dropped:
-            target.write(f"\n[{dropped} bytes in the middle were not kept]\n".encode())
-        target.write(tail)
+            _write_all(target, f"\n[{dropped} bytes in the middle were not kept]\n".encode())
+        _write_all(target, tail)
+
+
+def _write_all(target: io.FileIO, data: bytes | bytearray) -> None:
+    """Write data to an unbuffered file, which may take it in parts."""
+    rest = memoryview(bytes(data))
+    while rest:
+        rest = rest[target.write(rest) :]
 
 
 def _processes_of(root: int) -> list[psutil.Process]:

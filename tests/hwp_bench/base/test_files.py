@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import subprocess
 import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -60,6 +63,62 @@ def test_a_full_folder_is_not_overwritten_unless_asked(tmp_path: Path) -> None:
     with atomic_folder(target, overwrite=True) as folder:
         (folder / "new").write_text("x")
     assert [item.name for item in target.iterdir()] == ["new"]
+
+
+@pytest.mark.parametrize("kind", ["folder", "file"])
+@pytest.mark.parametrize("overwrite", [False, True])
+def test_what_appears_during_the_block_is_not_lost(
+    kind: str, overwrite: bool, tmp_path: Path
+) -> None:
+    """Oracle: the second of two makers finds what the first has made, or replaces it if asked."""
+    target = tmp_path / "made"
+    refused = kind == "file" or not overwrite
+    with contextlib.ExitStack() as stack:
+        if refused:
+            stack.enter_context(pytest.raises(UsageError, match="exists already"))
+        folder = stack.enter_context(atomic_folder(target, overwrite=overwrite))
+        (folder / "second").write_text("x")
+        if kind == "folder":
+            with atomic_folder(target) as other:
+                (other / "first").write_text("x")
+        else:
+            target.write_text("first")
+    assert [item.name for item in tmp_path.iterdir()] == ["made"]
+    if kind == "file":
+        assert target.read_text() == "first"
+    else:
+        names = [item.name for item in target.iterdir()]
+        assert names == (["first"] if refused else ["second"])
+
+
+def test_an_empty_folder_is_filled_and_a_link_stays_one(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    with atomic_folder(tmp_path / "link") as folder:
+        (folder / "whole").write_text("x")
+    assert (tmp_path / "link").is_symlink()
+    assert [item.name for item in (tmp_path / "real").iterdir()] == ["whole"]
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+def test_many_makers_of_one_folder_end_with_one_that_is_whole(tmp_path: Path) -> None:
+    """Oracle: without `overwrite` exactly one maker succeeds, and its content is what stays."""
+    target, start = tmp_path / "made", threading.Barrier(8)
+
+    def make(number: int) -> bool:
+        try:
+            with atomic_folder(target) as folder:
+                (folder / str(number)).write_text("x")
+                start.wait()
+        except UsageError:
+            return False
+        return True
+
+    with ThreadPoolExecutor(8) as pool:
+        made = list(pool.map(make, range(8)))
+    assert made.count(True) == 1
+    assert [item.name for item in target.iterdir()] == [str(made.index(True))]
+    assert list(tmp_path.iterdir()) == [target]
 
 
 def test_a_refusal_names_the_option_where_there_is_one(tmp_path: Path) -> None:

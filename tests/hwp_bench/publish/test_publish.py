@@ -57,6 +57,27 @@ def test_authors_get_no_test_pixel_and_no_truth(
             assert digest not in text
 
 
+def test_of_two_publications_at_once_one_is_told_and_no_salt_is_lost(
+    captures: list[Capture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Oracle: the salt on disc is that of the call that succeeded."""
+    from hwp_bench.publish import parts
+
+    out, sources = tmp_path / "publication", [captures[0].root]
+    honest, first = parts.write_request, []
+
+    def meanwhile(*arguments: Any) -> Path:
+        monkeypatch.setattr(parts, "write_request", honest)
+        first.append(publish(sources, out, salt=SALT))
+        return honest(*arguments)
+
+    monkeypatch.setattr(parts, "write_request", meanwhile)
+    with pytest.raises(UsageError, match="exists already"):
+        publish(sources, out, salt="00" * 32)
+    assert json.loads((out / "sealed" / parts.KEY).read_text())["salt"] == SALT
+    assert open_sealed(first[0].sealed).commitment == first[0].commitment
+
+
 def test_the_commitment_can_be_computed_by_hand_and_needs_the_salt(
     captures: list[Capture], publication: Publication
 ) -> None:
