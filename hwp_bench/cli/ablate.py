@@ -71,7 +71,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="throw a switch of the method's method.toml; may be given again",
     )
     parser.add_argument(
-        "--only", nargs="+", default=[], metavar="COMPONENT", help="cross these components"
+        "--only",
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="COMPONENT",
+        help="cross these components",
     )
     add_evaluation_arguments(parser)
     parser.add_argument("--seeds", type=int, default=3, help="number of seeds (default 3)")

@@ -31,6 +31,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--metric",
         nargs="+",
+        action="extend",
         default=[],
         metavar="NAME",
         help="metrics to compare (default: the headline metrics that all have)",

@@ -27,6 +27,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--capture",
         nargs="+",
+        action="extend",
         default=[],
         metavar="NAME",
         help="only folders whose names begin with this",

@@ -31,7 +31,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="simulated captures, rendered on first use (default mini)",
     )
     what.add_argument(
-        "--capture", nargs="+", metavar="PATH", help="capture folders, instead of a suite"
+        "--capture",
+        nargs="+",
+        action="extend",
+        metavar="PATH",
+        help="capture folders, instead of a suite",
     )
     parser.add_argument("--splits", help="split file (default: the 80/10/10 rule)")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="new folder")

@@ -65,7 +65,11 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         help="simulated captures, rendered on first use (default mini)",
     )
     what.add_argument(
-        "--capture", nargs="+", metavar="PATH", help="capture folders, instead of a suite"
+        "--capture",
+        nargs="+",
+        action="extend",
+        metavar="PATH",
+        help="capture folders, instead of a suite",
     )
     parser.add_argument("--splits", help="split file (default: the 80/10/10 rule)")
     parser.add_argument("--preset", help="preset of the method (default: the suite's, if any)")
@@ -107,6 +111,7 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--expose",
         nargs="+",
+        action="extend",
         default=[],
         metavar="PATH",
         help="further files and folders that an isolated method may read, such as weights",

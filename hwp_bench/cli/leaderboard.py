@@ -141,7 +141,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         help="largest difference of the macro mean of PSNR of a second run (default 0.1)",
     )
     confirm.add_argument(
-        "--captures", nargs="+", metavar="DIR", help="captures (default: the result's suite)"
+        "--captures",
+        nargs="+",
+        action="extend",
+        metavar="DIR",
+        help="captures (default: the result's suite)",
     )
     confirm.add_argument("--json", action="store_true", help="print the check as JSON")
     build = action("build", "write the static site", _BUILD)
@@ -150,6 +154,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--with",
         dest="folders",
         nargs="+",
+        action="extend",
         default=[],
         metavar="RESULTS",
         help="results folders of entries, for the images of their reports",

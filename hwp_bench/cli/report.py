@@ -33,6 +33,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--captures",
         nargs="+",
+        action="extend",
         default=[],
         metavar="FOLDER",
         help="capture folders, for severities (simulated ones are found in the cache)",

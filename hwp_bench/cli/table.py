@@ -70,6 +70,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--captures",
         nargs="+",
+        action="extend",
         default=[],
         metavar="FOLDER",
         help="capture folders, for severities and novelty (simulated ones are found in the cache)",

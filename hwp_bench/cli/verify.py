@@ -37,6 +37,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--captures",
         nargs="+",
+        action="extend",
         metavar="DIR",
         help="captures, or folders of captures (default: the result's suite)",
     )

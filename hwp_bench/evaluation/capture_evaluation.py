@@ -243,7 +243,7 @@ def _run(
         # A method is not to be marked down for it, nor is the next start to keep it.
         return None, (
             f"images are missing or damaged, and {record.shortage}. Make room and start again "
-            "with the same arguments: this capture is then evaluated anew"
+            "with the same arguments: this capture is then evaluated again"
         )
     return record, None
 

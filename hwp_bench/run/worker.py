@@ -282,7 +282,7 @@ class ReportClock:
         now = time.perf_counter()
         if now - self._last_progress >= PROGRESS_INTERVAL or done >= total:
             self._last_progress = now
-            # A bar that stands still is no reason to end a fit.
+            # A fit need not end because its bar stands still.
             with contextlib.suppress(HwpError):
                 write_json(self._progress_file, {"done": int(done), "total": int(total)})
             self._paused += time.perf_counter() - now

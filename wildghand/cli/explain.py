@@ -21,7 +21,9 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("avatar", type=Path, help="avatar folder")
     parser.add_argument("capture", type=Path, help="capture folder that it was fitted to")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="PNG file")
-    parser.add_argument("--frames", type=int, nargs="+", metavar="N", help="frames of the capture")
+    parser.add_argument(
+        "--frames", type=int, nargs="+", action="extend", metavar="N", help="frames of the capture"
+    )
     parser.add_argument(
         "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
     )

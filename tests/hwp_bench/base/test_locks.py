@@ -140,7 +140,8 @@ def test_a_full_disc_is_one_message_and_the_next_start_finishes(
         assert main(words) == 1
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert said.startswith("hwp-bench: error: ")
-    assert said.endswith("No space left on device")
+    assert f"{out}/captures/tiny: cannot be written (No space left on device)" in said
+    assert said.endswith("what is finished stays.")
     assert not (out / "results.json").exists()
     assert main(words) == 0
     assert read_results(out).captures[0].failed_frames == 0

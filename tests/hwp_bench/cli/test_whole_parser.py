@@ -52,3 +52,20 @@ def test_an_option_that_replaces_is_shown() -> None:
     (render,) = (p for p in every_parser() if p.prog == "wildghand render")
     assert "--overwrite" in render.format_help()
     assert "--overwrite" in (render.epilog or "")
+
+
+def test_an_option_with_several_values_may_also_be_repeated() -> None:
+    """`--capture A --capture B` had silently evaluated B alone."""
+    lists = [
+        (parser.prog, action)
+        for parser in every_parser()
+        for action in parser._actions
+        if action.option_strings and action.nargs == "+" and not action.default
+    ]
+    assert len(lists) >= 10
+    for program, action in lists:
+        option, value = action.option_strings[0], "3" if action.type is int else "a"
+        single = argparse.ArgumentParser()
+        single._add_action(action)
+        given = single.parse_args([option, value, option, value])
+        assert len(getattr(given, action.dest)) == 2, f"{program} {option}"

@@ -23,7 +23,7 @@ import cv2, numpy as np
 request, output = map(pathlib.Path, sys.argv[1:])
 here = pathlib.Path(__file__).parent
 value = json.loads((request / "request.json").read_text())
-filler, marker = output.parents[3] / "filler", here / f"ran-{value['id']}"
+filler, marker = pathlib.Path("FILLER"), here / f"ran-{value['id']}"
 full = not marker.exists() and value["id"] == "second"
 with marker.open("a") as stream:
     stream.write("x")
@@ -82,7 +82,7 @@ def evaluated(make_capture: CaptureMaker, tmp_path: Path) -> Callable[..., dict[
         method, disc = tmp_path / "filler", tmp_path / "disc"
         for folder in (method, disc):
             folder.mkdir()
-        script = _METHOD.replace("PRINT", printed or "pass")
+        script = _METHOD.replace("PRINT", printed or "pass").replace("FILLER", f"{disc}/filler")
         (method / "run.py").write_text(script.replace("STAYS", "yes" if stays else "no"))
         (method / "method.toml").write_text(
             'schema = "hwp-method/1"\nname = "filler"\n[entry]\n'
