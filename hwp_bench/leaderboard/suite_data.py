@@ -73,13 +73,27 @@ def rendered_data(cache: Path) -> SuiteData:
     return SuiteData({name: found[name] for name in suite_names() if name in found})
 
 
+def joined_data(known: SuiteData, rendered: SuiteData) -> SuiteData:
+    """Return all captures of both, as rendered where a capture is in both.
+
+    Args:
+        known: the data so far, of the same version of the renderer.
+        rendered: the data of captures in a cache, which need not hold every suite.
+    """
+    both = {
+        name: {**known.suites.get(name, {}), **rendered.suites.get(name, {})}
+        for name in suite_names()
+    }
+    return SuiteData({name: captures for name, captures in both.items() if captures})
+
+
 def write_suite_data(path: Path, data: SuiteData) -> Path:
     """Write the file; returns it."""
     return write_json(path, {"schema": SCHEMA, **asdict(data)})
 
 
 if __name__ == "__main__":
-    # For a version whose suites have other pixels: `python -m hwp_bench.leaderboard.suite_data`.
-    write_suite_data(
-        data_folder("leaderboard") / NAME, rendered_data(cache_root() / "sim" / "captures")
-    )
+    # After suites were rendered: `python -m hwp_bench.leaderboard.suite_data`. A new version of the
+    # renderer has other pixels: empty `suites` of the file before.
+    rendered = rendered_data(cache_root() / "sim" / "captures")
+    write_suite_data(data_folder("leaderboard") / NAME, joined_data(read_suite_data(), rendered))

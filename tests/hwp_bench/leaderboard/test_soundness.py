@@ -18,7 +18,14 @@ from hwp_bench.leaderboard.entries import entry_name, make_entry, read_entries, 
 from hwp_bench.leaderboard.rules import off_the_data
 from hwp_bench.leaderboard.soundness import sound_entries
 from hwp_bench.leaderboard.submit import add_entry
-from hwp_bench.leaderboard.suite_data import read_suite_data, rendered_data, write_suite_data
+from hwp_bench.leaderboard.suite_data import (
+    CaptureData,
+    SuiteData,
+    joined_data,
+    read_suite_data,
+    rendered_data,
+    write_suite_data,
+)
 from hwp_bench.results import Results, write_results
 
 
@@ -213,3 +220,11 @@ def test_the_digests_of_suites_are_those_of_rendered_captures(tmp_path: Path) ->
             if name in known.suites.get(suite, {}):
                 assert known.suites[suite][name].digest == data.digest, (suite, name)
     assert read_suite_data(write_suite_data(tmp_path / "suites.json", known)) == known
+
+
+def test_a_cache_without_a_suite_takes_nothing_away() -> None:
+    known = read_suite_data()
+    new = CaptureData("a" * 64)
+    joined = joined_data(known, SuiteData({"mini": {"capture0": new}})).suites
+    assert joined["smoke"] == known.suites["smoke"]
+    assert joined["mini"] == {**known.suites["mini"], "capture0": new}
