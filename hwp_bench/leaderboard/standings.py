@@ -6,10 +6,10 @@ from collections.abc import Sequence
 
 from hwp_bench.analysis.statistics.pairing import group_runs
 from hwp_bench.analysis.statistics.ranks import Rank, rank_methods, verdict
-from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.leaderboard.board_rows import BoardRow, board_rows
 from hwp_bench.leaderboard.entries import Entry
+from hwp_bench.leaderboard.rankable import rankable
 from hwp_bench.leaderboard.rules import HEADLINE, current, tables_of
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.report.evaluation_tables import labels, score_column
@@ -95,23 +95,19 @@ def ranks_of(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
     """Return ranks by the name of a row's first entry, and the sentence that says who wins.
 
     Args:
-        rows: of one suite and one version of the protocol. Those that lack a part of the suite
-            get no rank. Where the others cannot be ranked the sentence says why.
+        rows: of one suite and one version of the protocol. Those that `rankable` leaves out get
+            no rank, and the sentence names them.
     """
-    results = [entry.results for row in rows if row.whole for entry in row.entries]
-    if not results:
+    ranked, left_out = rankable(rows)
+    if not ranked:
         return {}, ""
-    try:
-        runs = group_runs(results)
-        ranking = rank_methods(runs, METRIC)
-    except UsageError as error:
-        # Such as one run that was submitted twice, or methods without a seed in common.
-        return {}, f"No ranks: {error.problem}."
+    runs = group_runs([entry.results for row in ranked for entry in row.entries])
+    ranking = rank_methods(runs, METRIC)
     by_label = {item.standing.label: item for item in ranking.ranks}
     found = {
         row.entries[0].name: by_label[run.label]
-        for row in rows
+        for row in ranked
         for run in runs
         if any(row.first is results for results in run.seeds.values())
     }
-    return found, verdict(ranking)
+    return found, f"{verdict(ranking)} {left_out}".rstrip()

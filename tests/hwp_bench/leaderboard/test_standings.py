@@ -53,11 +53,54 @@ def test_each_protocol_has_a_table_and_incomplete_rows_no_rank(entries) -> None:
     assert "rows of hwp-v1 stand in another table" in old.notes[-1]
 
 
-def test_a_run_that_was_submitted_twice_has_no_rank(entries) -> None:
-    twin = make_entry(entries[0].results, Submission(by="B"))
-    (table,) = board_tables([entries[0], twin])
-    assert [row[1] for row in table.rows] == [None, None]
-    assert table.notes[0].startswith("No ranks: two results are of Plain")
+def test_a_run_that_was_submitted_twice_is_ranked_once(entries) -> None:
+    plain, _, second, *_ = entries
+    twin = make_entry(plain.results, Submission(by="B"))
+    (table,) = board_tables([plain, second, twin])
+    assert [row[1] for row in table.rows] == [1, 2, None]
+    assert re.search(
+        r"No rank for a second entry of the same run: plain-mini-\S+\.$", table.notes[0]
+    )
+    # The one that was checked stays, whatever its name.
+    for one, other in ((plain, twin), (twin, plain)):
+        checked = replace(one, checks=(check_of(one),))
+        (table,) = board_tables([checked, second, other])
+        ranks = {row[-1]: row[1] for row in table.rows}
+        assert (ranks[one.name], ranks[other.name]) == (2, None)
+
+
+def test_a_row_of_another_seed_takes_no_rank_from_others() -> None:
+    found = []
+    for name, level, seeds in (
+        ("odd", 30.0, (7,)),
+        ("mine", 26.0, (0, 1)),
+        ("plain", 25.0, (0, 7)),
+        ("other", 24.0, (0,)),
+    ):
+        for seed in seeds:
+            results = complete_results(name, scorer(level), suite_name="mini")
+            found.append(make_entry(replace(results, seed=seed)))
+    (table,) = board_tables(found)
+    assert {row[0]: row[1] for row in table.rows} == {
+        "Mine": 1,
+        "Plain": 2,
+        "Other": 3,
+        "Odd": None,
+    }
+    assert table.notes[0].startswith("Mine wins with PSNR ")
+    assert "without the seed 0, which most rows have" in table.notes[0]
+    assert table.notes[0].endswith(f"every other row: {found[0].name}.")
+
+
+def test_a_row_that_shares_a_seed_with_everyone_is_ranked() -> None:
+    found = []
+    for name, level, seeds in (("bridge", 30.0, (1, 2)), ("b", 26.0, (0, 1)), ("c", 25.0, (0, 2))):
+        for seed in seeds:
+            results = complete_results(name, scorer(level), suite_name="mini")
+            found.append(make_entry(replace(results, seed=seed)))
+    (table,) = board_tables(found)
+    assert [row[1] for row in table.rows] == [1, 2, 3]
+    assert "No rank" not in table.notes[0]
 
 
 def test_the_command_shows_levels_and_badges_in_80_columns(
