@@ -33,10 +33,20 @@ class Column:
     group: str = ""
 
     @property
+    def arrow(self) -> str:
+        """A space and the arrow of the better direction; empty without one."""
+        return {True: " ↑", False: " ↓", None: ""}[self.higher_is_better]
+
+    @property
     def heading(self) -> str:
         """The title with its arrow."""
-        arrow = {True: " ↑", False: " ↓", None: ""}[self.higher_is_better]
-        return self.title + arrow
+        return self.title + self.arrow
+
+    @property
+    def name(self) -> str:
+        """The group and the title, where groups have no line of their own."""
+        parts = (self.title,) if self.group == self.title else (self.group, self.title)
+        return " ".join(parts).strip()
 
 
 @dataclass(frozen=True)
@@ -129,7 +139,7 @@ def to_markdown(table: Table) -> str:
         before, after = marks[table.rank(row, column)]
         return before + _markdown_text(table.text(row, column)) + after
 
-    heads = [_markdown_text(f"{column.group} {column.heading}".strip()) for column in table.columns]
+    heads = [_markdown_text((column.name + column.arrow).strip()) for column in table.columns]
     rules = [
         "---:" if any(isinstance(cells[index], int | float) for cells in table.rows) else "---"
         for index in range(len(table.columns))
@@ -230,7 +240,7 @@ def to_csv(table: Table) -> str:
     """
     stream = io.StringIO()
     writer = csv.writer(stream, lineterminator="\n")
-    writer.writerow([_csv_cell(f"{c.group} {c.title}".strip()) for c in table.columns])
+    writer.writerow([_csv_cell(column.name) for column in table.columns])
     writer.writerows([[_csv_cell(cell) for cell in row] for row in table.rows])
     return stream.getvalue()
 
@@ -249,7 +259,7 @@ def to_json(table: Table) -> str:
 
 def to_object(table: Table) -> dict[str, Any]:
     """Return the JSON object of a table."""
-    names = [f"{column.group} {column.title}".strip() for column in table.columns]
+    names = [column.name for column in table.columns]
     return {
         "caption": table.caption,
         "columns": [

@@ -36,7 +36,7 @@ def check_entries(entries: Iterable[Entry]) -> list[Entry]:
         _check_one(entry)
     for rows in tables_of(listed).values():
         _check_same(rows)
-    _check_revisions(listed)
+    check_revisions(listed)
     return listed
 
 
@@ -173,7 +173,12 @@ def off_the_data(entries: Sequence[Entry]) -> list[tuple[Entry, str]]:
     return list(found.values())
 
 
-def _check_revisions(entries: Sequence[Entry]) -> None:
+def check_revisions(entries: Sequence[Entry]) -> None:
+    """Check that every revision is of an entry that it can revise, and the only one of it.
+
+    Raises:
+        UsageError: one is not; it is named.
+    """
     named = {entry.name: entry for entry in entries}
     revised: dict[str, str] = {}
     for entry in entries:

@@ -21,7 +21,7 @@ from hwp_bench.evaluation.completeness import wrong_labels
 from hwp_bench.evaluation.evaluation_key import key_of
 from hwp_bench.leaderboard.entries import Entry, entry_files, read_checks, read_entry
 from hwp_bench.leaderboard.records import Check
-from hwp_bench.leaderboard.rules import check_entries, off_the_data, tables_of
+from hwp_bench.leaderboard.rules import check_entries, check_revisions, off_the_data, tables_of
 from hwp_bench.leaderboard.suite_data import CaptureData, SuiteData, read_suite_data
 from hwp_bench.metrics import HWP_V1, metric_names, penalty
 from hwp_bench.results import CaptureResult
@@ -215,9 +215,11 @@ def _without_false_revisions(entries: Sequence[Entry]) -> list[Entry]:
         for entry in ready:
             waiting.remove(entry)
             try:
-                kept = check_entries([*kept, entry])
+                check_revisions([*kept, entry])
             except UsageError as error:
                 notice(f"left out: {error}")
+            else:
+                kept.append(entry)
     for entry in waiting:
         notice(f"left out: {entry.name} revises {entry.submission.revises}, which is not sound")
     order = {entry.name: place for place, entry in enumerate(entries)}

@@ -93,7 +93,7 @@ def load_scene(name_or_path: str | Path) -> Scene:
     """
     name = str(name_or_path)
     if name in known_scenes():
-        return parse_scene(scene_path(name).read_text("utf-8"), where=f"{name}.toml")
+        return _shipped_scene(name)
     path = Path(name_or_path)
     if not path.is_file():
         raise UsageError(
@@ -106,6 +106,12 @@ def load_scene(name_or_path: str | Path) -> Scene:
     except (OSError, UnicodeDecodeError) as error:
         raise BadInput("cannot be read as text", where=path) from error
     return parse_scene(text, where=str(path))
+
+
+@cache
+def _shipped_scene(name: str) -> Scene:
+    """Read a scene that comes with the package once: a board asks for suites thousands of times."""
+    return parse_scene(scene_path(name).read_text("utf-8"), where=f"{name}.toml")
 
 
 def parse_scene(text: str, *, where: str) -> Scene:

@@ -44,6 +44,13 @@ def test_markdown_marks_best_and_second_and_escapes() -> None:
     assert {line.replace(r"\|", "").count("|") for line in lines} == {5}
 
 
+def test_a_group_named_as_its_column_is_said_once() -> None:
+    table = Table("t", (Column("Rank", 0, group="Rank"), Column("95 %", group="Rank")), ((1, "1"),))
+    assert format_table(table, "csv").splitlines()[0] == "Rank,Rank 95 %"
+    assert "| Rank | Rank 95 % |" in format_table(table, "md")
+    assert '"Rank": 1' in format_table(table, "json")
+
+
 def test_latex_is_booktabs_with_groups_and_escapes() -> None:
     text = format_table(TABLE, "tex")
     assert r"\textbf{22.00}" in text
