@@ -148,8 +148,8 @@ def verdict(ranking: Ranking) -> str:
         )
     return (
         f"No clear winner: {first.standing.label} leads with {mean} (macro mean), {text}, and "
-        f"is tied with {', '.join(tied)} (not significantly different, Bonferroni over the "
-        f"{len(rest)} pairs of the leader)."
+        f"is tied with {', '.join(tied)} (not significantly different"
+        + (f", Bonferroni over the {len(rest)} pairs of the leader)." if rest[1:] else ").")
     )
 
 
