@@ -16,6 +16,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.evaluation.scoring import read_prediction
 from hwp_bench.evaluation.side_by_side import square_around
 from hwp_bench.leaderboard.entries import Entry, digest
+from hwp_bench.leaderboard.rules import SUITES
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.report.sources import ResultsSource
@@ -48,12 +49,13 @@ class Shot:
 class Scene:
     """One test frame of one capture."""
 
-    #: The capture's id, and the frame's index.
+    #: The capture's id, with the suite where several suites have one of this name.
     capture: str
+    #: The frame's index.
     frame: int
     #: The truth, as an address within the site.
     truth: str
-    #: Methods, best frame first.
+    #: Methods, the best of the suite first: not of the frame, whose scores stand with its pictures.
     shots: tuple[Shot, ...]
 
 
@@ -74,22 +76,35 @@ def write_gallery(
         titles: how a method is called in lists, by the name of its entry.
 
     Returns:
-        `Scene`s as JSON values, in the order of the captures' ids and frames.
+        `Scene`s as JSON values, in the order of the suites, the captures and frames.
     """
-    by_capture: dict[str, list[tuple[Entry, ResultsSource, CaptureResult]]] = {}
-    for entry, source in sources:
+    by_capture: dict[tuple[str, str], list[tuple[Entry, ResultsSource, CaptureResult]]] = {}
+    ranked = sorted(sources, key=lambda pair: -pair[0].results.scores["psnr"])
+    for entry, source in ranked:
         for result in source.results.captures:
-            by_capture.setdefault(result.digest, []).append((entry, source, result))
+            if result.digest in captures:
+                key = (source.results.suite, result.digest)
+                by_capture.setdefault(key, []).append((entry, source, result))
+    order = sorted(by_capture, key=lambda key: _place(key[0], captures[key[1]].info.id))
+    ids = [captures[data].info.id for _, data in order]
     scenes = []
-    for data, found in by_capture.items():
-        if data in captures:
-            scenes += _scenes(folder, captures[data], found, titles)
-    return [asdict(scene) for scene in sorted(scenes, key=lambda one: (one.capture, one.frame))]
+    for suite, data in order:
+        capture = captures[data]
+        several = ids.count(capture.info.id) > 1
+        name = f"{capture.info.id} of {suite}" if several else capture.info.id
+        scenes += _scenes(folder, capture, name, by_capture[suite, data], titles)
+    return [asdict(scene) for scene in scenes]
+
+
+def _place(suite: str, identifier: str) -> tuple[int, int, str]:
+    """The place of a capture in lists: `capture10` comes after `capture9`."""
+    return SUITES.index(suite), len(identifier), identifier
 
 
 def _scenes(
     folder: Path,
     capture: Capture,
+    name: str,
     found: Sequence[tuple[Entry, ResultsSource, CaptureResult]],
     titles: Mapping[str, str],
 ) -> list[Scene]:
@@ -121,8 +136,7 @@ def _scenes(
             psnr = next(item.scores["psnr"] for item in result.frames if item.frame == frame)
             shots.append(Shot(entry.name, titles[entry.name], picture, error, psnr))
         if shots:
-            best_first = tuple(sorted(shots, key=lambda shot: -shot.psnr))
-            scenes.append(Scene(capture.info.id, frame, truth, best_first))
+            scenes.append(Scene(name, frame, truth, tuple(shots)))
     return scenes
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.page.render import render_template, style_sheet, write_report
 from hwp_bench.report.sources import ResultsSource, open_captures_of
+from hwp_bench.results import Results
 from hwp_bench.results.published import NOTE, read_published
 
 #: Title of the site.
@@ -62,14 +63,13 @@ def build_site(
     folders = {digest(source.results): source.folder for source in results_folders}
     captures = open_captures_of([source.results for source in results_folders])
     with atomic_folder(folder, overwrite=True) as temporary:
+        rows = shown_rows(entries)
         shown = [
             (entry, ResultsSource(entry.results, folders[digest(entry.results)]))
-            for entry in current(entries)
-            if digest(entry.results) in folders
+            for entry in _first_seeds([row for row, _ in rows], folders)
         ]
         titles = _titles([entry for entry, _ in shown])
         scenes = write_gallery(temporary, shown, captures, titles)
-        rows = shown_rows(entries)
         pages = method_pages(rows)
         page = board_page(rows, pictures=bool(scenes), pages=_addresses(pages))
         (temporary / "index.html").write_text(page, encoding="utf-8")
@@ -86,15 +86,38 @@ def build_site(
     return folder / "index.html"
 
 
+def _first_seeds(rows: Sequence[BoardRow], folders: Collection[str]) -> list[Entry]:
+    """Of each row the entry of the lowest seed whose results lie in one of some folders."""
+    found = ([one for one in row.entries if digest(one.results) in folders] for row in rows)
+    return [entries[0] for entries in found if entries]
+
+
 def _titles(entries: Sequence[Entry]) -> dict[str, str]:
     """How entries are called in lists: by method, with what tells two of one title apart."""
-    kinds = [(entry.results.method.title, entry.results.suite) for entry in entries]
-    return {
-        entry.name: f"{kind[0]} ({budget_text(entry.results.budget)}, seed {entry.results.seed})"
-        if kinds.count(kind) > 1
-        else kind[0]
-        for entry, kind in zip(entries, kinds, strict=True)
-    }
+    names: dict[str, str] = {}
+    for suite in {entry.results.suite for entry in entries}:
+        rows = [entry for entry in entries if entry.results.suite == suite]
+        for parts in (_title, _title_budget, _title_budget_digest):
+            texts = [parts(entry.results) for entry in rows]
+            names |= {
+                entry.name: text
+                for entry, text in zip(rows, texts, strict=True)
+                if entry.name not in names and texts.count(text) == 1
+            }
+        names |= {entry.name: entry.name for entry in rows if entry.name not in names}
+    return names
+
+
+def _title(results: Results) -> str:
+    return results.method.title
+
+
+def _title_budget(results: Results) -> str:
+    return f"{_title(results)} ({budget_text(results.budget)})"
+
+
+def _title_budget_digest(results: Results) -> str:
+    return f"{_title(results)} ({budget_text(results.budget)}, {results.method.digest[:8]})"
 
 
 def shown_rows(entries: Sequence[Entry]) -> list[tuple[BoardRow, Row]]:

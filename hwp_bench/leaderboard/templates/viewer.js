@@ -50,8 +50,8 @@ if (typeof document !== "undefined" && document.getElementById("viewer")) {
       var one = scene();
       var names = one.shots.map(function (item) { return item.entry; });
       var titles = one.shots.map(function (item) { return item.title; });
-      // At first the best method of the frame is on the right and the last one on the left.
-      var usual = { right: names[0], left: names.length > 1 ? names[names.length - 1] : "truth" };
+      // At first the best method of the suite is on the right and the next one on the left.
+      var usual = { right: names[0], left: names.length > 1 ? names[1] : "truth" };
       ["left", "right"].forEach(function (side) {
         var select = at(side);
         var chosen = select.selectedOptions.length ? select.selectedOptions[0].textContent : "";

@@ -18,7 +18,7 @@ from hwp_bench.base.files import sha256_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.leaderboard import site
+from hwp_bench.leaderboard import board_rows, site
 from hwp_bench.leaderboard.entries import make_entry
 from hwp_bench.leaderboard.gallery import FRAMES, _spread
 from hwp_bench.leaderboard.site import build_site
@@ -30,7 +30,15 @@ EVIL = "</script><img src=x onerror=alert(1)>"
 SCORES = {16: 30.0, 17: 10.0, 18: 20.0}
 
 
-def entry_of(folder: Path, capture: Capture, title: str, *, gain: float) -> ResultsSource:
+def entry_of(
+    folder: Path,
+    capture: Capture,
+    title: str,
+    *,
+    gain: float,
+    suite: str = "smoke",
+    seed: int = 0,
+) -> ResultsSource:
     """An entry that draws the truth times a gain; with 1 it is the truth."""
     example = results_example(f"m{gain:g}".replace(".", "-"))
     frames = [
@@ -41,7 +49,8 @@ def entry_of(folder: Path, capture: Capture, title: str, *, gain: float) -> Resu
     results = replace(
         example,
         method=replace(example.method, title=title),
-        suite="smoke",
+        suite=suite,
+        seed=seed,
         protocols=json.loads(json.dumps({p.name: p.as_dict() for p in PROTOCOLS})),
         captures=[replace(example.captures[0], id=capture.info.id, digest=digest, frames=frames)],
     )
@@ -92,6 +101,31 @@ def test_the_truth_as_an_entry_looks_like_the_truth(built: Path) -> None:
         # The error map of the truth is its coldest colour everywhere on the hand.
         assert picture(built, best["error"]).max() < 20
         assert picture(built, other["error"]).max() > 100
+
+
+def test_each_row_is_shown_once_and_each_suite_has_its_own_captures(
+    make_capture: CaptureMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    small = make_capture("capture1", frames=20, size=48, folder=tmp_path / "small")
+    large = make_capture("capture1", frames=20, size=64, folder=tmp_path / "large-capture")
+    captures = {sha256_json(one.info.to_json()): one for one in (small, large)}
+    monkeypatch.setattr(site, "open_captures_of", lambda results: captures)
+    # One capture is a whole suite here.
+    monkeypatch.setattr(board_rows, "missing", lambda results: [])
+    sources = [
+        entry_of(tmp_path / "better", small, "Mine", gain=0.9, seed=1),
+        entry_of(tmp_path / "first", small, "Mine", gain=0.9, seed=0),
+        entry_of(tmp_path / "truth", small, "Theirs", gain=1.0),
+        entry_of(tmp_path / "large", large, "Mine", gain=0.9, suite="mini"),
+    ]
+    page = build_site(tmp_path / "site", [make_entry(one.results) for one in sources], sources)
+    scenes = gallery(page)
+    names = [f"{small.info.id} of smoke", f"{small.info.id} of mini"]
+    assert [scene["capture"] for scene in scenes] == [name for name in names for _ in SCORES]
+    # The best of the suite comes first, in every frame; one seed stands for a method.
+    for scene, titles in zip(scenes, 3 * [["Theirs", "Mine"]] + 3 * [["Mine"]], strict=True):
+        assert [shot["title"] for shot in scene["shots"]] == titles
+    assert scenes[0]["shots"][1]["entry"] == make_entry(sources[1].results).name
 
 
 def test_without_predictions_there_is_no_viewer(
