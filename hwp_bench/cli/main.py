@@ -46,6 +46,7 @@ def command_tree() -> Command:
             "table": Command("print tables of results", f"{here}.table"),
             "report": Command("write one HTML page about results", f"{here}.report"),
             "leaderboard": Command("make, check and show leaderboards", f"{here}.leaderboard"),
+            "sealed": Command("make, reveal and check sealed suites", f"{here}.sealed"),
             "list": Command("list captures, suites, methods, metrics", f"{here}.list"),
             "data": Command("make, check and show captures", commands=data),
             "hands": Command("hand models", commands=hands),

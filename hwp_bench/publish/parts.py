@@ -6,7 +6,7 @@ import os
 import re
 import secrets
 import shutil
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -55,6 +55,7 @@ def publish(
     *,
     splits: Mapping[str, Split] | None = None,
     salt: str | None = None,
+    describe: Callable[[Path, str], None] | None = None,
 ) -> Publication:
     """Divide captures into a part for authors and a part that scores their submissions.
 
@@ -67,7 +68,9 @@ def publish(
         captures: capture folders.
         out: folder to make, with `public/` and `sealed/`.
         splits: splits by capture id; None applies the 80/10/10 rule.
-        salt: hex of at least 32 bytes; None draws one. Only tests give it.
+        salt: hex of at least 32 bytes that nobody knows; None draws one.
+        describe: writes more into the public part, before it takes its name; gets its folder and
+            the joint commitment.
 
     Returns:
         Where the parts are, and the commitment.
@@ -102,6 +105,8 @@ def publish(
         common = {"toolkit": __version__, "commitment": joint, "captures": entries}
         write_json(root / PUBLIC / MANIFEST, {"schema": PUBLIC_SCHEMA, **common})
         write_json(root / SEALED / KEY, {"schema": SEALED_SCHEMA, "salt": salt, **common})
+        if describe is not None:
+            describe(root / PUBLIC, joint)
         os.chmod(root / SEALED, 0o700)
     folder = Path(out)
     return Publication(

@@ -84,7 +84,7 @@ def _compare_public(root: Path, manifest: str | os.PathLike[str] | None, joint: 
         return
     path = default if manifest is None else Path(manifest)
     path = path / MANIFEST if path.is_dir() else path
-    if _read(path, PUBLIC_SCHEMA, _PublicManifest).commitment != joint:
+    if _read(path, PUBLIC_SCHEMA, PublicManifest).commitment != joint:
         raise BadInput(
             "publishes a commitment that is not this sealed part's",
             where=path,
@@ -93,26 +93,44 @@ def _compare_public(root: Path, manifest: str | os.PathLike[str] | None, joint: 
         )
 
 
+def read_manifest(public: str | os.PathLike[str]) -> PublicManifest:
+    """Read the manifest of a public part.
+
+    Raises:
+        BadInput: it is damaged, or its commitments do not make the joint one.
+    """
+    path = Path(public) / MANIFEST
+    found = _read(path, PUBLIC_SCHEMA, PublicManifest)
+    if joint_commitment([entry.commitment for entry in found.captures]) != found.commitment:
+        raise BadInput("does not follow from the captures", where=path, field="commitment")
+    return found
+
+
 def _read(path: Path, schema: str, kind: type[Record]) -> Record:
     value = without_schema(read_json(path), schema, where=path, error=BadInput)
     return parse_record(kind, value, where=path, error=BadInput, ignore_unknown=True)
 
 
 @dataclass(frozen=True)
-class _CommittedCapture:
-    """One capture in a sealed part's key file."""
+class CommittedCapture:
+    """One capture in a manifest or a sealed part's key file."""
 
+    #: Its id.
     id: Line
     #: `Split.from_json` checks it.
     split: Any
+    #: SHA-256 that binds its test frames, masks and split.
     commitment: Line
 
 
 @dataclass(frozen=True)
-class _PublicManifest:
-    """The fields of the public manifest that are compared."""
+class PublicManifest:
+    """The fields of a public manifest that are compared."""
 
+    #: Digest of all commitments.
     commitment: Line
+    #: The captures.
+    captures: Annotated[list[CommittedCapture], Meta(min_length=1)]
 
 
 @dataclass(frozen=True)
@@ -121,4 +139,4 @@ class _SealedKey:
 
     salt: Annotated[str, Meta(min_length=2 * SALT_BYTES, max_length=10_000)]
     commitment: Line
-    captures: Annotated[list[_CommittedCapture], Meta(min_length=1)]
+    captures: Annotated[list[CommittedCapture], Meta(min_length=1)]

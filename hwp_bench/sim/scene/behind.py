@@ -10,11 +10,10 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from hwp_bench.base.records import number
+from hwp_bench.base.records import Seed, number
 
 _Tone = Annotated[float, Meta(ge=-0.4, le=1.4)]
 _Place = Annotated[float, Meta(ge=-2.0, le=2.0)]
-_Seed = Annotated[int, Meta(ge=0, le=2**31)]
 
 
 @dataclass(frozen=True)
@@ -26,7 +25,7 @@ class Clutter:
     #: Speed, halves of the picture a second.
     speed: float = number(0.25, 0.0, 3.0)
     #: Which ones, and where they start.
-    seed: _Seed = 0
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Face:
     #: Skin tone as the subject has one; the subject's if None.
     tone: _Tone | None = None
     #: Which face: proportions, hair, clothes.
-    seed: _Seed = 0
+    seed: Seed = 0
     #: Where its middle is.
     place: tuple[_Place, _Place] = (0.25, -0.25)
     #: Half of the head's height.
@@ -60,7 +59,7 @@ class OtherArm:
     #: Rounds of its motion a second.
     pace: float = number(0.22, 0.0, 3.0)
     #: Phase and marks.
-    seed: _Seed = 0
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)

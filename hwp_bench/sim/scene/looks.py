@@ -13,7 +13,7 @@ from typing import Annotated, Any, Literal
 from msgspec import Meta
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.records import number
+from hwp_bench.base.records import Seed, number
 
 _Channel = Annotated[float, Meta(ge=0.0, le=1.0)]
 #: An sRGB colour, 0-1 each.
@@ -22,7 +22,6 @@ Color = tuple[_Channel, _Channel, _Channel]
 Wearing = Literal["both", "right", "left"]
 #: A finger.
 Finger = Literal["thumb", "index", "middle", "ring", "little"]
-_Seed = Annotated[int, Meta(ge=0, le=2**31)]
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class Tattoo:
     #: Where: the back of the hand, or the backs of the fingers.
     place: Literal["back", "fingers"] = "back"
     #: Which drawing of its kind.
-    seed: _Seed = 0
+    seed: Seed = 0
     #: Size relative to the place.
     size: float = number(1.0, 0.3, 2.0)
     #: sRGB of the ink.
@@ -104,7 +103,7 @@ class Glove:
     #: How far it lifts the surface, m.
     thickness: float = number(0.0012, 0.0002, 0.003)
     #: Which glove of its kind: weave and stains.
-    seed: _Seed = 0
+    seed: Seed = 0
     #: The hands that wear it.
     side: Wearing = "both"
 

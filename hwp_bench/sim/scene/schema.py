@@ -15,7 +15,7 @@ from msgspec import Meta
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
-from hwp_bench.base.records import number
+from hwp_bench.base.records import Seed, number
 from hwp_bench.base.text import ODD_CHARACTERS
 from hwp_bench.hands.gestures import gesture
 from hwp_bench.sim.geometry.noise import generator
@@ -42,8 +42,6 @@ Words = Annotated[
         description="a text that is not empty",
     ),
 ]
-#: A seed of random numbers.
-Seed = Annotated[int, Meta(ge=0, le=2**31)]
 _Share = Annotated[float, Meta(ge=-1.0, le=1.0)]
 _Brightness = Annotated[float, Meta(ge=0.0, le=20.0)]
 _Axis = Annotated[float, Meta(ge=-100.0, le=100.0)]

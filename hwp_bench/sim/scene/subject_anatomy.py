@@ -7,7 +7,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from hwp_bench.base.records import number
+from hwp_bench.base.records import Seed, number
 
 _Length = Annotated[float, Meta(ge=0.8, le=1.25)]
 _Width = Annotated[float, Meta(ge=0.75, le=1.25)]
@@ -23,7 +23,7 @@ class SubjectAnatomy:
     """
 
     #: Seed of what is drawn; the subject's own where it is absent.
-    seed: Annotated[int, Meta(ge=0, le=2**31)] | None = None
+    seed: Seed | None = None
     #: Spread of the bones' lengths, percent; bones of the palm have half of it.
     bone_length: float = number(0.0, 0.0, 10.0)
     #: Spread of the segments' thickness, percent.
