@@ -52,13 +52,15 @@ class Target:
     def name(self) -> str:
         """The command, without what it is given."""
         known = [word for word in self.words if word.replace("-", "").isalpha() and word.islower()]
-        return " ".join(known[: 3 if known[1] in ("data", "hands", "sim", "leaderboard") else 2])
+        groups = ("data", "hands", "sim", "sealed", "leaderboard")
+        return " ".join(known[: 3 if known[1] in groups else 2])
 
 
 _CAPTURE = ("capture/*.json", "capture/*.npz", "capture/frames/*", "capture/masks/*")
 _TRUTH = ("capture/truth/*.npz", "capture/truth/*/*")
 _RESULTS = ("results/results.json",)
 _AVATAR = ("avatar/avatar.json", "avatar/model.safetensors")
+_ENTRIES = ("entries/*.json", "entries/checks/*.json")
 _BENCH, _HAND = "hwp-bench", "wildghand"
 
 TARGETS = (
@@ -90,17 +92,29 @@ TARGETS = (
     Target((_BENCH, "report", "results", "-o", OUT, "--captures", "capture"),
            (*_RESULTS, *_CAPTURE), ("--title", "--base"), 2),
     Target((_BENCH, "verify", "results", "--captures", "capture"),
-           (*_RESULTS, "results/predictions/*/*", *_CAPTURE), ("--splits",), 2),
-    Target((_BENCH, "leaderboard", "check", "--entries", "entries"), ("entries/*.json",), weight=2),
-    Target((_BENCH, "leaderboard", "show", "--entries", "entries"), ("entries/*.json",)),
+           (*_RESULTS, "results/captures/*/predictions/*", "results/tables/*", *_CAPTURE),
+           ("--splits",), 2),
+    Target((_BENCH, "leaderboard", "check", "--entries", "entries"), _ENTRIES, weight=2),
+    Target((_BENCH, "leaderboard", "show", "--entries", "entries"), _ENTRIES),
     Target((_BENCH, "leaderboard", "build", "--entries", "entries", "-o", OUT),
-           ("entries/*.json",), weight=2),
+           _ENTRIES, weight=2),
     Target((_BENCH, "leaderboard", "add", "results", "--entries", "entries"), _RESULTS,
            whole=False),
     Target((_BENCH, "leaderboard", "submit", "results", "-o", OUT, "--entries", "entries"),
            _RESULTS, ("--by", "--link")),
     Target((_BENCH, "leaderboard", "confirm", "results", "--by", "x", "--entries", "entries"),
-           (*_RESULTS, "entries/*.json"), ("--tolerance", "--entry"), whole=False),
+           (*_RESULTS, *_ENTRIES), ("--tolerance", "--entry"), whole=False),
+    Target((_BENCH, "sealed", "check", "sealed/publication/public", "revealed.json",
+            "--no-render"), ("sealed/publication/public/*.json", "revealed.json")),
+    Target((_BENCH, "sealed", "reveal", "sealed", "-o", "@out.json"),
+           ("sealed/keeper/secret.json", "sealed/publication/*/*.json",
+            "sealed/publication/sealed/*/*.json")),
+    Target((_BENCH, "sealed", "make", "capture0", "-o", OUT, "--secret", "revealed.json",
+            "--workers", "1"), ("revealed.json",), ("--frames", "--size", "--secret"), 0.3, False),
+    Target((_BENCH, "evaluate", "submission", "--sealed", "sealed/publication/sealed", "-o", OUT,
+            "--isolation", "none"),
+           ("sealed/publication/*/*.json", "sealed/publication/sealed/*/*"), ("--steps",),
+           0.5, False),
     Target((_BENCH, "sim", "render", "scene.toml", "-o", OUT, "--frames", "10", "--size", "16",
             "--workers", "1", "--no-free-view"), ("scene.toml",),
            ("--frames", "--size", "--severity", "--subject", "--seed"), 2),
@@ -200,6 +214,7 @@ def fuzz(
         cases: how many; 0 for as many as the time allows.
         first: number of the first case.
     """
+    _refuse_empty(targets, seeds)
     programs = preload()
     tally = Tally(collections.Counter(), collections.Counter(), collections.Counter(), [])
     end = time.monotonic() + 60.0 * minutes
@@ -209,6 +224,18 @@ def fuzz(
             _try_case(number, targets, seeds, keep, Path(name), programs, seed, tally)
             number += 1
     return tally
+
+
+def _refuse_empty(targets: Sequence[Target], seeds: Path) -> None:
+    """Refuse patterns that no seed fits: nothing would be changed, and all would seem well.
+
+    Raises:
+        SystemExit: there is one; it is named.
+    """
+    for target in targets:
+        for pattern in target.files:
+            if not any(path.is_file() for path in seeds.glob(pattern)):
+                raise SystemExit(f"{target.name}: no seed fits {pattern}")
 
 
 def _try_case(
@@ -230,7 +257,7 @@ def _try_case(
     )
     folder = work / f"case-{number}"
     needed = {pattern.split("/")[0] for pattern in target.files} | {
-        word.removeprefix("mano:") for word in target.words
+        word.removeprefix("mano:").split("/")[0] for word in target.words
     }
     folder.mkdir()
     for part in sorted(needed):

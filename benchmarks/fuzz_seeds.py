@@ -7,7 +7,6 @@ import pickle
 import shutil
 import subprocess
 import sys
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -64,7 +63,10 @@ def make_seeds(folder: Path) -> None:
     _make(bench, "evaluate", str(method), *scored, "-o", str(folder / "results"))
     _make(bench, "data", "inputs", *scored, "-o", str(folder / "inputs"))
     _write_submission(folder)
-    shutil.copytree(ROOT / "leaderboard" / "entries", folder / "entries", ignore=_most_entries)
+    _copy_entry(folder / "entries")
+    sealed = ("--frames", "10", "--size", "32", "--workers", "1", "-o", str(folder / "sealed"))
+    _make(bench, "sealed", "make", "capture0", *sealed)
+    _make(bench, "sealed", "reveal", str(folder / "sealed"), "-o", str(folder / "revealed.json"))
     shutil.copy(ROOT / "splits" / "hwp-v1.json", folder / "splits.json")
     _write_split(folder / "split.json", capture)
     _make(hand, "fit", capture, "-o", str(folder / "avatar"), *FIT)
@@ -101,9 +103,14 @@ def _write_submission(folder: Path) -> None:
     )
 
 
-def _most_entries(folder: str, names: Sequence[str]) -> set[str]:
-    few = [name for name in sorted(names) if name.startswith("plain-smoke")][:2]
-    return {name for name in names if name.endswith(".json") and name not in few}
+def _copy_entry(target: Path) -> None:
+    """One entry of the leaderboard with its check: the smallest that has one."""
+    checks = list((ROOT / "leaderboard" / "entries" / "checks").glob("*.json"))
+    pairs = [(check.parent.parent / f"{check.name.split('.')[0]}.json", check) for check in checks]
+    entry, check = min(pairs, key=lambda pair: (pair[0].stat().st_size, pair[1].name))
+    (target / "checks").mkdir(parents=True)
+    shutil.copy(entry, target)
+    shutil.copy(check, target / "checks")
 
 
 def _write_split(path: Path, capture: str) -> None:

@@ -100,6 +100,13 @@ def test_mutations_change_files_and_repeat(tmp_path: Path) -> None:
     assert {"NaN", "1e999", '"\\ud800"', '{"a":1,"a":2}'} <= {*JSON_VALUES}
 
 
+def test_a_file_that_no_seed_has_is_named(tmp_path: Path) -> None:
+    """Nothing would be changed, and the run would say that nothing was found."""
+    target = Target(("hwp-bench", "table", "results"), ("results/*.json",))
+    with pytest.raises(SystemExit, match=r"hwp-bench table: no seed fits results/\*\.json"):
+        fuzz([target], tmp_path, tmp_path / "found", seed=0, cases=1)
+
+
 def test_a_short_run_of_cheap_commands_finds_nothing(
     make_capture: CaptureMaker, tmp_path: Path
 ) -> None:
