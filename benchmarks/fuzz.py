@@ -214,7 +214,6 @@ def fuzz(
         cases: how many; 0 for as many as the time allows.
         first: number of the first case.
     """
-    _refuse_empty(targets, seeds)
     programs = preload()
     tally = Tally(collections.Counter(), collections.Counter(), collections.Counter(), [])
     end = time.monotonic() + 60.0 * minutes
@@ -226,7 +225,7 @@ def fuzz(
     return tally
 
 
-def _refuse_empty(targets: Sequence[Target], seeds: Path) -> None:
+def refuse_empty(targets: Sequence[Target], seeds: Path) -> None:
     """Refuse patterns that no seed fits: nothing would be changed, and all would seem well.
 
     Raises:
@@ -358,6 +357,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         if not seeds.exists():
             seeds.mkdir(parents=True)
             make_seeds(seeds)
+        refuse_empty(chosen, seeds)
         tally = fuzz(
             chosen, seeds.absolute(), args.keep.absolute(), seed=args.seed, minutes=args.minutes,
             cases=args.cases, first=args.first,

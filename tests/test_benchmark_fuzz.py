@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from small_captures import CaptureMaker, results_example
 
-from benchmarks.fuzz import TARGETS, fuzz
+from benchmarks.fuzz import TARGETS, Target, fuzz, refuse_empty
 from benchmarks.fuzz_mutations import JSON_VALUES, mutate
 from benchmarks.fuzz_worker import faults_of, run_forked
 from hwp_bench.results import write_results
@@ -104,7 +104,7 @@ def test_a_file_that_no_seed_has_is_named(tmp_path: Path) -> None:
     """Nothing would be changed, and the run would say that nothing was found."""
     target = Target(("hwp-bench", "table", "results"), ("results/*.json",))
     with pytest.raises(SystemExit, match=r"hwp-bench table: no seed fits results/\*\.json"):
-        fuzz([target], tmp_path, tmp_path / "found", seed=0, cases=1)
+        refuse_empty([target], tmp_path)
 
 
 def test_a_short_run_of_cheap_commands_finds_nothing(
