@@ -91,6 +91,10 @@ def run_confined(
     Raises:
         MethodFailed: there is no such command, or it cannot be executed.
     """
+    log_problems: list[str] = []
+    # Before the program runs: it may write next to its log, and put a link in the place of one
+    # that is not there yet.
+    log = _open_log(program.log, log_problems)
     read, write = os.pipe()
     root = os.fspath(PACKAGES)
     bare = [sys.executable, "-I", "-S", "-B", "-c", _LAUNCH.format(root=root) + f"main({write})"]
@@ -106,10 +110,7 @@ def run_confined(
     os.close(write)
     assert process.stdin is not None
     assert process.stdout is not None
-    log_problems: list[str] = []
-    drain = threading.Thread(
-        target=_drain, args=(process.stdout, program.log, log_problems), daemon=True
-    )
+    drain = threading.Thread(target=_drain, args=(process.stdout, log, log_problems), daemon=True)
     drain.start()
     with os.fdopen(read, "rb") as report:
         try:
@@ -192,7 +193,17 @@ def _end(process: subprocess.Popen[bytes]) -> None:
     process.wait()
 
 
-def _drain(stream: IO[bytes], log: Path, problems: list[str]) -> None:
+def _open_log(path: Path, problems: list[str]) -> io.FileIO | None:
+    """Open the file of a log, never through a link; None and a reason where that fails."""
+    flags = os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW | os.O_CLOEXEC
+    try:
+        return io.FileIO(os.open(path, flags, 0o666), "wb")
+    except OSError as error:
+        problems.append(_why(error))
+        return None
+
+
+def _drain(stream: IO[bytes], log: io.FileIO | None, problems: list[str]) -> None:
     """Keep both ends of what a program prints: what it is, and what it died of.
 
     Where the log cannot be written, on a full disc for instance, the rest is read all the same:
@@ -200,36 +211,41 @@ def _drain(stream: IO[bytes], log: Path, problems: list[str]) -> None:
 
     Args:
         stream: what the program prints.
-        log: the file.
+        log: the file, which is closed at the end; None where it could not be opened.
         problems: takes the reason why the log is not whole.
     """
-    try:
-        _keep_ends(stream, log)
-    except OSError as error:
-        problems.append(error.strerror or type(error).__name__)
-        while os.read(stream.fileno(), 65536):
-            pass
+    if log is not None:
+        try:
+            with log:
+                _keep_ends(stream, log)
+        except OSError as error:
+            problems.append(_why(error))
+    while os.read(stream.fileno(), 65536):
+        pass
 
 
-def _keep_ends(stream: IO[bytes], log: Path) -> None:
+def _why(error: OSError) -> str:
+    return error.strerror or type(error).__name__
+
+
+def _keep_ends(stream: IO[bytes], target: io.FileIO) -> None:
     half = MAX_LOG_BYTES // 2
     kept = 0
     dropped = 0
     tail = bytearray()
-    # Unbuffered: what comes can be followed, and no rest waits for a disc that is full.
-    with open(log, "wb", buffering=0) as target:
-        # Whatever has come, and not whole blocks: the log can be followed while the program runs.
-        while chunk := os.read(stream.fileno(), 65536):
-            head = chunk[: half - kept]
-            _write_all(target, head)
-            kept += len(head)
-            tail += chunk[len(head) :]
-            surplus = max(0, len(tail) - half)
-            del tail[:surplus]
-            dropped += surplus
-        if dropped:
-            _write_all(target, f"\n[{dropped} bytes in the middle were not kept]\n".encode())
-        _write_all(target, tail)
+    # The file is unbuffered: what comes can be followed, and no rest waits for a disc that is
+    # full. Whatever has come is taken, and not whole blocks, for the same reason.
+    while chunk := os.read(stream.fileno(), 65536):
+        head = chunk[: half - kept]
+        _write_all(target, head)
+        kept += len(head)
+        tail += chunk[len(head) :]
+        surplus = max(0, len(tail) - half)
+        del tail[:surplus]
+        dropped += surplus
+    if dropped:
+        _write_all(target, f"\n[{dropped} bytes in the middle were not kept]\n".encode())
+    _write_all(target, tail)
 
 
 def _write_all(target: io.FileIO, data: bytes | bytearray) -> None:

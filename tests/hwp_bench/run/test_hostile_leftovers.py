@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ from hwp_bench.base.errors import MethodFailed
 from hwp_bench.evaluation.scoring import read_prediction
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.run.runner import run_method
+from hwp_bench.run.sandbox import supervise
 
 MODES = ("required", "none")
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="process control is Linux's")
@@ -52,6 +54,31 @@ log.symlink_to({str(secret)!r})
 """
     with pytest.raises(FileNotFoundError):  # by the test's own look at the log
         attack(script, "none")
+    assert secret.read_text() == "s3cret"
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_log_that_is_opened_late_leads_nowhere(
+    attack, tmp_path: Path, mode: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A busy machine lets the method run before the log's reader: it may not choose the file."""
+    secret = folder_of(tmp_path / "home") / "secret"
+    secret.write_text("s3cret")
+    honest = supervise._drain
+
+    def late(*arguments) -> None:
+        time.sleep(1.0)
+        honest(*arguments)
+
+    monkeypatch.setattr(supervise, "_drain", late)
+    script = f"""
+log = pathlib.Path(sys.argv[2]) / "log.txt"
+log.unlink(missing_ok=True)
+log.symlink_to({str(secret)!r})
+print("overwritten")
+"""
+    with pytest.raises(FileNotFoundError):  # by the test's own look at the log
+        attack(script, mode)
     assert secret.read_text() == "s3cret"
 
 
