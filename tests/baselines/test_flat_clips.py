@@ -14,8 +14,8 @@ import pytest
 from painted import QUICK, SilentReport, TrainingMaker
 
 from exposure_fit.method import ExposureMethod
-from hwp_bench.metrics.score import score_frame
 from hwp_bench.methods.contract import Budget, TrainingCapture
+from hwp_bench.metrics.score import score_frame
 from plain_fit.method import PlainMethod
 from trimmed_fit.method import TrimmedMethod
 from wild_fit.method import WildMethod
