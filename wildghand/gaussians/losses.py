@@ -39,7 +39,7 @@ def ssim_map(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     similarity", equation 13; zero padding as in 3DGS.
     """
     _same_shape(prediction, target, "target")
-    return _SsimMap.apply(_wide(prediction), _wide(target))
+    return _SsimMap.apply(full_precision(prediction), full_precision(target))
 
 
 def photometric_loss(
@@ -71,7 +71,11 @@ def photometric_loss(
             f"has shape {tuple(weights.shape)}, expected {tuple(prediction.shape[:3])}",
             field="weights",
         )
-    prediction, target, weights = _wide(prediction), _wide(target), _wide(weights)
+    prediction, target, weights = (
+        full_precision(prediction),
+        full_precision(target),
+        full_precision(weights),
+    )
     images = (prediction, target, weights)
     if dssim_weight > 0.0 and prediction.device.type == "cpu":
         from wildghand.gaussians.photometric_cpu import PhotometricCpu, takes
@@ -85,7 +89,7 @@ def photometric_loss(
     return (error * weights[..., None]).mean()
 
 
-def _wide(values: torch.Tensor) -> torch.Tensor:
+def full_precision(values: torch.Tensor) -> torch.Tensor:
     """Half precision as float32; gradients come back in the type that was given."""
     return values.float() if values.element_size() < 4 else values
 
