@@ -140,6 +140,5 @@ def main() -> None:
     print(to_markdown(Table("Long clips", columns, tuple(rows), ranked=False)))
 
 
-
 if __name__ == "__main__":
     main()

@@ -57,8 +57,8 @@ def photometric_loss(
         dssim_weight: lambda in [0, 1]; with 0 only L1 is computed.
 
     Returns:
-        scalar, float32 for half precision: the weighted sum divided by the number of values B H W C, so that a pixel counts
-        the same in every frame. Differentiable in `prediction` and `weights`.
+        scalar, float32 for half precision: the weighted sum divided by the number of values
+        B H W C, so that a pixel counts the same in every frame. Differentiable in `prediction` and `weights`.
 
     Raises:
         ShapeMismatch: the three do not describe the same images.

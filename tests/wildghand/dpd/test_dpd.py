@@ -179,7 +179,7 @@ def test_attributes_of_another_type_are_one_message(dtype: torch.dtype) -> None:
     module = trained()
     temporal = module.temporal(torch.arange(2))
     other = RawAttributes.split(attributes(2, 5).concatenate().to(dtype))
-    with pytest.raises(BadInput, match="that of the module torch.float32") as caught:
+    with pytest.raises(BadInput, match=r"that of the module torch\.float32") as caught:
         module.biases(other, temporal.z, temporal.omega)
     assert "raw.offsets" in str(caught.value)
 
