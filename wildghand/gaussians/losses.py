@@ -58,7 +58,8 @@ def photometric_loss(
 
     Returns:
         scalar, float32 for half precision: the weighted sum divided by the number of values
-        B H W C, so that a pixel counts the same in every frame. Differentiable in `prediction` and `weights`.
+        B H W C, so that a pixel counts the same in every frame. Differentiable in `prediction`
+        and `weights`.
 
     Raises:
         ShapeMismatch: the three do not describe the same images.

@@ -53,7 +53,7 @@ COLOURS = [(0, 0, 0), (128, 128, 128), (255, 255, 255), (200, 150, 120)]
 def flat(training: TrainingCapture, colour: tuple[int, int, int]) -> TrainingCapture:
     """Every pixel of every frame has one colour."""
     read = training.frame
-    training.frame = lambda index: np.zeros_like(read(index)) + np.uint8(colour)  # type: ignore[method-assign]
+    training.frame = lambda index: np.full_like(read(index), colour)  # type: ignore[method-assign]
     return training
 
 
