@@ -9,7 +9,7 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.base.errors import BadInput, ShapeMismatch, UsageError
 from hwp_bench.methods.settings import number
 from wildghand.dpd.field import BiasField
 from wildghand.gaussians.attributes import SIZES, RawAttributes
@@ -142,8 +142,17 @@ class DynamicPerturbation(nn.Module):
             (B, N, k) each.
 
         Raises:
+            BadInput: an attribute is not of the module's floating-point type.
             ShapeMismatch: the three do not describe the same frames.
         """
+        own = cast(nn.Linear, self.varphi["offsets"]).weight.dtype
+        for name, g in raw.items():
+            if g.dtype != own:
+                raise BadInput(
+                    f"type is {g.dtype}, that of the module {own}",
+                    field=f"raw.{name}",
+                    remedy="Convert the attributes, or the module with `to(dtype)`.",
+                )
         frames = {len(z), len(omega), *([len(raw.offsets)] if raw.offsets.ndim > 2 else [])}
         if len(frames) > 1 or raw.offsets.ndim > 3:
             raise ShapeMismatch(

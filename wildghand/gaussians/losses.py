@@ -21,6 +21,7 @@ C1, C2 = 0.01**2, 0.03**2
 def ssim_map(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     """Structural similarity at every pixel and channel.
 
+    Half precision is computed and returned in float32: its variances would be rounding alone.
     The window is a Gaussian of 11 px and sigma 1.5; population covariance; data range 1; beyond
     the border both images are 0. The gradient goes to `prediction` only.
 
@@ -38,7 +39,7 @@ def ssim_map(prediction: torch.Tensor, target: torch.Tensor) -> torch.Tensor:
     similarity", equation 13; zero padding as in 3DGS.
     """
     _same_shape(prediction, target, "target")
-    return _SsimMap.apply(prediction, target)
+    return _SsimMap.apply(full_precision(prediction), full_precision(target))
 
 
 def photometric_loss(
@@ -56,8 +57,9 @@ def photometric_loss(
         dssim_weight: lambda in [0, 1]; with 0 only L1 is computed.
 
     Returns:
-        scalar: the weighted sum divided by the number of values B H W C, so that a pixel counts
-        the same in every frame. Differentiable in `prediction` and `weights`.
+        scalar, float32 for half precision: the weighted sum divided by the number of values
+        B H W C, so that a pixel counts the same in every frame. Differentiable in `prediction`
+        and `weights`.
 
     Raises:
         ShapeMismatch: the three do not describe the same images.
@@ -70,6 +72,11 @@ def photometric_loss(
             f"has shape {tuple(weights.shape)}, expected {tuple(prediction.shape[:3])}",
             field="weights",
         )
+    prediction, target, weights = (
+        full_precision(prediction),
+        full_precision(target),
+        full_precision(weights),
+    )
     images = (prediction, target, weights)
     if dssim_weight > 0.0 and prediction.device.type == "cpu":
         from wildghand.gaussians.photometric_cpu import PhotometricCpu, takes
@@ -81,6 +88,11 @@ def photometric_loss(
         dissimilarity = 1.0 - ssim_map(prediction, target)
         error = (1.0 - dssim_weight) * error + dssim_weight * dissimilarity
     return (error * weights[..., None]).mean()
+
+
+def full_precision(values: torch.Tensor) -> torch.Tensor:
+    """Half precision as float32; gradients come back in the type that was given."""
+    return values.float() if values.element_size() < 4 else values
 
 
 class _SsimMap(torch.autograd.Function):

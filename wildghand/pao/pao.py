@@ -11,6 +11,7 @@ from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.methods.settings import check_source
+from wildghand.gaussians.losses import full_precision
 from wildghand.pao.regions.frame_regions import Regions
 from wildghand.pao.running_median import LEAST, running_median
 
@@ -165,7 +166,8 @@ class PerturbationAwareWeights(nn.Module):
 
         Args:
             error: (B, H, W) mean over channels of |rendering - input|; a pixel that is not
-                finite gets weight 0 and counts in no region.
+                finite gets weight 0 and counts in no region. Half precision, here and in omega
+                and `expected`, is computed in float32: float16 overflows in sums over a region.
             regions: y_u of the frames.
             hand: (B, H, W) y_h: bool, or coverage in [0, 1], hand where above a half.
             omega: (B,) temporal weights.
@@ -178,7 +180,8 @@ class PerturbationAwareWeights(nn.Module):
             ShapeMismatch: the arguments do not describe the same frames.
         """
         _check_shapes(error, regions, hand, omega)
-        error = error.detach()
+        error, omega = full_precision(error.detach()), full_precision(omega)
+        expected = None if expected is None else full_precision(expected)
         on_hand = hand if hand.dtype == torch.bool else hand > 0.5
         # Off the CPU the question would wait for the device.
         sound = error.device.type == "cpu" and bool(error.sum().isfinite())

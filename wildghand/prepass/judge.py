@@ -63,8 +63,10 @@ def _judge(given: PrepassInput, settings: PrepassSettings) -> FrameAssessment:
     survey = _survey(given, surfaces, usable, settings)
     usable = survey.readable
     if not usable.any():
+        flat = sum(_is_flat(image) for image in given.images)
         raise BadInput(
-            f"none of {len(usable)} training frames shows a hand where the parameters place one",
+            f"none of {len(usable)} training frames shows a hand where the parameters place one"
+            + (f"; {flat} of them are black or of one colour" if flat else ""),
             remedy="Check the capture with `hwp-bench data show`.",
         )
     if usable.sum() < settings.least_frames:
@@ -128,9 +130,15 @@ def _measurable(given: PrepassInput) -> np.ndarray:
         valid[row] = (
             len(shown) >= LEAST_PIXELS
             and np.count_nonzero(shown.max(axis=1) >= LOWEST) >= LEAST_PIXELS
-            and int(given.images[row].max()) > int(given.images[row].min())
+            and not _is_flat(given.images[row])
         )
     return valid
+
+
+def _is_flat(image: np.ndarray) -> bool:
+    """Whether an image is black or has one colour: no edge, so nothing tells hand from wall."""
+    pixels = image.reshape(-1, 3)
+    return int(pixels.max()) < LOWEST or bool((pixels == pixels[0]).all())
 
 
 def _footprints(

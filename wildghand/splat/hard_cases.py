@@ -199,6 +199,11 @@ def _calls() -> Iterator[_Entry]:
         f"alpha 1 - (1 - a)^2 with that of one Gaussian, to {IMAGE_TOLERANCE:g}",
         _run_doubled,
     )
+    yield (
+        "two equal hands in one place, in either order",
+        f"finite; image and gradients to {GRADIENT_TOLERANCE:g} of the other order",
+        _run_reordered,
+    )
 
 
 def _extremes() -> Iterator[_Entry]:
@@ -355,6 +360,27 @@ def _run_doubled(context: Context) -> Measured:
     )
     passed = two.finite and off <= IMAGE_TOLERANCE and float(one.alpha.max()) > 0.8
     return Measured(passed, f"off by {off:.0e}, alpha of one up to {float(one.alpha.max()):.2f}")
+
+
+def _run_reordered(context: Context) -> Measured:
+    scene = hand_scene()
+    count = len(scene.arguments["means"])
+    # Hand after hand, and pair after pair.
+    apart, paired = torch.arange(count).repeat(2), torch.arange(count).repeat_interleave(2)
+    made = [
+        _draw(
+            scene.changed(**{name: scene.arguments[name][order] for name in PER_GAUSSIAN}), context
+        )
+        for order in (apart, paired)
+    ]
+    off = difference(made[0].image, made[1].image)
+    for name in PER_GAUSSIAN:
+        # The nearer of two equal Gaussians is the one of lower index, in both orders.
+        first = made[0].gradients[name].unflatten(0, (2, count))
+        second = made[1].gradients[name].unflatten(0, (count, 2)).transpose(0, 1)
+        off = max(off, difference(first, second))
+    passed = made[0].finite and made[1].finite and off <= GRADIENT_TOLERANCE
+    return Measured(passed, f"off by {off:.0e}")
 
 
 def _run_finite(scene: HardScene, context: Context) -> Measured:

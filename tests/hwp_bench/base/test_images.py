@@ -242,3 +242,17 @@ def test_float_and_uint8_images_are_taken_alike() -> None:
             convert(np.zeros(3, np.int64))
         with pytest.raises(BadImage, match="NaN or infinite"):
             convert(np.array([np.nan]))
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 37), (37, 1), (1, 4096), (4096, 1), (2, 2)])
+def test_images_one_pixel_wide_and_of_4096_come_back(tmp_path: Path, size) -> None:
+    image = np.random.default_rng(1).integers(0, 256, (*size, 3), dtype=np.uint8)
+    path = write_image(tmp_path / "colour.png", image)
+    np.testing.assert_array_equal(read_rgb(path, size), image)
+    np.testing.assert_array_equal(cv2.imread(str(path))[:, :, ::-1], image)
+    # Neither channels nor rows lie next to one another.
+    strided = np.asfortranarray(image)[::-1]
+    write_image(tmp_path / "strided.png", strided)
+    np.testing.assert_array_equal(read_rgb(tmp_path / "strided.png"), image[::-1])
+    write_image(tmp_path / "mask.png", image[:, :, 0])
+    np.testing.assert_array_equal(read_gray(tmp_path / "mask.png"), image[:, :, 0])

@@ -10,7 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.base.errors import BadInput, ShapeMismatch, UsageError
 from wildghand.dpd.dpd import DynamicPerturbation, drop, encode_frames
 from wildghand.gaussians.attributes import SIZES, RawAttributes
 
@@ -172,3 +172,27 @@ def test_bad_arguments_are_named() -> None:
         drop(temporal.omega, torch.zeros(3), torch.Generator())
     with pytest.raises(UsageError, match="frame_count"):
         DynamicPerturbation(0)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16, torch.float64])
+def test_attributes_of_another_type_are_one_message(dtype: torch.dtype) -> None:
+    module = trained()
+    temporal = module.temporal(torch.arange(2))
+    other = RawAttributes.split(attributes(2, 5).concatenate().to(dtype))
+    with pytest.raises(BadInput, match=r"that of the module torch\.float32") as caught:
+        module.biases(other, temporal.z, temporal.omega)
+    assert "raw.offsets" in str(caught.value)
+
+
+def test_strided_attributes_give_the_biases_of_contiguous_ones() -> None:
+    """To an ulp of the largest: BLAS sums in another order where rows are not contiguous."""
+    module = trained()
+    temporal = module.temporal(torch.arange(2))
+    whole = attributes(2, 5).concatenate()
+    strided = whole.movedim(-1, 0).contiguous().movedim(0, -1)
+    assert not strided.is_contiguous()
+    made = [
+        module.biases(RawAttributes.split(g), temporal.z, temporal.omega).concatenate()
+        for g in (whole, strided)
+    ]
+    assert float((made[0] - made[1]).detach().abs().max()) <= 4.0 * torch.finfo().eps

@@ -139,3 +139,35 @@ def test_pixels_of_weight_zero_carry_no_l1_gradient() -> None:
 def test_shapes_that_do_not_fit(target: tuple, weights: tuple, field: str) -> None:
     with pytest.raises(ShapeMismatch, match=field):
         photometric_loss(images(0), torch.zeros(target), torch.zeros(weights), 0.2)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_half_precision_is_computed_in_float32(dtype: torch.dtype) -> None:
+    """Oracle: float32 of the same numbers, to the bit; gradients to half an ulp of the type."""
+    x, y, weights = images(7).to(dtype), images(8).to(dtype), images(9, (2, 24, 30)).to(dtype)
+    narrow, wide = x.clone().requires_grad_(), x.float().requires_grad_()
+    loss = photometric_loss(narrow, y, weights, 0.3)
+    expected = photometric_loss(wide, y.float(), weights.float(), 0.3)
+    assert loss.dtype == torch.float32
+    assert torch.equal(loss, expected)
+    # A gradient of one pixel is about 1e-4 of the loss, where float16 is already coarse.
+    (1e3 * loss).backward()
+    (1e3 * expected).backward()
+    assert narrow.grad.dtype == dtype
+    assert torch.equal(narrow.grad, wide.grad.to(dtype))
+    assert torch.equal(ssim_map(x, y), ssim_map(x.float(), y.float()))
+
+
+def test_memory_layout_changes_no_bit() -> None:
+    x, y, weights = images(10).float(), images(11).float(), images(12, (2, 24, 30)).float()
+
+    def strided(values: torch.Tensor) -> torch.Tensor:
+        return values.movedim(-1, 0).contiguous().movedim(0, -1)
+
+    results = []
+    for change in (torch.Tensor.contiguous, strided):
+        leaf = change(x).detach().requires_grad_()
+        loss = photometric_loss(leaf, change(y), change(weights), 0.3)
+        results.append((loss, *torch.autograd.grad(loss, leaf), ssim_map(change(x), change(y))))
+    assert not strided(x).is_contiguous()
+    assert all(torch.equal(one, other) for one, other in zip(*results, strict=True))

@@ -283,3 +283,27 @@ def test_bad_arguments_are_named() -> None:
     for bad in ({"alpha": float("nan")}, {"beta": -1.0}, {"variant": "mask"}, {"share_of": "u"}):
         with pytest.raises(UsageError, match=next(iter(bad))):
             PaoSettings(**bad)
+
+
+@pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])
+def test_errors_in_half_precision_weigh_as_the_numbers_that_they_are(dtype: torch.dtype) -> None:
+    """Oracle: the same numbers in float64. Tolerance: float32's sums over a region, 1e-5."""
+    error, masks, hand = scene(seed=4)
+    narrow = error.to(dtype)
+    omega = torch.tensor([0.25, -0.5])
+    made = [
+        PerturbationAwareWeights(PRINTED)(given, regions_of(masks), hand, omega.to(given)).weights
+        for given in (narrow, narrow.double())
+    ]
+    torch.testing.assert_close(made[0].double(), made[1].double(), rtol=1e-5, atol=1e-6)
+
+
+def test_strided_errors_and_hands_change_no_bit() -> None:
+    error, masks, hand = scene(seed=5)
+    made = [
+        PerturbationAwareWeights(PRINTED)(
+            change(error), regions_of(masks), change(hand), torch.zeros(2).double()
+        ).weights
+        for change in (torch.Tensor.contiguous, lambda x: x.mT.contiguous().mT)
+    ]
+    assert torch.equal(*made)
