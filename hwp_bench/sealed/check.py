@@ -44,7 +44,7 @@ class CheckedCapture:
 
 @dataclass(frozen=True)
 class Checked:
-    """What a check found; the secret fits the commitment, otherwise there is none."""
+    """Captures that were made again and compared; the secret itself fits its commitment."""
 
     #: The page of the suite.
     page: SuitePage

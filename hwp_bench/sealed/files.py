@@ -24,7 +24,7 @@ MAX_FILE = 1_000_000
 
 @dataclass(frozen=True)
 class SuitePage:
-    """What an organiser publishes before anybody submits: the recipe, and two commitments."""
+    """The page that is published before anybody submits: the recipe, and two commitments."""
 
     #: Everything but the secret.
     recipe: Recipe

@@ -1,4 +1,4 @@
-"""What a sealed suite is made of: public scenes, whose seeds and people a secret exchanges."""
+"""The recipe of a sealed suite: public scenes, whose seeds and people a secret exchanges."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def sealed_scene(scene: Scene, secret: str) -> Scene:
     Shape, skin, tone, age and sleeve, the variation of poses, paths of camera and objects' swings,
     noise, and everything else that is drawn follow from the secret. Gestures, light, perturbations
     and their times are the public scene's, and so are marks, gloves and proportions of a person,
-    drawn anew where they have a seed.
+    drawn again where they have a seed.
     """
     label = (scene.id, "person")
     person = with_subject(scene, derived_seed(secret, *label)).subject

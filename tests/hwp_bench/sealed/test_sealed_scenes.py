@@ -1,4 +1,4 @@
-"""What a secret decides. Oracles: HMAC written out, and the JSON of the public scenes."""
+"""The scenes of a secret. Oracles: HMAC written out, and the JSON of the public scenes."""
 
 from __future__ import annotations
 
