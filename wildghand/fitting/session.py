@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.files import disc_errors, sha256_file, sha256_json
 from hwp_bench.base.locks import exclusive
 from hwp_bench.base.progress import notice, progress
@@ -222,6 +222,16 @@ def _split(capture: Capture) -> Split:
 
 
 def every_frame(capture: Capture) -> Split:
-    """Every frame but the last two, which stand for the parts that a split must have."""
+    """Every frame but the last two, which stand for the parts that a split must have.
+
+    Raises:
+        BadInput: there are fewer than three.
+    """
     count = capture.info.frame_count
+    if count < 3:
+        raise BadInput(
+            f"has {count} of the 3 frames that a fit to all of them needs at least",
+            where=capture.root,
+            field="frame_count",
+        )
     return Split(capture.info.id, count, (0, count - 2), (count - 2, count - 1), (count - 1, count))
