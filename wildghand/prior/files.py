@@ -21,6 +21,7 @@ from hwp_bench.base.files import atomic_folder, inside, read_json, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture.schema import HandModelId
+from hwp_bench.hands import load_template
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import NetworkSettings, PredictionNetwork, network_settings
 from wildghand.network.weight_shapes import MAPS, shapes_of, shapes_of_settings
@@ -222,7 +223,7 @@ def _check_fit(
             remedy="Make one with `wildghand pretrain` on captures of this hand model.",
         )
     digest = record.hand_model.get("digest", "")
-    if digest != hand_model.digest:
+    if not _same_edition(digest, hand_model):
         raise BadInput(
             f"was made with another edition of the hand model {hand_model.name} "
             f"({digest[:12]}) than the capture ({hand_model.digest[:12]})",
@@ -230,6 +231,21 @@ def _check_fit(
             field="hand_model",
             remedy="Make one with `wildghand pretrain` on captures of this edition.",
         )
+
+
+def _same_edition(digest: str, hand_model: HandModelId) -> bool:
+    """Whether a digest and a capture's are of one edition of the hand model.
+
+    Both state the digest of their first hand: that of the left one where there is no right one.
+    """
+    if digest == hand_model.digest:
+        return True
+    try:
+        sides = {load_template(hand_model.source, side).digest for side in _SIDES}
+    except HwpError:
+        # A model that is not here: its captures cannot be fitted anyway.
+        return False
+    return {digest, hand_model.digest} <= sides
 
 
 def _read_prior(
