@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
-import os
+# isort: off
+from worker_threads import WORKER  # first: it says how many threads NumPy and torch use
+
+# isort: on
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,13 +19,6 @@ from hwp_bench.results import Results
 
 #: Skips that nobody allowed fail; and projects for the test of that.
 pytest_plugins = ["skips", "pytester"]
-
-# Workers of pytest-xdist share the processor, so that each of them and what it starts uses one
-# thread; torch and numba read this when they are imported.
-WORKER = "PYTEST_XDIST_WORKER" in os.environ
-if WORKER:
-    os.environ.setdefault("OMP_NUM_THREADS", "1")
-
 
 # How long an example takes says something about the machine and its load, not about the code.
 settings.register_profile(

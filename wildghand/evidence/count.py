@@ -48,7 +48,7 @@ def shown_frames(
         hands = {side: clip.hand(side, here) for side in rigs}
         shown = seen_anchors(hands, clip.viewmats[here], clip.Ks[here], says.shape[1:])
         for side, (pixels, facing) in shown.items():
-            found[side] += (_read(says, pixels) * (facing > 0.0)).sum(dim=0)
+            found[side] += (read_images(says, pixels) * (facing > 0.0)).sum(dim=0)
     return found
 
 
@@ -75,7 +75,7 @@ def seen_anchors(
         pixels, depth = places[side]
         facing = _facing(hand, viewmats)
         seen = facing > _FACING
-        seen &= depth < _read(nearest, pixels / _cell(size[0])) + _BEHIND
+        seen &= depth < read_images(nearest, pixels / _cell(size[0])) + _BEHIND
         found[side] = pixels, facing * seen
     return found
 
@@ -114,7 +114,7 @@ def _depth_image(places: Mapping[str, tuple[Tensor, Tensor]], size: torch.Size) 
     return -max_pool2d(-image.reshape(frames, 1, rows, columns), 3, 1, 1)[:, 0]
 
 
-def _read(images: Tensor, pixels: Tensor) -> Tensor:
+def read_images(images: Tensor, pixels: Tensor) -> Tensor:
     """(B, N) values of images (B, H, W) at (B, N, 2) places; 0 outside."""
     index, inside = _index(pixels, *images.shape[1:])
     return images.reshape(len(images), -1).gather(1, index) * inside

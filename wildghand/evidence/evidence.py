@@ -9,7 +9,7 @@ what the frames say, and the rest of the prior: no offset, and a disc that close
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -122,3 +122,13 @@ def weigh_evidence(shown: Mapping[str, Tensor], count: int, settings: EvidenceSe
         {side: shares(frames, settings.offset_share) for side, frames in shown.items()},
         {side: shares(frames, settings.shape_share) for side, frames in shown.items()},
     )
+
+
+def strengths(settings: EvidenceSettings) -> list[EvidenceSettings]:
+    """The strengths among which validation frames choose, the settings' own first.
+
+    The others are a quarter and four times of its `offset_share`, and no evidence at all.
+    """
+    share = settings.offset_share
+    others = [replace(settings, offset_share=factor * share) for factor in (0.25, 4.0)]
+    return [settings, *others, replace(settings, offset_share=0.0, shape_share=0.0)]

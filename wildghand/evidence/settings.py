@@ -20,3 +20,7 @@ class EvidenceSettings:
     #: Share of the training frames that must show a Gaussian until half of its shape and
     #: transparency is kept.
     shape_share: float = number(0.002, 0.0, 100.0)
+    #: After the last step, take a quarter or four times of `offset_share`, or no evidence at all,
+    #: where that draws the validation frames better. With fewer than four of these `offset_share`
+    #: holds.
+    validated: bool = True

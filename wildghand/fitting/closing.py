@@ -17,8 +17,8 @@ from wildghand.model.model import WildGHandModel
 
 #: Most weight masks of an avatar, spread evenly over the clip.
 MAX_MASKS = 100
-# Largest share of a budget that is kept for the light.
-_MOST = 0.5
+#: Largest share of a budget that is kept for the end of a fit.
+MOST_OF_BUDGET = 0.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,20 +55,17 @@ class LightFit:
         )
         return fit_light(samples, self.settings)
 
-    def seconds_for_steps(self, seconds: float) -> float:
-        """Return the part of a budget that is for steps: all but what the light will take.
+    def seconds(self) -> float:
+        """Return about how long `learn` takes.
 
-        The light of a few frames is fitted to see how long it takes. Nothing of the model changes.
-
-        Args:
-            seconds: of the whole fit.
+        The light of a few frames is fitted to see it. Nothing of the model changes.
         """
         if not self.settings.enabled:
-            return seconds
+            return 0.0
         self._timed(1)  # The first time takes longer than others.
         one, many = self._timed(1), min(len(self.frame_weights), CHUNK)
         each = max(0.0, self._timed(many) - one) / max(1, many - 1)
-        return seconds - min(one + each * (len(self.frame_weights) - 1), _MOST * seconds)
+        return one + each * (len(self.frame_weights) - 1)
 
     def _timed(self, frames: int) -> float:
         entered = time.perf_counter()

@@ -18,23 +18,25 @@ from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.evidence import shown_frames, weigh_evidence
-from wildghand.fitting.closing import LightFit, weight_masks
+from wildghand.fitting.averaging import StepAverage
+from wildghand.fitting.closing import MOST_OF_BUDGET, LightFit, weight_masks
+from wildghand.fitting.evidence_choice import EvidenceChoice
 from wildghand.fitting.hand_masks import hand_masks
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
+from wildghand.fitting.rates import make_optimizer, set_rates
 from wildghand.fitting.shared_features import SharedFeatures
 from wildghand.fitting.skin_places import skin_places
+from wildghand.fitting.start_colors import start_from_colors
 from wildghand.fitting.subject_shape import bent_templates, subject_of
 from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
-from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Loss, repeatable
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.training import TrainingClip, load_frames
 from wildghand.model.assemble import make_model
 from wildghand.model.model import RenderedFrames, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
-from wildghand.network import HandFeatures, parameter_groups
-from wildghand.pao.pao import PerturbationAwareWeights
+from wildghand.network import HandFeatures
 from wildghand.prior.files import choose_prior
 
 
@@ -89,14 +91,19 @@ class Fit:
             device,
             skin_places(training, self.frames, bent) if needs_places(settings) else (),
         )
+        count, shown = len(self.frames), {}
         if settings.evidence.enabled:
-            shown = shown_frames(
-                self.model.rigs, self.clip, self.weighting.visible, len(self.frames)
-            )
-            self.model.keep(weigh_evidence(shown, len(self.frames), settings.evidence))
+            shown = shown_frames(self.model.rigs, self.clip, self.weighting.visible, count)
+            self.model.keep(weigh_evidence(shown, count, settings.evidence))
+        if settings.start_colors:
+            start_from_colors(self.model, self.clip, self.frames, self.weighting)
+        self.choice = EvidenceChoice(self.model, training, settings, shown, count)
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal, device)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
+        self.average = StepAverage.of_optimizer(self.optimizer, settings.schedule.average_share)
+        #: Steps behind it.
+        self.steps = 0
         self.generator = torch.Generator().manual_seed(seed)
         self._record = FitRecord(
             frames=self.frames.indices.tolist(),
@@ -124,7 +131,7 @@ class Fit:
             UsageError: the processes cannot share the batch evenly.
             PeerLost: another process has ended.
         """
-        set_rates(self.optimizer, self.settings, fraction)
+        set_rates(self.optimizer, self.settings.schedule, fraction, self.steps)
         loss = self._loss(rows)
         mean = self.world.average_(loss.detach() + self.shared.value)
         known: Loss = float(mean) if self.device.type == "cpu" else mean
@@ -138,6 +145,7 @@ class Fit:
             self.world,
         )
         self.optimizer.take_step(waiting)
+        self.steps += 1
         return known
 
     def _loss(self, rows: torch.Tensor) -> torch.Tensor:
@@ -175,6 +183,8 @@ class Fit:
             "optimizer": self.optimizer.state_dict(),
             "generator": self.generator.get_state(),
             "shared": self.shared.state_dict(),
+            "average": self.average.state_dict(),
+            "steps": self.steps,
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
@@ -183,8 +193,10 @@ class Fit:
         self.weighting.load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
-        # States of before have none: their steps shared nothing.
+        # States of before have none of these: their steps shared nothing and were not averaged.
         self.shared.load_state_dict(state.get("shared", {"steps": 0}))
+        self.average.load_state_dict(state.get("average", {"steps": 0, "means": []}))
+        self.steps = int(state.get("steps", 0))
 
     def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
         """(B,) bool by side: which frames of a batch keep their biases in this step."""
@@ -228,6 +240,22 @@ class Fit:
         """The fit of the clip's light, which comes last."""
         weights = self.weighting.frame_weights
         return LightFit(self.model, self.clip, weights, self.settings.light, self.seed)
+
+    def seconds_for_steps(self, seconds: float) -> float:
+        """Return the part of a budget that is for steps: all but what `finish` will take.
+
+        Args:
+            seconds: of the whole fit.
+        """
+        needed = self.light.seconds() + self.choice.seconds()
+        return seconds - min(needed, MOST_OF_BUDGET * seconds)
+
+    def finish(self) -> None:
+        """Fit the light, and choose how strongly evidence acts; the last step is behind."""
+        for find in (self.light.learn, self.choice.best):
+            found = find()
+            if found is not None:
+                self.model.keep(found)
 
     def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
         """The avatar as it stands; it goes on changing with the fit.
@@ -317,40 +345,3 @@ def begin_temporal_weights(
     )
     temporal.begin(model.biases)
     return temporal
-
-
-def make_optimizer(
-    model: WildGHandModel, weights: PerturbationAwareWeights, settings: WildGHandSettings
-) -> ClippedAdam:
-    """Adam over everything that is fitted; each group keeps its first rate as `start`."""
-    rates = settings.schedule.rates
-    groups = {name: list(group) for name, group in parameter_groups(model.network).items()}
-    groups["dpd"] = list(model.perturbation.parameters())
-    groups["thresholds"] = list(weights.parameters())
-    groups["gains"] = [model.log_gains]
-    groups["pose"] = [model.pose_steps]
-    groups["transl"] = [model.transl_steps]
-    return ClippedAdam(
-        [
-            {
-                "params": group,
-                "lr": getattr(rates, name),
-                "start": getattr(rates, name),
-                "clipped": name != "thresholds",
-            }
-            for name, group in groups.items()
-            if group
-        ],
-        settings.schedule.clip_gradient,
-    )
-
-
-def set_rates(optimizer: ClippedAdam, settings: WildGHandSettings, fraction: float) -> None:
-    """Set the steps for a share of the budget that is used up."""
-    schedule = settings.schedule
-    if schedule.decay == "halving":
-        factor = 0.5 ** int(fraction * schedule.halvings)
-    else:
-        factor = schedule.final_rate**fraction
-    for group in optimizer.param_groups:
-        group["lr"] = group["start"] * factor

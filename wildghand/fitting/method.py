@@ -35,7 +35,8 @@ class WildGHandMethod:
 
     @denormals_flushed()
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> WildGHandAvatar:
-        """Fit an avatar to the training frames (the validation frames are not used).
+        """Fit an avatar to the training frames (validation frames only choose
+        how strongly evidence acts; see `wildghand.fitting.evidence_choice`).
 
         Args:
             training: what the method may see of the capture.

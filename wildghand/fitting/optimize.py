@@ -12,6 +12,7 @@ import torch
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Budget, Report
 from wildghand.avatar.avatar import WildGHandAvatar
+from wildghand.fitting.averaging import AveragedAvatar
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.parallel import World
 from wildghand.gaussians.fit_loop import Guard, Loss, batches, read_losses, repeatable, spent
@@ -66,8 +67,8 @@ def optimize(
         watch: looks at the fit after each step, and changes nothing of it.
 
     Returns:
-        The last state; the best one if the fit diverged later. Of several processes, rank 0's
-        has the record of the weights.
+        The mean of the last states; the best one if the fit diverged later. Of several processes,
+        rank 0's has the record of the weights.
 
     Raises:
         DidNotConverge: the fit diverged without ever having been better than its start.
@@ -79,9 +80,9 @@ def optimize(
         next(order)
     watchers = watchers or Watchers(settings.schedule.plateau_steps)
     step = start
-    report(step, fit.avatar(step))
+    report(step, AveragedAvatar(fit.avatar(step), fit.average))
     if budget.seconds is not None:
-        budget = dataclasses.replace(budget, seconds=fit.light.seconds_for_steps(budget.seconds))
+        budget = dataclasses.replace(budget, seconds=fit.seconds_for_steps(budget.seconds))
     with repeatable(fit.device):
         while step < steps:
             # All processes go by the clock of rank 0, or some would stop a step before the others.
@@ -94,7 +95,8 @@ def optimize(
                 break
             step += 1
             report.progress(step, steps)
-            report(step, fit.avatar(step))
+            fit.average.take()
+            report(step, AveragedAvatar(fit.avatar(step), fit.average))
             if after_step is not None:
                 after_step(step, watchers)
             if watch is not None:
@@ -105,15 +107,15 @@ def optimize(
                 break
         if not watchers.guard.sound():
             step = _go_back(fit, watchers, step)
-    light = fit.light.learn()
-    if light is not None:
-        fit.model.keep(light)
+    fit.average.put()
+    fit.finish()
     return fit.avatar(step, report.elapsed, final=world.is_main)
 
 
 def _go_back(fit: Fit, watchers: Watchers, step: int) -> int:
     """Bring a fit that diverged back to its best state; returns the steps behind that."""
     fit.model.load_state_dict(watchers.guard.best())
+    fit.average.forget()
     kept = watchers.guard.step
     _tell(fit.world, f"The fit diverged at step {step}; the state of step {kept} is kept.")
     return kept

@@ -11,6 +11,7 @@ from hwp_bench.hands.raster import draw_faces, mix_corners
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
 from wildghand.gaussians.attributes import CHANNELS, Activation, RawAttributes
 from wildghand.gaussians.bags import sum_bags
+from wildghand.gaussians.closed_surface import off_surface
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading_cpu import fill_harmonics
@@ -52,6 +53,7 @@ def _warm_up() -> None:
     gaussians, size = dress(anchors, prediction, Activation(), perturbation, torch.ones(1))
     assert size is not None
     (gaussians.means.sum() + size).backward()
+    off_surface(prediction.raw, Activation(), 1.0)
     first = zeros(1, dtype=torch.int64)
     sum_bags(zeros(1, 1), first, zeros(1), first)
     fill_harmonics(zeros(1, 3), 1, zeros(1, 3), 0)

@@ -109,6 +109,8 @@ class Weighting:
         places: ordinary errors by place; None where PAO does not count in them.
         tolerance: in [0, 1), how far a mismatch that all frames share lifts PAO's weights towards
             1: those of regions, and how much a frame teaches.
+        lifts: (R,) in [0, 1], how far the weights of each frame's regions are lifted: by the
+            tolerance, and by the probability that the frame is clean.
         pay_back: what the frames' biases explain; None where nothing follows from it.
     """
 
@@ -130,6 +132,7 @@ class Weighting:
         self.median: float | Tensor | None = None
         self._refine_pose = torch.zeros(count, dtype=torch.bool)
         self.tolerance = 0.0
+        self.lifts = torch.zeros(count)
         self._weighs_regions = pao.enabled and pao.variant != "binary"
         self._pixel_weights: Tensor | None = None
         self._regions: ClipRegions | None = None
@@ -259,8 +262,10 @@ class Weighting:
         if self.places is not None and self.median is not None:
             self.places.watch(rows, error, hands > 0.5, self.median)
         weights = found.weights[part]
-        if self.tolerance:
-            weights = torch.lerp(weights, hands[part].to(weights), self.tolerance)
+        lifts = self.lifts[rows[part]]
+        if bool((lifts > 0.0).any()):
+            share = upload(lifts, self.device)[:, None, None].to(weights)
+            weights = torch.lerp(weights, hands[part].to(weights), share)
         if self.settings.pao.variant == "scaled":
             weights = weights + self.settings.terms.outside_weight * (1.0 - hands[part])
         if self._pixel_weights is not None:
@@ -292,6 +297,8 @@ class Weighting:
             floor = self.settings.prepass.misplacement_floor
             shared = self.settings.pao.mismatch * assessment.shared_mismatch(floor)
             self.tolerance = shared**2 / (1.0 + shared**2)
+            spared = self.clean if self.settings.pao.spare_clean else torch.zeros_like(self.clean)
+            self.lifts = 1.0 - (1.0 - self.tolerance) * (1.0 - spared)
 
 
 def _mean_error(drawing: Tensor, image: Tensor) -> Tensor:

@@ -13,6 +13,7 @@ from torch import Tensor, relu, stack
 from torch.nn.functional import normalize
 
 from wildghand.gaussians.attributes import Activation, RawAttributes
+from wildghand.splat.threads import kernels_take
 
 # What costs nothing. Lengths in spacings of the anchors: how far a Gaussian reaches off the skin
 # (its distance and two standard deviations), how far it lies from its anchor along the skin, its
@@ -36,6 +37,11 @@ def off_surface(raw: RawAttributes, activation: Activation, spacing: float) -> T
         scalar: the sum of squares beyond what costs nothing, of lengths in spacings, of the log of
         a width, and of opacity.
     """
+    if kernels_take(*(tensor for _, tensor in raw.items())):
+        from wildghand.gaussians.closed_surface_cpu import OffSurfaceCpu
+
+        free = (_REACH, _SHIFT, math.log(_NARROW), _WIDE, _OPAQUE, _HOLE)
+        return OffSurfaceCpu.apply(raw.concatenate(), activation, spacing, free, _TINY)
     rows = _tangents(raw.quats)
     drawn = activation(raw)
     squares = (drawn.scales / spacing).square()

@@ -85,13 +85,44 @@ def load_frames(training: TrainingCapture) -> TrainingFrames:
         BadImage: an image is missing or damaged.
         BadInput: no frame is left.
     """
+    frames = _read_frames(training, training.train)
+    if not len(frames):
+        raise BadInput(
+            f"none of {len(training.train)} training frames has valid hand parameters and a mask",
+            where=training.root,
+            remedy="Check the capture with `hwp-bench data show`.",
+        )
+    return frames
+
+
+def load_validation_frames(training: TrainingCapture, most: int) -> TrainingFrames:
+    """Read validation frames that show a hand and whose parameters are valid.
+
+    Args:
+        training: what may be seen of the capture.
+        most: how many, evenly spread over those there are.
+
+    Returns:
+        The frames; there may be none. What is fitted too is left out.
+
+    Raises:
+        BadImage: an image is missing or damaged.
+    """
+    apart = np.setdiff1d(training.validation, training.train)
+    if len(apart) > most:
+        apart = apart[np.linspace(0, len(apart) - 1, most).round().astype(int)]
+    return _read_frames(training, apart)
+
+
+def _read_frames(training: TrainingCapture, numbers: np.ndarray) -> TrainingFrames:
+    """Read those of the frames that show a hand and whose parameters are valid."""
     valid = np.all([hand.valid for hand in training.hands.values()], axis=0)
     kept: list[int] = []
     # Filled frame by frame: a list of frames that is stacked in the end would hold all of them
     # twice. Memory of frames that are left out is never touched.
-    images = np.empty((len(training.train), training.height, training.width, 3), dtype=np.uint8)
-    masks = np.empty((len(training.train), training.height, training.width), dtype=np.uint8)
-    for frame in training.train.tolist():
+    images = np.empty((len(numbers), training.height, training.width, 3), dtype=np.uint8)
+    masks = np.empty((len(numbers), training.height, training.width), dtype=np.uint8)
+    for frame in numbers.tolist():
         if not valid[frame]:
             continue
         mask = training.mask(frame)
@@ -99,14 +130,8 @@ def load_frames(training: TrainingCapture) -> TrainingFrames:
             images[len(kept)] = training.frame(frame)
             masks[len(kept)] = mask
             kept.append(frame)
-    if not kept:
-        raise BadInput(
-            f"none of {len(training.train)} training frames has valid hand parameters and a mask",
-            where=training.root,
-            remedy="Check the capture with `hwp-bench data show`.",
-        )
     return TrainingFrames(
-        indices=np.array(kept),
+        indices=np.array(kept, dtype=np.int64),
         images=torch.from_numpy(images[: len(kept)]),
         masks=torch.from_numpy(masks[: len(kept)]),
     )

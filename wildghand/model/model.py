@@ -82,6 +82,7 @@ class WildGHandModel(nn.Module):
 
     Attributes:
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
+        evidence: by which free poses are drawn; None: as they were learnt.
         pose_steps: (S, R, 16, 3) rad, added to the given poses of the hands in order.
         transl_steps: (S, R, 3) m, added to the given translations.
     """
@@ -100,7 +101,7 @@ class WildGHandModel(nn.Module):
         super().__init__()
         self._template = template
         self._light: KnownLight | None = None
-        self._evidence: Evidence | None = None
+        self.evidence: Evidence | None = None
         self.rigs = dict(rigs)
         self.network = network
         self.perturbation = nn.ModuleDict(
@@ -127,7 +128,7 @@ class WildGHandModel(nn.Module):
             self._light = KnownLight.from_tensors(dict(self.named_buffers()), "light")
         if isinstance(found, Evidence):
             counts = {side: len(rig) for side, rig in self.rigs.items()}
-            self._evidence = Evidence.from_tensors(dict(self.named_buffers()), counts, "evidence")
+            self.evidence = Evidence.from_tensors(dict(self.named_buffers()), counts, "evidence")
 
     def finite(self) -> bool:
         """Whether every fitted number is finite."""
@@ -237,6 +238,7 @@ class WildGHandModel(nn.Module):
         height: int,
         *,
         refine: bool = False,
+        features: Mapping[str, HandFeatures] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Draw hands in any pose, free of what perturbed the training frames.
 
@@ -246,12 +248,19 @@ class WildGHandModel(nn.Module):
             Ks: (B, 3, 3) px.
             width, height: px.
             refine: apply the network's refinement of the parameters (head iv).
+            features: of the network by side, where they are at hand already.
 
         Returns:
             (B, H, W, 3) sRGB over black and (B, H, W, 1) coverage.
         """
         parts = [
-            self.gaussians(side, *hands[side], refine=refine, viewmats=viewmats)
+            self.gaussians(
+                side,
+                *hands[side],
+                refine=refine,
+                viewmats=viewmats,
+                features=None if features is None else features[side],
+            )
             for side in self.rigs
             if side in hands
         ]
@@ -267,6 +276,7 @@ class WildGHandModel(nn.Module):
         refine: bool = False,
         viewmats: Tensor | None = None,
         rows: Tensor | None = None,
+        features: HandFeatures | None = None,
     ) -> Gaussians:
         """The Gaussians of one hand in any pose, free of perturbations unless frames are named.
 
@@ -279,21 +289,23 @@ class WildGHandModel(nn.Module):
             viewmats: (B, 4, 4) of the cameras that look at them; with these, skin that faces them
                 with a normal that no training frame has shown is drawn by the fitted light.
             rows: (B,) positions among the training frames, whose biases and gains are added.
+            features: of the network, where they are at hand already.
         """
         rig = self.rigs[side]
         anchors = rig.pose(pose, betas, transl)
-        prediction = self.predict(side, anchors, pose)
+        features = self.network.features(side) if features is None else features
+        prediction = self.predict(side, anchors, pose, features)
         if self._light is not None and viewmats is not None:
             prediction = relit(
                 prediction,
                 self._light,
-                lambda normals: self.network(side, normals, pose),
+                lambda normals: self.network(side, normals, pose, features),
                 anchors,
                 viewmats,
             )
-        if self._evidence is not None:
+        if self.evidence is not None:
             bias = self.network.activation.log_scale_bias
-            settled = self._evidence.settle(side, prediction.raw, rig.spacing, bias)
+            settled = self.evidence.settle(side, prediction.raw, rig.spacing, bias)
             prediction = replace(prediction, raw=settled)
         if refine:
             step = prediction.refinement

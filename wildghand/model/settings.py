@@ -83,9 +83,15 @@ class ScheduleSettings:
     #: `geometric`: rates fall smoothly to `final_rate`; `halving`: by half, `halvings` times.
     decay: str = choice("geometric", "halving")
     #: Rates at the end of the budget, as a share of those at its start.
-    final_rate: float = number(0.05, 1e-6, 1.0)
+    final_rate: float = number(0.3, 1e-6, 1.0)
     #: How often `halving` halves.
     halvings: int = number(10, 0, 100)
+    #: After t steps, rates are also divided by sqrt(1 + t / root_steps); 0: they are not. A long
+    #: fit ends with lower rates than a short one.
+    root_steps: float = number(200.0, 0.0, 1e7)
+    #: The fit ends with a mean of its steps, nearly all of it from this share of them, the last
+    #: ones; 0: with the last step.
+    average_share: float = number(0.1, 0.0, 1.0)
     #: Most training frames for each second of a budget in seconds, evenly spread; 0: all. Every
     #: frame is judged before the first step, at a cost.
     frames_per_second: float = number(4.0, 0.0, 1e6)
@@ -103,6 +109,9 @@ class WildGHandSettings:
     #: it is of the fit's network and hand model. Empty: random weights. Else a folder made by
     #: `wildghand pretrain`; a relative path is one within this package.
     prior: str = "shipped"
+    #: Addition: where the frames show a tint that is far from the prior's, the fit starts from
+    #: theirs.
+    start_colors: bool = True
     #: Gaussians on each hand.
     gaussians: int = number(12_337, 1, 1_000_000)
     #: `auto` (CUDA where both a GPU and gsplat are there), `cpu` or `cuda`.
@@ -153,7 +162,9 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
             "beta": PAPER_PAO.beta,
             "error_threshold": PAPER_PAO.error_threshold,
             "share_threshold": PAPER_PAO.share_threshold,
+            "spare_clean": False,
         },
+        "start_colors": False,
         "subject": {"enabled": False},
         "light": {"enabled": False},
         "evidence": {"enabled": False},
@@ -162,6 +173,8 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
             "batch": 4,
             "texture_every": 1,
             "decay": "halving",
+            "root_steps": 0.0,
+            "average_share": 0.0,
             "rates": {"dpd": 1e-4},
         },
         "terms": {
@@ -202,11 +215,14 @@ _PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
 #: What settings that came later were before there were any.
 _BEFORE: Mapping[str, Any] = MappingProxyType(
     {
+        "start_colors": False,
         "dpd": {"rank": 0},
-        "pao": {"errors": "median", "mismatch": 0.0},
+        "pao": {"errors": "median", "mismatch": 0.0, "spare_clean": False},
         "subject": {"enabled": False},
         "light": {"enabled": False},
-        "evidence": {"enabled": False},
+        "evidence": {"enabled": False, "validated": False},
+        "prepass": {"clean_scale": 1.0},
+        "schedule": {"root_steps": 0.0, "average_share": 0.0},
         "terms": {"surface": 0.0, "leave_hidden": False},
     }
 )

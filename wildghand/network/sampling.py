@@ -52,6 +52,10 @@ class FixedGather(nn.Module):
             for name, tensor in tables.items():
                 self.register_buffer(prefix + name, tensor.contiguous(), persistent=False)
 
+    def transposed(self, values: Tensor) -> Tensor:
+        """(outputs, C) to (inputs, C): what each row gave is added up there; no gradient."""
+        return _sum_bags(values, self.back_index, self.back_weight, self.back_start)
+
     def forward(self, values: Tensor) -> Tensor:
         """(inputs, C) to (outputs, C)."""
         return _Gather.apply(

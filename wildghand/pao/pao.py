@@ -49,6 +49,10 @@ class PaoSettings:
     #: 1 (`wildghand.prepass.FrameAssessment.shared_mismatch`); 0: not at all. Read with
     #: `errors` "place".
     mismatch: float = 1.0
+    #: Lift the weights of a frame's regions towards 1 by the probability that the frame is clean,
+    #: as the pre-pass judges: a large error there is a fault of the fit. Read with `errors`
+    #: "place".
+    spare_clean: bool = True
     #: Factor of every region's weight.
     alpha: float = 1.0
     #: How strongly the temporal weight of a frame lowers its weight; 0 = not at all.

@@ -81,7 +81,7 @@ def _judge(given: PrepassInput, settings: PrepassSettings) -> FrameAssessment:
     verdict = Verdict(judged.clean[usable], model.gains)
     model = fit_intensity(survey.samples, cell_normals, settings, verdict)
     measured = _measured(given, survey, model, drawn)
-    weights = weigh_pixels(given.masks, measured, judged.clean, len(cell_normals), settings)
+    weights = weigh_pixels(given.masks, measured, judged.clean, model.known, settings)
     return replace(judged, pixel_weights=weights)
 
 

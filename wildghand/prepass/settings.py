@@ -54,6 +54,9 @@ class PrepassSettings:
     #: Distance of a pixel's tint from the skin's, in those of the clean frames at the same place,
     #: at which its weight has halved.
     tint_scale: float = 4.0
+    #: Factor on both scales in a frame that is surely clean. Little can cover the hand there, and
+    #: what looks odd (nails, rings, seams of a glove a little off their place) belongs to it.
+    clean_scale: float = 4.0
     #: Pixels that what is normal in the clean frames is worth in what is normal at a place.
     residual_prior: float = 20.0
     #: Fewer usable frames than this cannot be compared: all are judged clean.

@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
+from wildghand.prepass.assessment import CLEAN_FROM
 from wildghand.prepass.measurements import FrameMeasurements
 from wildghand.prepass.robust_location import normal_value
 from wildghand.prepass.settings import PrepassSettings
@@ -23,27 +24,29 @@ def weigh_pixels(
     masks: np.ndarray,
     measured: Mapping[int, FrameMeasurements],
     clean: np.ndarray,
-    cell_count: int,
+    known: np.ndarray,
     settings: PrepassSettings,
 ) -> np.ndarray:
     """Weigh the pixels of all frames.
 
     Two factors are multiplied. The residual under the intensity model measures whether the place
     looks as in other frames. If only perturbed frames show a place, the model has learnt the
-    object that covers it; the tint measures, for every place, whether the pixel is skin.
+    object that covers it; the tint measures, for every place, whether the pixel is skin. In a frame
+    that is surely clean more is allowed (`PrepassSettings.clean_scale`).
 
     Args:
         masks: (R, H, W) uint8, 255 = visible hand.
         measured: by row; rows that are missing cannot be used. Not empty.
         clean: (R,) probability that nothing perturbs a frame.
-        cell_count: number of cells of the surface.
+        known: (C,) bool, the cells of the surface that clean frames from different parts of the
+            clip show.
         settings: how far off halves a weight.
 
     Returns:
         (R, H, W) uint8, 255 = full weight; 255 also outside silhouette and mask, where there is
         nothing to judge by.
     """
-    found = list(measured.values())
+    found, cell_count = list(measured.values()), len(known)
     cells = [one.cells for one in found]
     trusts = clean[list(measured)].tolist()
     residuals = [one.residual for one in found]
@@ -66,12 +69,19 @@ def weigh_pixels(
         seen = masks[row].reshape(-1) / 255.0
         weight = np.ones(seen.size)
         shared = _shared(one.residual, one.pixels, masks[row].shape)
+        allowed = 1.0 + (settings.clean_scale - 1.0) * _sureness(clean[row])
+        # An object that stays for one episode passes for clean where no other frame shows the hand:
+        # there a residual is allowed to the pixels alone that have the colour of the hand.
+        safe = _amid(known[one.cells], one.pixels, masks[row].shape)
+        half_tint = settings.tint_scale * normal_tint[one.cells]
+        tinted = _fit(one.tint, np.where(safe, allowed, 1.0) * half_tint)
+        spared = 1.0 + (allowed - 1.0) * tinted
         weight[one.pixels] = (
-            _fit(shared, settings.residual_scale * normal[one.cells])
-            * _fit(one.tint, settings.tint_scale * normal_tint[one.cells])
+            _fit(shared, spared * settings.residual_scale * normal[one.cells])
+            * tinted
             * (_UNMASKED + (1.0 - _UNMASKED) * seen[one.pixels])
         )
-        weight[one.beyond] = _fit(one.tint_beyond, settings.tint_scale * tint_level)
+        weight[one.beyond] = _fit(one.tint_beyond, allowed * settings.tint_scale * tint_level)
         weights[row] = np.round(255.0 * weight).reshape(masks[row].shape)
     return weights
 
@@ -141,6 +151,11 @@ def geometric_normals(
     return (level * np.exp(sums / mass)).astype(np.float32)
 
 
+def _sureness(clean: float) -> float:
+    """In [0, 1], how sure it is that a frame is clean; 0 where it is as likely perturbed."""
+    return max(0.0, (clean - CLEAN_FROM) / (1.0 - CLEAN_FROM))
+
+
 def _shared(residual: np.ndarray, pixels: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
     """(P,) half of each pixel's own residual and half the mean of its surroundings."""
     planes = np.zeros((size[0] * size[1], 2), dtype=np.float32)
@@ -149,6 +164,15 @@ def _shared(residual: np.ndarray, pixels: np.ndarray, size: tuple[int, ...]) -> 
     around = cv2.blur(planes.reshape(*size, 2), (_WINDOW, _WINDOW)).reshape(-1, 2)[pixels]
     mean: np.ndarray = around[:, 0] / np.maximum(around[:, 1], 1e-6)
     return 0.5 * residual + 0.5 * mean
+
+
+def _amid(known: np.ndarray, pixels: np.ndarray, size: tuple[int, ...]) -> np.ndarray:
+    """(P,) bool: the pixel's place is known, and so are those around it."""
+    unknown = np.zeros(size, dtype=np.uint8)
+    unknown.reshape(-1)[pixels] = ~known
+    near = cv2.dilate(unknown, np.ones((_WINDOW, _WINDOW), dtype=np.uint8))
+    found: np.ndarray = near.reshape(-1)[pixels] == 0
+    return found
 
 
 def _fit(distance: np.ndarray, half: np.ndarray | float) -> np.ndarray:

@@ -11,8 +11,9 @@ from torch import Tensor
 
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fitting.fit import Fit, make_optimizer
+from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Watchers
+from wildghand.fitting.rates import make_optimizer
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Loss, batches
 from wildghand.model.settings import WildGHandSettings
@@ -47,8 +48,9 @@ class JointFit:
         seed: int,
         device: torch.device,
     ) -> None:
-        # Between two steps on a capture others move the texture branch, which they share.
-        schedule = dataclasses.replace(settings.schedule, texture_every=1)
+        # Between two steps on a capture others move the texture branch, which they share. Its last
+        # steps are thousands, at low rates: nothing is gained by their mean.
+        schedule = dataclasses.replace(settings.schedule, texture_every=1, average_share=0.0)
         settings = dataclasses.replace(settings, schedule=schedule)
         self.settings = settings
         self.device = device
@@ -115,6 +117,7 @@ class JointFit:
             "models": self._tensors(),
             "weightings": [fit.weighting.state_dict() for fit in self.fits],
             "generators": [fit.generator.get_state() for fit in self.fits],
+            "steps": [fit.steps for fit in self.fits],
             "optimizer": self.optimizer.state_dict(),
         }
 
@@ -125,6 +128,9 @@ class JointFit:
         for fit, weighting, generator in parts:
             fit.weighting.load_state_dict(weighting)
             fit.generator.set_state(generator.cpu())
+        # States of before have none: their rates did not depend on them.
+        for fit, steps in zip(self.fits, state.get("steps", [0] * len(self.fits)), strict=True):
+            fit.steps = int(steps)
         self.optimizer.load_state_dict(state["optimizer"])
 
     def _next(self) -> tuple[int, Tensor]:

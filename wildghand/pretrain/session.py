@@ -25,6 +25,13 @@ from wildghand.prior.files import save_prior
 from wildghand.prior.prior import Prior
 from wildghand.splat.threads import denormals_flushed
 
+# Thousands of steps end with low rates, as those of the shipped prior did.
+_RATES = {
+    "schedule.final_rate": 0.05,
+    "schedule.root_steps": 0.0,
+    "schedule.average_share": 0.0,
+}
+
 
 @denormals_flushed()
 def pretrain(
@@ -45,7 +52,7 @@ def pretrain(
         sources: capture folders, one for each subject; all their frames are used.
         out: the folder to make.
         settings: overrides of the defaults of a fit; it starts from random weights unless they
-            name a prior.
+            name a prior, and its rates fall to a twentieth.
         steps: optimizer steps over all captures; None: the settings' number for each capture.
         seed: of everything random.
         overwrite: replace a prior that is there.
@@ -59,8 +66,8 @@ def pretrain(
     """
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
-    # A new prior does not start from the one that ships, unless that is asked for.
-    settings = {"prior": "", **settings}
+    # A new prior starts from neither the one that ships nor one person's colours, unless asked to.
+    settings = {"prior": "", "start_colors": False, **_RATES, **settings}
     chosen = read_settings(settings)
     captures = [open_capture(source) for source in sources]
     _check_captures(captures)

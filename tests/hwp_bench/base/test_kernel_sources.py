@@ -50,6 +50,7 @@ def test_a_name_that_is_no_module_stands_in_the_package(root: Path) -> None:
         ("wildghand.splat.kernels.blend", "wildghand.splat.kernels.simd"),
         ("wildghand.gaussians.photometric_kernels", "wildghand.splat.kernels.simd"),
         ("wildghand.gaussians.adam_kernels", None),
+        ("wildghand.gaussians.closed_surface_kernels", "wildghand.splat.kernels.jobs"),
         ("wildghand.gaussians.posing_kernels", "wildghand.splat.kernels.jobs"),
         ("wildghand.gaussians.row_kernels", "wildghand.splat.kernels.jobs"),
         ("wildghand.model.dress_kernels", "wildghand.splat.kernels.jobs"),

@@ -19,8 +19,9 @@ from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fitting.fit import Fit, make_optimizer
+from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Plateau
+from wildghand.fitting.rates import make_optimizer
 from wildghand.fitting.skin_places import skin_places
 from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
 from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, ready_device

@@ -23,6 +23,8 @@ QUICK: dict[str, Any] = {
     "network.plane_resolution": 12,
     "device": "cpu",
 }
+#: What the pre-pass leads PAO to spare is off.
+STRICT: dict[str, Any] = {"pao.mismatch": 0.0, "pao.spare_clean": False}
 ROWS = torch.tensor([0, 3])
 TrainingMaker = Callable[..., TrainingCapture]
 
@@ -32,7 +34,7 @@ def fit_of(training: TrainingCapture, **changes: Any) -> Fit:
 
 
 def test_frames_teach_by_their_temporal_weights(make_training: TrainingMaker) -> None:
-    fit = fit_of(make_training(), **{"pao.mismatch": 0.0})
+    fit = fit_of(make_training(), **STRICT)
     omega = torch.tensor([0.0, -0.2])
     shares = fit.weighting.shares(ROWS, omega)
     np.testing.assert_allclose(shares, [1.0, 1.0 / (1.0 + 100.0 * 0.2)], rtol=1e-6)
@@ -106,7 +108,7 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
 ) -> None:
     training = make_training()
     fit, bare = (
-        fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on, "pao.mismatch": 0.0})
+        fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on, **STRICT})
         for on in (True, False)
     )
     templates = {side: training.template(side) for side in training.sides}
@@ -118,6 +120,26 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
     weights, whole = fit.weighting(ROWS, drawing).weights, bare.weighting(ROWS, drawing).weights
     expected = whole * torch.from_numpy(assessment.pixel_weights[ROWS.numpy()]).float() / 255.0
     torch.testing.assert_close(weights.detach(), expected.detach(), rtol=1e-5, atol=1e-6)
+
+
+def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(
+    make_training: TrainingMaker,
+) -> None:
+    # Oracle: w + c (1 - w) on the weights of regions, from those of the fit that spares nothing.
+    training = make_training()
+    spares, strict = (
+        fit_of(training, **{"pao.mismatch": 0.0, "pao.spare_clean": on}) for on in (True, False)
+    )
+    clean = spares.weighting.clean[ROWS]
+    assert (clean > 0.0).all()
+    drawing = spares.draw(ROWS)
+    found = spares.weighting(ROWS, drawing)
+    lower = strict.weighting(ROWS, drawing).weights
+    outside = spares.settings.terms.outside_weight * (1.0 - found.hand)
+    pixels = spares.weighting._uncovered(ROWS)
+    regions = lower - outside * pixels
+    expected = lower + clean[:, None, None] * (found.hand * pixels - regions)
+    torch.testing.assert_close(found.weights, expected, rtol=1e-5, atol=1e-6)
 
 
 def test_regions_that_are_drawn_badly_count_less(make_training: TrainingMaker) -> None:

@@ -104,6 +104,30 @@ def test_covered_pixels_lose_their_weight(lit_frames: Lit) -> None:
     assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
 
 
+def test_what_looks_odd_in_a_clean_frame_keeps_its_weight(lit_frames: Lit) -> None:
+    """A spot of another brightness, as a nail has that is a little off its place."""
+    linear, masks = lit_frames
+    linear, spot = linear.copy(), np.zeros_like(masks)
+    for frame in (*HIT.tolist(), int(SPARED[2])):
+        rows, columns = np.nonzero(masks[frame])
+        middle = np.median(rows).astype(int), np.median(columns).astype(int)
+        spot[frame, middle[0] - 1 : middle[0] + 2, middle[1] - 1 : middle[1] + 2] = True
+    spot &= masks
+    linear[spot] *= 1.4
+    linear[HIT] *= 0.3  # the light changes: these frames are not clean
+    given = as_input(developed(linear), masks)
+    judgement = judge_frames(given)
+    strict = judge_frames(given, PrepassSettings(clean_scale=1.0))
+    np.testing.assert_array_equal(judgement.clean, strict.clean)
+    assert (judgement.clean[HIT] < 0.5).all()
+    frame = SPARED[2]
+    assert judgement.clean[frame] > 0.8
+    mean = [one.pixel_weights[frame][spot[frame]].mean() / 255 for one in (judgement, strict)]
+    assert mean[0] > 0.8, mean
+    assert mean[1] < 0.3, mean
+    np.testing.assert_array_equal(judgement.pixel_weights[HIT], strict.pixel_weights[HIT])
+
+
 def test_an_object_where_no_clean_frame_shows_the_hand_is_not_learnt_as_skin(
     lit_frames: Lit,
 ) -> None:

@@ -1,0 +1,161 @@
+"""The choice of the evidence's strength. Oracles: the avatar's own pictures, drawings as truth."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hwp_bench.capture.splits import Split
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.avatar.files import load_avatar, save_avatar
+from wildghand.evidence import EvidenceSettings, strengths, weigh_evidence
+from wildghand.fitting.evidence_choice import LEAST, EvidenceChoice
+from wildghand.fitting.fit import Fit
+from wildghand.gaussians.training import load_validation_frames
+from wildghand.model.settings import read_settings
+
+QUICK: dict[str, Any] = {
+    "gaussians": 300,
+    "prior": "",
+    "network.identity_resolution": 24,
+    "network.plane_resolution": 12,
+    "prepass.enabled": False,
+    "subject.enabled": False,
+    "light.enabled": False,
+    "device": "cpu",
+}
+TrainingMaker = Callable[..., TrainingCapture]
+
+
+def begun(training: TrainingCapture, **changes: Any) -> Fit:
+    """A fit whose Gaussians stand off the skin, as chance wills."""
+    fit = Fit(training, read_settings({**QUICK, **changes}), 0, torch.device("cpu"))
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for value in fit.model.network.parameters():
+            value.add_(0.1 * torch.randn(value.shape, generator=generator))
+    return fit
+
+
+@pytest.fixture
+def training(make_training: TrainingMaker) -> TrainingCapture:
+    """Six of the painted frames are for validation."""
+    made = make_training()
+    first, last = made.split.test[[0, -1]].tolist()
+    made.split = Split(made.id, last + 1, (0, first - 6), (first - 6, first), (first, last + 1))
+    made._train = made.split.train
+    return made
+
+
+def drawn_with(fit: Fit, training: TrainingCapture, index: int) -> np.ndarray:
+    """(F, H, W, 3) validation frames as the avatar draws them with one of the strengths."""
+    chosen = strengths(fit.settings.evidence)[index]
+    before = fit.model.evidence
+    fit.model.evidence = weigh_evidence(fit.choice.shown, len(fit.frames), chosen)
+    avatar = fit.avatar(0)
+    images = [
+        avatar.render(training.hand_poses(frame), training.camera(frame))[..., :3]
+        for frame in training.validation.tolist()
+    ]
+    fit.model.evidence = before
+    return np.clip(np.stack(images), 0.0, 1.0)
+
+
+def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> None:
+    fit = begun(training)
+    frames = fit.choice.frames
+    assert frames is not None
+    hand = frames.masks.numpy()[..., None] / 255.0
+    truth = frames.images.numpy() / 255.0
+    for index, settings in enumerate(strengths(fit.settings.evidence)):
+        off = (drawn_with(fit, training, index) - truth) ** 2 * hand
+        expected = off.sum() / hand.sum() / 3.0
+        found = fit.choice.error(weigh_evidence(fit.choice.shown, len(fit.frames), settings))
+        assert found == pytest.approx(expected, rel=1e-4)
+
+
+@pytest.mark.parametrize("index", range(4))
+def test_the_strength_that_draws_the_frames_best_is_chosen(
+    index: int, training: TrainingCapture
+) -> None:
+    fit = begun(training)
+    frames = fit.choice.frames
+    assert frames is not None
+    images = torch.from_numpy((255.0 * drawn_with(fit, training, index)).round().astype(np.uint8))
+    truth = dataclasses.replace(frames, images=images)
+    choice = EvidenceChoice(fit.model, training, fit.settings, fit.choice.shown, len(fit.frames))
+    choice.__dict__["frames"] = truth
+    found = choice.best()
+    if index == 0:  # the model has it already
+        assert found is None
+        return
+    assert found is not None
+    chosen = strengths(fit.settings.evidence)[index]
+    expected = weigh_evidence(fit.choice.shown, len(fit.frames), chosen).to_tensors()
+    for name, shares in found.to_tensors().items():
+        assert torch.equal(shares, expected[name])
+
+
+def test_strengths_are_around_the_settings_own() -> None:
+    own = EvidenceSettings(offset_share=0.2)
+    shares = [(one.offset_share, one.shape_share) for one in strengths(own)]
+    assert shares == [(0.2, 0.002), (0.05, 0.002), (0.8, 0.002), (0.0, 0.0)]
+
+
+def test_looking_changes_nothing_and_finishing_keeps_the_best(
+    training: TrainingCapture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = begun(training)
+    before = {name: value.clone() for name, value in fit.model.state_dict().items()}
+    assert fit.choice.seconds() > 0.0
+    fit.choice.best()
+    assert all(torch.equal(value, before[name]) for name, value in fit.model.state_dict().items())
+    # No evidence at all is made to be the best.
+    kept = weigh_evidence(fit.choice.shown, len(fit.frames), strengths(fit.settings.evidence)[3])
+    monkeypatch.setattr(EvidenceChoice, "best", lambda choice: kept)
+    fit.finish()
+    frame = int(training.validation[0])
+    where = training.hand_poses(frame), training.camera(frame)
+    drawn = fit.avatar(0).render(*where)
+    fit.model.evidence = None
+    np.testing.assert_allclose(fit.avatar(0).render(*where), drawn, atol=1e-5)
+    again = load_avatar(save_avatar(fit.avatar(0), tmp_path / "avatar"))
+    np.testing.assert_allclose(again.render(*where), drawn, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "changes", [{"evidence.validated": False}, {"evidence.enabled": False}, {"mode": "paper"}]
+)
+def test_nothing_is_chosen_where_it_is_off(
+    changes: dict[str, Any], training: TrainingCapture
+) -> None:
+    fit = begun(training, **changes)
+    assert fit.choice.frames is None
+    assert fit.choice.best() is None
+    assert fit.choice.seconds() == 0.0
+
+
+def test_a_frame_or_two_do_not_judge(training: TrainingCapture) -> None:
+    first, last = training.targets[[0, -1]].tolist()
+    few = first - LEAST + 1
+    training.split = Split(training.id, last + 1, (0, few), (few, first), (first, last + 1))
+    training._train = training.split.train
+    assert begun(training).choice.frames is None
+
+
+def test_validation_frames_are_spread_and_never_fitted_ones(training: TrainingCapture) -> None:
+    first, last = training.validation[[0, -1]].tolist()
+    assert load_validation_frames(training, 2).indices.tolist() == [first, last]
+    training._train = np.sort(np.append(training.train, first))
+    assert first not in load_validation_frames(training, 100).indices
+    hand = training.hands["right"]
+    valid = hand.valid.copy()
+    valid[last] = False
+    training.hands = {"right": dataclasses.replace(hand, valid=valid)}
+    assert last not in load_validation_frames(training, 100).indices
