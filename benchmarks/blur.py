@@ -15,10 +15,11 @@ from functools import partial
 import numpy as np
 
 from benchmarks.simulation import SPREAD, Kind, frames_of
+from hwp_bench.base.embree import EmbreeMesh, library
+from hwp_bench.base.ray_mesh import EmbreexMesh
 from hwp_bench.metrics.psnr_ssim import decibels
 from hwp_bench.sim.effects.plan import hands_at, plan
-from hwp_bench.sim.geometry.embree import EmbreeMesh, library
-from hwp_bench.sim.geometry.raycast import EmbreexMesh, RenderCost
+from hwp_bench.sim.geometry.raycast import RenderCost
 from hwp_bench.sim.render.frame import carry_out, render_frame
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.optics import intrinsics, pixel_rays, viewmat

@@ -234,9 +234,11 @@ class WildGHandAvatar(HandAvatar):
         Raises:
             UsageError: no hand, or one that was not fitted.
         """
+        refine, posed = self.settings.heads.refinement, self.posed(hands)
+        dark = self.model.cast(posed)
         parts = [
-            self.model.gaussians(side, *given, refine=self.settings.heads.refinement)
-            for side, given in self.posed(hands).items()
+            self.model.gaussians(side, *given, refine=refine, dark=dark.get(side))
+            for side, given in posed.items()
         ]
 
         def array(tensors: list[torch.Tensor], fields: int) -> np.ndarray:

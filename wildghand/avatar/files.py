@@ -25,10 +25,11 @@ from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.avatar.tensors import read_tensors
 from wildghand.avatar.weight_masks import read_weight_masks, write_weight_masks
-from wildghand.evidence import Evidence
+from wildghand.evidence import Evidence, OtherHand
 from wildghand.light import KnownLight
 from wildghand.model.assemble import make_model
 from wildghand.model.settings import read_stored, read_version_1
+from wildghand.shadows import CastLight
 from wildghand.subject import SubjectShape
 
 #: Version of the folder.
@@ -136,12 +137,16 @@ def load_avatar(
             templates, settings, mean_color, frame_count, value.seed, device, subject
         )
         light = KnownLight.from_tensors(tensors, str(file))
-        if light is not None:
-            model.keep(light)
+        cast = CastLight.from_tensors(tensors, str(file))
+        for found in (light, cast):
+            if found is not None:
+                model.keep(found)
         counts = {side: len(rig) for side, rig in model.rigs.items()}
         evidence = Evidence.from_tensors(tensors, counts, str(file))
-        if evidence is not None:
-            model.keep(evidence)
+        borrowed = OtherHand.from_tensors(tensors, counts, str(file))
+        for kept in (evidence, borrowed):
+            if kept is not None:
+                model.keep(kept)
         model.load_state_dict(tensors, strict=True)
     except RuntimeError as error:
         problem = str(error).splitlines()[0][:300]

@@ -2,6 +2,14 @@
 
 from wildghand.evidence.count import shown_frames
 from wildghand.evidence.evidence import Evidence, strengths, weigh_evidence
+from wildghand.evidence.other_hand import OtherHand
 from wildghand.evidence.settings import EvidenceSettings
 
-__all__ = ["Evidence", "EvidenceSettings", "shown_frames", "strengths", "weigh_evidence"]
+__all__ = [
+    "Evidence",
+    "EvidenceSettings",
+    "OtherHand",
+    "shown_frames",
+    "strengths",
+    "weigh_evidence",
+]

@@ -17,6 +17,7 @@ from torch import Tensor
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.evidence import Evidence, EvidenceSettings, strengths, weigh_evidence
+from wildghand.fitting.cast_shadows import Dark, shadows_in
 from wildghand.gaussians.training import TrainingClip, TrainingFrames, load_validation_frames
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
@@ -117,6 +118,10 @@ class EvidenceChoice:
         device = self.model.log_gains.device
         return TrainingClip(self.training, self.frames.indices, self.model.rigs, device, 0)
 
+    @functools.cached_property
+    def _dark(self) -> Dark:
+        return shadows_in(self.model, self._clip)
+
     def _truth(self, row: int) -> tuple[Tensor, Tensor]:
         """(H, W, 3) image and (H, W) coverage of the hand in a validation frame."""
         assert self.frames is not None
@@ -139,6 +144,12 @@ class EvidenceChoice:
         size = self.training.width, self.training.height
         refine = self.settings.heads.refinement
         image, _ = self.model.draw(
-            hands, clip.viewmats[here], clip.Ks[here], *size, refine=refine, features=features
+            hands,
+            clip.viewmats[here],
+            clip.Ks[here],
+            *size,
+            refine=refine,
+            features=features,
+            dark=self._dark(torch.tensor([row])),
         )
         return image[0]

@@ -19,6 +19,8 @@ from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.evidence import shown_frames, weigh_evidence
 from wildghand.fitting.averaging import StepAverage
+from wildghand.fitting.borrowed_colors import BorrowedColors
+from wildghand.fitting.cast_shadows import cast_shadows, shadows_in
 from wildghand.fitting.closing import MOST_OF_BUDGET, LightFit, weight_masks
 from wildghand.fitting.evidence_choice import EvidenceChoice
 from wildghand.fitting.hand_masks import hand_masks
@@ -34,7 +36,8 @@ from wildghand.gaussians.fit_loop import Loss, repeatable
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.training import TrainingClip, load_frames
 from wildghand.model.assemble import make_model
-from wildghand.model.model import RenderedFrames, WildGHandModel
+from wildghand.model.model import WildGHandModel
+from wildghand.model.rendered import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import HandFeatures
 from wildghand.prior.files import choose_prior
@@ -95,8 +98,13 @@ class Fit:
         if settings.evidence.enabled:
             shown = shown_frames(self.model.rigs, self.clip, self.weighting.visible, count)
             self.model.keep(weigh_evidence(shown, count, settings.evidence))
+        cast_shadows(self.model, self.clip, self.frames, self.weighting, settings.shadows, seed)
+        #: The shadows in the training frames.
+        self.dark = shadows_in(self.model, self.clip)
         if settings.start_colors:
             start_from_colors(self.model, self.clip, self.frames, self.weighting)
+        #: The colours that one of two hands takes from the other, which come last.
+        self.borrowed = BorrowedColors.of(self.model, self.clip, self.weighting, settings.evidence)
         self.choice = EvidenceChoice(self.model, training, settings, shown, count)
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal, device)
@@ -233,6 +241,7 @@ class Fit:
                 move=self.weighting.moves(rows) if move is None else move,
                 refine=self.settings.heads.refinement,
                 features=features,
+                dark=self.dark(rows),
             )
 
     @property
@@ -251,8 +260,11 @@ class Fit:
         return seconds - min(needed, MOST_OF_BUDGET * seconds)
 
     def finish(self) -> None:
-        """Fit the light, and choose how strongly evidence acts; the last step is behind."""
-        for find in (self.light.learn, self.choice.best):
+        """Find what follows from the fitted model: the last step is behind.
+
+        That is the light, colours that hands take from each other, and how strongly evidence acts.
+        """
+        for find in (self.light.learn, self.borrowed.learn, self.choice.best):
             found = find()
             if found is not None:
                 self.model.keep(found)

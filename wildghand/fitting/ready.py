@@ -18,6 +18,7 @@ from wildghand.gaussians.shading_cpu import fill_harmonics
 from wildghand.model.dress import dress
 from wildghand.network import NetworkOutput, Refinement
 from wildghand.network.frame_heads_cpu import warm_up as warm_up_heads
+from wildghand.shadows import Obstacles
 
 
 def ready_fit(name: str) -> torch.device:
@@ -58,6 +59,9 @@ def _warm_up() -> None:
     sum_bags(zeros(1, 1), first, zeros(1), first)
     fill_harmonics(zeros(1, 3), 1, zeros(1, 3), 0)
     warm_up_heads()
+    # Shadows are cast by rays.
+    corner = np.eye(3)
+    Obstacles([(corner, np.array([[0, 1, 2]]))]).free(corner, corner, corner)
     # The pre-pass draws the hands.
     faces = np.zeros((1, 3), np.int64)
     face, mix = draw_faces(np.zeros((1, 2)), np.zeros(1), faces, (1, 1))

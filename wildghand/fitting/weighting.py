@@ -18,7 +18,7 @@ from wildghand.fitting.networks import choose_segmenter
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.gaussians.frame_table import FrameTable, shares_of_255, soft_weights, upload
 from wildghand.gaussians.training import TrainingFrames
-from wildghand.model.model import RenderedFrames
+from wildghand.model.rendered import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.pao.pao import PerturbationAwareWeights, binary_weights
 from wildghand.pao.place_errors import PlaceErrors
@@ -102,6 +102,8 @@ class Weighting:
         clean: (R,) probability that a frame is clean; ones without the pre-pass.
         frame_weights: (R,) by the pre-pass, from its floor to 1; ones without it. DPD's temporal
             weights start from them.
+        gains: (R,) gain on the linear light of each frame, mean over channels; ones without the
+            pre-pass.
         drop_probability: (R,) chance that a frame's biases are left out.
         pao: the paper's weights, whose thresholds are learnt.
         median: running median of the regions' errors; None before the first, and where PAO does
@@ -128,6 +130,7 @@ class Weighting:
         self.clean = torch.ones(count)
         self.drop_probability = torch.full((count,), settings.dpd.omega_dropout)
         self.frame_weights = torch.ones(count)
+        self.gains = torch.ones(count, dtype=torch.float64)
         self.pao = PerturbationAwareWeights(pao, hands).to(device)
         self.median: float | Tensor | None = None
         self._refine_pose = torch.zeros(count, dtype=torch.bool)
@@ -293,6 +296,7 @@ class Weighting:
         self._refine_pose = torch.from_numpy(assessment.refine_pose)
         self.frame_weights = torch.from_numpy(assessment.frame_weights).float()
         self._pixel_weights = torch.from_numpy(assessment.pixel_weights)
+        self.gains = torch.from_numpy(np.exp(assessment.log_gains.mean(axis=1)))
         if weighs_by_place(self.settings) and self.settings.pao.variant == "scaled":
             floor = self.settings.prepass.misplacement_floor
             shared = self.settings.pao.mismatch * assessment.shared_mismatch(floor)

@@ -9,7 +9,6 @@ normal, and its colour is multiplied by the ratio of both irradiances.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 
@@ -20,6 +19,7 @@ from torch import Tensor
 
 from hwp_bench.base.errors import BadInput
 from wildghand.light.settings import LightSettings
+from wildghand.light.sphere import spread_directions
 
 # Names under which an avatar keeps a light.
 _PREFIX = "light_"
@@ -149,7 +149,7 @@ def fit_light(samples: LightSamples, settings: LightSettings) -> KnownLight | No
     """
     if len(samples.places) < 10 * settings.directions or not samples.weights.sum() > 0.0:
         return None
-    directions = _spread(settings.directions)
+    directions = spread_directions(settings.directions)
     facing = np.maximum(samples.normals @ directions.T, 0.0)
     basis = np.column_stack([np.ones(len(facing)), facing])
     _, places = np.unique(samples.places, return_inverse=True)
@@ -184,14 +184,6 @@ def fit_light(samples: LightSamples, settings: LightSettings) -> KnownLight | No
         axis=_real(axis),
         cosine=_real(cosine),
     )
-
-
-def _spread(count: int) -> np.ndarray:
-    """(K, 3) unit vectors on a Fibonacci sphere."""
-    number = np.arange(count) + 0.5
-    z = 1.0 - 2.0 * number / count
-    angle, radius = number * math.pi * (3.0 - math.sqrt(5.0)), np.sqrt(1.0 - z * z)
-    return np.column_stack([radius * np.cos(angle), radius * np.sin(angle), z])
 
 
 def _real(values: np.ndarray | float) -> Tensor:

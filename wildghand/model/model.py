@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import replace
 
 import torch
 from torch import Tensor, nn
@@ -11,61 +11,19 @@ from torch import Tensor, nn
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal
 from wildghand.dpd.field import bone_features
 from wildghand.dpd.scale_gradients import scale_refinement
-from wildghand.evidence import Evidence
+from wildghand.evidence import Evidence, OtherHand
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight
 from wildghand.model.dress import Gaussians, dress
 from wildghand.model.relight import relit
+from wildghand.model.rendered import HandState, RenderedFrames, largest
 from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
+from wildghand.shadows import CastLight, HandShadows, ShadowSettings
+from wildghand.shadows.hand_shadows import Hands
 from wildghand.splat import rasterize
 from wildghand.subject import SubjectShape
-
-
-@dataclass(frozen=True, eq=False)
-class HandState:
-    """State of one hand in B training frames; the regularisers read it."""
-
-    #: Output of the network.
-    prediction: NetworkOutput
-    #: Mean over Gaussians and frames of the sum of |bias| over the channels, a scalar; None while
-    #: perturbations are not modelled.
-    bias_size: Tensor | None
-    #: (B,) temporal weight before dropout; zeros while perturbations are not modelled.
-    omega: Tensor
-    #: (B, N) opacities that were drawn.
-    opacities: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class RenderedFrames:
-    """B training frames as the model explains them."""
-
-    #: (B, H, W, 3) sRGB over black, with the frames' gains.
-    image: Tensor
-    #: (B, H, W, 1) coverage.
-    coverage: Tensor
-    #: By side.
-    hands: Mapping[str, HandState]
-
-    @property
-    def omega(self) -> Tensor:
-        """(B,) the temporal weight of largest magnitude among the hands."""
-        return largest([hand.omega for hand in self.hands.values()])
-
-
-def largest(omegas: Sequence[Tensor]) -> Tensor:
-    """The temporal weights of largest magnitude among the hands, (B,).
-
-    Args:
-        omegas: (B,) of each hand, at least one.
-    """
-    if len(omegas) == 1:
-        return omegas[0]
-    weights = torch.stack([*omegas])
-    chosen = weights.abs().argmax(dim=0, keepdim=True)
-    return weights.gather(0, chosen)[0]
 
 
 class WildGHandModel(nn.Module):
@@ -79,10 +37,14 @@ class WildGHandModel(nn.Module):
         embedding: width of the temporal embedding.
         rank: of the field of biases; 0: none.
         template: apply the network's displacement of the template (head iii).
+        darkest: share of the light that is left in the darkest shadow.
 
     Attributes:
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
+        light: by which unknown normals are drawn in free poses; None: as the network says.
         evidence: by which free poses are drawn; None: as they were learnt.
+        other_hand: colours of the other hand that free poses take; None: none.
+        shadows: that the hands cast; None: none.
         pose_steps: (S, R, 16, 3) rad, added to the given poses of the hands in order.
         transl_steps: (S, R, 3) m, added to the given translations.
     """
@@ -97,11 +59,15 @@ class WildGHandModel(nn.Module):
         embedding: int = 256,
         rank: int = 0,
         template: bool = True,
+        darkest: float = ShadowSettings.darkest,
     ) -> None:
         super().__init__()
+        self._darkest = darkest
+        self.shadows: HandShadows | None = None
         self._template = template
-        self._light: KnownLight | None = None
+        self.light: KnownLight | None = None
         self.evidence: Evidence | None = None
+        self.other_hand: OtherHand | None = None
         self.rigs = dict(rigs)
         self.network = network
         self.perturbation = nn.ModuleDict(
@@ -115,20 +81,24 @@ class WildGHandModel(nn.Module):
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
 
-    def keep(self, found: SubjectShape | KnownLight | Evidence) -> None:
+    def keep(self, found: SubjectShape | KnownLight | Evidence | OtherHand | CastLight) -> None:
         """Keep what was fitted next to the network, so that it is saved with it.
 
         Args:
-            found: the person's shape, which the rigs have already, or the light, by which unknown
-                normals are drawn from now on, or the evidence, by which free poses are.
+            found: the person's shape, which the rigs have already, or what the model draws by from
+                now on: see the attributes.
         """
         for name, values in found.to_tensors().items():
             self.register_buffer(name, values.to(self.log_gains.device))
         if isinstance(found, KnownLight):
-            self._light = KnownLight.from_tensors(dict(self.named_buffers()), "light")
+            self.light = KnownLight.from_tensors(dict(self.named_buffers()), "light")
         if isinstance(found, Evidence):
             counts = {side: len(rig) for side, rig in self.rigs.items()}
             self.evidence = Evidence.from_tensors(dict(self.named_buffers()), counts, "evidence")
+        if isinstance(found, OtherHand):
+            self.other_hand = found
+        if isinstance(found, CastLight):
+            self.shadows = HandShadows(self.rigs, found, self._darkest)
 
     def finite(self) -> bool:
         """Whether every fitted number is finite."""
@@ -161,6 +131,7 @@ class WildGHandModel(nn.Module):
         move: bool = False,
         refine: bool = False,
         features: Mapping[str, HandFeatures] | None = None,
+        dark: Mapping[str, Tensor] | None = None,
     ) -> RenderedFrames:
         """Draw training frames with everything that is particular to them.
 
@@ -174,7 +145,11 @@ class WildGHandModel(nn.Module):
             move: add `pose_steps` and `transl_steps` to the given parameters.
             refine: apply the network's refinement of the parameters (head iv).
             features: of the network by side, where they are at hand already.
+            dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
         """
+        if dark is None:
+            hands = {side: _in_frames(clip.parameters[side], rows) for side in self.rigs}
+            dark = self.cast(hands)
         temporal = {side: self.biases_of(side).temporal(rows) for side in self.perturbation}
         shares = None if teach is None else teach(self._largest_omega(temporal, rows))
         states, parts = {}, []
@@ -188,6 +163,7 @@ class WildGHandModel(nn.Module):
             prediction = self.predict(
                 side, anchors, pose.detach(), None if features is None else features[side]
             )
+            prediction = _darkened(prediction, dark.get(side))
             if refine:
                 step = prediction.refinement
                 if shares is not None:
@@ -231,7 +207,7 @@ class WildGHandModel(nn.Module):
 
     def draw(
         self,
-        hands: Mapping[str, tuple[Tensor, Tensor, Tensor]],
+        hands: Hands,
         viewmats: Tensor,
         Ks: Tensor,
         width: int,
@@ -239,6 +215,7 @@ class WildGHandModel(nn.Module):
         *,
         refine: bool = False,
         features: Mapping[str, HandFeatures] | None = None,
+        dark: Mapping[str, Tensor] | None = None,
     ) -> tuple[Tensor, Tensor]:
         """Draw hands in any pose, free of what perturbed the training frames.
 
@@ -249,10 +226,12 @@ class WildGHandModel(nn.Module):
             width, height: px.
             refine: apply the network's refinement of the parameters (head iv).
             features: of the network by side, where they are at hand already.
+            dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
 
         Returns:
             (B, H, W, 3) sRGB over black and (B, H, W, 1) coverage.
         """
+        dark = self.cast(hands) if dark is None else dark
         parts = [
             self.gaussians(
                 side,
@@ -260,6 +239,7 @@ class WildGHandModel(nn.Module):
                 refine=refine,
                 viewmats=viewmats,
                 features=None if features is None else features[side],
+                dark=dark.get(side),
             )
             for side in self.rigs
             if side in hands
@@ -277,6 +257,7 @@ class WildGHandModel(nn.Module):
         viewmats: Tensor | None = None,
         rows: Tensor | None = None,
         features: HandFeatures | None = None,
+        dark: Tensor | None = None,
     ) -> Gaussians:
         """The Gaussians of one hand in any pose, free of perturbations unless frames are named.
 
@@ -290,15 +271,18 @@ class WildGHandModel(nn.Module):
                 with a normal that no training frame has shown is drawn by the fitted light.
             rows: (B,) positions among the training frames, whose biases and gains are added.
             features: of the network, where they are at hand already.
+            dark: (B, N) factors of the hands' shadows; None: of those that it casts on itself.
         """
         rig = self.rigs[side]
         anchors = rig.pose(pose, betas, transl)
+        if dark is None:
+            dark = self.cast({side: (pose, betas, transl)}).get(side)
         features = self.network.features(side) if features is None else features
         prediction = self.predict(side, anchors, pose, features)
-        if self._light is not None and viewmats is not None:
+        if self.light is not None and viewmats is not None:
             prediction = relit(
                 prediction,
-                self._light,
+                self.light,
                 lambda normals: self.network(side, normals, pose, features),
                 anchors,
                 viewmats,
@@ -307,6 +291,9 @@ class WildGHandModel(nn.Module):
             bias = self.network.activation.log_scale_bias
             settled = self.evidence.settle(side, prediction.raw, rig.spacing, bias)
             prediction = replace(prediction, raw=settled)
+        if self.other_hand is not None:
+            prediction = replace(prediction, raw=self.other_hand.color(side, prediction.raw))
+        prediction = _darkened(prediction, dark)
         if refine:
             step = prediction.refinement
             anchors = rig.follow(pose + step.pose, betas + step.betas, transl + step.transl)
@@ -318,6 +305,17 @@ class WildGHandModel(nn.Module):
             perturbation = self._perturbation(side, temporal, anchors, None)
         made = dress(anchors, prediction, self.network.activation, perturbation)[0]
         return replace(made, colors=made.colors * self.log_gains[rows].exp()[:, None])
+
+    def cast(self, hands: Hands) -> dict[str, Tensor]:
+        """Shadows of hands that stand together; empty where the model casts none.
+
+        Args:
+            hands: pose (B, 16, 3), betas (10,), transl (B, 3) by side.
+
+        Returns:
+            (B, N) factors on the colours by side, without gradient.
+        """
+        return {} if self.shadows is None else self.shadows.of(hands)
 
     def predict(
         self, side: str, anchors: AnchorPoses, pose: Tensor, features: HandFeatures | None = None
@@ -334,6 +332,21 @@ class WildGHandModel(nn.Module):
         if self._template:
             return made
         return replace(made, template_offsets=torch.zeros_like(made.template_offsets))
+
+
+def _in_frames(
+    parameters: tuple[Tensor, Tensor, Tensor], rows: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """The parameters of a hand in some frames of a clip."""
+    pose, betas, transl = parameters
+    return pose[rows], betas, transl[rows]
+
+
+def _darkened(prediction: NetworkOutput, dark: Tensor | None) -> NetworkOutput:
+    """A prediction under shadows, (B, N) factors; None: under none."""
+    if dark is None:
+        return prediction
+    return replace(prediction, shadow=prediction.shadow * dark[..., None])
 
 
 def _rasterize(

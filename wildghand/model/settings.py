@@ -24,6 +24,7 @@ from wildghand.model.terms import PAPER_TERMS, TermWeights
 from wildghand.network.settings import NetworkSettings, network_settings
 from wildghand.pao.pao import PAPER_PAO, PaoSettings
 from wildghand.prepass import PrepassSettings
+from wildghand.shadows import ShadowSettings
 from wildghand.subject import SubjectSettings
 
 #: Where messages place a wrong setting.
@@ -128,6 +129,8 @@ class WildGHandSettings:
     subject: SubjectSettings = field(default_factory=SubjectSettings)
     #: Addition: a light for normals that no frame has shown.
     light: LightSettings = field(default_factory=LightSettings)
+    #: Addition: shadows that the hands cast on themselves and on each other.
+    shadows: ShadowSettings = field(default_factory=ShadowSettings)
     #: Addition: Gaussians that few frames show are discs on the skin.
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
@@ -167,6 +170,7 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
         "start_colors": False,
         "subject": {"enabled": False},
         "light": {"enabled": False},
+        "shadows": {"enabled": False},
         "evidence": {"enabled": False},
         "prepass": {"enabled": False},
         "schedule": {
@@ -203,6 +207,7 @@ _PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
         "dpd": {"gains": False},
         "subject": {"enabled": False},
         "light": {"enabled": False},
+        "shadows": {"enabled": False},
         "evidence": {"enabled": False},
         "prepass": {"enabled": False},
         "terms": {
@@ -220,7 +225,8 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
         "pao": {"errors": "median", "mismatch": 0.0, "spare_clean": False},
         "subject": {"enabled": False},
         "light": {"enabled": False},
-        "evidence": {"enabled": False, "validated": False},
+        "shadows": {"enabled": False},
+        "evidence": {"enabled": False, "validated": False, "color_share": 0.0},
         "prepass": {"clean_scale": 1.0},
         "schedule": {"root_steps": 0.0, "average_share": 0.0},
         "terms": {"surface": 0.0, "leave_hidden": False},

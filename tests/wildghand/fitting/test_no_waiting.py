@@ -26,6 +26,7 @@ from wildghand.fitting.skin_places import skin_places
 from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
 from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, ready_device
 from wildghand.model.settings import read_settings
+from wildghand.shadows import ShadowTable
 
 FAKE = torch.device("meta")
 HAS_GPU = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
@@ -115,6 +116,10 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     objective = fit.objective
     objective.temporal, objective._laplacians = moved((objective.temporal, objective._laplacians))
     places = skin_places(training, fit.frames, templates) if needs_places(settings) else ()
+    if fit.model.shadows is not None:
+        fit.model.shadows._corners = moved(fit.model.shadows._corners)
+        assert isinstance(fit.dark, ShadowTable)
+        fit.dark._device = FAKE
     fit.weighting = Weighting(fit.frames, len(training.sides), assessment, settings, FAKE, places)
     fit.optimizer = make_optimizer(fit.model, fit.weighting.pao, settings)
     return fit

@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 import trimesh
 
-from hwp_bench.sim.geometry.embree import EmbreeMesh, library
-from hwp_bench.sim.geometry.raycast import EmbreexMesh, Tracer
+from hwp_bench.base.embree import EmbreeMesh, library
+from hwp_bench.base.ray_mesh import EmbreexMesh
+from hwp_bench.sim.geometry.raycast import Tracer
 from hwp_bench.sim.render.shading import openness
 
 
@@ -73,5 +74,5 @@ def test_hits_equal_those_of_embreex_bit_for_bit() -> None:
 
 
 def test_a_tracer_works_through_embreex_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("hwp_bench.sim.geometry.embree.library", lambda: None)
+    monkeypatch.setattr("hwp_bench.base.embree.library", lambda: None)
     test_hits_lie_on_the_sphere()

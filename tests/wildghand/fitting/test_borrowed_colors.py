@@ -1,0 +1,163 @@
+"""Colours that hands take from each other. Oracle: the mixture by hand."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.base.errors import BadInput
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.avatar.files import load_avatar, save_avatar
+from wildghand.evidence import OtherHand
+from wildghand.fitting.borrowed_colors import clearly_visible, known_normals
+from wildghand.fitting.fit import Fit
+from wildghand.gaussians.attributes import CHANNELS, SIZES
+from wildghand.light import KnownLight
+from wildghand.model.settings import read_settings
+
+TINY: dict[str, Any] = {
+    "gaussians": 300,
+    "prior": "",
+    "network.identity_resolution": 24,
+    "network.plane_resolution": 12,
+    "prepass.enabled": False,
+    "subject.enabled": False,
+    "shadows.enabled": False,
+    "start_colors": False,
+    "device": "cpu",
+}
+# Channels of the colours in the attributes and in the map.
+COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
+TrainingMaker = Callable[..., TrainingCapture]
+
+
+def a_light(cosine: float = 0.5) -> KnownLight:
+    return KnownLight(
+        directions=torch.eye(3),
+        strengths=torch.ones(3),
+        ambient=torch.tensor(0.3),
+        axis=torch.tensor([0.0, 0.0, -1.0]),
+        cosine=torch.tensor(cosine),
+    )
+
+
+@pytest.fixture
+def fit(make_training: TrainingMaker) -> Fit:
+    made = Fit(make_training("both"), read_settings(TINY), 0, torch.device("cpu"))
+    with torch.no_grad():  # the hands start alike
+        made.model.network.identity.maps["left"][:, COLORS] += 0.5
+    made.model.keep(a_light())
+    return made
+
+
+def sharing(fit: Fit, left: float, right: float) -> OtherHand | None:
+    """What is taken if so much of each hand's colours is its own."""
+    counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
+    own = {"left": left, "right": right}
+    given = {side: np.full(counts[side], own[side]) for side in counts}
+    return dataclasses.replace(fit.borrowed, own=given).learn()
+
+
+@torch.no_grad()
+def level(fit: Fit, side: str, change: torch.Tensor | float) -> np.ndarray:
+    """Log linear light of the mean colours over the known normals, with a change of the logits."""
+    normals = known_normals(a_light())
+    poses = fit.clip.parameters[side][0]
+    rows = torch.linspace(0, len(poses) - 1, len(normals)).long()
+    spread = normals[:, None].expand(-1, len(fit.model.rigs[side]), 3)
+    made = fit.model.network(side, spread.contiguous(), poses[rows], None)
+    logits = torch.logit(made.raw.logit_colors.sigmoid() * made.shadow).mean(dim=0) + change
+    return np.log(srgb_to_linear(logits.sigmoid().double().numpy()))
+
+
+def test_a_hand_that_nothing_shows_takes_the_others_colours(fit: Fit) -> None:
+    found = sharing(fit, 0.0, 1.0)
+    assert found is not None
+    assert not np.allclose(level(fit, "left", 0.0), level(fit, "right", 0.0), atol=0.1)
+    after = level(fit, "left", found.changes["left"])
+    np.testing.assert_allclose(after, level(fit, "right", 0.0), atol=2e-3)
+    np.testing.assert_allclose(found.changes["right"], 0.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("left", "right"), [(0.3, 0.8), (1.0, 1.0), (0.0, 0.0)])
+def test_the_mixture_is_by_what_each_knows(fit: Fit, left: float, right: float) -> None:
+    found = sharing(fit, left, right)
+    assert found is not None
+    before = {side: level(fit, side, 0.0) for side in ("left", "right")}
+    share = (1.0 - left) * right
+    expected = (1.0 - share) * before["left"] + share * before["right"]
+    np.testing.assert_allclose(level(fit, "left", found.changes["left"]), expected, atol=2e-3)
+
+
+def test_frames_that_show_a_hand_clearly_make_its_colours_its_own(fit: Fit) -> None:
+    assert set(fit.borrowed.own) == {"left", "right"}
+    for own in fit.borrowed.own.values():
+        assert own.min() == 0.0  # the backs that no frame shows
+        assert own.max() > 0.9
+
+
+def test_unsure_frames_say_nothing_of_colours(fit: Fit) -> None:
+    rows = torch.arange(len(fit.frames))
+    fit.weighting.frame_weights[:] = 0.35
+    assert not clearly_visible(fit.weighting)(rows).any()
+    fit.weighting.frame_weights[:] = 1.0
+    torch.testing.assert_close(clearly_visible(fit.weighting)(rows), fit.weighting.visible(rows))
+
+
+def test_known_normals_lie_in_the_cap() -> None:
+    normals = known_normals(a_light(0.5)).double().numpy()
+    np.testing.assert_allclose(np.linalg.norm(normals, axis=1), 1.0, atol=1e-6)
+    np.testing.assert_allclose(
+        normals[:, 2], [-1.0] + 4 * [-math.cos(0.6 * math.pi / 3)], atol=1e-6
+    )
+
+
+def test_nothing_is_taken_without_a_light_or_another_hand(
+    fit: Fit, make_training: TrainingMaker
+) -> None:
+    fit.model.light = None
+    assert sharing(fit, 0.0, 1.0) is None
+    one = Fit(make_training(), read_settings(TINY), 0, torch.device("cpu"))
+    one.model.keep(a_light())
+    assert one.borrowed.own == {}
+    assert one.borrowed.learn() is None
+    off = read_settings({**TINY, "evidence.color_share": 0.0})
+    assert Fit(make_training("both"), off, 0, torch.device("cpu")).borrowed.own == {}
+
+
+def test_an_avatar_keeps_them(fit: Fit, tmp_path: Path) -> None:
+    frame = int(fit.training.validation[0])
+    where = fit.training.hand_poses(frame), fit.training.camera(frame)
+    before = fit.avatar(0).render(*where)
+    found = sharing(fit, 0.0, 1.0)
+    assert found is not None
+    fit.model.keep(found)
+    drawn = fit.avatar(0).render(*where)
+    assert np.abs(drawn - before).max() > 0.05
+    again = load_avatar(save_avatar(fit.avatar(0), tmp_path / "avatar"))
+    np.testing.assert_array_equal(again.render(*where), drawn)
+
+
+@pytest.mark.parametrize(
+    "value",
+    [torch.zeros(40, 2), torch.full((40, 3), 100.0), torch.full((40, 3), float("nan")), None],
+    ids=str,
+)
+def test_hostile_changes_are_refused_by_name(value: torch.Tensor | None) -> None:
+    tensors = OtherHand({side: torch.zeros(40, 3) for side in ("left", "right")}).to_tensors()
+    counts = {"left": 40, "right": 40}
+    if value is None:
+        del tensors["other_hand_left"]
+    else:
+        tensors["other_hand_left"] = value
+    with pytest.raises(BadInput, match="other_hand_left"):
+        OtherHand.from_tensors(tensors, counts, "an avatar")
+    assert OtherHand.from_tensors({}, counts, "an avatar") is None

@@ -1,0 +1,148 @@
+"""How dark shadows make Gaussians: in any pose, and in the frames of a clip."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hwp_bench.hands import TemplateTensors, pose_hand, vertex_normals
+from wildghand.gaussians.frame_table import upload
+from wildghand.gaussians.rig import HandRig
+from wildghand.gaussians.training import TrainingClip
+from wildghand.shadows.cast_light import CastLight
+from wildghand.shadows.obstacles import Obstacles
+
+#: Pose (B, 16, 3) rad, betas (10,) and translation (B, 3) m by side.
+Hands = Mapping[str, tuple[Tensor, Tensor, Tensor]]
+
+
+class HandShadows:
+    """Shadows of hands under a light.
+
+    They are cast at the vertices of the posed templates, and Gaussians take them from the vertices
+    around their anchors. There is no gradient.
+
+    Args:
+        rigs: by side; the light of each is kept off by all that are posed with it.
+        light: under which they stand.
+        darkest: share of the light that is left in the darkest shadow.
+    """
+
+    def __init__(self, rigs: Mapping[str, HandRig], light: CastLight, darkest: float) -> None:
+        self._darkest = darkest
+        self._templates = {side: _on_cpu(rig.template) for side, rig in rigs.items()}
+        self._faces = {side: made.faces.numpy() for side, made in self._templates.items()}
+        # Directions without strength cast nothing.
+        lit = light.strengths > 0.0
+        self._light = CastLight(light.directions[lit], light.strengths[lit], light.ambient)
+        self._corners: dict[str, tuple[Tensor, Tensor]] = {}
+        for side, rig in rigs.items():
+            faces = torch.as_tensor(rig.anchors.face_index, device=rig.template.faces.device)
+            self._corners[side] = (
+                rig.template.faces[faces],
+                torch.as_tensor(rig.anchors.barycentric).to(rig.template.vertices),
+            )
+
+    def of(self, hands: Hands) -> dict[str, Tensor]:
+        """Factors on the sRGB colours of the Gaussians of hands that stand together.
+
+        Args:
+            hands: by side, in B frames.
+
+        Returns:
+            (B, N) in (0, 1] by side.
+        """
+        return {
+            side: self.spread(side, upload(torch.from_numpy(dark), hands[side][0].device))
+            for side, dark in self.at_vertices(hands).items()
+        }
+
+    def spread(self, side: str, dark: Tensor) -> Tensor:
+        """Factors (B, N) of Gaussians from those of vertices (B, V)."""
+        corners, mix = self._corners[side]
+        return (dark[:, corners] * mix).sum(dim=-1)
+
+    @torch.no_grad()
+    def at_vertices(self, hands: Hands) -> dict[str, np.ndarray]:
+        """Factors at the vertices: (B, V) float32 by side; see `of`."""
+        posed = {side: self._posed(side, *given) for side, given in hands.items()}
+        frames = len(next(iter(posed.values()))[0])
+        dark = {side: np.empty(places.shape[:2], np.float32) for side, (places, _) in posed.items()}
+        for frame in range(frames):
+            in_the_way = Obstacles(
+                [(places[frame], self._faces[side]) for side, (places, _) in posed.items()]
+            )
+            for side, (places, normals) in posed.items():
+                dark[side][frame] = self._dark(in_the_way, places[frame], normals[frame])
+        return dark
+
+    def _dark(self, in_the_way: Obstacles, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        free = in_the_way.free(places, normals, self._light.directions)
+        return self._light.darkening(normals, free, self._darkest)
+
+    def _posed(
+        self, side: str, pose: Tensor, betas: Tensor, transl: Tensor
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and normals, (B, V, 3) each."""
+        template = self._templates[side]
+        given = (each.detach().float().cpu() for each in (pose, betas, transl))
+        vertices = pose_hand(template, *given).vertices
+        return vertices.numpy(), vertex_normals(vertices, template.faces).numpy()
+
+
+class ShadowTable:
+    """The factors in the frames of a clip, cast when they are first asked for.
+
+    Args:
+        shadows: of the hands.
+        clip: their poses in R frames.
+    """
+
+    def __init__(self, shadows: HandShadows, clip: TrainingClip) -> None:
+        self._shadows = shadows
+        self._device = clip.viewmats.device
+        # Copies, so that nobody waits for the device later.
+        self._hands = {
+            side: tuple(given.cpu() for given in parameters)
+            for side, parameters in clip.parameters.items()
+        }
+        self._known = np.zeros(len(clip.viewmats), dtype=bool)
+        self._dark: dict[str, Tensor] = {}
+
+    def __call__(self, rows: Tensor) -> dict[str, Tensor]:
+        """Factors in some of the frames, as `HandShadows.of` returns them.
+
+        Args:
+            rows: (B,) int64, which of the R frames; on the CPU.
+        """
+        new = np.unique(rows.numpy()[~self._known[rows.numpy()]])
+        if len(new):
+            here = torch.from_numpy(new)
+            hands = {
+                side: (pose[here], betas, transl[here])
+                for side, (pose, betas, transl) in self._hands.items()
+            }
+            for side, dark in self._shadows.at_vertices(hands).items():
+                if side not in self._dark:
+                    self._dark[side] = torch.ones(len(self._known), dark.shape[1])
+                self._dark[side][here] = torch.from_numpy(dark)
+            self._known[new] = True
+        return {
+            side: self._shadows.spread(side, upload(dark[rows], self._device))
+            for side, dark in self._dark.items()
+        }
+
+
+def _on_cpu(template: TemplateTensors) -> TemplateTensors:
+    """The same arrays as float32 on the CPU."""
+    changed = {}
+    for item in dataclasses.fields(template):
+        tensor = getattr(template, item.name)
+        if tensor is not None:
+            tensor = tensor.detach().cpu()
+            changed[item.name] = tensor.float() if tensor.is_floating_point() else tensor
+    return dataclasses.replace(template, **changed)
