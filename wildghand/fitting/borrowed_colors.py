@@ -25,6 +25,8 @@ from wildghand.model.model import WildGHandModel
 
 # Weight of a frame from which its colours begin to count; what perturbs a frame changes them.
 _UNSURE = 0.35
+# A colour that is somebody's is better than none: it takes so much less to be lent.
+_LENT = 0.25
 # Poses and normals at which hands are compared: normals of the cap that the light knows, at this
 # share of its angle around its axis.
 _POSES, _RING, _INSIDE = 5, 4, 0.6
@@ -43,6 +45,8 @@ class BorrowedColors:
     #: (N,) by side in [0, 1), how far each Gaussian's colour is the hand's own; empty: nothing is
     #: taken.
     own: Mapping[str, np.ndarray]
+    #: (N,) by side in [0, 1), how far it is good enough for the other hand.
+    lent: Mapping[str, np.ndarray]
 
     @classmethod
     def of(
@@ -61,15 +65,15 @@ class BorrowedColors:
             settings: how.
         """
         if len(model.rigs) < 2 or not settings.enabled or settings.color_share <= 0.0:
-            return cls(model, clip, {})
+            return cls(model, clip, {}, {})
         count = len(weighting.frame_weights)
         shown = shown_frames(model.rigs, clip, clearly_visible(weighting), count)
         half = settings.color_share * count
-        return cls(
-            model,
-            clip,
-            {side: (n / (n + half)).cpu().double().numpy() for side, n in shown.items()},
-        )
+
+        def shares(half: float) -> dict[str, np.ndarray]:
+            return {side: (n / (n + half)).cpu().double().numpy() for side, n in shown.items()}
+
+        return cls(model, clip, own=shares(half), lent=shares(_LENT * half))
 
     @torch.no_grad()
     def learn(self) -> OtherHand | None:
@@ -84,7 +88,7 @@ class BorrowedColors:
         levels = {side: _log_linear(values) for side, values in logits.items()}
         changes = {}
         for side, other in (("left", "right"), ("right", "left")):
-            share = ((1.0 - self.own[side]) * self.own[other])[:, None]
+            share = ((1.0 - self.own[side]) * self.lent[other])[:, None]
             mixed = levels[side] + share * (levels[other] - levels[side])
             srgb = linear_to_srgb(np.exp(mixed)).clip(_EDGE, 1.0 - _EDGE)
             change = np.log(srgb / (1.0 - srgb)) - logits[side]

@@ -9,6 +9,9 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.tables import Column, Table
+from hwp_bench.evaluation.budget.ceiling import NAME as CEILING
+from hwp_bench.evaluation.budget.ceiling import TEXT as CEILING_TEXT
+from hwp_bench.evaluation.budget.ceiling import ceiling
 from hwp_bench.evaluation.budget.corrections import CORRECTIONS
 from hwp_bench.evaluation.budget.frames import pairs_of
 from hwp_bench.evaluation.budget.pair import Pair, error_of
@@ -26,7 +29,8 @@ SCHEMA = "hwp-budget/1"
 class BudgetRow:
     """One thing that was replaced or corrected."""
 
-    #: `truth` (before fitting) or `correction` (of the rendered test frames).
+    #: `truth` (before fitting), `correction` (of the rendered test frames) or `ceiling` (an avatar
+    #: without an error of its own).
     kind: str
     #: Its name.
     name: str
@@ -74,7 +78,7 @@ def make_budget(runs: BudgetRuns) -> Budget:
             psnr = {capture.id: _psnr(capture) for capture in result.captures}
             rows.append(_row("truth", name, TRUTHS.get(name, "all truths above"), psnr, base))
     corrected: dict[str, dict[str, float]] = {name: {} for name in CORRECTIONS}
-    shown = {}
+    shown, ceilings = {}, {}
     for capture, found in zip(runs.captures, given.captures, strict=True):
         scores = {frame.frame: frame.scores["psnr"] for frame in found.frames}
         gains: dict[str, list[float]] = {name: [] for name in CORRECTIONS}
@@ -85,12 +89,17 @@ def make_budget(runs: BudgetRuns) -> Budget:
                 gains[name].append(scores[frame] + better)
         for name, values in gains.items():
             corrected[name][found.id] = float(np.mean(values))
+        most = ceiling(capture, scores)
+        if most is not None:
+            ceilings[found.id] = float(np.mean(list(most.values())))
         order = sorted(scores, key=lambda frame: (scores[frame], frame))
         shown[found.id] = order[len(order) // 2]
     rows += [
         _row("correction", name, text, corrected[name], base)
         for name, (_, text) in CORRECTIONS.items()
     ]
+    if len(ceilings) == len(base):
+        rows.append(_row("ceiling", CEILING, CEILING_TEXT, ceilings, base))
     return Budget(given.method.title, base, tuple(rows), shown)
 
 
@@ -139,6 +148,11 @@ def budget_tables(budget: Budget) -> dict[str, Table]:
     notes = (
         "Truths replace what the method is given before it fits; corrections are fitted to each "
         "rendered test frame and bound what that kind of error costs. Rows do not add up.",
+        *(
+            [f"{CEILING.capitalize()}: what is left then are errors of the given test poses alone."]
+            if any(row.kind == "ceiling" for row in budget.rows)
+            else []
+        ),
         f"Means over {count} capture{'' if count == 1 else 's'}; least and most: of one capture.",
     )
     names = [row.name for row in budget.rows]

@@ -63,7 +63,7 @@ def sharing(fit: Fit, left: float, right: float) -> OtherHand | None:
     counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
     own = {"left": left, "right": right}
     given = {side: np.full(counts[side], own[side]) for side in counts}
-    return dataclasses.replace(fit.borrowed, own=given).learn()
+    return dataclasses.replace(fit.borrowed, own=given, lent=given).learn()
 
 
 @torch.no_grad()
@@ -102,6 +102,10 @@ def test_frames_that_show_a_hand_clearly_make_its_colours_its_own(fit: Fit) -> N
     for own in fit.borrowed.own.values():
         assert own.min() == 0.0  # the backs that no frame shows
         assert own.max() > 0.9
+    for side, lent in fit.borrowed.lent.items():
+        # Four times as easily: odds of n / half.
+        own = fit.borrowed.own[side]
+        np.testing.assert_allclose(lent, 4.0 * own / (1.0 + 3.0 * own), atol=1e-6)
 
 
 def test_unsure_frames_say_nothing_of_colours(fit: Fit) -> None:
