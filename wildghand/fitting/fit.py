@@ -102,7 +102,7 @@ class Fit:
         #: The shadows in the training frames.
         self.dark = shadows_in(self.model, self.clip)
         if settings.start_colors:
-            start_from_colors(self.model, self.clip, self.frames, self.weighting)
+            start_from_colors(self.model, self.clip, self.frames, self.weighting, self.dark)
         #: The colours that one of two hands takes from the other, which come last.
         self.borrowed = BorrowedColors.of(self.model, self.clip, self.weighting, settings.evidence)
         self.choice = EvidenceChoice(self.model, training, settings, shown, count)

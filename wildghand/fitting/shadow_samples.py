@@ -9,7 +9,7 @@ from torch import Tensor
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.hands import pose_hand
 from wildghand.evidence.count import read_images, seen_anchors
-from wildghand.fitting.start_colors import best_of_each_part
+from wildghand.fitting.chosen_frames import best_of_each_part
 from wildghand.fitting.weighting import Weighting
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig

@@ -8,14 +8,17 @@ they are light too, which the network has to tell from colour.
 
 from __future__ import annotations
 
-import itertools
+import functools
 
 import torch
 from torch import Tensor
 
 from wildghand.evidence.count import read_images, seen_anchors
+from wildghand.fitting.cast_shadows import Dark
+from wildghand.fitting.chosen_frames import best_of_each_part
 from wildghand.fitting.weighting import Weighting
 from wildghand.gaussians.attributes import CHANNELS, SIZES
+from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
 from wildghand.model.model import WildGHandModel
 from wildghand.network.sampling import PlaneSampler
@@ -39,7 +42,11 @@ _COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 
 @torch.no_grad()
 def start_from_colors(
-    model: WildGHandModel, clip: TrainingClip, frames: TrainingFrames, weighting: Weighting
+    model: WildGHandModel,
+    clip: TrainingClip,
+    frames: TrainingFrames,
+    weighting: Weighting,
+    dark: Dark,
 ) -> None:
     """Move the identity map to the frames' colours where their tint is far from the network's.
 
@@ -50,6 +57,7 @@ def start_from_colors(
         clip: hands and cameras of the frames.
         frames: that are fitted.
         weighting: how much each pixel says of the hand.
+        dark: the shadows in the frames; they and the light are taken out of the colours.
     """
     direct = model.network.attribute_head.direct
     if direct is None:
@@ -60,16 +68,18 @@ def start_from_colors(
     here = rows.to(says.device)
     hands = {side: clip.hand(side, here) for side in model.rigs}
     seen = seen_anchors(hands, clip.viewmats[here], clip.Ks[here], says.shape[1:])
+    shadows = dark(rows)
     to_map = torch.linalg.pinv(direct.weight[_COLORS, _COLORS])
     for side, (pixels, facing) in seen.items():
         views = read_images(says, pixels) * facing
         shown = [read_images(images[..., channel].contiguous(), pixels) for channel in range(3)]
-        wanted = _logits(torch.stack(shown, dim=-1))
+        normals, poses = quat_third_axis(hands[side].orientations), clip.parameters[side][0][here]
+        wanted = _logits(torch.stack(shown, dim=-1) / _lit(model, normals, shadows.get(side)))
         chart = model.network.charts[side]
         assert isinstance(chart, Chart)
         share = None
         for _ in range(_ROUNDS):
-            made = model.predict(side, hands[side], clip.parameters[side][0][here])
+            made = model.network(side, normals, poses)
             drawn = _logits(made.raw.logit_colors.sigmoid() * made.shadow)
             off = _mean((wanted - drawn).clamp(-_FARTHEST, _FARTHEST), views)
             share = tint_share(off) if share is None else share
@@ -81,26 +91,17 @@ def start_from_colors(
             model.network.identity.maps[side][:, _COLORS] += _SHARE * step
 
 
-def best_of_each_part(weights: Tensor, count: int) -> Tensor:
-    """Which frame weighs most in each of some parts of a clip; the first of equal ones.
-
-    Args:
-        weights: (R,) of the frames, in their order.
-        count: of parts at most, of equal length.
-
-    Returns:
-        (count,) int64, ascending, on the CPU; fewer if there are fewer frames.
-    """
-    given = weights.cpu()
-    edges = torch.linspace(0, len(given), min(count, len(given)) + 1).long().tolist()
-    parts = itertools.pairwise(edges)
-    return torch.tensor([start + int(given[start:end].argmax()) for start, end in parts])
-
-
 def tint_share(off: Tensor) -> Tensor:
     """(N, 1) in [0, 1], how far colours that differ by (N, 3) are not skin: by their tint alone."""
     tint = (off - off.mean(dim=-1, keepdim=True)).norm(dim=-1, keepdim=True)
     return ((tint - FROM) / (FULL - FROM)).clamp(0.0, 1.0)
+
+
+def _lit(model: WildGHandModel, normals: Tensor, dark: Tensor | None) -> Tensor:
+    """(B, N, 1) factors of light and shadows on colours of (B, N) places."""
+    shading = None if model.shadows is None else model.shadows.shading(normals)
+    factors = [factor for factor in (shading, dark) if factor is not None]
+    return functools.reduce(torch.mul, factors, torch.ones_like(normals[..., 0]))[..., None]
 
 
 def _logits(colors: Tensor) -> Tensor:

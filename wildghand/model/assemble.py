@@ -50,7 +50,7 @@ def make_model(
             dpd=dpd.enabled,
             rank=dpd.rank,
             template=settings.heads.template,
-            darkest=settings.shadows.darkest,
+            shadows=settings.shadows,
         )
     if subject is not None:
         model.keep(subject)

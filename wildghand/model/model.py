@@ -37,14 +37,15 @@ class WildGHandModel(nn.Module):
         embedding: width of the temporal embedding.
         rank: of the field of biases; 0: none.
         template: apply the network's displacement of the template (head iii).
-        darkest: share of the light that is left in the darkest shadow.
+        shadows: how hands are drawn in the light that casts shadows, once there is one.
 
     Attributes:
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
         light: by which unknown normals are drawn in free poses; None: as the network says.
         evidence: by which free poses are drawn; None: as they were learnt.
         other_hand: colours of the other hand that free poses take; None: none.
-        shadows: that the hands cast; None: none.
+        shadows: the hands in the light that casts shadows; None: the network alone says how bright
+            skin is.
         pose_steps: (S, R, 16, 3) rad, added to the given poses of the hands in order.
         transl_steps: (S, R, 3) m, added to the given translations.
     """
@@ -59,10 +60,10 @@ class WildGHandModel(nn.Module):
         embedding: int = 256,
         rank: int = 0,
         template: bool = True,
-        darkest: float = ShadowSettings.darkest,
+        shadows: ShadowSettings | None = None,
     ) -> None:
         super().__init__()
-        self._darkest = darkest
+        self._shadow_settings = shadows or ShadowSettings()
         self.shadows: HandShadows | None = None
         self._template = template
         self.light: KnownLight | None = None
@@ -98,7 +99,7 @@ class WildGHandModel(nn.Module):
         if isinstance(found, OtherHand):
             self.other_hand = found
         if isinstance(found, CastLight):
-            self.shadows = HandShadows(self.rigs, found, self._darkest)
+            self.shadows = HandShadows(self.rigs, found, self._shadow_settings)
 
     def finite(self) -> bool:
         """Whether every fitted number is finite."""
@@ -163,7 +164,7 @@ class WildGHandModel(nn.Module):
             prediction = self.predict(
                 side, anchors, pose.detach(), None if features is None else features[side]
             )
-            prediction = _darkened(prediction, dark.get(side))
+            prediction = _dimmed(prediction, dark.get(side))
             if refine:
                 step = prediction.refinement
                 if shares is not None:
@@ -283,7 +284,7 @@ class WildGHandModel(nn.Module):
             prediction = relit(
                 prediction,
                 self.light,
-                lambda normals: self.network(side, normals, pose, features),
+                lambda normals: self._shaded(self.network(side, normals, pose, features), normals),
                 anchors,
                 viewmats,
             )
@@ -293,7 +294,7 @@ class WildGHandModel(nn.Module):
             prediction = replace(prediction, raw=settled)
         if self.other_hand is not None:
             prediction = replace(prediction, raw=self.other_hand.color(side, prediction.raw))
-        prediction = _darkened(prediction, dark)
+        prediction = _dimmed(prediction, dark)
         if refine:
             step = prediction.refinement
             anchors = rig.follow(pose + step.pose, betas + step.betas, transl + step.transl)
@@ -305,6 +306,12 @@ class WildGHandModel(nn.Module):
             perturbation = self._perturbation(side, temporal, anchors, None)
         made = dress(anchors, prediction, self.network.activation, perturbation)[0]
         return replace(made, colors=made.colors * self.log_gains[rows].exp()[:, None])
+
+    def _shaded(self, prediction: NetworkOutput, normals: Tensor) -> NetworkOutput:
+        """A prediction in the light that casts shadows, with nothing in its way."""
+        if self.shadows is None:
+            return prediction
+        return _dimmed(prediction, self.shadows.shading(normals))
 
     def cast(self, hands: Hands) -> dict[str, Tensor]:
         """Shadows of hands that stand together; empty where the model casts none.
@@ -328,7 +335,8 @@ class WildGHandModel(nn.Module):
             pose: (B, 16, 3) axis-angle, rad.
             features: of the network, where they are at hand already.
         """
-        made = self.network(side, quat_third_axis(anchors.orientations), pose, features)
+        normals = quat_third_axis(anchors.orientations)
+        made = self._shaded(self.network(side, normals, pose, features), normals)
         if self._template:
             return made
         return replace(made, template_offsets=torch.zeros_like(made.template_offsets))
@@ -342,8 +350,8 @@ def _in_frames(
     return pose[rows], betas, transl[rows]
 
 
-def _darkened(prediction: NetworkOutput, dark: Tensor | None) -> NetworkOutput:
-    """A prediction under shadows, (B, N) factors; None: under none."""
+def _dimmed(prediction: NetworkOutput, dark: Tensor | None) -> NetworkOutput:
+    """A prediction whose colours are multiplied by (B, N) factors; None: as it is."""
     if dark is None:
         return prediction
     return replace(prediction, shadow=prediction.shadow * dark[..., None])

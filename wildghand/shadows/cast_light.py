@@ -19,7 +19,7 @@ _MOST_DIRECTIONS, _LARGEST = 4096, 1e6
 # casts a shadow.
 _LEAST = 1e-3
 # Linear light to sRGB is about this power.
-_SRGB = 1.0 / 2.2
+SRGB = 1.0 / 2.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +47,12 @@ class CastLight:
         falling = np.maximum(normals @ self.directions.T, 0.0) * self.strengths
         without = self.ambient + falling.sum(axis=1) + _LEAST
         share = (self.ambient + (falling * free).sum(axis=1) + _LEAST) / without
-        return np.clip(share, darkest, 1.0) ** _SRGB
+        return np.clip(share, darkest, 1.0) ** SRGB
+
+    def lit(self) -> CastLight:
+        """The same light without the directions that nothing comes from."""
+        shining = self.strengths > 0.0
+        return CastLight(self.directions[shining], self.strengths[shining], self.ambient)
 
     def to_tensors(self) -> dict[str, Tensor]:
         """The fields by the names under which an avatar keeps them."""

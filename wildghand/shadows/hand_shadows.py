@@ -1,4 +1,4 @@
-"""How dark shadows make Gaussians: in any pose, and in the frames of a clip."""
+"""How bright a light makes Gaussians: in any pose, and in the frames of a clip."""
 
 from __future__ import annotations
 
@@ -13,32 +13,39 @@ from hwp_bench.hands import TemplateTensors, pose_hand, vertex_normals
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip
-from wildghand.shadows.cast_light import CastLight
+from wildghand.shadows.cast_light import SRGB, CastLight
 from wildghand.shadows.obstacles import Obstacles
+from wildghand.shadows.settings import ShadowSettings
+
+# Least and largest irradiance that skin is drawn in: where little is seen the light may be wrong.
+_DIM, _BRIGHT = 0.15, 4.0
 
 #: Pose (B, 16, 3) rad, betas (10,) and translation (B, 3) m by side.
 Hands = Mapping[str, tuple[Tensor, Tensor, Tensor]]
 
 
 class HandShadows:
-    """Shadows of hands under a light.
+    """Hands under a light, and the shadows that they cast.
 
-    They are cast at the vertices of the posed templates, and Gaussians take them from the vertices
-    around their anchors. There is no gradient.
+    Shadows are cast at the vertices of the posed templates, and Gaussians take them from the
+    vertices around their anchors. There is no gradient.
 
     Args:
         rigs: by side; the light of each is kept off by all that are posed with it.
         light: under which they stand.
-        darkest: share of the light that is left in the darkest shadow.
+        settings: how hands are drawn in it.
     """
 
-    def __init__(self, rigs: Mapping[str, HandRig], light: CastLight, darkest: float) -> None:
-        self._darkest = darkest
+    def __init__(
+        self, rigs: Mapping[str, HandRig], light: CastLight, settings: ShadowSettings
+    ) -> None:
+        self._settings = settings
         self._templates = {side: _on_cpu(rig.template) for side, rig in rigs.items()}
         self._faces = {side: made.faces.numpy() for side, made in self._templates.items()}
-        # Directions without strength cast nothing.
-        lit = light.strengths > 0.0
-        self._light = CastLight(light.directions[lit], light.strengths[lit], light.ambient)
+        self._light = light.lit()
+        device = next(iter(rigs.values())).template.vertices.device
+        self._directions = torch.from_numpy(self._light.directions).to(device).double()
+        self._strengths = torch.from_numpy(self._light.strengths).to(device).double()
         self._corners: dict[str, tuple[Tensor, Tensor]] = {}
         for side, rig in rigs.items():
             faces = torch.as_tensor(rig.anchors.face_index, device=rig.template.faces.device)
@@ -46,6 +53,27 @@ class HandShadows:
                 rig.template.faces[faces],
                 torch.as_tensor(rig.anchors.barycentric).to(rig.template.vertices),
             )
+
+    @torch.no_grad()
+    def shading(self, normals: Tensor) -> Tensor | None:
+        """Factors on the sRGB colours of skin with nothing in the way; None: ones.
+
+        Args:
+            normals: (B, N, 3) of length 1.
+
+        Returns:
+            (B, N), 1 at the mean irradiance of what the light was found in.
+        """
+        if not self._settings.shading:
+            return None
+        # In float64, frame by frame: rounded, a frame has the same bits in every batch.
+        falling = torch.stack(
+            [
+                (one.double() @ self._directions.mT).clamp(min=0.0) @ self._strengths
+                for one in normals
+            ]
+        )
+        return (falling + self._light.ambient).clamp(_DIM, _BRIGHT).pow(SRGB).to(normals)
 
     def of(self, hands: Hands) -> dict[str, Tensor]:
         """Factors on the sRGB colours of the Gaussians of hands that stand together.
@@ -82,7 +110,7 @@ class HandShadows:
 
     def _dark(self, in_the_way: Obstacles, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
         free = in_the_way.free(places, normals, self._light.directions)
-        return self._light.darkening(normals, free, self._darkest)
+        return self._light.darkening(normals, free, self._settings.darkest)
 
     def _posed(
         self, side: str, pose: Tensor, betas: Tensor, transl: Tensor

@@ -9,7 +9,7 @@ from hwp_bench.methods.settings import number
 
 @dataclass(frozen=True)
 class ShadowSettings:
-    """How the light that casts shadows is found, and how its shadows are drawn."""
+    """How the light that casts shadows is found, and how hands are drawn in it."""
 
     #: Find a light before the first step, and darken Gaussians that the hands keep it from.
     enabled: bool = True
@@ -25,5 +25,8 @@ class ShadowSettings:
     least_gain: float = number(0.006, 0.0, 1.0)
     #: Half the angle over which a lamp is spread, degrees.
     softness: float = number(12.0, 0.0, 60.0)
+    #: The light also says how bright a normal is with nothing in the way; the network says what is
+    #: left. Else the network alone does.
+    shading: bool = True
     #: Share of the light that is left in the darkest shadow.
     darkest: float = number(0.15, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""What an avatar without any error of its own would score at the poses that methods are given."""
+"""The score of an avatar without any error of its own at the poses that methods are given."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def at_given_poses(
     """A true frame whose hands are moved from their true poses to the estimated ones.
 
     Each pixel of the moved surface takes its colour from where its point is in the true frame;
-    pixels beside it follow the nearest one on it.
+    pixels next to it follow the nearest one on it.
 
     Args:
         capture: with true hands.

@@ -117,7 +117,8 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     objective.temporal, objective._laplacians = moved((objective.temporal, objective._laplacians))
     places = skin_places(training, fit.frames, templates) if needs_places(settings) else ()
     if fit.model.shadows is not None:
-        fit.model.shadows._corners = moved(fit.model.shadows._corners)
+        for name in ("_corners", "_directions", "_strengths"):
+            setattr(fit.model.shadows, name, moved(getattr(fit.model.shadows, name)))
         assert isinstance(fit.dark, ShadowTable)
         fit.dark._device = FAKE
     fit.weighting = Weighting(fit.frames, len(training.sides), assessment, settings, FAKE, places)

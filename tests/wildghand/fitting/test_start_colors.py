@@ -12,9 +12,12 @@ import torch
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.evidence.count import read_images, seen_anchors
+from wildghand.fitting.cast_shadows import shadows_in
+from wildghand.fitting.chosen_frames import best_of_each_part
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.start_colors import best_of_each_part, start_from_colors, tint_share
+from wildghand.fitting.start_colors import start_from_colors, tint_share
 from wildghand.model.settings import read_settings
+from wildghand.shadows import CastLight
 
 TINY: dict[str, Any] = {
     "gaussians": 600,
@@ -24,6 +27,7 @@ TINY: dict[str, Any] = {
     "prepass.enabled": False,
     "subject.enabled": False,
     "start_colors": False,
+    "shadows.enabled": False,
     "device": "cpu",
 }
 TrainingMaker = Callable[..., TrainingCapture]
@@ -61,14 +65,14 @@ def test_a_tint_that_is_far_from_the_networks_is_taken_from_the_frames(fit: Fit)
     before = off_the_frames(fit, images)
     frames = dataclasses.replace(fit.frames, images=images)
     others = {k: v.clone() for k, v in fit.model.network.state_dict().items() if "maps" not in k}
-    start_from_colors(fit.model, fit.clip, frames, fit.weighting)
+    start_from_colors(fit.model, fit.clip, frames, fit.weighting, fit.dark)
     assert off_the_frames(fit, images) < 0.6 * before
     after = fit.model.network.state_dict()
     assert all(torch.equal(after[name], value) for name, value in others.items())
     # The same once more.
     first = fit.model.network.identity.maps["right"].clone()
     again = Fit(fit.training, fit.settings, 0, torch.device("cpu"))
-    start_from_colors(again.model, again.clip, frames, again.weighting)
+    start_from_colors(again.model, again.clip, frames, again.weighting, again.dark)
     assert torch.equal(again.model.network.identity.maps["right"], first)
 
 
@@ -81,8 +85,29 @@ def test_brightness_is_left_to_the_fit(fit: Fit, brightness: float) -> None:
     images[:] = images[0, -1, 0]
     before = fit.model.network.identity.maps["right"].clone()
     frames = dataclasses.replace(fit.frames, images=images)
-    start_from_colors(fit.model, fit.clip, frames, fit.weighting)
+    start_from_colors(fit.model, fit.clip, frames, fit.weighting, fit.dark)
     assert torch.equal(fit.model.network.identity.maps["right"], before)
+
+
+def test_light_and_shadows_are_no_tint(make_training: TrainingMaker) -> None:
+    """Frames that the model has drawn in a strong light, in the colours that it starts with."""
+    settings = read_settings({**TINY, "shadows.enabled": True})
+    fit = Fit(make_training(), settings, 0, torch.device("cpu"))
+    strong = np.array([3.0], np.float32)
+    fit.model.keep(CastLight(np.array([[0.0, 0.0, -1.0]], np.float32), strong, 0.3))
+    size = fit.training.width, fit.training.height
+    dark = shadows_in(fit.model, fit.clip)
+    with torch.no_grad():
+        drawn = fit.model.draw_frames(fit.clip, torch.arange(len(fit.frames)), *size)
+    images = (255.0 * drawn.image.clamp(0.0, 1.0)).round().byte()
+    frames = dataclasses.replace(fit.frames, images=images)
+    before = fit.model.network.identity.maps["right"].clone()
+    start_from_colors(fit.model, fit.clip, frames, fit.weighting, dark)
+    moved = (fit.model.network.identity.maps["right"] - before).abs()
+    fit.model.shadows = None
+    start_from_colors(fit.model, fit.clip, frames, fit.weighting, lambda rows: {})
+    misled = (fit.model.network.identity.maps["right"] - before).abs()
+    assert float(moved.mean()) < 0.2 * float(misled.mean())
 
 
 def test_a_fit_starts_so_unless_it_is_switched_off(
@@ -101,7 +126,7 @@ def test_a_network_without_a_direct_path_stays_as_it_is(make_training: TrainingM
         make_training(), read_settings({**TINY, "network.direct": False}), 0, torch.device("cpu")
     )
     before = fit.model.snapshot()
-    start_from_colors(fit.model, fit.clip, fit.frames, fit.weighting)
+    start_from_colors(fit.model, fit.clip, fit.frames, fit.weighting, fit.dark)
     assert all(torch.equal(value, before[name]) for name, value in fit.model.state_dict().items())
 
 

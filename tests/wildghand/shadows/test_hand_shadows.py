@@ -16,9 +16,10 @@ from hwp_bench.hands import load_template, pose_hand, vertex_normals
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.fit import Fit
+from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig, make_rig
 from wildghand.model.settings import read_settings
-from wildghand.shadows import CastLight, HandShadows, Obstacles, ShadowTable
+from wildghand.shadows import CastLight, HandShadows, Obstacles, ShadowSettings, ShadowTable
 from wildghand.shadows.obstacles import LIFT
 
 QUICK: dict[str, Any] = {
@@ -30,6 +31,7 @@ QUICK: dict[str, Any] = {
     "subject.enabled": False,
     "device": "cpu",
 }
+DEEP = ShadowSettings(darkest=0.0)
 TrainingMaker = Callable[..., TrainingCapture]
 
 
@@ -87,7 +89,7 @@ def test_what_is_in_the_way_is_what_rays_meet() -> None:
 
 
 def test_an_open_hand_has_less_shadow_than_a_bent_one(rigs: dict[str, HandRig]) -> None:
-    shadows = HandShadows({"right": rigs["right"]}, a_light(), 0.0)
+    shadows = HandShadows({"right": rigs["right"]}, a_light(), DEEP)
     least = []
     for bend in (0.0, 0.9):
         dark = shadows.of({"right": hand(bend, (0.0, 0.0, 0.4))})["right"]
@@ -100,7 +102,7 @@ def test_an_open_hand_has_less_shadow_than_a_bent_one(rigs: dict[str, HandRig]) 
 
 def test_factors_at_vertices_are_those_of_the_formula(rigs: dict[str, HandRig]) -> None:
     light, darkest = a_light(), 0.15
-    shadows = HandShadows({"right": rigs["right"]}, light, darkest)
+    shadows = HandShadows({"right": rigs["right"]}, light, ShadowSettings(darkest=darkest))
     pose = hand(0.9, (0.0, 0.0, 0.4))
     got = shadows.at_vertices({"right": pose})["right"][0]
     template = rigs["right"].template
@@ -121,7 +123,7 @@ def test_factors_at_vertices_are_those_of_the_formula(rigs: dict[str, HandRig]) 
 
 def test_a_hand_in_the_light_of_the_other_shades_it(rigs: dict[str, HandRig]) -> None:
     lamp = CastLight(np.array([[0.0, 0.0, -1.0]], np.float32), np.ones(1, np.float32), 0.25)
-    shadows = HandShadows(rigs, lamp, 0.0)
+    shadows = HandShadows(rigs, lamp, DEEP)
     middles = {side: rig.template.vertices.mean(dim=0) for side, rig in rigs.items()}
     # One is straight in front of the other.
     far = hand(0.0, tuple((torch.tensor([0.0, 0.0, 0.5]) - middles["right"]).tolist()))
@@ -133,9 +135,27 @@ def test_a_hand_in_the_light_of_the_other_shades_it(rigs: dict[str, HandRig]) ->
     torch.testing.assert_close(behind["left"], shadows.of({"left": near})["left"])
 
 
+def test_shading_is_the_irradiance_with_nothing_in_the_way(rigs: dict[str, HandRig]) -> None:
+    light = a_light()
+    normals = np.random.default_rng(3).normal(size=(2, 50, 3))
+    normals /= np.linalg.norm(normals, axis=-1, keepdims=True)
+    falling = np.maximum(normals @ light.directions.T.astype(float), 0.0) @ light.strengths
+    expected = (0.25 + falling) ** (1.0 / 2.2)
+    got = HandShadows(rigs, light, ShadowSettings()).shading(torch.from_numpy(normals).float())
+    assert got is not None
+    np.testing.assert_allclose(got, expected, rtol=1e-5)
+    off = HandShadows(rigs, light, ShadowSettings(shading=False))
+    assert off.shading(torch.zeros(1, 1, 3)) is None
+    # In the dark skin is dim and not black.
+    dark = CastLight(light.directions, np.zeros(3, np.float32), 0.0)
+    night = HandShadows(rigs, dark, ShadowSettings()).shading(torch.zeros(1, 1, 3))
+    assert night is not None
+    assert 0.3 < float(night[0, 0]) < 0.5
+
+
 def test_the_table_of_a_clip_holds_the_same(make_training: TrainingMaker) -> None:
     fit = Fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
-    shadows = HandShadows(fit.model.rigs, a_light(), 0.15)
+    shadows = HandShadows(fit.model.rigs, a_light(), ShadowSettings())
     table = ShadowTable(shadows, fit.clip)
     pose, betas, transl = fit.clip.parameters["right"]
     for rows in ([3], [0, 3, 5], [5, 0]):
@@ -156,9 +176,14 @@ def test_shadows_darken_what_is_drawn_and_are_kept(
     fit.model.keep(a_light())
     avatar = fit.avatar(0)
     made = avatar.pose(hands)
-    dark = fit.model.cast(avatar.posed(hands))["right"][0].numpy()
+    posed = avatar.posed(hands)
+    dark = fit.model.cast(posed)["right"][0].numpy()
     assert dark.min() < 0.98
-    np.testing.assert_allclose(made.colors, without.colors * dark[:, None], atol=1e-6)
+    anchors = fit.model.rigs["right"].pose(*posed["right"])
+    lit = fit.model.shadows.shading(quat_third_axis(anchors.orientations))
+    assert lit is not None
+    factor = (dark * lit[0].numpy())[:, None]
+    np.testing.assert_allclose(made.colors, without.colors * factor, atol=1e-6)
     np.testing.assert_array_equal(made.opacities, without.opacities)
     drawn = avatar.render(hands, camera)
     again = load_avatar(save_avatar(avatar, tmp_path / "avatar"))
@@ -169,7 +194,7 @@ def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMak
     fit = Fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
     fit.model.keep(a_light())
     rows = torch.tensor([1, 4])
-    table = ShadowTable(HandShadows(fit.model.rigs, a_light(), 0.15), fit.clip)
+    table = ShadowTable(HandShadows(fit.model.rigs, a_light(), ShadowSettings()), fit.clip)
     size = fit.training.width, fit.training.height
     # Without factors at hand the model casts them itself.
     own = fit.model.draw_frames(fit.clip, rows, *size)
