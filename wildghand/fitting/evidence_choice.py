@@ -120,7 +120,11 @@ class EvidenceChoice:
 
     @functools.cached_property
     def _dark(self) -> Dark:
-        return shadows_in(self.model, self._clip)
+        """The shadows in the frames, cast at once, so that `seconds` has cast them."""
+        assert self.frames is not None
+        dark = shadows_in(self.model, self._clip)
+        dark(torch.arange(len(self.frames)))
+        return dark
 
     def _truth(self, row: int) -> tuple[Tensor, Tensor]:
         """(H, W, 3) image and (H, W) coverage of the hand in a validation frame."""
