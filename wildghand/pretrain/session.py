@@ -66,8 +66,15 @@ def pretrain(
     """
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
-    # A new prior starts from neither the one that ships nor one person's colours, unless asked to.
-    settings = {"prior": "", "start_colors": False, **_RATES, **settings}
+    # A new prior starts from neither the one that ships nor one person's colours, and knows light
+    # by itself, unless asked to.
+    settings = {
+        "prior": "",
+        "start_colors": False,
+        "shadows.enabled": False,
+        **_RATES,
+        **settings,
+    }
     chosen = read_settings(settings)
     captures = [open_capture(source) for source in sources]
     _check_captures(captures)
