@@ -23,13 +23,9 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.model.dress import Gaussians
+from wildghand.model.model import rasterize_hands
 from wildghand.shadows import CastLight
-from wildghand.splat import rasterize
-
-#: Directions of the sky, which come after those of the lamps.
-SKY = 48
-#: Directions of one lamp.
-CONE = 7
+from wildghand.shadows.find_light import CONE, SKY
 
 
 def lamps_of(light: CastLight) -> list[tuple[np.ndarray, float]]:
@@ -55,7 +51,7 @@ def white_hands(avatar: WildGHandAvatar, capture: Capture, frame: int) -> list[n
         anchors = model.rigs[side].pose(*given)
         shading = model.shadows.shading(quat_third_axis(anchors.orientations))
         lit = torch.ones_like(dark[side]) if shading is None else shading
-        parts.append(model.gaussians(side, *given))
+        parts.append(model.gaussians(side, *given, dark=dark[side]))
         factors.append([lit, lit * dark[side], dark[side]])
     pictures = []
     for choice in range(3):
@@ -70,22 +66,8 @@ def white_hands(avatar: WildGHandAvatar, capture: Capture, frame: int) -> list[n
 
 def _drawn(parts: list[Gaussians], capture: Capture, frame: int) -> np.ndarray:
     camera = capture.camera(frame)
-
-    def joined(name: str, fields: int) -> Tensor:
-        tensors = [getattr(part, name) for part in parts]
-        return torch.cat([one if one.ndim == fields else one[0] for one in tensors])
-
-    image, _, _ = rasterize(
-        joined("means", 2),
-        joined("quats", 2),
-        joined("scales", 2),
-        joined("opacities", 1),
-        joined("colors", 2),
-        torch.as_tensor(camera.viewmat, dtype=torch.float32)[None],
-        torch.as_tensor(camera.K, dtype=torch.float32)[None],
-        camera.width,
-        camera.height,
-    )
+    viewmats, Ks = (torch.as_tensor(one).float()[None] for one in (camera.viewmat, camera.K))
+    image, _ = rasterize_hands(parts, viewmats, Ks, camera.width, camera.height)
     drawn: np.ndarray = image[0].clamp(0.0, 1.0).numpy()
     return drawn
 

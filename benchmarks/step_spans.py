@@ -47,7 +47,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     ),
     "shading": ("wildghand.plain.model:sh_basis",),
     "rasterizer": (
-        "wildghand.model.model:_rasterize",
+        "wildghand.model.model:rasterize_hands",
         "wildghand.model.model:rasterize",
         "wildghand.plain.model:rasterize",
     ),

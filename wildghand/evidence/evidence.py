@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from hwp_bench.base.errors import BadInput
 from wildghand.evidence.settings import EvidenceSettings
 from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.kept_tensors import kept_tensor
 
 _OFFSETS, _SHAPES = "evidence_offsets_", "evidence_shapes_"
 # The disc: standard deviations along the skin and across it, in spacings of the anchors, and its
@@ -91,11 +91,7 @@ class Evidence:
             return None
         for side, count in counts.items():
             for name in (f"{_OFFSETS}{side}", f"{_SHAPES}{side}"):
-                tensor = tensors.get(name)
-                if tensor is None or tuple(tensor.shape) != (count,):
-                    raise BadInput(f"has not the shape {(count,)}", where=where, field=name)
-                if not bool(((tensor >= 0.0) & (tensor <= 1.0)).all()):
-                    raise BadInput("lies outside 0 to 1", where=where, field=name)
+                kept_tensor(tensors, name, (count,), (0, 1), where)
         return cls(
             {side: tensors[f"{_OFFSETS}{side}"].float() for side in counts},
             {side: tensors[f"{_SHAPES}{side}"].float() for side in counts},

@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from hwp_bench.base.errors import BadInput
 from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.kept_tensors import kept_tensor
 
 _PREFIX = "other_hand_"
 # Largest change of a colour that is read, in logits.
@@ -54,11 +54,10 @@ class OtherHand:
         """
         if not any(f"{_PREFIX}{side}" in tensors for side in counts):
             return None
-        for side, count in counts.items():
-            name = f"{_PREFIX}{side}"
-            tensor = tensors.get(name)
-            if tensor is None or tuple(tensor.shape) != (count, 3):
-                raise BadInput(f"has not the shape {(count, 3)}", where=where, field=name)
-            if not bool((tensor.abs() <= _LARGEST).all()):
-                raise BadInput(f"lies outside {-_LARGEST} to {_LARGEST}", where=where, field=name)
-        return cls({side: tensors[f"{_PREFIX}{side}"].float() for side in counts})
+        bounds = (-_LARGEST, _LARGEST)
+        return cls(
+            {
+                side: kept_tensor(tensors, f"{_PREFIX}{side}", (count, 3), bounds, where).float()
+                for side, count in counts.items()
+            }
+        )

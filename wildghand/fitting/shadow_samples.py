@@ -14,7 +14,7 @@ from wildghand.fitting.weighting import Weighting
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
-from wildghand.shadows import Obstacles, ShadowSamples, ShadowSettings
+from wildghand.shadows import Obstacles, ShadowSamples, ShadowSettings, obstacles_in_frames
 
 # Weight of a frame from which it is read, if at least so many frames have it.
 _GOOD, _LEAST = 0.5, 4
@@ -97,7 +97,4 @@ def _obstacles(rigs: dict[str, HandRig], clip: TrainingClip, rows: Tensor) -> li
         pose, betas, transl = clip.parameters[side]
         vertices = pose_hand(rig.template, pose[rows], betas, transl[rows]).vertices
         surfaces.append((vertices.cpu().numpy(), rig.template.faces.cpu().numpy()))
-    return [
-        Obstacles([(vertices[frame], faces) for vertices, faces in surfaces])
-        for frame in range(len(rows))
-    ]
+    return list(obstacles_in_frames(surfaces))

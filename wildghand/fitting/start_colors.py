@@ -8,8 +8,6 @@ they are light too, which the network has to tell from colour.
 
 from __future__ import annotations
 
-import functools
-
 import torch
 from torch import Tensor
 
@@ -99,9 +97,9 @@ def tint_share(off: Tensor) -> Tensor:
 
 def _lit(model: WildGHandModel, normals: Tensor, dark: Tensor | None) -> Tensor:
     """(B, N, 1) factors of light and shadows on colours of (B, N) places."""
+    lit = torch.ones_like(normals[..., 0]) if dark is None else dark
     shading = None if model.shadows is None else model.shadows.shading(normals)
-    factors = [factor for factor in (shading, dark) if factor is not None]
-    return functools.reduce(torch.mul, factors, torch.ones_like(normals[..., 0]))[..., None]
+    return (lit if shading is None else lit * shading)[..., None]
 
 
 def _logits(colors: Tensor) -> Tensor:

@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 from torch import Tensor
 
 from hwp_bench.base.errors import BadInput
+from wildghand.gaussians.kept_tensors import kept_tensor
 from wildghand.light.settings import LightSettings
 from wildghand.light.sphere import spread_directions
 
@@ -119,20 +120,17 @@ class KnownLight:
         """
         if f"{_PREFIX}directions" not in tensors:
             return None
-        found = {item.name: tensors.get(f"{_PREFIX}{item.name}") for item in fields(cls)}
-        directions = found["directions"]
-        count = len(directions) if directions is not None and directions.ndim == 2 else 0
+        directions, found = tensors[f"{_PREFIX}directions"], {}
+        count = len(directions) if directions.ndim == 2 else 0
         shapes = {"directions": (count, 3), "strengths": (count,), "ambient": ()}
         shapes |= {"axis": (3,), "cosine": ()}
         for name, shape in shapes.items():
-            tensor, field = found[name], f"{_PREFIX}{name}"
-            if tensor is None or tuple(tensor.shape) != shape or not 0 < count <= _MOST_DIRECTIONS:
+            field = f"{_PREFIX}{name}"
+            if not 0 < count <= _MOST_DIRECTIONS:
                 raise BadInput(f"has not the shape {shape}", where=where, field=field)
-            signed = name in ("directions", "axis", "cosine")
-            low, high = (-1.001, 1.001) if signed else (0.0, 1e6)
-            if not bool(((tensor >= low) & (tensor <= high)).all()):
-                raise BadInput(f"lies outside {low} to {high}", where=where, field=field)
-        return cls(**{name: tensor.float() for name, tensor in found.items() if tensor is not None})
+            bounds = (-1.001, 1.001) if name in ("directions", "axis", "cosine") else (0.0, 1e6)
+            found[name] = kept_tensor(tensors, field, shape, bounds, where).float()
+        return cls(**found)
 
 
 def fit_light(samples: LightSamples, settings: LightSettings) -> KnownLight | None:

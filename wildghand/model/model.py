@@ -183,7 +183,7 @@ class WildGHandModel(nn.Module):
             )
             parts.append(gaussians)
             states[side] = HandState(prediction, bias_size, omega, gaussians.opacities)
-        image, coverage = _rasterize(parts, clip.viewmats[rows], clip.Ks[rows], width, height)
+        image, coverage = rasterize_hands(parts, clip.viewmats[rows], clip.Ks[rows], width, height)
         # The image lies over black, so a gain on it is one on every Gaussian.
         image = image * self.log_gains[rows].exp()[:, None, None]
         return RenderedFrames(image, coverage, states)
@@ -245,7 +245,7 @@ class WildGHandModel(nn.Module):
             for side in self.rigs
             if side in hands
         ]
-        return _rasterize(parts, viewmats, Ks, width, height)
+        return rasterize_hands(parts, viewmats, Ks, width, height)
 
     def gaussians(
         self,
@@ -357,9 +357,21 @@ def _dimmed(prediction: NetworkOutput, dark: Tensor | None) -> NetworkOutput:
     return replace(prediction, shadow=prediction.shadow * dark[..., None])
 
 
-def _rasterize(
+def rasterize_hands(
     parts: list[Gaussians], viewmats: Tensor, Ks: Tensor, width: int, height: int
 ) -> tuple[Tensor, Tensor]:
+    """Draw the Gaussians of hands together in B frames.
+
+    Args:
+        parts: of each hand.
+        viewmats: (B, 4, 4).
+        Ks: (B, 3, 3) px.
+        width, height: px.
+
+    Returns:
+        (B, H, W, 3) sRGB over black and (B, H, W, 1) coverage.
+    """
+
     def joined(name: str, shared: int) -> Tensor:
         tensors = [getattr(part, name) for part in parts]
         if len(tensors) == 1:

@@ -3,7 +3,7 @@
 from wildghand.shadows.cast_light import CastLight
 from wildghand.shadows.find_light import ShadowSamples, find_light
 from wildghand.shadows.hand_shadows import HandShadows, ShadowTable
-from wildghand.shadows.obstacles import Obstacles
+from wildghand.shadows.obstacles import Obstacles, obstacles_in_frames
 from wildghand.shadows.settings import ShadowSettings
 
 __all__ = [
@@ -14,4 +14,5 @@ __all__ = [
     "ShadowSettings",
     "ShadowTable",
     "find_light",
+    "obstacles_in_frames",
 ]

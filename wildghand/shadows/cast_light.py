@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import BadInput
+from wildghand.gaussians.kept_tensors import kept_tensor
 
 # Names under which an avatar keeps a light.
 _PREFIX = "shadows_"
@@ -84,11 +85,9 @@ class CastLight:
         found = {}
         for name, shape in shapes.items():
             field = f"{_PREFIX}{name}"
-            tensor = tensors.get(field)
-            if tensor is None or tuple(tensor.shape) != shape or not 0 < count <= _MOST_DIRECTIONS:
+            if not 0 < count <= _MOST_DIRECTIONS:
                 raise BadInput(f"has not the shape {shape}", where=where, field=field)
-            low, high = (-1.001, 1.001) if name == "directions" else (0.0, _LARGEST)
-            if not bool(((tensor >= low) & (tensor <= high)).all()):
-                raise BadInput(f"lies outside {low} to {high}", where=where, field=field)
+            bounds = (-1.001, 1.001) if name == "directions" else (0.0, _LARGEST)
+            tensor = kept_tensor(tensors, field, shape, bounds, where)
             found[name] = tensor.detach().float().cpu().numpy()
         return cls(found["directions"], found["strengths"], float(found["ambient"]))

@@ -22,8 +22,10 @@ from wildghand.light.sphere import ring_around, spread_directions
 from wildghand.shadows.cast_light import CastLight
 from wildghand.shadows.settings import ShadowSettings
 
-# Directions of the sky from which the walls shine.
-_SKY = 48
+#: Directions of the sky from which the walls shine; they come after those of the lamps.
+SKY = 48
+#: Directions of one lamp, its middle first.
+CONE = 7
 # The six walls.
 _WALLS = np.concatenate([np.eye(3), -np.eye(3)])
 # Turns of albedo, strengths and robust weights.
@@ -88,9 +90,9 @@ def find_light(samples: ShadowSamples, settings: ShadowSettings) -> CastLight | 
     if len(samples.places) < _SAMPLES_EACH * most or not samples.weights.sum() > 0.0:
         return None
     pursuit = _Pursuit(samples)
-    sky = spread_directions(_SKY)
+    sky = spread_directions(SKY)
     # The mean of a half space's cosines, so that a wall of strength 1 gives about 1.
-    shares = np.maximum(sky @ _WALLS.T, 0.0) * (4.0 / _SKY)
+    shares = np.maximum(sky @ _WALLS.T, 0.0) * (4.0 / SKY)
     basis = np.column_stack([np.ones(len(samples.light)), samples.falling(sky) @ shares])
     solved = pursuit.solve(basis)
     candidates = spread_directions(settings.directions)
@@ -210,7 +212,7 @@ def _light_of(
     walls = 1 + len(_WALLS)
     directions, parts = [], []
     for lamp, strength in zip(lamps, strengths[walls:], strict=True):
-        cone = np.concatenate([lamp[None], ring_around(lamp, math.radians(softness))])
+        cone = np.concatenate([lamp[None], ring_around(lamp, math.radians(softness), CONE - 1)])
         directions.append(cone)
         parts.append(np.full(len(cone), strength / len(cone)))
     directions.append(sky)

@@ -14,7 +14,7 @@ from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.shadows.cast_light import SRGB, CastLight
-from wildghand.shadows.obstacles import Obstacles
+from wildghand.shadows.obstacles import Obstacles, obstacles_in_frames
 from wildghand.shadows.settings import ShadowSettings
 
 # Least and largest irradiance that skin is drawn in: where little is seen the light may be wrong.
@@ -98,12 +98,9 @@ class HandShadows:
     def at_vertices(self, hands: Hands) -> dict[str, np.ndarray]:
         """Factors at the vertices: (B, V) float32 by side; see `of`."""
         posed = {side: self._posed(side, *given) for side, given in hands.items()}
-        frames = len(next(iter(posed.values()))[0])
         dark = {side: np.empty(places.shape[:2], np.float32) for side, (places, _) in posed.items()}
-        for frame in range(frames):
-            in_the_way = Obstacles(
-                [(places[frame], self._faces[side]) for side, (places, _) in posed.items()]
-            )
+        surfaces = [(places, self._faces[side]) for side, (places, _) in posed.items()]
+        for frame, in_the_way in enumerate(obstacles_in_frames(surfaces)):
             for side, (places, normals) in posed.items():
                 dark[side][frame] = self._dark(in_the_way, places[frame], normals[frame])
         return dark

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -13,6 +13,18 @@ from hwp_bench.base.ray_mesh import ray_mesh
 LIFT = 2e-3
 # Cosine between normal and direction up to which a place has no light from there anyway.
 _GRAZING = 0.02
+
+
+def obstacles_in_frames(
+    surfaces: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> Iterator[Obstacles]:
+    """The hands of one frame after the other.
+
+    Args:
+        surfaces: (B, V, 3) m in B frames and (F, 3) of each hand, at least one.
+    """
+    for frame in range(len(surfaces[0][0])):
+        yield Obstacles([(vertices[frame], faces) for vertices, faces in surfaces])
 
 
 class Obstacles:
