@@ -11,7 +11,7 @@ import numpy as np
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.evaluation.budget.ceiling import NAME as CEILING
 from hwp_bench.evaluation.budget.ceiling import TEXT as CEILING_TEXT
-from hwp_bench.evaluation.budget.ceiling import ceiling
+from hwp_bench.evaluation.budget.ceiling import Ceiling
 from hwp_bench.evaluation.budget.corrections import CORRECTIONS
 from hwp_bench.evaluation.budget.frames import pairs_of
 from hwp_bench.evaluation.budget.pair import Pair, error_of
@@ -83,15 +83,17 @@ def make_budget(runs: BudgetRuns) -> Budget:
         scores = {frame.frame: frame.scores["psnr"] for frame in found.frames}
         gains: dict[str, list[float]] = {name: [] for name in CORRECTIONS}
         folder = runs.folders[GIVEN] / "captures" / found.id / "predictions"
+        ceiling, most = Ceiling.of(capture), []
         for frame, pair in pairs_of(capture, folder, list(scores)):
             for name, (correct, _) in CORRECTIONS.items():
                 better = 0.0 if pair is None else gained(correct(pair), pair)
                 gains[name].append(scores[frame] + better)
+            if ceiling is not None:
+                most.append(ceiling.psnr(frame, pair, scores[frame]))
         for name, values in gains.items():
             corrected[name][found.id] = float(np.mean(values))
-        most = ceiling(capture, scores)
-        if most is not None:
-            ceilings[found.id] = float(np.mean(list(most.values())))
+        if ceiling is not None:
+            ceilings[found.id] = float(np.mean(most))
         order = sorted(scores, key=lambda frame: (scores[frame], frame))
         shown[found.id] = order[len(order) // 2]
     rows += [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import cv2
 import numpy as np
@@ -11,11 +12,10 @@ from scipy.spatial.transform import Rotation
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import TRUE_TEMPLATE
 from hwp_bench.capture.subject_mesh import read_subject_mesh
+from hwp_bench.evaluation.budget.pair import Pair, error_of
 from hwp_bench.evaluation.budget.surface import MovingSurface
 from hwp_bench.hands import HandTemplate
-from hwp_bench.metrics.pixels import scored_pixels
-from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.psnr_ssim import decibels, squared_error
+from hwp_bench.metrics.psnr_ssim import decibels
 
 #: Name of its row, and what it is.
 NAME = "true colours"
@@ -63,26 +63,29 @@ def at_given_poses(
     return moved
 
 
-def ceiling(capture: Capture, scores: Mapping[int, float]) -> dict[int, float] | None:
-    """PSNR of `at_given_poses` in test frames, dB.
+@dataclass(frozen=True, eq=False)
+class Ceiling:
+    """What an avatar without an error of its own scores on a capture that knows the truth."""
 
-    Args:
-        capture: which.
-        scores: of the method in these frames, which hold where the hand was not estimated.
+    #: The capture.
+    capture: Capture
+    #: Rest hands of its subject, by side.
+    templates: Mapping[str, HandTemplate]
 
-    Returns:
-        By frame; None where the capture does not know the truth.
-    """
-    if capture.true_hands is None:
-        return None
-    templates, found = surfaces_of(capture), {}
-    for frame, score in scores.items():
-        moved = at_given_poses(capture, frame, templates)
-        if moved is None:
-            found[frame] = score
-            continue
-        mask, exact = capture.scoring_mask(frame)
-        region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
-        error = squared_error(moved, capture.frame(frame) / 255.0)[region].mean()
-        found[frame] = decibels(float(error))
-    return found
+    @classmethod
+    def of(cls, capture: Capture) -> Ceiling | None:
+        """The ceiling of a capture; None where it does not know the true poses."""
+        return None if capture.true_hands is None else cls(capture, surfaces_of(capture))
+
+    def psnr(self, frame: int, pair: Pair | None, score: float) -> float:
+        """PSNR of `at_given_poses`, dB.
+
+        Args:
+            frame: which test frame.
+            pair: its truth, next to what the method drew; None where that cannot be scored.
+            score: of the method, which holds where there is no pair or no estimate of the hands.
+        """
+        if pair is None:
+            return score
+        moved = at_given_poses(self.capture, frame, self.templates)
+        return score if moved is None else decibels(error_of(moved, pair))

@@ -7,10 +7,10 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
-import pytest
 
 from hwp_bench.capture import Capture, CaptureWriter, open_capture
-from hwp_bench.evaluation.budget.ceiling import at_given_poses, ceiling, surfaces_of
+from hwp_bench.evaluation.budget.ceiling import Ceiling, at_given_poses, surfaces_of
+from hwp_bench.evaluation.budget.pair import Pair
 from hwp_bench.hands import HandParameters
 from hwp_bench.metrics.protocol import PSNR_CAP
 
@@ -33,6 +33,13 @@ def with_estimates(
     return open_capture(folder)
 
 
+def pair_of(capture: Capture) -> Pair:
+    """The truth of the frame next to a black prediction."""
+    target = capture.frame(FRAME) / 255.0
+    region = capture.mask(FRAME) > 250
+    return Pair(np.zeros_like(target), target, region, np.zeros_like(target))
+
+
 def test_at_exact_poses_it_is_the_truth(
     make_painted: Callable[..., Capture], tmp_path: Path
 ) -> None:
@@ -43,10 +50,11 @@ def test_at_exact_poses_it_is_the_truth(
     inside = painted.mask(FRAME) > 250
     # Sources are rounded to 1/32 px by OpenCV.
     np.testing.assert_allclose(moved[inside], painted.frame(FRAME)[inside] / 255.0, atol=0.02)
-    found = ceiling(capture, {FRAME: 20.0})
-    assert found is not None
-    assert found[FRAME] > 45.0
-    assert found[FRAME] <= PSNR_CAP
+    ceiling = Ceiling.of(capture)
+    assert ceiling is not None
+    assert 45.0 < ceiling.psnr(FRAME, pair_of(capture), 20.0) <= PSNR_CAP
+    # A frame that the method failed on keeps its penalty, as in every row.
+    assert ceiling.psnr(FRAME, None, 0.0) == 0.0
 
 
 def test_a_wrong_place_moves_the_image_by_as_much(
@@ -67,9 +75,9 @@ def test_a_wrong_place_moves_the_image_by_as_much(
     # The hand is not flat: parts that are nearer move a little more.
     assert np.abs(moved - shifted)[inside].mean() < 0.02
     assert np.abs(moved - painted.frame(FRAME) / 255.0)[inside].mean() > 0.02
-    found, exact = ceiling(capture, {FRAME: 20.0}), 45.0
-    assert found is not None
-    assert found[FRAME] < exact
+    ceiling, exact = Ceiling.of(capture), 45.0
+    assert ceiling is not None
+    assert ceiling.psnr(FRAME, pair_of(capture), 20.0) < exact
 
 
 def test_what_is_not_known_has_no_ceiling(
@@ -77,9 +85,11 @@ def test_what_is_not_known_has_no_ceiling(
 ) -> None:
     painted = make_painted()
     without = with_estimates(painted, tmp_path / "without", dict(painted.hands), truth=False)
-    assert ceiling(without, {FRAME: 20.0}) is None
+    assert Ceiling.of(without) is None
     valid = painted.hands["right"].valid.copy()
     valid[FRAME] = False
     lost = {"right": replace(painted.hands["right"], valid=valid)}
     capture = with_estimates(painted, tmp_path / "lost", lost)
-    assert ceiling(capture, {FRAME: 21.5}) == {FRAME: pytest.approx(21.5)}
+    ceiling = Ceiling.of(capture)
+    assert ceiling is not None
+    assert ceiling.psnr(FRAME, pair_of(capture), 21.5) == 21.5
