@@ -18,14 +18,11 @@ from torch import Tensor
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.evidence import Evidence, EvidenceSettings, strengths, weigh_evidence
 from wildghand.fitting.cast_shadows import Dark, shadows_in
-from wildghand.gaussians.training import TrainingClip, TrainingFrames, load_validation_frames
+from wildghand.fitting.judging_frames import judging_frames
+from wildghand.gaussians.training import TrainingClip, TrainingFrames
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import HandFeatures
-
-#: Validation frames that are drawn at most, and those that judge at least: one or two, which a fit
-#: to all frames leaves out, say little.
-MOST, LEAST = 8, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,8 +46,7 @@ class EvidenceChoice:
         evidence = self.settings.evidence
         if not (evidence.enabled and evidence.validated):
             return None
-        frames = load_validation_frames(self.training, MOST)
-        return frames if len(frames) >= LEAST else None
+        return judging_frames(self.training)
 
     def best(self) -> Evidence | None:
         """The evidence that draws validation frames best; None where that is the model's own."""

@@ -8,9 +8,11 @@ import numpy as np
 
 from hwp_bench.hands import HandTemplate
 from hwp_bench.methods.contract import TrainingCapture
+from wildghand.fitting.judging_frames import judging_frames
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.subject import SubjectShape, fit_subject
+from wildghand.subject.compared_frames import ComparedFrames
 
 
 def subject_of(
@@ -29,7 +31,19 @@ def subject_of(
         frames.indices,
         np.asarray(frames.masks),
         settings.subject,
+        judges=_judges(training, templates) if settings.subject.validated else None,
     )
+
+
+def _judges(
+    training: TrainingCapture, templates: Mapping[str, HandTemplate]
+) -> ComparedFrames | None:
+    """The validation frames that judge a shape; None where they are too few."""
+    frames = judging_frames(training)
+    if frames is None:
+        return None
+    masks = np.asarray(frames.masks) > 127
+    return ComparedFrames(templates, training.hands, training.cameras, frames.indices, masks)
 
 
 def bent_templates(

@@ -32,8 +32,27 @@ class OutlinePoints:
     gap: np.ndarray
 
 
+@dataclass(frozen=True, eq=False)
+class MaskOutline:
+    """The outline of a mask, read once for many drawings."""
+
+    #: (H, W) float32 px from the border, as `outward_distance`.
+    distance: np.ndarray
+    #: The same, smoothed: its slope is the outward direction.
+    smooth: np.ndarray
+    #: Whether there is a border at all.
+    bordered: bool
+
+    @classmethod
+    def of(cls, mask: np.ndarray) -> MaskOutline:
+        """Read the outline of a mask, (H, W) bool, visible hand."""
+        distance = outward_distance(mask)
+        smooth = _smoothed(distance).astype(np.float32)
+        return cls(distance.astype(np.float32), smooth, bool(mask.any() and not mask.all()))
+
+
 def compare_outlines(
-    pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray, mask: np.ndarray
+    pixels: np.ndarray, depth: np.ndarray, faces: np.ndarray, outline: MaskOutline
 ) -> OutlinePoints:
     """Compare the outline of a mesh with that of a mask.
 
@@ -41,22 +60,22 @@ def compare_outlines(
         pixels: (V, 2) px, the mesh in the image.
         depth: (V,) m.
         faces: (F, 3).
-        mask: (H, W) bool, visible hand.
+        outline: of the mask.
 
     Returns:
         The points where both outlines run alike. Distances of both are read in the same way, so
         that the rounding to pixels is the same.
     """
-    face, mix = draw_faces(pixels, depth, faces, mask.shape)
+    face, mix = draw_faces(pixels, depth, faces, outline.distance.shape)
     drawn = face >= 0
-    mine, other = outward_distance(drawn), outward_distance(mask)
+    mine = outward_distance(drawn)
     # Without a border OpenCV's distances are as large as numbers get, and their slope is noise.
-    bordered = mask.any() and not mask.all()
-    rim = drawn & (mine > -0.7) & bordered
+    rim = drawn & (mine > -0.7) & outline.bordered
     rim[:_EDGE] = rim[-_EDGE:] = False
     rim[:, :_EDGE] = rim[:, -_EDGE:] = False
     rows, columns = np.nonzero(rim)
-    here, there = _direction(mine, rows, columns), _direction(other, rows, columns)
+    here = _direction(_smoothed(mine), rows, columns)
+    there = _direction(outline.smooth, rows, columns)
     alike = (here * there).sum(axis=1) > _ALIKE
     rows, columns = rows[alike], columns[alike]
     second = mix[rows, columns]
@@ -64,7 +83,7 @@ def compare_outlines(
         face=face[rows, columns],
         mix=np.column_stack([1.0 - second.sum(axis=1), second]),
         outward=here[alike],
-        gap=(mine - other)[rows, columns],
+        gap=(mine - outline.distance)[rows, columns],
     )
 
 
@@ -80,10 +99,13 @@ def outward_distance(area: np.ndarray) -> np.ndarray:
     return result
 
 
-def _direction(distance: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
-    """(M, 2) unit gradients (x, y) of a smoothed distance; zeros where it has none."""
+def _smoothed(distance: np.ndarray) -> np.ndarray:
     # SciPy's filter, too, gives the same bits wherever an array lies.
-    smooth = gaussian_filter(distance, _SMOOTH, mode="mirror", truncate=2.7)
+    return np.asarray(gaussian_filter(distance, _SMOOTH, mode="mirror", truncate=2.7))
+
+
+def _direction(smooth: np.ndarray, rows: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """(M, 2) unit gradients (x, y) of a smoothed distance; zeros where it has none."""
     across = smooth[rows, columns + 1] - smooth[rows, columns - 1]
     down = smooth[rows + 1, columns] - smooth[rows - 1, columns]
     length = np.sqrt(across * across + down * down)

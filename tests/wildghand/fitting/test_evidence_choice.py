@@ -15,8 +15,9 @@ from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.evidence import EvidenceSettings, strengths, weigh_evidence
-from wildghand.fitting.evidence_choice import LEAST, EvidenceChoice
+from wildghand.fitting.evidence_choice import EvidenceChoice
 from wildghand.fitting.fit import Fit
+from wildghand.fitting.judging_frames import LEAST
 from wildghand.gaussians.training import load_validation_frames
 from wildghand.model.settings import read_settings
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from wildghand.subject.outlines import compare_outlines, outward_distance
+from wildghand.subject.outlines import MaskOutline, compare_outlines, outward_distance
 
 SIZE = 64
 MIDDLE, RADIUS = np.array([31.3, 32.6]), 15.0
@@ -20,6 +20,10 @@ def fan(radius: float, middle: np.ndarray = MIDDLE) -> tuple[np.ndarray, np.ndar
     return np.vstack([middle, ring]), np.full(65, 0.5), faces
 
 
+def outline(radius: float, middle: np.ndarray = MIDDLE) -> MaskOutline:
+    return MaskOutline.of(disc(radius, middle))
+
+
 def disc(radius: float, middle: np.ndarray = MIDDLE) -> np.ndarray:
     rows, columns = np.mgrid[:SIZE, :SIZE] + 0.5
     inside: np.ndarray = np.hypot(columns - middle[0], rows - middle[1]) < radius
@@ -28,7 +32,7 @@ def disc(radius: float, middle: np.ndarray = MIDDLE) -> np.ndarray:
 
 @pytest.mark.parametrize("grown", [-3.0, -1.0, 0.0, 0.7, 2.0, 4.0])
 def test_the_gap_of_a_grown_disc_is_its_growth(grown: float) -> None:
-    seen = compare_outlines(*fan(RADIUS), disc(RADIUS + grown))
+    seen = compare_outlines(*fan(RADIUS), outline(RADIUS + grown))
     assert len(seen.gap) > 60
     # Tolerance: both outlines are rounded to pixels.
     assert np.abs(np.mean(seen.gap) - grown) < 0.35
@@ -38,7 +42,7 @@ def test_the_gap_of_a_grown_disc_is_its_growth(grown: float) -> None:
 def test_the_gaps_of_a_shifted_disc_are_its_shift() -> None:
     shift = np.array([1.5, -0.8])
     vertices, depth, faces = fan(RADIUS)
-    seen = compare_outlines(vertices, depth, faces, disc(RADIUS, MIDDLE + shift))
+    seen = compare_outlines(vertices, depth, faces, outline(RADIUS, MIDDLE + shift))
     solved = np.linalg.lstsq(seen.outward, seen.gap, rcond=None)[0]
     np.testing.assert_allclose(solved, shift, atol=0.35)
     np.testing.assert_allclose(np.linalg.norm(seen.outward, axis=1), 1.0, atol=1e-4)
@@ -54,7 +58,7 @@ def test_the_gaps_of_a_shifted_disc_are_its_shift() -> None:
 def test_the_edge_of_the_image_is_no_outline() -> None:
     middle = np.array([60.0, 32.0])
     vertices, depth, faces = fan(RADIUS, middle)
-    seen = compare_outlines(vertices, depth, faces, disc(RADIUS, middle))
+    seen = compare_outlines(vertices, depth, faces, outline(RADIUS, middle))
     place = np.einsum("mc,mck->mk", seen.mix, vertices[faces[seen.face]])
     assert len(place)
     assert (place[:, 0] < SIZE - 3).all()
@@ -62,12 +66,12 @@ def test_the_edge_of_the_image_is_no_outline() -> None:
 
 @pytest.mark.parametrize("value", [False, True])
 def test_a_mask_without_an_outline_says_nothing(value: bool) -> None:
-    mask = np.full((SIZE, SIZE), value)
+    mask = MaskOutline.of(np.full((SIZE, SIZE), value))
     assert not len(compare_outlines(*fan(RADIUS), mask).gap)
 
 
 def test_a_hand_outside_the_image_says_nothing() -> None:
-    seen = compare_outlines(*fan(RADIUS, np.array([-200.0, 10.0])), disc(RADIUS))
+    seen = compare_outlines(*fan(RADIUS, np.array([-200.0, 10.0])), outline(RADIUS))
     assert not len(seen.gap)
 
 
