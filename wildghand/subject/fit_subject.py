@@ -25,7 +25,7 @@ from wildghand.subject.shape import SubjectShape, side_flip
 
 #: Factors on the expected error of an outline among which frames that are not fitted choose, from
 #: the stiffest hand to the softest.
-STIFFNESS = (4.0, 2.0, 1.0, 0.5, 0.25)
+STIFFNESS = (4.0, 2.0, 1.0, 0.5)
 # The reach in the first round, in those of the last.
 _FIRST_REACH = 3.0
 # Least number of points that a fit needs.

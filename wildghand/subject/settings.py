@@ -35,8 +35,8 @@ class SubjectSettings:
     joint_spread: float = number(2e-3, 1e-6, 0.1)
     #: Expected error of the given translation of a hand in a frame, m.
     transl_spread: float = number(2e-3, 1e-6, 0.1)
-    #: Let validation frames choose how far the hand bends: not at all, or with 4, 2, 1, 1/2 or 1/4
-    #: times `noise`. With fewer than four of these `noise` holds.
+    #: Let validation frames choose how far the hand bends: not at all, or with 4, 2, 1 or 1/2 times
+    #: `noise`. With fewer than four of these `noise` holds.
     validated: bool = True
     #: Share of the template's misfit in validation frames by which a softer hand must be better.
     least_gain: float = number(0.04, 0.0, 1.0)

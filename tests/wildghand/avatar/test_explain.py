@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from tiny_fits import TINY
 
 import wildghand
 from hwp_bench.base.errors import UsageError
@@ -19,19 +20,11 @@ from wildghand.avatar.explain import explain_frames, explanation_sheet
 from wildghand.avatar.files import save_avatar
 from wildghand.cli.main import main
 
-QUICK = {
-    "gaussians": 300,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "device": "cpu",
-}
-
 
 @pytest.fixture(scope="module")
 def fitted(make_painted: Callable[..., Capture]) -> tuple[WildGHandAvatar, Capture]:
     capture = make_painted()
-    avatar = wildghand.fit(capture.root, settings=QUICK, steps=2, all_frames=True)
+    avatar = wildghand.fit(capture.root, settings=TINY, steps=2, all_frames=True)
     with torch.no_grad():
         for module in avatar.model.biases:
             module.psi.weight.zero_()
@@ -80,7 +73,7 @@ def test_what_cannot_be_explained_is_refused(fitted) -> None:
         explain_frames(avatar, capture, [len(capture) - 1])
     bare = wildghand.fit(
         capture.root,
-        settings={**QUICK, "dpd.enabled": False},
+        settings={**TINY, "dpd.enabled": False},
         steps=1,
         all_frames=True,
     )

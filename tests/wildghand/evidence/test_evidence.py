@@ -10,6 +10,7 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from tiny_fits import UNJUDGED
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.methods.contract import TrainingCapture
@@ -20,15 +21,6 @@ from wildghand.fitting.fit import Fit
 from wildghand.gaussians.attributes import Activation, RawAttributes
 from wildghand.model.settings import read_settings
 
-QUICK = {
-    "gaussians": 300,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "prepass.enabled": False,
-    "subject.enabled": False,
-    "device": "cpu",
-}
 SPACING = 2e-3
 TrainingMaker = Callable[..., TrainingCapture]
 
@@ -102,7 +94,7 @@ def test_the_depth_image_has_the_nearest_of_all_hands_around_a_cell() -> None:
 
 def test_frames_show_what_faces_them_and_lies_in_the_mask(make_training: TrainingMaker) -> None:
     """All of a frame counts as visible: about half of a hand faces a camera, and never all."""
-    fit = Fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
+    fit = Fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     rows, size = len(fit.frames), fit.frames.masks.shape[1:]
     everything = shown_frames(
         fit.model.rigs, fit.clip, lambda part: torch.ones(len(part), *size), rows
@@ -122,9 +114,9 @@ def test_frames_show_what_faces_them_and_lies_in_the_mask(make_training: Trainin
 
 def test_an_avatar_keeps_its_evidence(make_training: TrainingMaker, tmp_path: Path) -> None:
     training = make_training()
-    fit = Fit(training, read_settings(QUICK), 0, torch.device("cpu"))
+    fit = Fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
     bare = Fit(
-        training, read_settings({**QUICK, "evidence.enabled": False}), 0, torch.device("cpu")
+        training, read_settings({**UNJUDGED, "evidence.enabled": False}), 0, torch.device("cpu")
     )
     frame = int(training.validation[0])
     where = training.hand_poses(frame), training.camera(frame)

@@ -18,6 +18,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 from splat_transform import transform, validation_errors
+from tiny_fits import TINY
 
 import wildghand
 from hwp_bench.base.errors import UsageError
@@ -33,19 +34,11 @@ from wildghand.export.skinned_glb import quaternions, strongest
 from wildghand.export.spz import FRACTIONAL_BITS, packed_rotations, spz_bytes
 from wildghand.export.texture import baked
 
-QUICK = {
-    "gaussians": 300,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "device": "cpu",
-}
-
 
 @pytest.fixture(scope="module")
 def fitted(make_painted: Callable[..., Capture]) -> tuple[WildGHandAvatar, Capture]:
     capture = make_painted()
-    return wildghand.fit(capture.root, settings=QUICK, steps=2, all_frames=True), capture
+    return wildghand.fit(capture.root, settings=TINY, steps=2, all_frames=True), capture
 
 
 def read_ply(path: Path) -> PosedGaussians:

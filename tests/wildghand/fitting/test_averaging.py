@@ -15,6 +15,7 @@ import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from painted import SilentReport
+from tiny_fits import QUICK
 
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
 from wildghand.fitting.averaging import AveragedAvatar, StepAverage
@@ -23,13 +24,7 @@ from wildghand.fitting.optimize import optimize
 from wildghand.gaussians.fit_loop import batches, repeatable
 from wildghand.model.settings import read_settings
 
-QUICK: dict[str, Any] = {
-    "gaussians": 600,
-    "schedule.steps": 24,
-    "device": "cpu",
-    "network.identity_resolution": 40,
-    "network.plane_resolution": 20,
-}
+FIT: dict[str, Any] = {**QUICK, "schedule.steps": 24}
 TrainingMaker = Callable[..., TrainingCapture]
 CPU = torch.device("cpu")
 
@@ -93,7 +88,7 @@ def test_in_place_gives_every_bit_back() -> None:
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 1.0])
 def test_a_fit_ends_with_the_mean_of_its_steps(share: float, make_training: TrainingMaker) -> None:
-    settings = read_settings({**QUICK, "schedule.average_share": share})
+    settings = read_settings({**FIT, "schedule.average_share": share})
     training = make_training()
     avatar = optimize(Fit(training, settings, 0, CPU), Budget(), SilentReport())
     fit, steps = Fit(training, settings, 0, CPU), settings.schedule.steps
@@ -114,7 +109,7 @@ def test_a_fit_ends_with_the_mean_of_its_steps(share: float, make_training: Trai
 def test_a_checkpoint_is_drawn_as_a_fit_that_ends_there(make_training: TrainingMaker) -> None:
     training, drawn = make_training(), {}
     # What comes after the last step (light, strength of the evidence) is not in a checkpoint.
-    changes = {**QUICK, "light.enabled": False, "evidence.enabled": False}
+    changes = {**FIT, "light.enabled": False, "evidence.enabled": False}
 
     class Drawing(SilentReport):
         def __call__(self, step: int, avatar: Avatar) -> None:

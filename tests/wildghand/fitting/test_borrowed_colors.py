@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_fits import UNJUDGED
 
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.base.errors import BadInput
@@ -23,17 +24,7 @@ from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.light import KnownLight
 from wildghand.model.settings import read_settings
 
-TINY: dict[str, Any] = {
-    "gaussians": 300,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "prepass.enabled": False,
-    "subject.enabled": False,
-    "shadows.enabled": False,
-    "start_colors": False,
-    "device": "cpu",
-}
+PLAIN: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False, "start_colors": False}
 # Channels of the colours in the attributes and in the map.
 COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 TrainingMaker = Callable[..., TrainingCapture]
@@ -51,7 +42,7 @@ def a_light(cosine: float = 0.5) -> KnownLight:
 
 @pytest.fixture
 def fit(make_training: TrainingMaker) -> Fit:
-    made = Fit(make_training("both"), read_settings(TINY), 0, torch.device("cpu"))
+    made = Fit(make_training("both"), read_settings(PLAIN), 0, torch.device("cpu"))
     with torch.no_grad():  # the hands start alike
         made.model.network.identity.maps["left"][:, COLORS] += 0.5
     made.model.keep(a_light())
@@ -129,11 +120,11 @@ def test_nothing_is_taken_without_a_light_or_another_hand(
 ) -> None:
     fit.model.light = None
     assert sharing(fit, 0.0, 1.0) is None
-    one = Fit(make_training(), read_settings(TINY), 0, torch.device("cpu"))
+    one = Fit(make_training(), read_settings(PLAIN), 0, torch.device("cpu"))
     one.model.keep(a_light())
     assert one.borrowed.own == {}
     assert one.borrowed.learn() is None
-    off = read_settings({**TINY, "evidence.color_share": 0.0})
+    off = read_settings({**PLAIN, "evidence.color_share": 0.0})
     assert Fit(make_training("both"), off, 0, torch.device("cpu")).borrowed.own == {}
 
 

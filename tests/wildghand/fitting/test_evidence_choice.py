@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_fits import UNJUDGED
 
 from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import TrainingCapture
@@ -21,16 +22,7 @@ from wildghand.fitting.judging_frames import LEAST
 from wildghand.gaussians.training import load_validation_frames
 from wildghand.model.settings import read_settings
 
-QUICK: dict[str, Any] = {
-    "gaussians": 300,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "prepass.enabled": False,
-    "subject.enabled": False,
-    "light.enabled": False,
-    "device": "cpu",
-}
+QUICK: dict[str, Any] = {**UNJUDGED, "light.enabled": False}
 TrainingMaker = Callable[..., TrainingCapture]
 
 

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 from painted import FRAMES, SilentReport, TrainingMaker
+from tiny_fits import TINY
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.capture import Capture
@@ -21,17 +22,11 @@ from hwp_bench.metrics.score import score_frame
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fitting.method import WildGHandMethod
 
-TINY: dict[str, Any] = {
-    "gaussians": 600,
-    "schedule.steps": 12,
-    "device": "cpu",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-}
+SHORT: dict[str, Any] = {**TINY, "gaussians": 600, "schedule.steps": 12}
 
 
 def fitted(training: TrainingCapture, **changes: Any) -> WildGHandAvatar:
-    return WildGHandMethod({**TINY, **changes}, 0).fit(training, Budget(), SilentReport())
+    return WildGHandMethod({**SHORT, **changes}, 0).fit(training, Budget(), SilentReport())
 
 
 def check(avatar: WildGHandAvatar, training: TrainingCapture, truth: np.ndarray) -> None:

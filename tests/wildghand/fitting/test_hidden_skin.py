@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_fits import UNJUDGED
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit
@@ -18,15 +19,6 @@ from wildghand.fitting.weighting import Weighting
 from wildghand.model.settings import read_settings
 
 CPU = torch.device("cpu")
-QUICK: dict[str, Any] = {
-    "gaussians": 300,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "prepass.enabled": False,
-    "subject.enabled": False,
-    "device": "cpu",
-}
 TrainingMaker = Callable[..., TrainingCapture]
 
 
@@ -49,7 +41,7 @@ def test_without_a_hand_nothing_is_hidden() -> None:
 
 def covered(training: TrainingCapture, **changes: Any) -> tuple[Fit, torch.Tensor]:
     """A fit whose first frame's mask has lost its upper half, and what is hidden in it then."""
-    fit = Fit(training, read_settings({**QUICK, **changes}), 0, CPU)
+    fit = Fit(training, read_settings({**UNJUDGED, **changes}), 0, CPU)
     masks = fit.frames.masks.clone()
     rows = torch.nonzero((masks[0] > 127).any(dim=1))[:, 0]
     masks[0, : int(rows.float().mean())] = 0

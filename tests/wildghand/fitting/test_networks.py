@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_fits import QUICK
 from tiny_networks import write_sam_file, write_sam_folder, write_vgg19
 
 from hwp_bench.base.errors import BadInput, UsageError
@@ -31,13 +32,7 @@ from wildghand.fitting.networks import check_networks
 from wildghand.model.settings import read_settings
 from wildghand.sam import AutomaticSettings
 
-QUICK: dict[str, Any] = {
-    "gaussians": 300,
-    "schedule.steps": 3,
-    "device": "cpu",
-    "network.identity_resolution": 40,
-    "network.plane_resolution": 20,
-}
+FIT: dict[str, Any] = {**QUICK, "gaussians": 300, "schedule.steps": 3}
 TrainingMaker = Callable[..., TrainingCapture]
 
 
@@ -58,7 +53,7 @@ def _fewer_points(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def weights(training: TrainingCapture, **changes: Any) -> torch.Tensor:
-    fit = Fit(training, read_settings({**QUICK, **changes}), 0, torch.device("cpu"))
+    fit = Fit(training, read_settings({**FIT, **changes}), 0, torch.device("cpu"))
     rows = torch.arange(3)
     with torch.no_grad():
         return fit.weighting(rows, fit.draw(rows)).weights
@@ -101,7 +96,7 @@ def test_the_binary_mask_is_the_hand_that_was_chosen(
     # The pre-pass would weigh pixels too.
     binary = {"pao.variant": "binary", "prepass.enabled": False}
     found = weights(training, **binary, **{"pao.hand": hand})
-    settings = read_settings({**QUICK, **binary})
+    settings = read_settings({**FIT, **binary})
     fit = Fit(training, settings, 0, torch.device("cpu"))
     masks = hand_masks(training, fit.frames, hand, torch.device("cpu"))
     assert torch.equal(found, (masks[:3] > 127).float())
@@ -130,7 +125,7 @@ def test_roots_are_the_wrists_in_the_image(hands: str, make_training: TrainingMa
 def with_every_network(folder: Path, regions: str, hand: str) -> dict[str, Any]:
     """Settings of the mode `paper` with each of its networks from a file."""
     return {
-        **QUICK,
+        **FIT,
         "mode": "paper",
         "pao.regions": f"sam:{folder / regions}",
         "pao.hand": f"sam:{folder / hand}",
@@ -150,7 +145,7 @@ def test_a_fit_from_the_command_line_with_every_network(
     assert avatar.model.finite()
     assert avatar.settings.perceptual == settings["perceptual"]
     assert avatar.settings.pao.regions == settings["pao.regions"]
-    refused = [*command[:-1], str(tmp_path / "b"), *options({**QUICK, "perceptual": "vgg19:/none"})]
+    refused = [*command[:-1], str(tmp_path / "b"), *options({**FIT, "perceptual": "vgg19:/none"})]
     assert wildghand([*refused, "--set", "terms.perceptual=0.001"]) != 0
     assert "/none: does not exist" in capsys.readouterr().err
 
@@ -187,7 +182,7 @@ def test_an_evaluation_in_the_sandbox_sees_the_files(
 def test_an_ablation_takes_the_networks_too(
     folder: Path, make_painted: Callable[..., Capture], tmp_path: Path, capsys: Any
 ) -> None:
-    settings = {**QUICK, "mode": "paper", "pao.hand": f"sam:{folder / 'sam.pth'}"}
+    settings = {**FIT, "mode": "paper", "pao.hand": f"sam:{folder / 'sam.pth'}"}
     settings["pao.regions"] = f"sam:{folder / 'sam.pth'}"
     command = ["ablate", "--binary-mask", "--seeds", "1", "-o", str(tmp_path / "runs")]
     command += ["--capture", str(make_painted().root), *options(settings)]

@@ -17,6 +17,7 @@ from typing import Any
 import pytest
 import torch
 from painted import FRAMES, SilentReport
+from tiny_fits import TINY
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.capture import Capture
@@ -33,14 +34,7 @@ from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients,
 from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
 
-TINY: dict[str, Any] = {
-    "gaussians": 300,
-    "schedule.steps": 4,
-    "schedule.batch": 2,
-    "device": "cpu",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-}
+SHORT: dict[str, Any] = {**TINY, "schedule.steps": 4, "schedule.batch": 2}
 VARIANTS: dict[str, dict[str, Any]] = {
     # Every other frame keeps its biases: processes must draw the same chances.
     "default": {"dpd.omega_dropout": 0.5},
@@ -54,7 +48,7 @@ CPU = torch.device("cpu")
 
 
 def fitted(request: Path, changes: dict[str, Any], world: World) -> State:
-    settings = read_settings({**TINY, **changes})
+    settings = read_settings({**SHORT, **changes})
     fit = Fit(open_request(request), settings, 0, CPU, world)
     fit.require_same(0)
     return optimize(fit, Budget(), SilentReport()).model.snapshot()
@@ -62,7 +56,7 @@ def fitted(request: Path, changes: dict[str, Any], world: World) -> State:
 
 def resumed(request: Path, world: World, state: Path) -> State:
     """Two steps, a saved state, and the rest from it."""
-    settings = read_settings({**TINY, **VARIANTS["default"]})
+    settings = read_settings({**SHORT, **VARIANTS["default"]})
     half, watchers = Fit(open_request(request), settings, 0, CPU, world), Watchers(0)
 
     def save(step: int, watched: Watchers) -> None:
@@ -86,7 +80,7 @@ class NanObjective(Objective):
 
 def check_spoiled(request: Path, world: World) -> None:
     """A loss that is NaN in one process only stops the step in all of them."""
-    settings = read_settings(TINY)
+    settings = read_settings(SHORT)
     fit = Fit(open_request(request), settings, 0, CPU, world)
     before = fit.model.snapshot()
     if world.rank == 1:
@@ -180,7 +174,7 @@ def test_two_processes_fit_as_one_with_the_whole_batch(name: str, folder: Path) 
     """
     changes = VARIANTS[name]
     start = Fit(
-        open_request(folder / "request"), read_settings({**TINY, **changes}), 0, CPU
+        open_request(folder / "request"), read_settings({**SHORT, **changes}), 0, CPU
     ).model.snapshot()
     alone, together = fitted(folder / "request", changes, SINGLE_PROCESS), found(folder)[name]
     change = max(float((alone[key] - start[key]).abs().max()) for key in start)
@@ -213,7 +207,7 @@ def test_torchrun_makes_one_avatar_and_one_message(
     make_painted: Callable[..., Capture], tmp_path: Path
 ) -> None:
     capture, avatar = make_painted().root, tmp_path / "avatar"
-    options = [word for name, value in TINY.items() for word in ("--set", f"{name}={value}")]
+    options = [word for name, value in SHORT.items() for word in ("--set", f"{name}={value}")]
     command = ["fit", str(capture), "-o", str(avatar), "--steps", "2", *options]
     made = torchrun(command)
     assert made.returncode == 0, made.stderr
@@ -295,7 +289,7 @@ def test_an_evaluation_is_one_process_whatever_torchrun_says(
 ) -> None:
     monkeypatch.setenv("WORLD_SIZE", "2")
     monkeypatch.setenv("RANK", "1")
-    avatar = WildGHandMethod({**TINY, "schedule.steps": 1, "schedule.batch": 1}).fit(
+    avatar = WildGHandMethod({**SHORT, "schedule.steps": 1, "schedule.batch": 1}).fit(
         make_training(), Budget(), SilentReport()
     )
     assert avatar.steps == 1

@@ -18,6 +18,7 @@ from typing import Any
 import pytest
 import torch
 from painted import SilentReport
+from tiny_fits import QUICK
 
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, TrainingCapture
@@ -30,12 +31,6 @@ from wildghand.fitting.method import WildGHandMethod
 from wildghand.fitting.ready import ready_fit
 from wildghand.model.settings import read_settings
 
-QUICK: dict[str, Any] = {
-    "gaussians": 600,
-    "device": "cpu",
-    "network.identity_resolution": 40,
-    "network.plane_resolution": 20,
-}
 #: Settings that call other kernels, or the same ones in another way.
 VARIANTS: tuple[dict[str, Any], ...] = (
     {},

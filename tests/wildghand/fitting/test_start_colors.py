@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_fits import UNJUDGED
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.evidence.count import read_images, seen_anchors
@@ -19,23 +20,18 @@ from wildghand.fitting.start_colors import start_from_colors, tint_share
 from wildghand.model.settings import read_settings
 from wildghand.shadows import CastLight
 
-TINY: dict[str, Any] = {
+PLAIN: dict[str, Any] = {
+    **UNJUDGED,
     "gaussians": 600,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "prepass.enabled": False,
-    "subject.enabled": False,
     "start_colors": False,
     "shadows.enabled": False,
-    "device": "cpu",
 }
 TrainingMaker = Callable[..., TrainingCapture]
 
 
 @pytest.fixture
 def fit(make_training: TrainingMaker) -> Fit:
-    return Fit(make_training(), read_settings(TINY), 0, torch.device("cpu"))
+    return Fit(make_training(), read_settings(PLAIN), 0, torch.device("cpu"))
 
 
 @torch.no_grad()
@@ -91,7 +87,7 @@ def test_brightness_is_left_to_the_fit(fit: Fit, brightness: float) -> None:
 
 def test_light_and_shadows_are_no_tint(make_training: TrainingMaker) -> None:
     """Frames that the model has drawn in a strong light, in the colours that it starts with."""
-    settings = read_settings({**TINY, "shadows.enabled": True})
+    settings = read_settings({**PLAIN, "shadows.enabled": True})
     fit = Fit(make_training(), settings, 0, torch.device("cpu"))
     strong = np.array([3.0], np.float32)
     fit.model.keep(CastLight(np.array([[0.0, 0.0, -1.0]], np.float32), strong, 0.3))
@@ -116,14 +112,14 @@ def test_a_fit_starts_so_unless_it_is_switched_off(
     calls: list[bool] = []
     monkeypatch.setattr("wildghand.fitting.fit.start_from_colors", lambda *a: calls.append(True))
     training = make_training()
-    for settings in ({**TINY, "start_colors": True}, TINY, {**TINY, "mode": "paper"}):
+    for settings in ({**PLAIN, "start_colors": True}, PLAIN, {**PLAIN, "mode": "paper"}):
         Fit(training, read_settings(settings), 0, torch.device("cpu"))
     assert calls == [True]
 
 
 def test_a_network_without_a_direct_path_stays_as_it_is(make_training: TrainingMaker) -> None:
     fit = Fit(
-        make_training(), read_settings({**TINY, "network.direct": False}), 0, torch.device("cpu")
+        make_training(), read_settings({**PLAIN, "network.direct": False}), 0, torch.device("cpu")
     )
     before = fit.model.snapshot()
     start_from_colors(fit.model, fit.clip, fit.frames, fit.weighting, fit.dark)

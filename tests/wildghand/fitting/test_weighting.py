@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from tiny_fits import TINY
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit
@@ -16,13 +17,6 @@ from wildghand.fitting.weighting import assess_frames
 from wildghand.model.settings import read_settings
 
 CPU = torch.device("cpu")
-QUICK: dict[str, Any] = {
-    "gaussians": 300,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "device": "cpu",
-}
 #: What the pre-pass leads PAO to spare is off.
 STRICT: dict[str, Any] = {"pao.mismatch": 0.0, "pao.spare_clean": False}
 ROWS = torch.tensor([0, 3])
@@ -30,7 +24,7 @@ TrainingMaker = Callable[..., TrainingCapture]
 
 
 def fit_of(training: TrainingCapture, **changes: Any) -> Fit:
-    return Fit(training, read_settings({**QUICK, **changes}), 0, CPU)
+    return Fit(training, read_settings({**TINY, **changes}), 0, CPU)
 
 
 def test_frames_teach_by_their_temporal_weights(make_training: TrainingMaker) -> None:

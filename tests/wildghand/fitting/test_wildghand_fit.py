@@ -15,6 +15,7 @@ import pytest
 import scipy.spatial
 import torch
 from painted import FRAMES, SIZE, SilentReport
+from tiny_fits import QUICK
 
 from hwp_bench.base.errors import BadInput, DidNotConverge, UsageError
 from hwp_bench.base.images import read_rgb
@@ -33,18 +34,12 @@ from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.splat import rasterize
 
-QUICK: dict[str, Any] = {
-    "gaussians": 600,
-    "schedule.steps": 60,
-    "device": "cpu",
-    "network.identity_resolution": 40,
-    "network.plane_resolution": 20,
-}
+FIT: dict[str, Any] = {**QUICK, "schedule.steps": 60}
 TrainingMaker = Callable[..., TrainingCapture]
 
 
 def fitted(training: TrainingCapture, steps: int = 60, **changes: Any) -> WildGHandAvatar:
-    return WildGHandMethod({**QUICK, "schedule.steps": steps, **changes}, 0).fit(
+    return WildGHandMethod({**FIT, "schedule.steps": steps, **changes}, 0).fit(
         training, Budget(), SilentReport()
     )
 
@@ -62,7 +57,7 @@ def test_a_fit_learns_what_the_frames_show(hands: str, make_training: TrainingMa
     start, end = fitted(training, steps=1), fitted(training)
     frame = int(training.validation[0])
     assert error(end, training, frame) < 0.6 * error(start, training, frame)
-    assert end.steps == QUICK["schedule.steps"]
+    assert end.steps == FIT["schedule.steps"]
     assert set(end.record.temporal) == set(training.sides)
     assert sorted(end.weight_masks) == end.record.frames == training.train.tolist()
 
@@ -100,9 +95,7 @@ def test_the_same_seed_gives_the_same_bits_and_another_does_not(
     training = make_training()
     first, again = (fitted(training, steps=8).model.snapshot() for _ in range(2))
     assert all(torch.equal(first[name], again[name]) for name in first)
-    other = WildGHandMethod({**QUICK, "schedule.steps": 8}, 1).fit(
-        training, Budget(), SilentReport()
-    )
+    other = WildGHandMethod({**FIT, "schedule.steps": 8}, 1).fit(training, Budget(), SilentReport())
     assert any(not torch.equal(first[n], v) for n, v in other.model.snapshot().items())
 
 
@@ -110,7 +103,7 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
     make_training: TrainingMaker, tmp_path: Path
 ) -> None:
     training, device = make_training(), torch.device("cpu")
-    settings = read_settings({**QUICK, "schedule.steps": 30})
+    settings = read_settings({**FIT, "schedule.steps": 30})
 
     class Stopped(Exception):
         pass
@@ -192,7 +185,7 @@ def test_the_commands_make_draw_and_export_an_avatar(
     make_painted: Callable[..., Capture], tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     capture, avatar = make_painted().root, tmp_path / "avatar"
-    options = [word for name, value in QUICK.items() for word in ("--set", f"{name}={value}")]
+    options = [word for name, value in FIT.items() for word in ("--set", f"{name}={value}")]
     assert main(["fit", str(capture), "-o", str(avatar), "--steps", "5", *options]) == 0
     assert not (tmp_path / "avatar.fit").exists()
     assert "5 steps" in capsys.readouterr().out
@@ -220,7 +213,7 @@ def test_from_python_nothing_is_written(
 ) -> None:
     source = make_painted().root
     before = sorted(path.name for path in source.parent.iterdir())
-    changes = {**QUICK, "schedule.steps": 3}
+    changes = {**FIT, "schedule.steps": 3}
     avatar = fit_capture(source, settings=changes)
     written = fit_capture(str(source), str(tmp_path / "avatar"), settings=changes)
     assert sorted(path.name for path in source.parent.iterdir()) == before
@@ -240,7 +233,7 @@ def test_posed_gaussians_are_what_is_drawn(hands: str, make_training: TrainingMa
     avatar = fitted(training, steps=2, **{"light.enabled": False})
     poses, camera = training.hand_poses(3), training.camera(3)
     posed = avatar.pose(poses)
-    count = len(training.sides) * QUICK["gaussians"]
+    count = len(training.sides) * FIT["gaussians"]
     assert len(posed) == count
     shapes = [np.shape(array) for array in (posed.means, posed.quats, posed.scales, posed.colors)]
     assert shapes == [(count, 3), (count, 4), (count, 3), (count, 3)]

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from browser import least_contrast, open_page, overflow, show
+from tiny_fits import TINY
 
 import wildghand
 from hwp_bench.base.errors import HwpError, UsageError
@@ -28,13 +29,7 @@ from wildghand.page.bake import joint_motions
 from wildghand.page.poses import sample_poses
 from wildghand.page.settings import PageSettings
 
-QUICK = {
-    "gaussians": 600,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "device": "cpu",
-}
+QUICK: dict[str, Any] = {**TINY, "gaussians": 600}
 SMALL = PageSettings(clip_samples=16, random_samples=12, still_size=48)
 LEAST = 30.0
 

@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 import torch
 from browser import open_page
+from tiny_fits import TINY
 
 import wildghand
 from hwp_bench.capture import Capture
@@ -27,13 +28,7 @@ from wildghand.page.settings import PageSettings
 from wildghand.page.weights import mean_weights
 from wildghand.splat import rasterize
 
-QUICK: dict[str, Any] = {
-    "gaussians": 600,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "device": "cpu",
-}
+QUICK: dict[str, Any] = {**TINY, "gaussians": 600}
 SMALL = PageSettings(clip_samples=16, random_samples=12, still_size=48)
 
 

@@ -16,6 +16,7 @@ import pytest
 import torch
 from painted import FRAMES, cameras, hand_parameters, painted_info
 from safetensors.torch import load_file, save_file
+from tiny_fits import TINY
 
 import wildghand
 from hwp_bench.base.errors import BadInput, UsageError
@@ -35,13 +36,7 @@ from wildghand.network import network_settings
 from wildghand.pretrain.joint import JointFit, take_steps
 from wildghand.prior.files import DESCRIPTION, WEIGHTS, choose_prior, find_prior, load_prior
 
-QUICK: dict[str, Any] = {
-    "gaussians": 400,
-    "schedule.steps": 40,
-    "device": "cpu",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-}
+QUICK: dict[str, Any] = {**TINY, "gaussians": 400, "schedule.steps": 40}
 NETWORK = network_settings(identity_resolution=24, plane_resolution=12)
 CPU = torch.device("cpu")
 #: Gains of the tones of the subjects; the last one is not pretrained on.

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 import trimesh
+from tiny_fits import UNJUDGED
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template, pose_hand, vertex_normals
@@ -22,15 +22,6 @@ from wildghand.model.settings import read_settings
 from wildghand.shadows import CastLight, HandShadows, Obstacles, ShadowSettings, ShadowTable
 from wildghand.shadows.obstacles import LIFT
 
-QUICK: dict[str, Any] = {
-    "gaussians": 300,
-    "prior": "",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-    "prepass.enabled": False,
-    "subject.enabled": False,
-    "device": "cpu",
-}
 DEEP = ShadowSettings(darkest=0.0)
 TrainingMaker = Callable[..., TrainingCapture]
 
@@ -154,7 +145,7 @@ def test_shading_is_the_irradiance_with_nothing_in_the_way(rigs: dict[str, HandR
 
 
 def test_the_table_of_a_clip_holds_the_same(make_training: TrainingMaker) -> None:
-    fit = Fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
+    fit = Fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     shadows = HandShadows(fit.model.rigs, a_light(), ShadowSettings())
     table = ShadowTable(shadows, fit.clip)
     pose, betas, transl = fit.clip.parameters["right"]
@@ -168,7 +159,7 @@ def test_shadows_darken_what_is_drawn_and_are_kept(
     make_training: TrainingMaker, tmp_path: Path
 ) -> None:
     training = make_training()
-    fit = Fit(training, read_settings(QUICK), 0, torch.device("cpu"))
+    fit = Fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
     frame = int(training.validation[0])
     hands, camera = training.hand_poses(frame), training.camera(frame)
     fit.model.shadows = None
@@ -191,7 +182,7 @@ def test_shadows_darken_what_is_drawn_and_are_kept(
 
 
 def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMaker) -> None:
-    fit = Fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
+    fit = Fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     fit.model.keep(a_light())
     rows = torch.tensor([1, 4])
     table = ShadowTable(HandShadows(fit.model.rigs, a_light(), ShadowSettings()), fit.clip)
@@ -205,10 +196,10 @@ def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMak
 
 
 def test_a_fit_finds_a_light_unless_it_is_switched_off(make_training: TrainingMaker) -> None:
-    found = Fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
+    found = Fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     assert found.model.shadows is not None
     assert set(found.dark(torch.tensor([0]))) == {"right"}
-    off = read_settings({**QUICK, "shadows.enabled": False})
+    off = read_settings({**UNJUDGED, "shadows.enabled": False})
     without = Fit(make_training(), off, 0, torch.device("cpu"))
     assert without.model.shadows is None
     assert without.dark(torch.tensor([0])) == {}

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from painted import SilentReport
+from tiny_fits import TINY
 
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, TrainingCapture
@@ -20,12 +21,7 @@ from wildghand.fitting.optimize import optimize
 from wildghand.model.settings import read_settings
 from wildghand.viewer.live import Live
 
-QUICK: dict[str, Any] = {
-    "gaussians": 400,
-    "device": "cpu",
-    "network.identity_resolution": 24,
-    "network.plane_resolution": 12,
-}
+QUICK: dict[str, Any] = {**TINY, "gaussians": 400}
 TrainingMaker = Callable[..., TrainingCapture]
 
 
