@@ -65,7 +65,7 @@ def at_given_poses(
 
 @dataclass(frozen=True, eq=False)
 class Ceiling:
-    """What an avatar without an error of its own scores on a capture that knows the truth."""
+    """The score of an avatar without an error of its own, on a capture that knows the truth."""
 
     #: The capture.
     capture: Capture
