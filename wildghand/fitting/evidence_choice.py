@@ -18,7 +18,6 @@ from torch import Tensor
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.evidence import Evidence, EvidenceSettings, strengths, weigh_evidence
 from wildghand.fitting.cast_shadows import Dark, shadows_in
-from wildghand.fitting.judging_frames import judging_frames
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
@@ -39,14 +38,14 @@ class EvidenceChoice:
     shown: Mapping[str, Tensor]
     #: Training frames that are fitted.
     frame_count: int
+    #: Validation frames; None where they are too few.
+    judges: TrainingFrames | None
 
-    @functools.cached_property
+    @property
     def frames(self) -> TrainingFrames | None:
-        """The validation frames that judge; None where they are too few or nothing is chosen."""
+        """The validation frames that judge; None also where nothing is chosen."""
         evidence = self.settings.evidence
-        if not (evidence.enabled and evidence.validated):
-            return None
-        return judging_frames(self.training)
+        return self.judges if evidence.enabled and evidence.validated else None
 
     def best(self) -> Evidence | None:
         """The evidence that draws validation frames best; None where that is the model's own."""

@@ -24,6 +24,7 @@ from wildghand.fitting.cast_shadows import cast_shadows, shadows_in
 from wildghand.fitting.closing import MOST_OF_BUDGET, LightFit, weight_masks
 from wildghand.fitting.evidence_choice import EvidenceChoice
 from wildghand.fitting.hand_masks import hand_masks
+from wildghand.fitting.judging_frames import judging_frames
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
 from wildghand.fitting.rates import make_optimizer, set_rates
@@ -74,7 +75,8 @@ class Fit:
         self.frames = load_frames(training)
         self.mean_color = self.frames.mean_color()
         templates = {side: training.template(side) for side in training.sides}
-        subject = subject_of(training, self.frames, templates, settings)
+        judges = judging_frames(training, settings)
+        subject = subject_of(training, self.frames, templates, settings, judges)
         self.model = make_model(
             templates, settings, self.mean_color, len(self.frames), seed, device, subject
         )
@@ -105,7 +107,7 @@ class Fit:
             start_from_colors(self.model, self.clip, self.frames, self.weighting, self.dark)
         #: The colours that one of two hands takes from the other, which come last.
         self.borrowed = BorrowedColors.of(self.model, self.clip, self.weighting, settings.evidence)
-        self.choice = EvidenceChoice(self.model, training, settings, shown, count)
+        self.choice = EvidenceChoice(self.model, training, settings, shown, count, judges)
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal, device)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)

@@ -8,7 +8,6 @@ import numpy as np
 
 from hwp_bench.hands import HandTemplate
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fitting.judging_frames import judging_frames
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.subject import SubjectShape, fit_subject
@@ -20,10 +19,24 @@ def subject_of(
     frames: TrainingFrames,
     templates: Mapping[str, HandTemplate],
     settings: WildGHandSettings,
+    judges: TrainingFrames | None,
 ) -> SubjectShape | None:
-    """Bend the templates to the masks of the frames; None where the settings do not."""
+    """Bend the templates to the masks of the frames; None where the settings do not.
+
+    Args:
+        training: hands and cameras.
+        frames: that are fitted.
+        templates: by side.
+        settings: of the fit.
+        judges: validation frames, which choose how far the hand bends; None where they are too few.
+    """
     if not settings.subject.enabled:
         return None
+
+    def compared(some: TrainingFrames) -> ComparedFrames:
+        masks = np.asarray(some.masks) > 127
+        return ComparedFrames(templates, training.hands, training.cameras, some.indices, masks)
+
     return fit_subject(
         templates,
         training.hands,
@@ -31,19 +44,8 @@ def subject_of(
         frames.indices,
         np.asarray(frames.masks),
         settings.subject,
-        judges=_judges(training, templates) if settings.subject.validated else None,
+        judges=compared(judges) if judges is not None and settings.subject.validated else None,
     )
-
-
-def _judges(
-    training: TrainingCapture, templates: Mapping[str, HandTemplate]
-) -> ComparedFrames | None:
-    """The validation frames that judge a shape; None where they are too few."""
-    frames = judging_frames(training)
-    if frames is None:
-        return None
-    masks = np.asarray(frames.masks) > 127
-    return ComparedFrames(templates, training.hands, training.cameras, frames.indices, masks)
 
 
 def bent_templates(

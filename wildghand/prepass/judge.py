@@ -60,7 +60,8 @@ def judge_frames(given: PrepassInput, settings: PrepassSettings | None = None) -
 def _judge(given: PrepassInput, settings: PrepassSettings) -> FrameAssessment:
     surfaces = HandSurfaces(given.templates, settings.patch_size)
     usable = _measurable(given)
-    survey = _survey(given, surfaces, usable, settings)
+    drawn = list(_footprints(given, surfaces, usable))
+    survey = _survey(given, drawn, len(surfaces.cell_normals), settings)
     usable = survey.readable
     if not usable.any():
         flat = sum(_is_flat(image) for image in given.images)
@@ -71,7 +72,7 @@ def _judge(given: PrepassInput, settings: PrepassSettings) -> FrameAssessment:
         )
     if usable.sum() < settings.least_frames:
         return neutral_assessment(given.indices, usable, given.size, settings.omega_dropout)
-    drawn = list(_footprints(given, surfaces, usable))
+    drawn = [(row, footprint) for row, footprint in drawn if usable[row]]
     cell_normals = surfaces.cell_normals
     model = fit_intensity(survey.samples, cell_normals, settings)
     judged = classify_frames(
@@ -152,16 +153,19 @@ def _footprints(
 
 
 def _survey(
-    given: PrepassInput, surfaces: HandSurfaces, usable: np.ndarray, settings: PrepassSettings
+    given: PrepassInput,
+    drawn: Sequence[tuple[int, Footprint]],
+    cell_count: int,
+    settings: PrepassSettings,
 ) -> _Survey:
     count = len(given.indices)
     table = log_light_table()
-    quota = max(16, settings.sample_count // max(int(usable.sum()), 1))
-    shown = ShownCells(len(surfaces.cell_normals))
+    quota = max(16, settings.sample_count // max(len(drawn), 1))
+    shown = ShownCells(cell_count)
     off, border = np.full(count, np.nan), np.full(count, np.nan)
     motion, sizes = np.zeros(count), np.zeros(count, dtype=np.int64)
     cells, light, normals = [], [], []
-    for row, footprint in _footprints(given, surfaces, usable):
+    for row, footprint in drawn:
         motion[row] = footprint.motion
         masked = given.masks[row] > 127
         values = given.images[row].reshape(-1, 3)[footprint.pixels]

@@ -12,7 +12,6 @@ from hwp_bench.capture import Cameras
 from hwp_bench.hands import (
     HandParameters,
     HandTemplate,
-    TemplateTensors,
     boundary_vertices,
     pose_hand,
     project,
@@ -26,14 +25,16 @@ _WRIST = 0.015
 
 
 @dataclass(frozen=True, eq=False)
-class ComparedFrame:
-    """M points of the outline of the hands in one frame, and how the hands were posed."""
+class PosedFrames:
+    """The hands in all F frames, as the cameras see them."""
 
-    #: The points.
-    points: OutlinePoints
-    #: (V, 3) m, the vertices of all hands in the world.
-    mesh: np.ndarray
-    #: (16, 3, 3) rotation of each joint, for each hand.
+    #: (F, V, 3) m, the vertices of all hands in the world.
+    meshes: np.ndarray
+    #: (F, V, 2) px, the same in the image.
+    pixels: np.ndarray
+    #: (F, V) m along the viewing axis.
+    depths: np.ndarray
+    #: (F, 16, 3, 3) rotation of each joint, for each hand.
     turns: list[np.ndarray]
 
 
@@ -82,45 +83,41 @@ class ComparedFrames:
     def __len__(self) -> int:
         return len(self._outlines)
 
-    def bent(self, shape: SubjectShape) -> dict[str, TemplateTensors]:
-        """The person's hands, by side."""
-        return {
-            side: shape.applied(template).to_torch(torch.float64)
-            for side, template in self.templates.items()
-        }
+    def posed(self, shape: SubjectShape, moves: np.ndarray | None = None) -> PosedFrames:
+        """Pose the person's hands in every frame.
 
-    def compare(
-        self,
-        bent: Mapping[str, TemplateTensors],
-        frame: int,
-        *,
-        moves: np.ndarray | None = None,
-        most: int | None = None,
-    ) -> ComparedFrame:
+        Args:
+            shape: of the person.
+            moves: (S, F, 3) m, added to the given translations of each hand.
+        """
+        vertices, turns = [], []
+        for index, (side, template) in enumerate(self.templates.items()):
+            pose, betas, transl = self._parameters[side]
+            if moves is not None:
+                transl = transl + torch.as_tensor(moves[index])
+            bent = shape.applied(template).to_torch(torch.float64)
+            posed = pose_hand(bent, pose, betas, transl)
+            vertices.append(posed.vertices)
+            turns.append(posed.transforms[..., :3, :3].numpy())
+        meshes = torch.cat(vertices, dim=1)
+        pixels, depths = project(meshes, torch.as_tensor(self.viewmats), torch.as_tensor(self.Ks))
+        return PosedFrames(meshes.numpy(), pixels.numpy(), depths.numpy(), turns)
+
+    def compare(self, posed: PosedFrames, frame: int, most: int | None = None) -> OutlinePoints:
         """Draw the hands into a frame, and compare their outline with the mask's.
 
         Args:
-            bent: hands, as `bent` makes them.
+            posed: the hands.
             frame: row of the frame, from 0.
-            moves: (S, 3) m, added to the given translation of each hand.
             most: points at most, evenly spread over the outline.
+
+        Returns:
+            Points away from the wrist.
         """
-        vertices, turns = [], []
-        for index, (side, template) in enumerate(bent.items()):
-            pose, betas, transl = self._parameters[side]
-            given = transl[frame : frame + 1]
-            if moves is not None:
-                given = given + torch.as_tensor(moves[index])
-            posed = pose_hand(template, pose[frame : frame + 1], betas, given)
-            vertices.append(posed.vertices[0])
-            turns.append(posed.transforms[0, :, :3, :3].numpy())
-        viewmat, K = (torch.as_tensor(part[frame])[None] for part in (self.viewmats, self.Ks))
-        mesh = torch.cat(vertices)
-        pixels, depth = project(mesh[None], viewmat, K)
         seen = compare_outlines(
-            pixels[0].numpy(), depth[0].numpy(), self.faces, self._outlines[frame]
+            posed.pixels[frame], posed.depths[frame], self.faces, self._outlines[frame]
         )
-        return ComparedFrame(self._chosen(seen, most), mesh.numpy(), turns)
+        return self._chosen(seen, most)
 
     def misfit(self, shape: SubjectShape, reach: float) -> float | None:
         """How far the outlines of a person's hands are from those of the masks.
@@ -134,8 +131,8 @@ class ComparedFrames:
 
         Source: the robust function of Geman and McClure, 1987.
         """
-        bent = self.bent(shape)
-        gaps = [self.compare(bent, frame).points.gap for frame in range(len(self))]
+        posed = self.posed(shape)
+        gaps = [self.compare(posed, frame).gap for frame in range(len(self))]
         squared = np.square(np.concatenate(gaps)) if gaps else np.zeros(0)
         return float((squared / (1.0 + squared / reach**2)).mean()) if squared.size else None
 

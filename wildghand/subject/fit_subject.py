@@ -17,9 +17,10 @@ from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
 from hwp_bench.hands.skeleton import PARENTS
 from hwp_bench.hands.template import JOINT_COUNT
-from wildghand.subject.compared_frames import ComparedFrame, ComparedFrames
+from wildghand.subject.compared_frames import ComparedFrames, PosedFrames
 from wildghand.subject.control_points import ControlPoints, place_control_points
 from wildghand.subject.linear_hand import joint_turns, vertex_turns
+from wildghand.subject.outlines import OutlinePoints
 from wildghand.subject.settings import SubjectSettings
 from wildghand.subject.shape import SubjectShape, side_flip
 
@@ -75,7 +76,7 @@ def _judged(problem: _Problem, judges: ComparedFrames, settings: SubjectSettings
         return problem.bend(1.0)
     shapes, misfits = [problem.shape], [before]
     for factor in STIFFNESS:
-        shape = problem.bend(factor)
+        shape = problem.bend(factor) if len(shapes) == 1 else problem.bend_further(factor)
         misfit = judges.misfit(shape, settings.reach)
         if misfit is None or misfit >= misfits[-1]:
             break
@@ -99,17 +100,13 @@ class _Problem:
         self.shape = SubjectShape(np.zeros_like(first.vertices), np.zeros((JOINT_COUNT, 3)))
         # (S, F, 3) m, added to the given translations so far.
         self._moves = np.zeros((len(seen.templates), len(seen), 3))
-        self._begun = False
 
     def _size(self) -> int:
         moves = 3 * len(self.seen.templates) * len(self.seen)
         return 3 * (self.points.shares.shape[1] + JOINT_COUNT) + moves
 
     def bend(self, factor: float) -> SubjectShape:
-        """Bend the hand, from where it is.
-
-        The first time the reach falls round by round. Then outlines are near each other, and one
-        round with the last reach is enough.
+        """Bend the template; the reach falls round by round.
 
         Args:
             factor: on the expected error of the outlines.
@@ -118,12 +115,18 @@ class _Problem:
             The shape; the one before where too little can be compared.
         """
         settings = self.settings
-        rounds = np.ones(1) if self._begun else np.linspace(0.0, 1.0, settings.rounds)
-        self._begun = True
-        for fraction in rounds:
+        for fraction in np.linspace(0.0, 1.0, settings.rounds):
             reach = settings.reach * _FIRST_REACH ** (1.0 - fraction)
             if not self._solve(reach, factor * settings.noise):
                 break
+        return self.shape
+
+    def bend_further(self, factor: float) -> SubjectShape:
+        """Bend a hand whose outlines are near the masks': one round with the last reach is enough.
+
+        Arguments and result are those of `bend`.
+        """
+        self._solve(self.settings.reach, factor * self.settings.noise)
         return self.shape
 
     def _solve(self, reach: float, noise: float) -> bool:
@@ -137,13 +140,13 @@ class _Problem:
             Whether enough can be compared.
         """
         rows, gaps = [], []
-        bent = self.seen.bent(self.shape)
+        posed = self.seen.posed(self.shape, self._moves)
         quota = max(20, self.settings.points // len(self.seen))
         for frame in range(len(self.seen)):
-            compared = self.seen.compare(bent, frame, moves=self._moves[:, frame], most=quota)
-            if len(compared.points.gap):
-                rows.append(self._rows(compared, frame))
-                gaps.append(compared.points.gap)
+            seen = self.seen.compare(posed, frame, quota)
+            if len(seen.gap):
+                rows.append(self._rows(seen, posed, frame))
+                gaps.append(seen.gap)
         if not rows or sum(map(len, gaps)) < _LEAST:
             return False
         matrix, gap = np.concatenate(rows), np.concatenate(gaps)
@@ -165,11 +168,11 @@ class _Problem:
         moves = values[cut + 3 * JOINT_COUNT :].reshape(len(self.seen.templates), -1, 3)
         return nodes, joints.reshape(-1, 3), moves
 
-    def _rows(self, compared: ComparedFrame, frame: int) -> np.ndarray:
-        """Rows of the linear problem of one frame, (M, size) float32."""
-        seen, viewmat, K = compared.points, self.seen.viewmats[frame], self.seen.Ks[frame]
+    def _rows(self, seen: OutlinePoints, posed: PosedFrames, frame: int) -> np.ndarray:
+        """Rows of the linear problem of the M points of one frame, (M, size) float32."""
+        viewmat, K = self.seen.viewmats[frame], self.seen.Ks[frame]
         at = self.seen.faces[seen.face]
-        place = np.einsum("mc,mck->mk", seen.mix, compared.mesh[at])
+        place = np.einsum("mc,mck->mk", seen.mix, posed.meshes[frame][at])
         # px along the outward direction for each metre of the point, (M, 3).
         camera = place @ viewmat[:3, :3].T + viewmat[:3, 3]
         away = camera[:, 2:]
@@ -179,7 +182,7 @@ class _Problem:
         )
         slope = slope @ viewmat[:3, :3]
         result = np.zeros((len(at), self._size()), dtype=np.float32)
-        self._fill(result, at, seen.mix, slope, compared.turns, frame)
+        self._fill(result, at, seen.mix, slope, [turns[frame] for turns in posed.turns], frame)
         return result
 
     def _fill(
@@ -201,19 +204,14 @@ class _Problem:
             corner, flip = at[mine] - index * self.seen.count, side_flip(side)
             used, where = np.unique(corner, return_inverse=True)
             where = where.reshape(corner.shape)
-            moved = vertex_turns(turns[index], template.weights[used])
-            bones = joint_turns(turns[index], template.weights[used])
-            shares = self.points.shares[used]
-            surface = np.zeros((len(mine), nodes, 3))
-            joints = np.zeros((len(mine), JOINT_COUNT, 3))
-            for k in range(3):
-                part, share = where[:, k], mix[mine, k]
-                step = np.einsum("mi,mij->mj", slope[mine], moved[part]) * flip
-                surface += (share[:, None] * shares[part])[..., None] * step[:, None]
-                step = np.einsum("mi,mjik->mjk", slope[mine], bones[part]) * flip
-                joints += share[:, None, None] * step
-            result[mine, :cut] = surface.reshape(len(mine), -1)
-            result[mine, cut : cut + 3 * JOINT_COUNT] = joints.reshape(len(mine), -1)
+            moved = vertex_turns(turns[index], template.weights[used])[where]
+            steps = (slope[mine, None, None] @ moved)[:, :, 0] * flip
+            shares = mix[mine, :, None] * self.points.shares[used][where]
+            result[mine, :cut] = (shares.transpose(0, 2, 1) @ steps).reshape(len(mine), -1)
+            bones = joint_turns(turns[index], template.weights[used]).reshape(len(used), -1)
+            bones = np.einsum("mc,mcx->mx", mix[mine], bones[where])
+            step = np.einsum("mi,mjik->mjk", slope[mine], bones.reshape(-1, JOINT_COUNT, 3, 3))
+            result[mine, cut : cut + 3 * JOINT_COUNT] = (step * flip).reshape(len(mine), -1)
             start = cut + 3 * JOINT_COUNT + 3 * (index * len(self.seen) + frame)
             result[mine, start : start + 3] = slope[mine]
 

@@ -14,6 +14,8 @@ from hwp_bench.hands.raster import draw_faces
 _EDGE = 3
 # Standard deviation of the smoothing before an outline's direction is read, px.
 _SMOOTH = 1.5
+# Pixels around a drawing beyond which nothing changes at its outline: the smoothing reads 4 px.
+_MARGIN = 6
 # Least cosine between the outward directions of drawing and mask.
 _ALIKE = 0.6
 
@@ -67,23 +69,46 @@ def compare_outlines(
         that the rounding to pixels is the same.
     """
     face, mix = draw_faces(pixels, depth, faces, outline.distance.shape)
-    drawn = face >= 0
-    mine = outward_distance(drawn)
+    area = face >= 0
     # Without a border OpenCV's distances are as large as numbers get, and their slope is noise.
-    rim = drawn & (mine > -0.7) & outline.bordered
+    if not (area.any() and outline.bordered):
+        return OutlinePoints(
+            face=np.zeros(0, dtype=np.int32),
+            mix=np.zeros((0, 3)),
+            outward=np.zeros((0, 2)),
+            gap=np.zeros(0),
+        )
+    window = _around(area)
+    drawn = area[window]
+    mine = outward_distance(drawn)
+    rim = np.zeros(area.shape, dtype=bool)
+    rim[window] = drawn & (mine > -0.7)
     rim[:_EDGE] = rim[-_EDGE:] = False
     rim[:, :_EDGE] = rim[:, -_EDGE:] = False
-    rows, columns = np.nonzero(rim)
-    here = _direction(_smoothed(mine), rows, columns)
-    there = _direction(outline.smooth, rows, columns)
+    places = np.nonzero(rim)
+    within = tuple(place - part.start for place, part in zip(places, window, strict=True))
+    here = _direction(_smoothed(mine), *within)
+    there = _direction(outline.smooth, *places)
+    gap = mine[within] - outline.distance[places]
     alike = (here * there).sum(axis=1) > _ALIKE
-    rows, columns = rows[alike], columns[alike]
+    rows, columns = (place[alike] for place in places)
     second = mix[rows, columns]
     return OutlinePoints(
         face=face[rows, columns],
         mix=np.column_stack([1.0 - second.sum(axis=1), second]),
         outward=here[alike],
-        gap=(mine - outline.distance)[rows, columns],
+        gap=gap[alike],
+    )
+
+
+def _around(area: np.ndarray) -> tuple[slice, slice]:
+    """The rows and columns of a bool area, not empty, and of what its outline is read from."""
+
+    rows, columns = (np.flatnonzero(area.any(axis=axis)) for axis in (1, 0))
+    first = max(int(rows[0]) - _MARGIN, 0), max(int(columns[0]) - _MARGIN, 0)
+    return (
+        slice(first[0], int(rows[-1]) + _MARGIN + 1),
+        slice(first[1], int(columns[-1]) + _MARGIN + 1),
     )
 
 

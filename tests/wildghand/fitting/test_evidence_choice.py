@@ -82,8 +82,7 @@ def test_the_strength_that_draws_the_frames_best_is_chosen(
     assert frames is not None
     images = torch.from_numpy((255.0 * drawn_with(fit, training, index)).round().astype(np.uint8))
     truth = dataclasses.replace(frames, images=images)
-    choice = EvidenceChoice(fit.model, training, fit.settings, fit.choice.shown, len(fit.frames))
-    choice.__dict__["frames"] = truth
+    choice = dataclasses.replace(fit.choice, judges=truth)
     found = choice.best()
     if index == 0:  # the model has it already
         assert found is None

@@ -12,6 +12,7 @@ from tiny_fits import TINY
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.fit import Fit
+from wildghand.fitting.judging_frames import judging_frames
 from wildghand.fitting.subject_shape import bent_templates, subject_of
 from wildghand.fitting.weighting import assess_frames
 from wildghand.model.settings import read_settings
@@ -41,7 +42,8 @@ def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
     training = make_training()
     fit = fit_of(training, **{"pao.mismatch": 0.5})
     templates = {side: training.template(side) for side in training.sides}
-    subject = subject_of(training, fit.frames, templates, fit.settings)
+    judges = judging_frames(training, fit.settings)
+    subject = subject_of(training, fit.frames, templates, fit.settings, judges)
     bent = bent_templates(templates, subject)
     assessment = assess_frames(training, fit.frames, bent, fit.settings)
     assert assessment is not None
@@ -106,7 +108,8 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
         for on in (True, False)
     )
     templates = {side: training.template(side) for side in training.sides}
-    subject = subject_of(training, fit.frames, templates, fit.settings)
+    judges = judging_frames(training, fit.settings)
+    subject = subject_of(training, fit.frames, templates, fit.settings, judges)
     bent = bent_templates(templates, subject)
     assessment = assess_frames(training, fit.frames, bent, fit.settings)
     assert assessment is not None

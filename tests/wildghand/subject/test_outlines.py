@@ -55,6 +55,19 @@ def test_the_gaps_of_a_shifted_disc_are_its_shift() -> None:
     assert (np.abs(np.linalg.norm(place - MIDDLE, axis=1) - RADIUS) < 1.5).all()
 
 
+@pytest.mark.parametrize("grown", [-3.0, 2.0])
+def test_what_is_around_a_hand_does_not_change_its_outline(grown: float) -> None:
+    """Oracle: the same disc with nothing but background up to the borders of a larger image."""
+    vertices, depth, faces = fan(RADIUS)
+    mask = disc(RADIUS + grown)
+    small = compare_outlines(vertices, depth, faces, MaskOutline.of(mask))
+    larger = MaskOutline.of(np.pad(mask, ((70, 20), (30, 50))))
+    seen = compare_outlines(vertices + np.array([30.0, 70.0]), depth, faces, larger)
+    np.testing.assert_array_equal(seen.face, small.face)
+    for name in ("mix", "outward", "gap"):
+        np.testing.assert_allclose(getattr(seen, name), getattr(small, name), atol=1e-5)
+
+
 def test_the_edge_of_the_image_is_no_outline() -> None:
     middle = np.array([60.0, 32.0])
     vertices, depth, faces = fan(RADIUS, middle)
