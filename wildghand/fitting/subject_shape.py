@@ -44,7 +44,7 @@ def subject_of(
         frames.indices,
         np.asarray(frames.masks),
         settings.subject,
-        judges=compared(judges) if judges is not None and settings.subject.validated else None,
+        judges=None if judges is None else compared(judges),
     )
 
 

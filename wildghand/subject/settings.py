@@ -18,7 +18,7 @@ class SubjectSettings:
     #: Control points on the hand.
     nodes: int = number(200, 20, 1000)
     #: Rounds; in each the silhouettes are drawn again.
-    rounds: int = number(4, 1, 100)
+    rounds: int = number(2, 1, 100)
     #: Points of all outlines together that are compared in a round.
     points: int = number(3000, 100, 100_000)
     #: Distance at which a point of the outline counts a quarter in the last round, px; three times
@@ -26,7 +26,11 @@ class SubjectSettings:
     reach: float = number(1.5, 0.1, 100.0)
     #: Expected error of a point of the outline, px; as large as neighbouring points and frames,
     #: which err together, make it.
-    noise: float = number(3.0, 0.01, 1000.0)
+    noise: float = number(1.5, 0.01, 1000.0)
+    #: Expected change of the length of a bone, or of a side of the palm, relative to the template.
+    length_spread: float = number(0.1, 1e-6, 1.0)
+    #: Expected change of the thickness of a finger's segment.
+    thickness_spread: float = number(0.15, 1e-6, 1.0)
     #: Expected displacement of a control point, m.
     spread: float = number(4e-3, 1e-5, 0.1)
     #: Expected difference between control points 1 cm apart, m.
@@ -35,8 +39,8 @@ class SubjectSettings:
     joint_spread: float = number(2e-3, 1e-6, 0.1)
     #: Expected error of the given translation of a hand in a frame, m.
     transl_spread: float = number(2e-3, 1e-6, 0.1)
-    #: Let validation frames choose how far the hand bends: not at all, or with 4, 2, 1 or 1/2 times
-    #: `noise`. With fewer than four of these `noise` holds.
+    #: Let frames that are not compared choose how far the hand bends: validation frames, or
+    #: training frames where there are fewer than four of those. Else the hand is rather stiff.
     validated: bool = True
-    #: Share of the template's misfit in validation frames by which a softer hand must be better.
+    #: Share of the template's misfit in those frames by which a softer hand must be better.
     least_gain: float = number(0.04, 0.0, 1.0)
