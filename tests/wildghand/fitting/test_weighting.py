@@ -38,14 +38,12 @@ def test_frames_teach_by_their_temporal_weights(make_training: TrainingMaker) ->
 def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
     make_training: TrainingMaker,
 ) -> None:
-    # Oracle: the formula on the best tenth of the misplacements, by hand.
+    # Oracle: the formula on the best tenth of the misplacements, by hand. A bent template would
+    # meet the masks of this clip.
     training = make_training()
-    fit = fit_of(training, **{"pao.mismatch": 0.5})
+    fit = fit_of(training, **{"pao.mismatch": 0.5, "subject.enabled": False})
     templates = {side: training.template(side) for side in training.sides}
-    judges = judging_frames(training, fit.settings)
-    subject = subject_of(training, fit.frames, templates, fit.settings, judges)
-    bent = bent_templates(templates, subject)
-    assessment = assess_frames(training, fit.frames, bent, fit.settings)
+    assessment = assess_frames(training, fit.frames, templates, fit.settings)
     assert assessment is not None
     found = np.quantile(assessment.misplacement[assessment.usable], 0.1)
     shared = 0.5 * found / fit.settings.prepass.misplacement_floor
@@ -57,7 +55,8 @@ def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
     # Regions that are rejected keep that share of the hand's weight.
     drawing = fit.draw(ROWS)
     lifted = fit.weighting(ROWS, drawing).weights
-    strict = fit_of(training, **{"pao.mismatch": 0.0}).weighting(ROWS, drawing).weights
+    without = {"pao.mismatch": 0.0, "subject.enabled": False}
+    strict = fit_of(training, **without).weighting(ROWS, drawing).weights
     assert (lifted >= strict - 1e-6).all()
     assert lifted.sum() > strict.sum()
     # Without the pre-pass nothing is known of it.
