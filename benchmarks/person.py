@@ -32,7 +32,7 @@ from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.sim.produce.subject_mesh import add_subject_mesh
 from wildghand.fitting.judging_frames import judging_frames
 from wildghand.fitting.subject_shape import subject_of
-from wildghand.gaussians.training import load_frames
+from wildghand.gaussians.training import TrainingFrames, load_frames
 from wildghand.model.settings import read_settings
 from wildghand.subject import SubjectShape
 from wildghand.subject.shape import side_flip
@@ -56,18 +56,20 @@ class Person:
 
     name: str
     training: TrainingCapture
-    #: The right rest hand of the model, and what the person's lacks of it.
+    #: The frames that are fitted.
+    frames: TrainingFrames
+    #: The rest hand of the model, of either side.
     template: HandTemplate
+    #: What the model's right hand lacks of the person's.
     truth: SubjectShape
 
     def shape(self, settings: Mapping[str, object], validation: bool) -> tuple[SubjectShape, float]:
         """The shape that a fit finds, and its seconds."""
         training, found = self.training, read_settings(settings)
-        frames = load_frames(training)
         templates = {side: training.template(side) for side in training.sides}
         judges = judging_frames(training, found) if validation else None
         began = time.perf_counter()
-        shape = subject_of(training, frames, templates, found, judges)
+        shape = subject_of(training, self.frames, templates, found, judges)
         assert shape is not None
         return shape, time.perf_counter() - began
 
@@ -101,7 +103,8 @@ def open_person(folder: Path, work: Path) -> Person:
         joints.append((own.joints - template.joints - template.joint_basis @ betas) * flip)
     mean = np.mean(joints, axis=0)
     truth = SubjectShape(np.mean(surfaces, axis=0) - mean[0], mean - mean[0])
-    return Person(capture.info.id, training, training.template(training.sides[0]), truth)
+    template = training.template(training.sides[0])
+    return Person(capture.info.id, training, load_frames(training), template, truth)
 
 
 def drawn(person: Person, shape: SubjectShape) -> np.ndarray:

@@ -59,6 +59,14 @@ def finger_joints(finger: str) -> tuple[int, int, int]:
     return first, first + 1, first + 2
 
 
+def moved_joints() -> np.ndarray:
+    """(16, 16) float64: 1 where the second joint is the first one or moves with it, else 0."""
+    below = np.eye(len(PARENTS))
+    for joint in range(len(PARENTS) - 1, 0, -1):
+        below[PARENTS[joint]] = np.maximum(below[PARENTS[joint]], below[joint])
+    return below
+
+
 @dataclass(frozen=True, eq=False)
 class PalmDirections:
     """Three unit vectors (3,), perpendicular to each other."""

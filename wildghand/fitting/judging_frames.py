@@ -5,10 +5,7 @@ from __future__ import annotations
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.training import TrainingFrames, load_validation_frames
 from wildghand.model.settings import WildGHandSettings
-
-#: Frames that judge at most, and at least: one or two, which a fit to all frames leaves out, say
-#: little.
-MOST, LEAST = 8, 4
+from wildghand.subject.fit_subject import LEAST_CHOOSING, MOST_CHOOSING
 
 
 def judging_frames(training: TrainingCapture, settings: WildGHandSettings) -> TrainingFrames | None:
@@ -25,5 +22,5 @@ def judging_frames(training: TrainingCapture, settings: WildGHandSettings) -> Tr
     bends, weighs = subject.enabled and subject.validated, evidence.enabled and evidence.validated
     if not (bends or weighs):
         return None
-    frames = load_validation_frames(training, MOST)
-    return frames if len(frames) >= LEAST else None
+    frames = load_validation_frames(training, MOST_CHOOSING)
+    return frames if len(frames) >= LEAST_CHOOSING else None

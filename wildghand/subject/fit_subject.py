@@ -27,7 +27,7 @@ from wildghand.subject.unknowns import Unknowns
 STIFFNESS = (8.0, 4.0, 2.0, 1.0, 0.7)
 #: The stiffness where no frames choose.
 FIXED_STIFFNESS = 4.0
-#: Training frames that choose where no validation frames do, at most and at least.
+#: Frames that choose, at most and at least: one or two say little.
 MOST_CHOOSING, LEAST_CHOOSING = 8, 4
 # The reach in the first round, in those of the last.
 _FIRST_REACH = 3.0

@@ -103,7 +103,6 @@ def compare_outlines(
 
 def _around(area: np.ndarray) -> tuple[slice, slice]:
     """The rows and columns of a bool area, not empty, and of what its outline is read from."""
-
     rows, columns = (np.flatnonzero(area.any(axis=axis)) for axis in (1, 0))
     first = max(int(rows[0]) - _MARGIN, 0), max(int(columns[0]) - _MARGIN, 0)
     return (

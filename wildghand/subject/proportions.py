@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.hands import HandTemplate
-from hwp_bench.hands.skeleton import FINGERS, PARENTS, finger_joints, palm_directions
+from hwp_bench.hands.skeleton import FINGERS, finger_joints, moved_joints, palm_directions
 from hwp_bench.hands.template import JOINT_COUNT
 from wildghand.subject.shape import side_flip
 
@@ -39,7 +39,7 @@ def hand_proportions(template: HandTemplate) -> Proportions:
         template: the hand, of either side.
     """
     moves: list[tuple[np.ndarray, np.ndarray, bool]] = []
-    below = _below()
+    below = moved_joints()
     for finger, name in enumerate(FINGERS):
         chain = finger_joints(name)
         ends = [*template.joints[list(chain)], template.vertices[template.fingertips[finger]]]
@@ -70,11 +70,3 @@ def hand_proportions(template: HandTemplate) -> Proportions:
         joints=np.stack([move[1] for move in moves], axis=-1) * flip,
         lengths=np.array([move[2] for move in moves]),
     )
-
-
-def _below() -> np.ndarray:
-    """(16, 16) float64: 1 where the second joint is the first one or moves with it."""
-    below = np.eye(JOINT_COUNT)
-    for joint in range(JOINT_COUNT - 1, 0, -1):
-        below[PARENTS[joint]] = np.maximum(below[PARENTS[joint]], below[joint])
-    return below

@@ -6,7 +6,7 @@ import numpy as np
 import torch
 
 from hwp_bench.hands.rotations import cross_matrix
-from hwp_bench.hands.skeleton import PARENTS
+from hwp_bench.hands.skeleton import moved_joints
 from hwp_bench.importers.video.clip_model import ANCHOR_UNIT, ClipModel, ClipVariables
 
 #: Variables of one frame: turn 3, fingers 45, anchor 2, log depth 1.
@@ -49,7 +49,7 @@ class SurfaceMotion:
         self._turn_rates = right_jacobian(array(free.turn))
         self._finger_rates = right_jacobian(self._fingers)
         self._weights = array(tensors.weights)
-        self._below = _descendants()
+        self._below = moved_joints()
 
     def by_variables(self, frame: int, vertices: np.ndarray) -> np.ndarray:
         """Differentiate vertices' pixels of the whole frame.
@@ -114,11 +114,3 @@ def right_jacobian(vectors: np.ndarray) -> np.ndarray:
 
 def _cross(vectors: np.ndarray) -> np.ndarray:
     return np.asarray(cross_matrix(torch.from_numpy(vectors)).numpy())
-
-
-def _descendants() -> np.ndarray:
-    """(16, 16): 1 where the second joint moves with the first."""
-    below = np.eye(len(PARENTS))
-    for joint in range(len(PARENTS) - 1, 0, -1):
-        below[PARENTS[joint]] = np.maximum(below[PARENTS[joint]], below[joint])
-    return below

@@ -18,9 +18,9 @@ from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.evidence import EvidenceSettings, strengths, weigh_evidence
 from wildghand.fitting.evidence_choice import EvidenceChoice
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.judging_frames import LEAST
 from wildghand.gaussians.training import load_validation_frames
 from wildghand.model.settings import read_settings
+from wildghand.subject.fit_subject import LEAST_CHOOSING
 
 QUICK: dict[str, Any] = {**UNJUDGED, "light.enabled": False}
 TrainingMaker = Callable[..., TrainingCapture]
@@ -135,7 +135,7 @@ def test_nothing_is_chosen_where_it_is_off(
 
 def test_a_frame_or_two_do_not_judge(training: TrainingCapture) -> None:
     first, last = training.targets[[0, -1]].tolist()
-    few = first - LEAST + 1
+    few = first - LEAST_CHOOSING + 1
     training.split = Split(training.id, last + 1, (0, few), (few, first), (first, last + 1))
     training._train = training.split.train
     assert begun(training).choice.frames is None
