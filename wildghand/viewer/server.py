@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import socket
 import sys
+import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
@@ -14,6 +15,10 @@ from wildghand.viewer.guard import LOOPBACK, guarded
 
 if TYPE_CHECKING:
     from viser import ViserServer
+
+
+#: A web socket waits ten seconds for a browser that does not say goodbye; viser waits six for it.
+CLOSING_SECONDS = 15.0
 
 
 @dataclass(frozen=True)
@@ -69,14 +74,19 @@ def serving(address: Address, title: str) -> Iterator[ViserServer]:
             """Refuse: a page may ask for a tunnel through a machine of viser's authors."""
             return None
 
+    others = set(threading.enumerate())
     with contextlib.redirect_stdout(sys.stderr), guarded(address.loopback):
         server = Server(host=address.host, port=address.port, label=title, verbose=False)
+    started = set(threading.enumerate()) - others
     try:
         server.gui.configure_theme(show_logo=False, show_share_button=False, control_width="medium")
         yield server
     finally:
         with contextlib.redirect_stdout(sys.stderr):
             server.stop()
+            # Its thread says on standard output that it stopped, however late that is.
+            for thread in started:
+                thread.join(CLOSING_SECONDS)
 
 
 def url(server: ViserServer) -> str:

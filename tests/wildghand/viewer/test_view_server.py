@@ -2,18 +2,21 @@
 
 from __future__ import annotations
 
+import atexit
 import builtins
 import json
 import os
 import signal
 import subprocess
 import sys
+import time
 import urllib.error
 import urllib.request
 from pathlib import Path
 from typing import Any
 
 import pytest
+import rich
 
 from hwp_bench.base.errors import UsageError
 from wildghand.avatar.avatar import WildGHandAvatar
@@ -42,11 +45,17 @@ def connect(address: str, origin: str | None) -> str:
         return str(error.response.status_code)
 
 
+def page_status(address: str) -> int:
+    """The status of a page; a connection that stays open would hold the server up."""
+    with urllib.request.urlopen(address) as page:
+        return int(page.status)
+
+
 def test_other_pages_cannot_look(capfd: pytest.CaptureFixture[str]) -> None:
     with serving(Address(port=0), "test") as server:
         address = url(server)
         assert address.startswith("http://127.0.0.1:")
-        assert urllib.request.urlopen(address).status == 200
+        assert page_status(address) == 200
         assert connect(address, address) == "open"
         assert connect(address, None) == "open"
         assert connect(address, "https://elsewhere.org") == "403"
@@ -54,12 +63,38 @@ def test_other_pages_cannot_look(capfd: pytest.CaptureFixture[str]) -> None:
         asked = urllib.request.Request(address, headers={"Host": "rebound.org"})
         with pytest.raises(urllib.error.HTTPError) as refused:
             urllib.request.urlopen(asked)
+        refused.value.close()
         assert refused.value.code == 403
         assert server.request_share_url() is None
     # Results go to standard output; what viser says does not.
     assert capfd.readouterr().out == ""
     with pytest.raises(OSError, match="refused"):
         urllib.request.urlopen(address)
+
+
+def test_a_server_that_stops_late_keeps_off_standard_output(
+    monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """As with a browser that never answers: viser gives up before its thread ends."""
+    say = rich.print
+
+    def late(*words: Any) -> None:
+        time.sleep(0.3)
+        say(*words)
+
+    def hasty(server: viser.ViserServer) -> None:
+        sockets = server._websock_server
+        atexit.unregister(server.stop)
+        atexit.unregister(sockets.stop)
+        sockets._background_event_loop.call_soon_threadsafe(sockets._stop_event.set)
+
+    monkeypatch.setattr(rich, "print", late)
+    monkeypatch.setattr(viser.ViserServer, "stop", hasty)
+    with serving(Address(port=0), "late"):
+        pass
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert "Server stopped" in said.err
 
 
 def test_a_port_that_is_taken_is_passed_over() -> None:
@@ -126,7 +161,7 @@ def test_ctrl_c_ends_the_view_with_status_0(tiny_avatar: WildGHandAvatar, tmp_pa
     try:
         assert running.stdout is not None
         facts = json.loads(running.stdout.readline())
-        assert urllib.request.urlopen(facts["url"]).status == 200
+        assert page_status(facts["url"]) == 200
         running.send_signal(signal.SIGINT)
         out, err = running.communicate()
     finally:
