@@ -10,6 +10,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,7 +32,7 @@ from hwp_bench.importers.video import FitSettings
 from hwp_bench.tracking.model_files import HAND, PALM, models_folder
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.from_video import VideoFit, make_avatar
+from wildghand.from_video import VideoFit, make_avatar, turntable
 from wildghand.from_video.capture import import_options, stride
 from wildghand.from_video.job import Job
 from wildghand.from_video.settings import QUICK as QUICK_CHANGES
@@ -47,6 +48,8 @@ NAMES = [stage.name for stage in STAGES]
 IMPORT = FitSettings(
     start_steps=30, landmark_steps=30, contour_steps=3, contour_rounds=1, texture_weight=0.0
 )
+#: Edge, px, and frames of turntables here. Those of every size are drawn alike.
+SIZE, FRAMES = 96, 12
 CLIP = Path(__file__).resolve().parents[4] / "shared" / "data" / "real_hand"
 
 
@@ -59,8 +62,16 @@ def choices(folder: Path, **changes: Any) -> VideoFit:
     return VideoFit(**{**given, **changes})
 
 
+@pytest.fixture(scope="module", autouse=True)
+def small_turntables() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(turntable, "SIZE", SIZE)
+        patch.setattr(turntable, "FRAMES", FRAMES)
+        yield
+
+
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def made(tmp_path_factory: pytest.TempPathFactory, small_turntables: None) -> Path:
     """A folder with a video, its landmarks, and the avatar that was made of them."""
     folder = tmp_path_factory.mktemp("made")
     clip = make_clip(COUNT)
@@ -102,10 +113,10 @@ def test_the_folder_is_an_avatar_with_clip_and_sheet(made: Path, tmp_path: Path)
     views = []
     while (read := clip.read())[0]:
         views.append(read[1])
-    assert len(views) == 96
+    assert len(views) == FRAMES
     # The hand is there, and turns.
     assert all((view.max(axis=2) > 60).mean() > 0.05 for view in views)
-    assert np.abs(views[0].astype(int) - views[48]).mean() > 1
+    assert np.abs(views[0].astype(int) - views[FRAMES // 2]).mean() > 1
     assert read_rgb(out / "sheet.jpg").shape[0] > 1000
     # What other commands expect of an avatar.
     words = ["render", str(out), "--poses", str(out / "work" / "capture"), "--frames", "3:5"]
@@ -155,10 +166,11 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 sys.path[:0] = sys.argv[4:]
-from test_from_video import choices
+from test_from_video import FRAMES, SIZE, choices
 from wildghand.fitting import session
 from wildghand.from_video import capture, make_avatar, run, turntable
 folder, out, where = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
+turntable.SIZE, turntable.FRAMES = SIZE, FRAMES
 def die(*args, **more):
     os.kill(os.getpid(), signal.SIGKILL)
 if where == "fit":
