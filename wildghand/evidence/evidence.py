@@ -123,8 +123,9 @@ def weigh_evidence(shown: Mapping[str, Tensor], count: int, settings: EvidenceSe
 def strengths(settings: EvidenceSettings) -> list[EvidenceSettings]:
     """The strengths among which validation frames choose, the settings' own first.
 
-    The others are a quarter and four times of its `offset_share`, and no evidence at all.
+    The others are a quarter and four times of its `offset_share`, and offsets as they were learnt.
+    Discs stay in each of them: they close what no frame shows, which validation frames, taken from
+    where the camera stood, show neither.
     """
     share = settings.offset_share
-    others = [replace(settings, offset_share=factor * share) for factor in (0.25, 4.0)]
-    return [settings, *others, replace(settings, offset_share=0.0, shape_share=0.0)]
+    return [settings, *(replace(settings, offset_share=factor * share) for factor in (0.25, 4, 0))]

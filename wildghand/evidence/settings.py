@@ -23,7 +23,6 @@ class EvidenceSettings:
     #: Share of the training frames that must show a place clearly until its colour is half its own;
     #: the rest is that of the same place of the other hand, where that is known. 0: all of it is.
     color_share: float = number(0.02, 0.0, 100.0)
-    #: After the last step, take a quarter or four times of `offset_share`, or no evidence at all,
-    #: where that draws the validation frames better. With fewer than four of these `offset_share`
-    #: holds.
+    #: After the last step, take a quarter or four times of `offset_share`, or 0, where that draws
+    #: the validation frames better. With fewer than four of these `offset_share` holds.
     validated: bool = True
