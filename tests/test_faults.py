@@ -16,8 +16,8 @@ import pytest
 
 from benchmarks.faults import Target, make_targets, torture
 
-#: Kills of each command here; the benchmark has time for more.
-KILLS = 1
+#: Kills of each command here.
+KILLS = 2
 
 
 @pytest.fixture(scope="module")
