@@ -87,6 +87,29 @@ def boundary_vertices(faces: np.ndarray) -> np.ndarray:
     return np.unique(edges[np.bincount(edge_of.ravel(), minlength=len(edges)) == 1])
 
 
+def open_loops(faces: np.ndarray) -> list[np.ndarray]:
+    """Return the open ends of a mesh, each as the vertices around it.
+
+    Args:
+        faces: (F, 3) int, all with the same side in front.
+
+    Returns:
+        (L,) int64 for each open end, one neighbour after the other in the direction of the faces'
+        own edges, the longest first; none for a closed mesh. Where more than two open edges meet in
+        a vertex, one of the ways through it is taken.
+    """
+    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
+    both = {(int(a), int(b)) for a, b in directed}
+    following = {a: b for a, b in sorted(both) if (b, a) not in both}
+    loops = []
+    while following:
+        loop = [next(iter(following))]
+        while (after := following.pop(loop[-1], None)) not in (None, loop[0]):
+            loop.append(after)
+        loops.append(np.array(loop, dtype=np.int64))
+    return sorted(loops, key=len, reverse=True)
+
+
 def _split(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
     """The four faces of each face, and the end points of the new vertices (from `count` on)."""
     edges, edge_of = unique_edges(faces)

@@ -225,21 +225,23 @@ class WildGHandAvatar(HandAvatar):
 
     @denormals_flushed()
     @torch.no_grad()
-    def pose(self, hands: Mapping[str, HandPose]) -> PosedGaussians:
+    def pose(self, hands: Mapping[str, HandPose], *, closed: bool = False) -> PosedGaussians:
         """Pose the Gaussians of the given hands, one hand after the other.
 
         Args:
             hands: by side.
+            closed: after them, the walls that close the open ends of the wrists in `render`.
 
         Raises:
             UsageError: no hand, or one that was not fitted.
         """
         refine, posed = self.settings.heads.refinement, self.posed(hands)
         dark = self.model.cast(posed)
-        parts = [
-            self.model.gaussians(side, *given, refine=refine, dark=dark.get(side))
+        made = {
+            side: self.model.gaussians(side, *given, refine=refine, dark=dark.get(side))
             for side, given in posed.items()
-        ]
+        }
+        parts = [*made.values(), *(self.model.walls(posed, made) if closed else ())]
 
         def array(tensors: list[torch.Tensor], fields: int) -> np.ndarray:
             """Of one frame of each hand; tensors that all frames share have no frames."""

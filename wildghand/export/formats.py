@@ -109,7 +109,8 @@ def export(
         hands = {side: shown[side] for side in shown_sides(avatar, capture)}
     if settings.mesh:
         return _write_mesh(avatar, path, hands, capture)
-    posed = _splat_bytes(avatar.pose(hands), path.suffix.lower(), settings, capture is not None)
+    splats = avatar.pose(hands, closed=True)
+    posed = _splat_bytes(splats, path.suffix.lower(), settings, capture is not None)
     atomic_write(path, posed[0])
     return {"gaussians": posed[1]}
 

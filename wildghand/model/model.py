@@ -17,12 +17,13 @@ from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight
 from wildghand.model.dress import Gaussians, dress
+from wildghand.model.rasterize_hands import rasterize_hands
 from wildghand.model.relight import relit
 from wildghand.model.rendered import HandState, RenderedFrames, largest
+from wildghand.model.wrist import WristWall
 from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
 from wildghand.shadows import CastLight, HandShadows, ShadowSettings
 from wildghand.shadows.hand_shadows import Hands
-from wildghand.splat import rasterize
 from wildghand.subject import SubjectShape
 
 
@@ -69,6 +70,7 @@ class WildGHandModel(nn.Module):
         self.light: KnownLight | None = None
         self.evidence: Evidence | None = None
         self.other_hand: OtherHand | None = None
+        self._walls: dict[str, WristWall | None] = {}
         self.rigs = dict(rigs)
         self.network = network
         self.perturbation = nn.ModuleDict(
@@ -96,6 +98,7 @@ class WildGHandModel(nn.Module):
         if isinstance(found, Evidence):
             counts = {side: len(rig) for side, rig in self.rigs.items()}
             self.evidence = Evidence.from_tensors(dict(self.named_buffers()), counts, "evidence")
+            self._walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
         if isinstance(found, OtherHand):
             self.other_hand = found
         if isinstance(found, CastLight):
@@ -220,6 +223,8 @@ class WildGHandModel(nn.Module):
     ) -> tuple[Tensor, Tensor]:
         """Draw hands in any pose, free of what perturbed the training frames.
 
+        With `evidence`, a wall closes the open end of the wrist, which no frame looks into.
+
         Args:
             hands: pose (B, 16, 3), betas (10,), transl (B, 3) by side.
             viewmats: (B, 4, 4).
@@ -233,8 +238,8 @@ class WildGHandModel(nn.Module):
             (B, H, W, 3) sRGB over black and (B, H, W, 1) coverage.
         """
         dark = self.cast(hands) if dark is None else dark
-        parts = [
-            self.gaussians(
+        parts = {
+            side: self.gaussians(
                 side,
                 *hands[side],
                 refine=refine,
@@ -244,8 +249,19 @@ class WildGHandModel(nn.Module):
             )
             for side in self.rigs
             if side in hands
-        ]
-        return rasterize_hands(parts, viewmats, Ks, width, height)
+        }
+        walls = self.walls(hands, parts)
+        return rasterize_hands([*parts.values(), *walls], viewmats, Ks, width, height)
+
+    def walls(self, hands: Hands, parts: Mapping[str, Gaussians]) -> list[Gaussians]:
+        """Close the wrists of hands; none while there is no evidence.
+
+        Args:
+            hands: pose (B, 16, 3), betas (10,), transl (B, 3) by side.
+            parts: the Gaussians of these hands, by side.
+        """
+        walls = ((self._walls.get(side), side) for side in parts)
+        return [wall.close(parts[side], *hands[side]) for wall, side in walls if wall is not None]
 
     def gaussians(
         self,
@@ -355,43 +371,3 @@ def _dimmed(prediction: NetworkOutput, dark: Tensor | None) -> NetworkOutput:
     if dark is None:
         return prediction
     return replace(prediction, shadow=prediction.shadow * dark[..., None])
-
-
-def rasterize_hands(
-    parts: list[Gaussians], viewmats: Tensor, Ks: Tensor, width: int, height: int
-) -> tuple[Tensor, Tensor]:
-    """Draw the Gaussians of hands together in B frames.
-
-    Args:
-        parts: of each hand.
-        viewmats: (B, 4, 4).
-        Ks: (B, 3, 3) px.
-        width, height: px.
-
-    Returns:
-        (B, H, W, 3) sRGB over black and (B, H, W, 1) coverage.
-    """
-
-    def joined(name: str, shared: int) -> Tensor:
-        tensors = [getattr(part, name) for part in parts]
-        if len(tensors) == 1:
-            return tensors[0]
-        if any(tensor.dim() > shared for tensor in tensors):
-            tensors = [
-                tensor if tensor.dim() > shared else tensor.expand(len(viewmats), *tensor.shape)
-                for tensor in tensors
-            ]
-        return torch.cat(tensors, dim=tensors[0].dim() - shared)
-
-    image, coverage, _ = rasterize(
-        joined("means", 2),
-        joined("quats", 2),
-        joined("scales", 2),
-        joined("opacities", 1),
-        joined("colors", 2),
-        viewmats,
-        Ks,
-        width,
-        height,
-    )
-    return image, coverage

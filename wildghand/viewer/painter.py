@@ -73,7 +73,7 @@ class Painter:
         """
         began = time.perf_counter()
         if self._posed is None or self._posed[0] is not hands:
-            self._posed = hands, self._avatar.pose(hands)
+            self._posed = hands, self._avatar.pose(hands, closed=True)
         posed, entered = self._posed[1], time.perf_counter()
         device = torch.device(self._avatar.device)
 

@@ -9,7 +9,7 @@ import trimesh
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import HandTemplate, load_template, pose_hand, subdivide
-from hwp_bench.hands.topology import MAX_TIMES, boundary_vertices, mano_hd
+from hwp_bench.hands.topology import MAX_TIMES, boundary_vertices, mano_hd, open_loops
 
 
 def boundary_count(faces: np.ndarray) -> int:
@@ -125,3 +125,24 @@ def test_the_open_end_is_the_wrist() -> None:
     assert 8 <= len(ring) <= 40
     # All of it lies near the wrist joint, far from any finger.
     assert np.linalg.norm(hand.vertices[ring] - hand.joints[0], axis=1).max() < 0.06
+
+
+def test_the_open_end_is_one_loop_along_edges_of_the_mesh() -> None:
+    hand = load_template()
+    (loop,) = open_loops(hand.faces)
+    np.testing.assert_array_equal(np.sort(loop), boundary_vertices(hand.faces))
+    # Oracle: trimesh's own edges, each with the number of its faces.
+    edges = trimesh.Trimesh(hand.vertices, hand.faces, process=False).edges
+    directed = {(int(a), int(b)) for a, b in edges}
+    for a, b in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True):
+        assert (a, b) in directed
+        assert (b, a) not in directed
+
+
+def test_every_open_end_is_a_loop_and_a_closed_mesh_has_none() -> None:
+    tube = trimesh.creation.cylinder(1.0, 2.0, sections=12)
+    assert open_loops(np.asarray(tube.faces)) == []
+    # Without its two lids, whose faces are those that look up or down.
+    walls = np.asarray(tube.faces)[np.abs(tube.face_normals[:, 2]) < 0.5]
+    assert [len(loop) for loop in open_loops(walls)] == [12, 12]
+    assert open_loops(np.zeros((0, 3), dtype=np.int64)) == []
