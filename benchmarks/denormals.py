@@ -32,6 +32,7 @@ TERMS = {
         if name not in ("dssim_weight", "outside_weight", "leave_hidden")
     },
     "dpd.gain_weight": 0.1,
+    "dpd.tint_weight": 1.0,
     "dpd.omega_weight": 1.0,
 }
 

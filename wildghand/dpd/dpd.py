@@ -38,6 +38,9 @@ class DpdSettings:
     gains: bool = True
     #: Weight of the square of the log gains, for a frame that is surely clean.
     gain_weight: float = number(0.1)
+    #: Weight of the square of what separates the log gains of a frame's channels: exposure wanders
+    #: more than white balance, and a palm that only perturbed frames show is redder by itself.
+    tint_weight: float = number(1.0)
     #: Chance that a frame's biases are left out of a step. With the pre-pass, that of clean frames
     #: holds instead (`prepass.omega_dropout`).
     omega_dropout: float = number(0.3, 0.0, 1.0)

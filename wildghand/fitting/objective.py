@@ -107,10 +107,10 @@ class Objective:
             held = self.temporal.temporal_loss(model.biases, int(rows[0]))
             total = total + settings.dpd.omega_weight * held
         if settings.dpd.gains:
-            # Clean frames have no gain: without this prior gain and colours could trade places.
-            device = model.log_gains.device
-            size = model.log_gains[upload(rows, device)].square().mean(dim=-1)
-            total = total + settings.dpd.gain_weight * (upload(clean, device) * size).mean()
+            device, dpd = model.log_gains.device, settings.dpd
+            gains = model.log_gains[upload(rows, device)]
+            total = total + dpd.gain_weight * terms.gain_of_clean(gains, upload(clean, device))
+            total = total + dpd.tint_weight * terms.tint_of_gains(gains)
         return total
 
     def of_features(self, features: Mapping[str, HandFeatures]) -> Tensor | None:

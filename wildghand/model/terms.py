@@ -155,6 +155,27 @@ def silhouette(coverage: Tensor, hand: Tensor) -> Tensor:
     return (coverage - hand.to(coverage)).square().mean()
 
 
+def gain_of_clean(log_gains: Tensor, clean: Tensor) -> Tensor:
+    """Mean of the squared log gains, by how clean frames are.
+
+    Clean frames have no gain: without this, gain and colours could trade places.
+
+    Args:
+        log_gains: (B, 3) of the frames' sRGB colours.
+        clean: (B,) probability that a frame is clean.
+    """
+    return (clean * log_gains.square().mean(dim=-1)).mean()
+
+
+def tint_of_gains(log_gains: Tensor) -> Tensor:
+    """Mean squared distance of (B, 3) log gains from the mean of their frame's channels.
+
+    A side of the hand that only perturbed frames show has a colour of its own, such as a palm's. A
+    gain explains it as well as the hand does, and would take it away from the avatar.
+    """
+    return (log_gains - log_gains.mean(dim=-1, keepdim=True)).square().mean()
+
+
 def weight_reward(sizes: Tensor) -> Tensor:
     """Minus the mean of W, from W or its means by frame: lowest where nothing is weighed down."""
     return -sizes.mean()

@@ -149,7 +149,7 @@ def fake_device(monkeypatch: pytest.MonkeyPatch) -> None:
     optimizers = sys.modules[torch.optim.Optimizer.__module__]
     name = "_get_fused_kernels_supported_devices"
     monkeypatch.setattr(optimizers, name, lambda: ["cpu", "cuda", "meta"])
-    monkeypatch.setattr("wildghand.model.model.rasterize", stand_in)
+    monkeypatch.setattr("wildghand.model.rasterize_hands.rasterize", stand_in)
 
 
 @pytest.mark.parametrize("name", VARIANTS)

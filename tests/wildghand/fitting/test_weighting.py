@@ -25,7 +25,9 @@ TrainingMaker = Callable[..., TrainingCapture]
 
 
 def fit_of(training: TrainingCapture, **changes: Any) -> Fit:
-    return Fit(training, read_settings({**TINY, **changes}), 0, CPU)
+    """A fit before its first step; shadows take part in no weight, and their time is saved."""
+    settings = read_settings({**TINY, "shadows.enabled": False, **changes})
+    return Fit(training, settings, 0, CPU)
 
 
 def test_frames_teach_by_their_temporal_weights(make_training: TrainingMaker) -> None:

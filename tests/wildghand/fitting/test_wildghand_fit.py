@@ -6,6 +6,7 @@ before it was written.
 
 from __future__ import annotations
 
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -166,6 +167,16 @@ def test_an_avatar_is_read_as_it_was_written(make_training: TrainingMaker, tmp_p
         save_avatar(avatar, tmp_path / "avatar")
 
 
+@pytest.fixture(scope="module")
+def saved(make_painted: Callable[..., Capture], tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The folder of an avatar; tests that change it copy it."""
+    avatar = tmp_path_factory.mktemp("saved") / "avatar"
+    options = [word for name, value in FIT.items() for word in ("--set", f"{name}={value}")]
+    capture = str(make_painted().root)
+    assert main(["fit", capture, "-o", str(avatar), "--steps", "1", *options]) == 0
+    return avatar
+
+
 @pytest.mark.parametrize(
     ("name", "content", "message"),
     [
@@ -175,9 +186,9 @@ def test_an_avatar_is_read_as_it_was_written(make_training: TrainingMaker, tmp_p
     ],
 )
 def test_damaged_avatars_are_one_line(
-    name: str, content: str, message: str, make_training: TrainingMaker, tmp_path: Path
+    name: str, content: str, message: str, saved: Path, tmp_path: Path
 ) -> None:
-    save_avatar(fitted(make_training(), steps=1), tmp_path / "avatar")
+    shutil.copytree(saved, tmp_path / "avatar")
     (tmp_path / "avatar" / name).write_text(content)
     with pytest.raises(BadInput, match=message) as caught:
         load_avatar(tmp_path / "avatar")

@@ -91,6 +91,20 @@ def test_pixels_that_are_not_finite_are_left_out(dtype: torch.dtype, share: floa
     assert FilterBankLoss()(image, target, WEIGHTS.to(dtype)).isfinite()
 
 
+def test_gains_of_clean_frames_and_tints_of_all_are_charged() -> None:
+    gains = torch.tensor([[0.1, 0.1, 0.1], [-0.3, 0.0, 0.6], [0.0, 0.0, 0.0]], requires_grad=True)
+    clean = torch.tensor([1.0, 0.25, 1.0])
+    # By hand: frames count by how clean they are; a grey gain has no tint.
+    size = (0.01 + 0.25 * (0.09 + 0.36) / 3) / 3
+    assert float(terms.gain_of_clean(gains, clean).detach()) == pytest.approx(size, rel=1e-6)
+    tint = terms.tint_of_gains(gains)
+    assert float(tint.detach()) == pytest.approx((0.16 + 0.01 + 0.25) / 9, rel=1e-6)
+    tint.backward()
+    assert gains.grad is not None
+    torch.testing.assert_close(gains.grad[[0, 2]], torch.zeros(2, 3), atol=1e-8, rtol=0)
+    torch.testing.assert_close(gains.grad.sum(dim=1), torch.zeros(3), atol=1e-7, rtol=0)
+
+
 def test_no_weight_no_loss() -> None:
     image = IMAGE.clone().requires_grad_(True)
     loss = terms.reconstruction(image, TARGET, torch.zeros_like(WEIGHTS), 0.2)
