@@ -83,31 +83,42 @@ def boundary_vertices(faces: np.ndarray) -> np.ndarray:
     Returns:
         (N,) int64, the vertices of the edges that belong to one face only.
     """
-    edges, edge_of = unique_edges(faces)
-    return np.unique(edges[np.bincount(edge_of.ravel(), minlength=len(edges)) == 1])
+    return np.unique(_open_edges(faces))
 
 
 def open_loops(faces: np.ndarray) -> list[np.ndarray]:
     """Return the open ends of a mesh, each as the vertices around it.
 
     Args:
-        faces: (F, 3) int, all with the same side in front.
+        faces: (F, 3) int.
 
     Returns:
         (L,) int64 for each open end, one neighbour after the other in the direction of the faces'
         own edges, the longest first; none for a closed mesh. Where more than two open edges meet in
         a vertex, one of the ways through it is taken.
     """
-    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]).tolist()
-    both = {(int(a), int(b)) for a, b in directed}
-    following = {a: b for a, b in sorted(both) if (b, a) not in both}
+    following = dict(_open_edges(faces).tolist())
     loops = []
     while following:
         loop = [next(iter(following))]
-        while (after := following.pop(loop[-1], None)) not in (None, loop[0]):
-            loop.append(after)
+        step = following.pop(loop[0])
+        while step != loop[0] and step in following:
+            loop.append(step)
+            step = following.pop(step)
         loops.append(np.array(loop, dtype=np.int64))
     return sorted(loops, key=len, reverse=True)
+
+
+def boundary_loop(faces: np.ndarray) -> np.ndarray:
+    """Return the longest loop of boundary vertices, in order; empty for a closed mesh."""
+    return next(iter(open_loops(faces)), np.zeros(0, dtype=np.int64))
+
+
+def _open_edges(faces: np.ndarray) -> np.ndarray:
+    """(E, 2) directed edges that belong to one face only."""
+    edges, edge_of = unique_edges(faces)
+    once = np.bincount(edge_of.ravel(), minlength=len(edges)) == 1
+    return _directed_edges(faces)[once[edge_of.ravel()]]
 
 
 def _split(faces: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -128,9 +139,14 @@ def unique_edges(faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     Returns:
         (E, 2) edges in sorted order, and for each face the edges ab, bc, ca as (3, F).
     """
-    directed = np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    edges, inverse = np.unique(np.sort(directed, axis=1), axis=0, return_inverse=True)
+    ends = np.sort(_directed_edges(faces), axis=1)
+    edges, inverse = np.unique(ends, axis=0, return_inverse=True)
     return edges, inverse.reshape(3, -1)
+
+
+def _directed_edges(faces: np.ndarray) -> np.ndarray:
+    """(3 F, 2): the edge ab of each face, then bc, then ca."""
+    return np.concatenate([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
 
 
 def _with_midpoints(values: np.ndarray, edges: np.ndarray) -> np.ndarray:

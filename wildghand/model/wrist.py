@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import cv2
 import numpy as np
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from hwp_bench.hands import TemplateTensors, pose_hand
-from hwp_bench.hands.topology import open_loops
+from hwp_bench.hands import TemplateTensors, anchor_positions, pose_hand
+from hwp_bench.hands.topology import boundary_loop
 from wildghand.gaussians.quaternions import matrix_to_quat
 from wildghand.gaussians.rig import HandRig
 from wildghand.model.dress import Gaussians
@@ -51,29 +52,19 @@ class WristWall:
         Args:
             rig: of the hand, with its anchors.
         """
-        vertices = rig.template.vertices.detach().cpu().double().numpy()
-        faces = rig.template.faces.cpu().numpy()
-        loops = open_loops(faces)
-        if not loops:
+        vertices, faces = rig.template.vertices, rig.template.faces
+        border = torch.from_numpy(boundary_loop(faces.cpu().numpy())).to(vertices.device)
+        if not len(border):
             return None
-        border = max(loops, key=lambda loop: _length(vertices[loop]))
-        if np.ptp(vertices[border], axis=0).max() > _WIDEST:
+        places = vertices[border]
+        if float((places.amax(dim=0) - places.amin(dim=0)).max()) > _WIDEST:
             return None
-        shares = _fan(vertices[border])
+        shares = _fan(places.cpu().double().numpy())
         if not len(shares):
             return None
-        corners = vertices[faces[torch.as_tensor(rig.anchors.face_index).cpu().numpy()]]
-        weights = torch.as_tensor(rig.anchors.barycentric).cpu().numpy()
-        anchors = (weights[..., None] * corners).sum(axis=1)
-        away = np.linalg.norm(anchors[:, None] - vertices[border], axis=-1).min(axis=1)
-        near = np.flatnonzero(away <= max(_NEAR, away.min()))
-        device = rig.template.vertices.device
-        return cls(
-            rig.template,
-            torch.from_numpy(border).to(device),
-            torch.from_numpy(shares).float().to(device),
-            torch.from_numpy(near).to(device),
-        )
+        away = torch.cdist(anchor_positions(vertices, faces, rig.anchors), places).amin(dim=1)
+        skin = torch.nonzero(away <= away.min().clamp(min=_NEAR))[:, 0]
+        return cls(rig.template, border, torch.from_numpy(shares).to(vertices), skin)
 
     def close(self, hand: Gaussians, pose: Tensor, betas: Tensor, transl: Tensor) -> Gaussians:
         """The wall of a posed hand.
@@ -81,7 +72,7 @@ class WristWall:
         Args:
             hand: its Gaussians in B frames.
             pose: (B, 16, 3) axis-angle, rad.
-            betas: (10,).
+            betas: (10,) or (B, 10).
             transl: (B, 3) m.
 
         Returns:
@@ -111,11 +102,6 @@ class WristWall:
         )
 
 
-def _length(loop: np.ndarray) -> float:
-    """Of a closed line, m."""
-    return float(np.linalg.norm(loop - np.roll(loop, -1, axis=0), axis=1).sum())
-
-
 def _fan(border: np.ndarray) -> np.ndarray:
     """Points of a grid inside a closed line, as shares of its vertices.
 
@@ -134,28 +120,17 @@ def _fan(border: np.ndarray) -> np.ndarray:
     reach = np.arange(0.0, np.abs(flat).max() + _SPACING, _SPACING)
     line = np.concatenate([-reach[:0:-1], reach])
     grid = np.stack(np.meshgrid(line, line), axis=-1).reshape(-1, 2)
+    closed = flat.astype(np.float32)
+    depths = [cv2.pointPolygonTest(closed, point, True) for point in grid.tolist()]
+    grid = grid[np.array(depths) >= _INSIDE * _WIDE * _SPACING]
     after = np.roll(flat, -1, axis=0)
     # grid = a flat + b after, in each triangle.
     weights = np.einsum("lij,pj->pli", np.linalg.pinv(np.stack([flat, after], axis=-1)), grid)
     inside = (weights >= -1e-9).all(axis=-1) & (weights.sum(axis=-1) <= 1.0)
-    kept = np.flatnonzero(
-        inside.any(axis=1) & (_from_line(grid, flat, after) >= _INSIDE * _WIDE * _SPACING)
-    )
-    triangle = inside[kept].argmax(axis=1)
-    first, second = weights[kept, triangle].T
+    rows, triangle = np.arange(len(grid)), inside.argmax(axis=1)
+    first, second = weights[rows, triangle].T
     count = len(border)
     shares = np.repeat((1.0 - first - second)[:, None] / count, count, axis=1)
-    rows = np.arange(len(kept))
     shares[rows, triangle] += first
     shares[rows, (triangle + 1) % count] += second
     return shares
-
-
-def _from_line(points: np.ndarray, starts: np.ndarray, ends: np.ndarray) -> np.ndarray:
-    """(P,) distances of (P, 2) points from the nearest of L segments."""
-    along = ends - starts
-    square = np.maximum((along**2).sum(axis=1), 1e-18)
-    to = points[:, None] - starts
-    share = np.clip((to * along).sum(axis=-1) / square, 0.0, 1.0)
-    distances: np.ndarray = np.linalg.norm(to - share[..., None] * along, axis=-1).min(axis=1)
-    return distances

@@ -100,25 +100,6 @@ def unit(vectors: np.ndarray) -> np.ndarray:
     return vectors / np.maximum(length, 1e-12)
 
 
-def boundary_loop(faces: np.ndarray) -> np.ndarray:
-    """The longest loop of boundary vertices, in order."""
-    edges = np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]])
-    _, inverse, counts = np.unique(
-        np.sort(edges, axis=1), axis=0, return_inverse=True, return_counts=True
-    )
-    following = dict(edges[counts[inverse.reshape(-1)] == 1].tolist())
-    loops = []
-    while following:
-        start = next(iter(following))
-        loop = [start]
-        step = following.pop(start)
-        while step != start and step in following:
-            loop.append(step)
-            step = following.pop(step)
-        loops.append(loop)
-    return np.array(max(loops, key=len, default=[]), dtype=np.int64)
-
-
 def _adjacency(faces: np.ndarray, vertex_count: int) -> csr_matrix:
     from scipy.sparse import csr_matrix
 

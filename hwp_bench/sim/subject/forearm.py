@@ -11,7 +11,8 @@ from functools import lru_cache
 
 import numpy as np
 
-from hwp_bench.sim.geometry.mesh import boundary_loop, unit
+from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.surface import Material, Surface
 from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.atlas import SkinAtlas, kept

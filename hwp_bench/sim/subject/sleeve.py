@@ -8,7 +8,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.sim.geometry.mesh import boundary_loop, unit
+from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.sim.geometry.mesh import unit
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import Material, Surface
 from hwp_bench.sim.subject.limb import ringed

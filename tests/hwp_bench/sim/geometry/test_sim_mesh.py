@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import trimesh
 
+from hwp_bench.hands.topology import boundary_loop
 from hwp_bench.sim.geometry.mesh import (
-    boundary_loop,
     normal_operator,
     smoothing,
     subdivision,

@@ -25,7 +25,7 @@ from benchmarks.rig_files import (
 )
 from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands import HandTemplate, load_template
-from hwp_bench.sim.geometry.mesh import boundary_loop
+from hwp_bench.hands.topology import boundary_loop
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.schema import Scene
 from hwp_bench.sim.subject.joint_names import hand_joints
