@@ -237,11 +237,11 @@ class WildGHandAvatar(HandAvatar):
         """
         refine, posed = self.settings.heads.refinement, self.posed(hands)
         dark = self.model.cast(posed)
-        made = {
+        found = {
             side: self.model.gaussians(side, *given, refine=refine, dark=dark.get(side))
             for side, given in posed.items()
         }
-        parts = [*made.values(), *(self.model.walls(posed, made) if closed else ())]
+        parts = [made for made, _ in found.values()] + (self.model.walls(found) if closed else [])
 
         def array(tensors: list[torch.Tensor], fields: int) -> np.ndarray:
             """Of one frame of each hand; tensors that all frames share have no frames."""

@@ -23,7 +23,7 @@ from wildghand.model.rendered import HandState, RenderedFrames, largest
 from wildghand.model.wrist import WristWall
 from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
 from wildghand.shadows import CastLight, HandShadows, ShadowSettings
-from wildghand.shadows.hand_shadows import Hands
+from wildghand.shadows.hand_shadows import Hand, Hands
 from wildghand.subject import SubjectShape
 
 
@@ -70,7 +70,7 @@ class WildGHandModel(nn.Module):
         self.light: KnownLight | None = None
         self.evidence: Evidence | None = None
         self.other_hand: OtherHand | None = None
-        self._walls: dict[str, WristWall | None] = {}
+        self._walls: dict[str, WristWall] = {}
         self.rigs = dict(rigs)
         self.network = network
         self.perturbation = nn.ModuleDict(
@@ -98,7 +98,8 @@ class WildGHandModel(nn.Module):
         if isinstance(found, Evidence):
             counts = {side: len(rig) for side, rig in self.rigs.items()}
             self.evidence = Evidence.from_tensors(dict(self.named_buffers()), counts, "evidence")
-            self._walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
+            walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
+            self._walls = {side: wall for side, wall in walls.items() if wall is not None}
         if isinstance(found, OtherHand):
             self.other_hand = found
         if isinstance(found, CastLight):
@@ -238,7 +239,7 @@ class WildGHandModel(nn.Module):
             (B, H, W, 3) sRGB over black and (B, H, W, 1) coverage.
         """
         dark = self.cast(hands) if dark is None else dark
-        parts = {
+        found = {
             side: self.gaussians(
                 side,
                 *hands[side],
@@ -250,18 +251,20 @@ class WildGHandModel(nn.Module):
             for side in self.rigs
             if side in hands
         }
-        walls = self.walls(hands, parts)
-        return rasterize_hands([*parts.values(), *walls], viewmats, Ks, width, height)
+        parts = [made for made, _ in found.values()] + self.walls(found)
+        return rasterize_hands(parts, viewmats, Ks, width, height)
 
-    def walls(self, hands: Hands, parts: Mapping[str, Gaussians]) -> list[Gaussians]:
+    def walls(self, found: Mapping[str, tuple[Gaussians, Hand]]) -> list[Gaussians]:
         """Close the wrists of hands; none while there is no evidence.
 
         Args:
-            hands: pose (B, 16, 3), betas (10,), transl (B, 3) by side.
-            parts: the Gaussians of these hands, by side.
+            found: by side, as `gaussians` returns them.
         """
-        walls = ((self._walls.get(side), side) for side in parts)
-        return [wall.close(parts[side], *hands[side]) for wall, side in walls if wall is not None]
+        return [
+            self._walls[side].close(made, *hand)
+            for side, (made, hand) in found.items()
+            if side in self._walls
+        ]
 
     def gaussians(
         self,
@@ -275,7 +278,7 @@ class WildGHandModel(nn.Module):
         rows: Tensor | None = None,
         features: HandFeatures | None = None,
         dark: Tensor | None = None,
-    ) -> Gaussians:
+    ) -> tuple[Gaussians, Hand]:
         """The Gaussians of one hand in any pose, free of perturbations unless frames are named.
 
         Args:
@@ -289,6 +292,9 @@ class WildGHandModel(nn.Module):
             rows: (B,) positions among the training frames, whose biases and gains are added.
             features: of the network, where they are at hand already.
             dark: (B, N) factors of the hands' shadows; None: of those that it casts on itself.
+
+        Returns:
+            The Gaussians, and the parameters that they are posed by: the given or the refined ones.
         """
         rig = self.rigs[side]
         anchors = rig.pose(pose, betas, transl)
@@ -313,15 +319,17 @@ class WildGHandModel(nn.Module):
         prediction = _dimmed(prediction, dark)
         if refine:
             step = prediction.refinement
-            anchors = rig.follow(pose + step.pose, betas + step.betas, transl + step.transl)
+            pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
+            anchors = rig.follow(pose, betas, transl)
+        hand = pose, betas, transl
         if rows is None:
-            return dress(anchors, prediction, self.network.activation)[0]
+            return dress(anchors, prediction, self.network.activation)[0], hand
         perturbation = None
         if side in self.perturbation:
             temporal = self.biases_of(side).temporal(rows)
             perturbation = self._perturbation(side, temporal, anchors, None)
         made = dress(anchors, prediction, self.network.activation, perturbation)[0]
-        return replace(made, colors=made.colors * self.log_gains[rows].exp()[:, None])
+        return replace(made, colors=made.colors * self.log_gains[rows].exp()[:, None]), hand
 
     def _shaded(self, prediction: NetworkOutput, normals: Tensor) -> NetworkOutput:
         """A prediction in the light that casts shadows, with nothing in its way."""

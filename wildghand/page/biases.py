@@ -75,8 +75,8 @@ def bake_biases(
         pose, transl = given[:, :48].reshape(-1, 16, 3), given[:, 48:]
         betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32, device=given.device)
         refine = avatar.settings.heads.refinement
-        clean = model.gaussians(side, pose, betas, transl, refine=refine)
-        biased = model.gaussians(side, pose, betas, transl, refine=refine, rows=rows)
+        clean, _ = model.gaussians(side, pose, betas, transl, refine=refine)
+        biased, _ = model.gaussians(side, pose, betas, transl, refine=refine, rows=rows)
         found[part] = _differences(clean, biased, len(pose))
         for row in range(len(pose)):
             linear, _ = hand.motions(pose[row].double().cpu().numpy(), np.zeros(3))

@@ -20,8 +20,10 @@ from wildghand.shadows.settings import ShadowSettings
 # Least and largest irradiance that skin is drawn in: where little is seen the light may be wrong.
 _DIM, _BRIGHT = 0.15, 4.0
 
-#: Pose (B, 16, 3) rad, betas (10,) and translation (B, 3) m by side.
-Hands = Mapping[str, tuple[Tensor, Tensor, Tensor]]
+#: Pose (B, 16, 3) rad, betas (10,) or (B, 10), and translation (B, 3) m.
+Hand = tuple[Tensor, Tensor, Tensor]
+#: By side.
+Hands = Mapping[str, Hand]
 
 
 class HandShadows:

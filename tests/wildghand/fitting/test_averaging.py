@@ -24,8 +24,7 @@ from wildghand.fitting.optimize import optimize
 from wildghand.gaussians.fit_loop import batches, repeatable
 from wildghand.model.settings import read_settings
 
-#: The bent hand is what it is before the first step, which no mean knows; its time is saved.
-FIT: dict[str, Any] = {**QUICK, "schedule.steps": 24, "subject.enabled": False}
+FIT: dict[str, Any] = {**QUICK, "schedule.steps": 24}
 TrainingMaker = Callable[..., TrainingCapture]
 CPU = torch.device("cpu")
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +33,7 @@ from wildghand.fitting.method import WildGHandMethod
 from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.parallel import World
 from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import read_settings
 from wildghand.splat import rasterize
 
@@ -53,7 +55,9 @@ def error(avatar: WildGHandAvatar, training: TrainingCapture, frame: int) -> flo
 
 
 @pytest.mark.parametrize("hands", ["right", "both"])
-def test_a_fit_learns_what_the_frames_show(hands: str, make_training: TrainingMaker) -> None:
+def test_a_fit_learns_what_the_frames_show(
+    hands: str, make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
     training = make_training(hands)
     start, end = fitted(training, steps=1), fitted(training)
     before, after = (
@@ -61,6 +65,10 @@ def test_a_fit_learns_what_the_frames_show(hands: str, make_training: TrainingMa
         for avatar in (start, end)
     )
     assert after < 0.6 * before
+    # So few Gaussians are thin, and the wall of the wrist, which no frame shows, shines through.
+    monkeypatch.setattr(WildGHandModel, "walls", lambda *_: [])
+    frame = int(training.validation[0])
+    assert error(end, training, frame) < 0.6 * error(start, training, frame)
     assert end.steps == FIT["schedule.steps"]
     assert set(end.record.temporal) == set(training.sides)
     assert sorted(end.weight_masks) == end.record.frames == training.train.tolist()
@@ -279,6 +287,26 @@ def test_posed_gaussians_are_what_is_drawn(hands: str, make_training: TrainingMa
         ]
     )
     assert scipy.spatial.cKDTree(vertices).query(rest.means)[0].max() < 0.02
+
+
+def test_the_wall_of_a_wrist_moves_with_the_refined_hand(
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    training = make_training()
+    avatar = fitted(training, steps=2, **{"shadows.enabled": False})
+    assert avatar.settings.heads.refinement
+    own, before = (avatar.pose(training.hand_poses(3), closed=closed) for closed in (False, True))
+    predict, shift = WildGHandModel.predict, torch.tensor([0.01, -0.02, 0.03])
+
+    def moved(*args: Any) -> Any:
+        made = predict(*args)
+        refinement = replace(made.refinement, transl=made.refinement.transl + shift)
+        return replace(made, refinement=refinement)
+
+    monkeypatch.setattr(WildGHandModel, "predict", moved)
+    after = avatar.pose(training.hand_poses(3), closed=True)
+    assert len(before) > len(own)
+    np.testing.assert_allclose(after.means - before.means, shift.expand(len(after), 3), atol=1e-5)
 
 
 def test_settings_of_presets_and_switches() -> None:

@@ -53,7 +53,7 @@ def biased(avatar: WildGHandAvatar, capture: Capture, frame: int) -> np.ndarray:
     given = avatar.posed({"right": capture.hand_poses(frame)["right"]})["right"]
     rows, camera = torch.tensor([avatar.record.frames.index(frame)]), capture.camera(frame)
     with torch.no_grad():
-        made = avatar.model.gaussians("right", *given, rows=rows)
+        made, _ = avatar.model.gaussians("right", *given, rows=rows)
         image, cover, _ = rasterize(
             made.means,
             made.quats,
@@ -86,7 +86,7 @@ def test_gaussians_of_a_frame_are_those_that_the_fit_draws(make_training: Any) -
         frame = int(fit.frames.indices[4])
         avatar = fit.avatar(0)
         given = avatar.posed({"right": training.hand_poses(frame)["right"]})["right"]
-        made = fit.model.gaussians("right", *given, rows=row)
+        made, _ = fit.model.gaussians("right", *given, rows=row)
         camera = training.camera(frame)
         image, _, _ = rasterize(
             made.means,
@@ -115,7 +115,7 @@ def test_baked_biases_are_the_models(fitted) -> None:
     clean = avatar.pose({"right": hands[4]})
     given = avatar.posed({"right": hands[4]})["right"]
     with torch.no_grad():
-        truth = avatar.model.gaussians("right", *given, rows=torch.tensor([4]))
+        truth, _ = avatar.model.gaussians("right", *given, rows=torch.tensor([4]))
     added = found.at(4)
     np.testing.assert_allclose(added[:, 3:6], truth.colors[0].numpy() - clean.colors, atol=0.01)
     np.testing.assert_allclose(
