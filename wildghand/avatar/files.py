@@ -25,7 +25,7 @@ from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.avatar.tensors import read_tensors
 from wildghand.avatar.weight_masks import read_weight_masks, write_weight_masks
-from wildghand.evidence import Evidence, OtherHand
+from wildghand.evidence import ColorChanges, Evidence, rename_former
 from wildghand.light import KnownLight
 from wildghand.model.assemble import make_model
 from wildghand.model.settings import read_stored, read_version_1
@@ -130,7 +130,7 @@ def load_avatar(
     mean_color, frame_count = torch.tensor(value.mean_color), max(1, len(value.fit.frames))
     device = torch.device(device)
     file = root / MODEL
-    tensors = read_tensors(file, settings, value.sides, frame_count)
+    tensors = rename_former(read_tensors(file, settings, value.sides, frame_count))
     try:
         subject = SubjectShape.from_tensors(tensors, next(iter(templates.values())), str(file))
         model = make_model(
@@ -143,8 +143,8 @@ def load_avatar(
                 model.keep(found)
         counts = {side: len(rig) for side, rig in model.rigs.items()}
         evidence = Evidence.from_tensors(tensors, counts, str(file))
-        borrowed = OtherHand.from_tensors(tensors, counts, str(file))
-        for kept in (evidence, borrowed):
+        colors = ColorChanges.from_tensors(tensors, counts, str(file))
+        for kept in (evidence, colors):
             if kept is not None:
                 model.keep(kept)
         model.load_state_dict(tensors, strict=True)

@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from wildghand.dpd.dpd import DynamicPerturbation
+from wildghand.gaussians.adam import ClippedAdam
 
 #: Steps of Adam, and the size of the first, that bring temporal weights to their start.
 _STEPS, _RATE = 100, 5e-3
@@ -66,12 +67,15 @@ class TemporalTarget:
             return
         for module in modules:
             learnt = [*module.phi.parameters(), *module.psi.parameters()]
-            optimizer = torch.optim.Adam(learnt, lr=_RATE)
+            optimizer = ClippedAdam(
+                [{"params": learnt, "lr": _RATE}], betas=(0.9, 0.999), epsilon=1e-8
+            )
             for step in range(_STEPS):
                 optimizer.param_groups[0]["lr"] = _RATE * (1.0 - step / _STEPS)
-                optimizer.zero_grad(set_to_none=True)
-                self._distance(module, slice(None)).backward()
-                optimizer.step()
+                optimizer.clear()
+                distance = self._distance(module, slice(None))
+                distance.backward()
+                optimizer.take_step(distance)
             for layer in module.varphi.parameters():
                 nn.init.zeros_(layer)
             module.zero_grad(set_to_none=True)

@@ -1,14 +1,16 @@
 """Evidence: how much training frames say of each Gaussian, and what holds where they do not."""
 
+from wildghand.evidence.color_changes import ColorChanges, rename_former
 from wildghand.evidence.count import shown_frames
-from wildghand.evidence.evidence import Evidence, strengths, weigh_evidence
-from wildghand.evidence.other_hand import OtherHand
+from wildghand.evidence.evidence import Evidence, fill_shares, strengths, weigh_evidence
 from wildghand.evidence.settings import EvidenceSettings
 
 __all__ = [
+    "ColorChanges",
     "Evidence",
     "EvidenceSettings",
-    "OtherHand",
+    "fill_shares",
+    "rename_former",
     "shown_frames",
     "strengths",
     "weigh_evidence",

@@ -129,3 +129,12 @@ def strengths(settings: EvidenceSettings) -> list[EvidenceSettings]:
     """
     share = settings.offset_share
     return [settings, *(replace(settings, offset_share=factor * share) for factor in (0.25, 4, 0))]
+
+
+def fill_shares(settings: EvidenceSettings) -> list[float]:
+    """The values of `fill_share` among which validation frames choose, the settings' own first.
+
+    The others are five times as much, and colours as they were learnt.
+    """
+    own = settings.fill_share
+    return [own, 5.0 * own, 0.0] if own > 0.0 else [0.0]

@@ -23,6 +23,10 @@ class EvidenceSettings:
     #: Share of the training frames that must show a place clearly until its colour is half its own;
     #: the rest is that of the same place of the other hand, where that is known. 0: all of it is.
     color_share: float = number(0.02, 0.0, 100.0)
+    #: Share of the training frames that must show a place until its colour is half its own; the
+    #: rest is that of the skin around it. 0: all of it is its own.
+    fill_share: float = number(0.02, 0.0, 100.0)
     #: After the last step, take a quarter or four times of `offset_share`, or 0, where that draws
-    #: the validation frames better. With fewer than four of these `offset_share` holds.
+    #: the validation frames better; then five times of `fill_share`, or 0. With fewer than four of
+    #: these frames the settings hold.
     validated: bool = True

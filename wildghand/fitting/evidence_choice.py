@@ -1,8 +1,9 @@
-"""How strongly evidence acts, chosen by validation frames, which the fit has not seen.
+"""How far evidence and the skin around a place act, chosen by validation frames.
 
 Where a person's hand is far from the hand model, offsets from the skin are the person's and not
-errors of depth, and evidence takes away what is right. Nothing in the training frames says so: they
-are drawn without it.
+errors of depth, and evidence takes away what is right. Where a palm has another colour than the
+back, as that of a glove, the back says nothing of it. Nothing in the training frames tells: they
+are drawn without evidence, and show other places.
 """
 
 from __future__ import annotations
@@ -12,23 +13,29 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-import torch
 from torch import Tensor
 
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.evidence import Evidence, EvidenceSettings, strengths, weigh_evidence
-from wildghand.fitting.cast_shadows import Dark, shadows_in
-from wildghand.gaussians.training import TrainingClip, TrainingFrames
+from wildghand.evidence import (
+    ColorChanges,
+    Evidence,
+    EvidenceSettings,
+    fill_shares,
+    strengths,
+    weigh_evidence,
+)
+from wildghand.fitting.filled_colors import FilledColors
+from wildghand.fitting.judged_drawings import JudgedDrawings
+from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
-from wildghand.network import HandFeatures
 
 
 @dataclass(frozen=True, eq=False)
 class EvidenceChoice:
-    """The choice of the strength of evidence at the end of a fit."""
+    """The choice of the strength of evidence, and of colours, at the end of a fit."""
 
-    #: What is drawn; its evidence is put back.
+    #: What is drawn; its evidence and colours are put back.
     model: WildGHandModel
     #: What may be seen of the capture.
     training: TrainingCapture
@@ -40,6 +47,8 @@ class EvidenceChoice:
     frame_count: int
     #: Validation frames; None where they are too few.
     judges: TrainingFrames | None
+    #: The colours of places that few frames have shown.
+    filled: FilledColors
 
     @property
     def frames(self) -> TrainingFrames | None:
@@ -47,108 +56,85 @@ class EvidenceChoice:
         evidence = self.settings.evidence
         return self.judges if evidence.enabled and evidence.validated else None
 
-    def best(self) -> Evidence | None:
-        """The evidence that draws validation frames best; None where that is the model's own."""
-        if self.frames is None:
-            return None
-        candidates = [self._evidence(index) for index in range(len(self._strengths))]
-        features = self._features()
-        errors = [self.error(evidence, features) for evidence in candidates]
-        chosen = min(range(len(errors)), key=errors.__getitem__)  # the first of equal ones
-        return candidates[chosen] if chosen else None
+    def best(self) -> list[Evidence | ColorChanges]:
+        """What draws validation frames best; without what is the model's own already.
+
+        Where nothing is judged, that is the fill by the settings' own share.
+        """
+        if not self.settings.evidence.enabled:
+            return []
+        if self.drawings is None:
+            evidence, (colors,) = None, self.filled.carried_on(self._fills[:1])
+        else:
+            evidence, colors = self._judged(self.drawings)
+        found: list[Evidence | ColorChanges] = [] if evidence is None else [evidence]
+        if colors is not None and colors is not self.model.color_changes:
+            found.append(colors)
+        return found
+
+    def _judged(self, drawings: JudgedDrawings) -> tuple[Evidence | None, ColorChanges | None]:
+        """The evidence, None where it is the model's own, and with it the changes of colours."""
+        features = drawings.features()
+        rows = range(len(drawings.frames))
+        predicted = {row: drawings.predict(row, features) for row in rows}
+        changes = self.model.color_changes
+        several = [self._evidence(index) for index in range(len(self._strengths))]
+        # Of equal ones min takes the first, which is the settings' own.
+        best = min(several, key=lambda each: drawings.error(predicted, each, changes))
+        if self.model.light is not None:
+            fills = self.filled.carried_on(self._fills)
+            changes = min(fills, key=lambda each: drawings.error(predicted, best, each))
+        return None if best is several[0] else best, changes
 
     def seconds(self) -> float:
         """Return about how long `best` takes; nothing of the model changes."""
-        if self.frames is None:
+        if not self.settings.evidence.enabled:
             return 0.0
-        own = self._evidence(0)
-        self.error(own, self._features(), 1)  # The first time takes longer than others.
-        entered = time.perf_counter()
-        features = self._features()
+        return self._seconds_of_drawings() + self._seconds_of_fills()
+
+    def _seconds_of_drawings(self) -> float:
+        drawings = self.drawings
+        if drawings is None:
+            return 0.0
+        evidence, changes = self._evidence(0), self.model.color_changes
+        # The first time takes longer than others.
+        drawings.error({0: drawings.predict(0, drawings.features())}, evidence, changes)
         begun = time.perf_counter()
-        self.error(own, features, 1)
-        drawings = len(self._strengths) * len(self.frames)
+        features = drawings.features()
+        shared = time.perf_counter()
+        predicted = {0: drawings.predict(0, features)}
+        asked = time.perf_counter()
+        drawings.error(predicted, evidence, changes)
+        drawn = time.perf_counter()
         # With a light, which there is at the end alone, the network is asked twice.
-        each = (time.perf_counter() - begun) * (2.0 if self.settings.light.enabled else 1.0)
-        return begun - entered + each * drawings
+        times = 2.0 if self.settings.light.enabled else 1.0
+        each = times * (asked - shared)
+        each += (len(self._strengths) + len(self._fills)) * (drawn - asked)
+        return shared - begun + each * len(drawings.frames)
 
-    @torch.no_grad()
-    def error(
-        self,
-        evidence: Evidence,
-        features: Mapping[str, HandFeatures] | None = None,
-        count: int | None = None,
-    ) -> float:
-        """Mean squared error of sRGB over the hand in validation frames, drawn with the evidence.
+    def _seconds_of_fills(self) -> float:
+        """About how long the fills take; without a light there are none."""
+        if not self.settings.light.enabled:
+            return 0.0
+        begun = time.perf_counter()
+        self.filled.rehearse()
+        return (time.perf_counter() - begun) * sum(share > 0.0 for share in self._fills)
 
-        Args:
-            evidence: instead of the model's own.
-            features: of the network by side, where they are at hand already.
-            count: the first frames alone; None: all.
-        """
-        assert self.frames is not None
-        before = self.model.evidence
-        self.model.evidence = evidence
-        try:
-            squares, pixels = 0.0, 0.0
-            for row in range(len(self.frames) if count is None else count):
-                image, hand = self._truth(row)
-                off = (self._drawn(row, features).clamp(0.0, 1.0) - image).square().mean(dim=-1)
-                squares += float((off * hand).sum())
-                pixels += float(hand.sum())
-        finally:
-            self.model.evidence = before
-        return squares / pixels
+    @functools.cached_property
+    def drawings(self) -> JudgedDrawings | None:
+        """The validation frames as they are drawn; None where nothing is chosen."""
+        if self.frames is None:
+            return None
+        refine = self.settings.heads.refinement
+        return JudgedDrawings(self.model, self.training, refine, self.frames)
 
     @functools.cached_property
     def _strengths(self) -> list[EvidenceSettings]:
         return strengths(self.settings.evidence)
 
+    @functools.cached_property
+    def _fills(self) -> list[float]:
+        return fill_shares(self.settings.evidence)
+
     def _evidence(self, index: int) -> Evidence:
         return weigh_evidence(self.shown, self.frame_count, self._strengths[index])
-
-    @functools.cached_property
-    def _clip(self) -> TrainingClip:
-        assert self.frames is not None
-        device = self.model.log_gains.device
-        return TrainingClip(self.training, self.frames.indices, self.model.rigs, device, 0)
-
-    @functools.cached_property
-    def _dark(self) -> Dark:
-        """The shadows in the frames, cast at once, so that `seconds` has cast them."""
-        assert self.frames is not None
-        dark = shadows_in(self.model, self._clip)
-        dark(torch.arange(len(self.frames)))
-        return dark
-
-    def _truth(self, row: int) -> tuple[Tensor, Tensor]:
-        """(H, W, 3) image and (H, W) coverage of the hand in a validation frame."""
-        assert self.frames is not None
-        device = self.model.log_gains.device
-        image = self.frames.images[row].to(device).float() / 255.0
-        return image, self.frames.masks[row].to(device).float() / 255.0
-
-    @torch.no_grad()
-    def _features(self) -> dict[str, HandFeatures]:
-        return {side: self.model.network.features(side) for side in self.model.rigs}
-
-    def _drawn(self, row: int, features: Mapping[str, HandFeatures] | None) -> Tensor:
-        """(H, W, 3) sRGB over black."""
-        clip = self._clip
-        hands = {
-            side: (pose[row : row + 1], betas, transl[row : row + 1])
-            for side, (pose, betas, transl) in clip.parameters.items()
-        }
-        here = slice(row, row + 1)
-        size = self.training.width, self.training.height
-        refine = self.settings.heads.refinement
-        image, _ = self.model.draw(
-            hands,
-            clip.viewmats[here],
-            clip.Ks[here],
-            *size,
-            refine=refine,
-            features=features,
-            dark=self._dark(torch.tensor([row])),
-        )
-        return image[0]

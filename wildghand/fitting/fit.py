@@ -23,6 +23,7 @@ from wildghand.fitting.borrowed_colors import BorrowedColors
 from wildghand.fitting.cast_shadows import cast_shadows, shadows_in
 from wildghand.fitting.closing import MOST_OF_BUDGET, LightFit, weight_masks
 from wildghand.fitting.evidence_choice import EvidenceChoice
+from wildghand.fitting.filled_colors import FilledColors
 from wildghand.fitting.hand_masks import hand_masks
 from wildghand.fitting.judging_frames import judging_frames
 from wildghand.fitting.objective import Objective
@@ -107,7 +108,15 @@ class Fit:
             start_from_colors(self.model, self.clip, self.frames, self.weighting, self.dark)
         #: The colours that one of two hands takes from the other, which come last.
         self.borrowed = BorrowedColors.of(self.model, self.clip, self.weighting, settings.evidence)
-        self.choice = EvidenceChoice(self.model, training, settings, shown, count, judges)
+        self.choice = EvidenceChoice(
+            self.model,
+            training,
+            settings,
+            shown,
+            count,
+            judges,
+            FilledColors(self.model, self.borrowed, shown, count),
+        )
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal, device)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
@@ -264,12 +273,15 @@ class Fit:
     def finish(self) -> None:
         """Find what follows from the fitted model: the last step is behind.
 
-        That is the light, colours that hands take from each other, and how strongly evidence acts.
+        That is the light, colours that hands take from each other, how strongly evidence acts, and
+        colours that places take from the skin around them.
         """
-        for find in (self.light.learn, self.borrowed.learn, self.choice.best):
+        for find in (self.light.learn, self.borrowed.learn):
             found = find()
             if found is not None:
                 self.model.keep(found)
+        for chosen in self.choice.best():
+            self.model.keep(chosen)
 
     def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
         """The avatar as it stands; it goes on changing with the fit.

@@ -1,4 +1,4 @@
-"""Adam with the norm of the gradient clipped: two passes over everything that is fitted.
+"""Adam, with the norm of the gradient clipped: two passes over everything that is fitted.
 
 On the CPU a step of torch's optimizer and of its clipping starts some two hundred operations on
 tensors that are mostly tiny. Here all tensors are cut into pieces that compiled code goes through,
@@ -18,9 +18,6 @@ from torch import Tensor
 from wildghand.gaussians.adam_kernels import PIECE, Pieces, add_squares, advance, update
 from wildghand.splat.threads import even_jobs, run, thread_count
 
-# Gradients of a mean over all pixels are small next to Adam's usual 1e-8.
-_EPSILON = 1e-15
-_BETAS = (0.9, 0.99)
 # Added to the norm that the limit is divided by, as in torch.
 _LEAST_NORM = 1e-6
 # Sets of parameters whose tables are kept.
@@ -39,16 +36,29 @@ class ClippedAdam(torch.optim.Adam):
         groups: as torch takes them; each may have `clipped`, whether its gradients count in the
             norm and are scaled (true where it is left out). Parameters are float32.
         limit: largest norm; 0 leaves gradients as they are.
+        betas: shares of the moments that a step keeps.
+        epsilon: added to the root of the second moment.
 
-    Source: Kingma and Ba, "Adam: a method for stochastic optimization"; betas 0.9 and 0.99,
-    epsilon 1e-15.
+    Source: Kingma and Ba, "Adam: a method for stochastic optimization".
     """
 
-    def __init__(self, groups: Iterable[dict[str, Any]], limit: float) -> None:
-        super().__init__(list(groups), eps=_EPSILON, betas=_BETAS, fused=True)
-        self.limit = limit
+    def __init__(
+        self,
+        groups: Iterable[dict[str, Any]],
+        limit: float = 0.0,
+        *,
+        betas: tuple[float, float] = (0.9, 0.99),
+        epsilon: float = 1e-15,
+    ) -> None:
+        super().__init__(list(groups), eps=epsilon, betas=betas, fused=True)
+        self.limit, self._betas, self._epsilon = limit, betas, epsilon
         #: By which parameters have a gradient: not all of them have one at every step.
         self._tables: list[_Tables] = []
+
+    def add_param_group(self, param_group: dict[str, Any]) -> None:
+        """As in torch, without its compiler, which takes two seconds to import and is not used."""
+        added = torch.optim.Optimizer.add_param_group
+        getattr(added, "__wrapped__", added)(self, param_group)
 
     def clear(self) -> None:
         """Drop all gradients."""
@@ -99,7 +109,7 @@ class ClippedAdam(torch.optim.Adam):
         gradients = [_laid_out_alike(parameter) for _, parameter in chosen]
         tables = next((made for made in self._tables if made.are_of(chosen)), None)
         if tables is None:
-            tables = _Tables([(p, self._moments(p)) for _, p in chosen])
+            tables = _Tables([(p, self._moments(p)) for _, p in chosen], self._betas, self._epsilon)
             self._tables = [tables, *self._tables[: _TABLES - 1]]
         clipped = np.array([group.get("clipped", True) for group, _ in chosen])
         rates = np.array([float(group["lr"]) for group, _ in chosen])
@@ -131,10 +141,16 @@ class _Tables:
 
     Args:
         tensors: parameters, each with its count of steps and its moments.
+        betas, epsilon: see `ClippedAdam`.
     """
 
-    def __init__(self, tensors: Sequence[tuple[Tensor, dict[str, Tensor]]]) -> None:
-        self._held = tensors
+    def __init__(
+        self,
+        tensors: Sequence[tuple[Tensor, dict[str, Tensor]]],
+        betas: tuple[float, float],
+        epsilon: float,
+    ) -> None:
+        self._held, self._betas, self._epsilon = tensors, betas, epsilon
         names = ("exp_avg", "exp_avg_sq", "step")
         rest = [[state[name].data_ptr() for _, state in tensors] for name in names]
         self._addresses = np.zeros((5, len(tensors)), np.int64)
@@ -177,8 +193,8 @@ class _Tables:
             norm = math.sqrt(self._sums[clipped[pieces.owner]].sum())
             # A norm that is not finite makes everything NaN, as in torch; the guard will see it.
             scales[clipped] = np.minimum(np.float32(1.0), limit / np.float32(norm + _LEAST_NORM))
-        advance(addresses, rates, _BETAS, self._factors)
-        run(update, jobs, addresses, pieces, self._factors, scales, _BETAS, _EPSILON)
+        advance(addresses, rates, self._betas, self._factors)
+        run(update, jobs, addresses, pieces, self._factors, scales, self._betas, self._epsilon)
 
 
 def warm_up() -> None:

@@ -81,14 +81,15 @@ def repeatable(device: torch.device) -> Iterator[None]:
     if device.type != "cpu" or before == (True, False):
         yield
         return
-    warn_only = torch.is_deterministic_algorithms_warn_only_enabled()
-    torch.use_deterministic_algorithms(True)
+    mode = torch.get_deterministic_debug_mode()
+    # `use_deterministic_algorithms` also tells torch's compiler, which takes two seconds to import.
+    torch.set_deterministic_debug_mode("error")
     # Filling new memory with NaN costs time and changes no result.
     filling.fill_uninitialized_memory = False
     try:
         yield
     finally:
-        torch.use_deterministic_algorithms(before[0], warn_only=warn_only)
+        torch.set_deterministic_debug_mode(mode)
         filling.fill_uninitialized_memory = before[1]
 
 

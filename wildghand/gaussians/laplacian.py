@@ -87,12 +87,9 @@ def surface_laplacian(
         neighbours: of each anchor; fewer where there are fewer anchors.
         dtype: of the values that will be given.
     """
-    vertices, faces = rig.template.vertices, rig.template.faces
-    positions = anchor_positions(vertices, faces, rig.anchors)
-    frames = anchor_frames(vertices, faces, rig.anchors)
-    near = nearest_on_surface(positions.cpu().numpy(), frames[..., 2].cpu().numpy(), neighbours)
-    matrix = _difference_matrix(near)
-    device = positions.device
+    frames = anchor_frames(rig.template.vertices, rig.template.faces, rig.anchors)
+    matrix = _difference_matrix(nearest_on_surface(*rest_anchors(rig), neighbours))
+    device = frames.device
 
     def sparse(scipy_matrix: Any) -> Tensor:
         with warnings.catch_warnings():
@@ -107,6 +104,14 @@ def surface_laplacian(
             )
 
     return SurfaceLaplacian(sparse(matrix), sparse(matrix.T.tocsr()), frames, rig.spacing)
+
+
+def rest_anchors(rig: HandRig) -> tuple[np.ndarray, np.ndarray]:
+    """(N, 3) positions, m, and (N, 3) unit normals of the anchors on the rest surface."""
+    vertices, faces = rig.template.vertices, rig.template.faces
+    positions = anchor_positions(vertices, faces, rig.anchors)
+    normals = anchor_frames(vertices, faces, rig.anchors)[..., 2]
+    return positions.cpu().numpy(), normals.cpu().numpy()
 
 
 def nearest_on_surface(positions: np.ndarray, normals: np.ndarray, count: int) -> np.ndarray:

@@ -11,14 +11,14 @@ from torch import Tensor, nn
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal
 from wildghand.dpd.field import bone_features
 from wildghand.dpd.scale_gradients import scale_refinement
-from wildghand.evidence import Evidence, OtherHand
+from wildghand.evidence import ColorChanges, Evidence
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight
 from wildghand.model.dress import Gaussians, dress
+from wildghand.model.free_poses import dimmed, dressed, predict_hand
 from wildghand.model.rasterize_hands import rasterize_hands
-from wildghand.model.relight import relit
 from wildghand.model.rendered import HandState, RenderedFrames, largest
 from wildghand.model.wrist import WristWall
 from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
@@ -44,7 +44,7 @@ class WildGHandModel(nn.Module):
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
         light: by which unknown normals are drawn in free poses; None: as the network says.
         evidence: by which free poses are drawn; None: as they were learnt.
-        other_hand: colours of the other hand that free poses take; None: none.
+        color_changes: of places that few frames have shown, in free poses; None: none.
         shadows: the hands in the light that casts shadows; None: the network alone says how bright
             skin is.
         pose_steps: (S, R, 16, 3) rad, added to the given poses of the hands in order.
@@ -69,7 +69,7 @@ class WildGHandModel(nn.Module):
         self._template = template
         self.light: KnownLight | None = None
         self.evidence: Evidence | None = None
-        self.other_hand: OtherHand | None = None
+        self.color_changes: ColorChanges | None = None
         self._walls: dict[str, WristWall] = {}
         self.rigs = dict(rigs)
         self.network = network
@@ -84,7 +84,7 @@ class WildGHandModel(nn.Module):
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
 
-    def keep(self, found: SubjectShape | KnownLight | Evidence | OtherHand | CastLight) -> None:
+    def keep(self, found: SubjectShape | KnownLight | Evidence | ColorChanges | CastLight) -> None:
         """Keep what was fitted next to the network, so that it is saved with it.
 
         Args:
@@ -100,8 +100,8 @@ class WildGHandModel(nn.Module):
             self.evidence = Evidence.from_tensors(dict(self.named_buffers()), counts, "evidence")
             walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
             self._walls = {side: wall for side, wall in walls.items() if wall is not None}
-        if isinstance(found, OtherHand):
-            self.other_hand = found
+        if isinstance(found, ColorChanges):
+            self.color_changes = found
         if isinstance(found, CastLight):
             self.shadows = HandShadows(self.rigs, found, self._shadow_settings)
 
@@ -168,7 +168,7 @@ class WildGHandModel(nn.Module):
             prediction = self.predict(
                 side, anchors, pose.detach(), None if features is None else features[side]
             )
-            prediction = _dimmed(prediction, dark.get(side))
+            prediction = dimmed(prediction, dark.get(side))
             if refine:
                 step = prediction.refinement
                 if shares is not None:
@@ -179,7 +179,7 @@ class WildGHandModel(nn.Module):
             perturbation, omega = None, pose.new_zeros(len(rows))
             if side in self.perturbation:
                 omega = temporal[side].omega
-                perturbation = self._perturbation(
+                perturbation = self.perturbation_in(
                     side, temporal[side], anchors, None if kept is None else kept[side]
                 )
             gaussians, bias_size = dress(
@@ -198,7 +198,7 @@ class WildGHandModel(nn.Module):
             return self.log_gains.new_zeros(len(rows))
         return largest([hand.omega.detach() for hand in temporal.values()])
 
-    def _perturbation(
+    def perturbation_in(
         self, side: str, temporal: Temporal, anchors: AnchorPoses, kept: Tensor | None
     ) -> Perturbation:
         """The perturbation of one hand in B frames, with its field where that can be seen."""
@@ -251,8 +251,31 @@ class WildGHandModel(nn.Module):
             for side in self.rigs
             if side in hands
         }
+        return self.rasterize(found, viewmats, Ks, width, height)
+
+    def rasterize(
+        self,
+        found: Mapping[str, tuple[Gaussians, Hand]],
+        viewmats: Tensor,
+        Ks: Tensor,
+        width: int,
+        height: int,
+    ) -> tuple[Tensor, Tensor]:
+        """Draw hands and their walls.
+
+        Args:
+            found: by side, as `gaussians` returns them.
+            viewmats, Ks, width, height: see `draw`.
+
+        Returns:
+            See `draw`.
+        """
         parts = [made for made, _ in found.values()] + self.walls(found)
         return rasterize_hands(parts, viewmats, Ks, width, height)
+
+    def wall(self, side: str) -> WristWall | None:
+        """What closes the wrist of one hand; None while there is no evidence, or no open end."""
+        return self._walls.get(side)
 
     def walls(self, found: Mapping[str, tuple[Gaussians, Hand]]) -> list[Gaussians]:
         """Close the wrists of hands; none while there is no evidence.
@@ -296,46 +319,17 @@ class WildGHandModel(nn.Module):
         Returns:
             The Gaussians, and the parameters that they are posed by: the given or the refined ones.
         """
-        rig = self.rigs[side]
-        anchors = rig.pose(pose, betas, transl)
-        if dark is None:
-            dark = self.cast({side: (pose, betas, transl)}).get(side)
-        features = self.network.features(side) if features is None else features
-        prediction = self.predict(side, anchors, pose, features)
-        if self.light is not None and viewmats is not None:
-            prediction = relit(
-                prediction,
-                self.light,
-                lambda normals: self._shaded(self.network(side, normals, pose, features), normals),
-                anchors,
-                viewmats,
-            )
-        if self.evidence is not None:
-            bias = self.network.activation.log_scale_bias
-            settled = self.evidence.settle(side, prediction.raw, rig.spacing, bias)
-            prediction = replace(prediction, raw=settled)
-        if self.other_hand is not None:
-            prediction = replace(prediction, raw=self.other_hand.color(side, prediction.raw))
-        prediction = _dimmed(prediction, dark)
-        if refine:
-            step = prediction.refinement
-            pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
-            anchors = rig.follow(pose, betas, transl)
         hand = pose, betas, transl
-        if rows is None:
-            return dress(anchors, prediction, self.network.activation)[0], hand
-        perturbation = None
-        if side in self.perturbation:
-            temporal = self.biases_of(side).temporal(rows)
-            perturbation = self._perturbation(side, temporal, anchors, None)
-        made = dress(anchors, prediction, self.network.activation, perturbation)[0]
-        return replace(made, colors=made.colors * self.log_gains[rows].exp()[:, None]), hand
+        if dark is None:
+            dark = self.cast({side: hand}).get(side)
+        predicted = predict_hand(self, side, hand, viewmats, features)
+        return dressed(self, side, predicted, refine=refine, rows=rows, dark=dark)
 
-    def _shaded(self, prediction: NetworkOutput, normals: Tensor) -> NetworkOutput:
+    def shaded(self, prediction: NetworkOutput, normals: Tensor) -> NetworkOutput:
         """A prediction in the light that casts shadows, with nothing in its way."""
         if self.shadows is None:
             return prediction
-        return _dimmed(prediction, self.shadows.shading(normals))
+        return dimmed(prediction, self.shadows.shading(normals))
 
     def cast(self, hands: Hands) -> dict[str, Tensor]:
         """Shadows of hands that stand together; empty where the model casts none.
@@ -360,7 +354,7 @@ class WildGHandModel(nn.Module):
             features: of the network, where they are at hand already.
         """
         normals = quat_third_axis(anchors.orientations)
-        made = self._shaded(self.network(side, normals, pose, features), normals)
+        made = self.shaded(self.network(side, normals, pose, features), normals)
         if self._template:
             return made
         return replace(made, template_offsets=torch.zeros_like(made.template_offsets))
@@ -372,10 +366,3 @@ def _in_frames(
     """The parameters of a hand in some frames of a clip."""
     pose, betas, transl = parameters
     return pose[rows], betas, transl[rows]
-
-
-def _dimmed(prediction: NetworkOutput, dark: Tensor | None) -> NetworkOutput:
-    """A prediction whose colours are multiplied by (B, N) factors; None: as it is."""
-    if dark is None:
-        return prediction
-    return replace(prediction, shadow=prediction.shadow * dark[..., None])

@@ -226,7 +226,12 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
         "subject": {"enabled": False},
         "light": {"enabled": False},
         "shadows": {"enabled": False},
-        "evidence": {"enabled": False, "validated": False, "color_share": 0.0},
+        "evidence": {
+            "enabled": False,
+            "validated": False,
+            "color_share": 0.0,
+            "fill_share": 0.0,
+        },
         "prepass": {"clean_scale": 1.0},
         "schedule": {"root_steps": 0.0, "average_share": 0.0},
         "terms": {"surface": 0.0, "leave_hidden": False},

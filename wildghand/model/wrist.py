@@ -45,6 +45,9 @@ class WristWall:
     #: (K,) int64, at least one: Gaussians of the wrist, whose median colour the wall has.
     skin: Tensor
 
+    def __len__(self) -> int:
+        return len(self.shares)
+
     @classmethod
     def of(cls, rig: HandRig) -> WristWall | None:
         """The wall of a hand; None where its mesh is closed or the open end too narrow or wide.
@@ -80,16 +83,11 @@ class WristWall:
         """
         vertices = pose_hand(self.template, pose, betas, transl).vertices
         border = vertices[:, self.border]
-        centre = border.mean(dim=1, keepdim=True)
-        spokes = border - centre
-        normal = normalize(torch.linalg.cross(spokes, spokes.roll(-1, dims=1)).sum(dim=1), dim=-1)
-        # Inwards is where the hand is, whichever way round the border runs.
-        inwards = (normal * (vertices.mean(dim=1) - centre[:, 0])).sum(dim=-1, keepdim=True)
-        normal = torch.where(inwards < 0.0, -normal, normal)
+        spokes, normal = self.plane(vertices)
         means = self.shares @ border + _DEPTH * normal[:, None]
         along = normalize(spokes[:, 0] - (spokes[:, 0] * normal).sum(-1, True) * normal, dim=-1)
         axes = torch.stack([along, torch.linalg.cross(normal, along), normal], dim=-1)
-        count = len(self.shares)
+        count = len(self)
         colors = hand.colors[..., self.skin, :].median(dim=-2, keepdim=True).values
         scales = _SPACING * means.new_tensor([_WIDE, _WIDE, _THIN])
         return replace(
@@ -100,6 +98,24 @@ class WristWall:
             opacities=means.new_full((*hand.opacities.shape[:-1], count), _OPAQUE),
             colors=colors.expand(*colors.shape[:-2], count, 3),
         )
+
+    def plane(self, vertices: Tensor) -> tuple[Tensor, Tensor]:
+        """The plane of the open end of a posed hand.
+
+        Args:
+            vertices: (B, V, 3) m.
+
+        Returns:
+            (B, L, 3) m from the middle of the border to its vertices, and (B, 3) unit normals that
+            point into the hand.
+        """
+        border = vertices[:, self.border]
+        centre = border.mean(dim=1, keepdim=True)
+        spokes = border - centre
+        normal = normalize(torch.linalg.cross(spokes, spokes.roll(-1, dims=1)).sum(dim=1), dim=-1)
+        # Inwards is where the hand is, whichever way round the border runs.
+        inwards = (normal * (vertices.mean(dim=1) - centre[:, 0])).sum(dim=-1, keepdim=True)
+        return spokes, torch.where(inwards < 0.0, -normal, normal)
 
 
 def _fan(border: np.ndarray) -> np.ndarray:

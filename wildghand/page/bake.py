@@ -18,6 +18,7 @@ from hwp_bench.hands.rotations import axis_angle_to_matrix
 from hwp_bench.hands.skeleton import PARENTS
 from wildghand.avatar import PosedGaussians, WildGHandAvatar
 from wildghand.gaussians.rig import HandRig
+from wildghand.model.wrist import WristWall
 from wildghand.splat.threads import denormals_flushed
 
 #: Joints that move one Gaussian at most.
@@ -50,7 +51,10 @@ class PoseBasis:
 
 @dataclass(frozen=True, eq=False)
 class BakedHand:
-    """One hand with N Gaussians, as a page knows it; lengths in m, colours in sRGB."""
+    """One hand with N Gaussians, as a page knows it; lengths in m, colours in sRGB.
+
+    Those of the wall that closes the open end of the wrist come last.
+    """
 
     #: (16, 3) rest joints of this person.
     joints: np.ndarray
@@ -128,13 +132,14 @@ def bake_hand(
     rig, betas = avatar.model.rigs[side], avatar.betas[side]
     shape = torch.as_tensor(betas, dtype=torch.float32, device=rig.template.joints.device)
     joints = (rig.template.joints + rig.template.joint_basis @ shape).double().cpu().numpy()
-    influences, weights = _skin(rig)
+    wall = avatar.model.wall(side)
+    influences, weights = _skin(rig, wall)
     gaussians = [gaussians_of(avatar, side, pose, np.zeros(3)) for pose in poses]
     empty = PoseBasis(*(np.zeros((0,)) for _ in range(5)))
     hand = BakedHand(
         joints, influences, weights, empty, empty, np.zeros(0), gaussians[0].opacities, np.zeros(0)
     )
-    rest = np.empty((len(poses), len(rig), 3), dtype=np.float32)
+    rest = np.empty((len(poses), len(influences), 3), dtype=np.float32)
     for row, (pose, drawn) in enumerate(zip(poses, gaussians, strict=True)):
         linear, shifts = hand.motions(pose, np.zeros(3))
         rest[row] = np.linalg.solve(linear, (drawn.means - shifts)[..., None])[..., 0]
@@ -151,28 +156,33 @@ def bake_hand(
         colors=_basis(colors, poses, color_rank),
         covariances=covariance[:, rows, columns],
         opacities=np.mean([drawn.opacities for drawn in gaussians], axis=0),
-        normals=_rest_normals(rig, shape),
+        normals=_rest_normals(rig, wall, shape),
     )
 
 
 def gaussians_of(
     avatar: WildGHandAvatar, side: str, pose: np.ndarray, transl: np.ndarray
 ) -> PosedGaussians:
-    """The Gaussians of one hand as the avatar poses them, with its own shape."""
+    """The Gaussians of one hand and its wall as the avatar poses them, with its own shape."""
     from hwp_bench.methods.contract import HandPose
 
-    return avatar.pose({side: HandPose(side, pose, avatar.betas[side], transl)})
+    hand = HandPose(side, pose, avatar.betas[side], transl)
+    return avatar.pose({side: hand}, closed=True)
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:
     return axis_angle_to_matrix(torch.as_tensor(np.array(vectors, dtype=np.float64))).numpy()
 
 
-def _skin(rig: HandRig) -> tuple[np.ndarray, np.ndarray]:
+def _skin(rig: HandRig, wall: WristWall | None) -> tuple[np.ndarray, np.ndarray]:
     faces, anchors = rig.template.faces.cpu(), rig.anchors
     corners = faces[torch.as_tensor(anchors.face_index).cpu()]
     mix = torch.as_tensor(anchors.barycentric).cpu()
-    weights = (rig.template.weights.cpu()[corners] * mix[..., None]).sum(dim=1)
+    by_vertex = rig.template.weights.cpu()
+    weights = (by_vertex[corners] * mix[..., None]).sum(dim=1)
+    if wall is not None:
+        border = wall.shares.cpu() @ by_vertex[wall.border.cpu()]
+        weights = torch.cat([weights, border.to(weights)])
     kept, joints = weights.topk(INFLUENCES, dim=1)
     kept = kept / kept.sum(dim=1, keepdim=True)
     # As the page stores them, so that both compute the same.
@@ -180,12 +190,17 @@ def _skin(rig: HandRig) -> tuple[np.ndarray, np.ndarray]:
     return joints.numpy().astype(np.uint8), whole / whole.sum(axis=1, keepdims=True)
 
 
-def _rest_normals(rig: HandRig, shape: torch.Tensor) -> np.ndarray:
+def _rest_normals(rig: HandRig, wall: WristWall | None, shape: torch.Tensor) -> np.ndarray:
     from hwp_bench.hands import anchor_normals
 
     zeros = shape.new_zeros(1, 16, 3), shape, shape.new_zeros(1, 3)
     vertices = pose_hand(rig.template, *zeros).vertices
-    return anchor_normals(vertices, rig.template.faces, rig.anchors)[0].cpu().numpy()
+    normals = anchor_normals(vertices, rig.template.faces, rig.anchors)[0].cpu().numpy()
+    if wall is None:
+        return normals
+    _, inwards = wall.plane(vertices)
+    outwards = -inwards.cpu().numpy().repeat(len(wall), axis=0)
+    return np.concatenate([normals, outwards])
 
 
 def _covariances(gaussians: PosedGaussians) -> np.ndarray:

@@ -67,7 +67,9 @@ def bake_biases(
     if side not in model.perturbation or not len(frames) or rank < 1:
         return None
     known = {frame: row for row, frame in enumerate(avatar.record.frames)}
-    found = np.empty((len(frames), len(hand), WIDTH), dtype=np.float32)
+    # The wall of the wrist, which comes last, is not fitted.
+    found = np.zeros((len(frames), len(hand), WIDTH), dtype=np.float32)
+    count = len(model.rigs[side])
     for start in range(0, len(frames), _CHUNK):
         part = slice(start, start + _CHUNK)
         given = torch.as_tensor(motion[part], dtype=torch.float32, device=model.log_gains.device)
@@ -77,7 +79,7 @@ def bake_biases(
         refine = avatar.settings.heads.refinement
         clean, _ = model.gaussians(side, pose, betas, transl, refine=refine)
         biased, _ = model.gaussians(side, pose, betas, transl, refine=refine, rows=rows)
-        found[part] = _differences(clean, biased, len(pose))
+        found[part, :count] = _differences(clean, biased, len(pose))
         for row in range(len(pose)):
             linear, _ = hand.motions(pose[row].double().cpu().numpy(), np.zeros(3))
             places = found[start + row, :, :3, None]

@@ -119,9 +119,9 @@ def _html(
             {
                 **_hand(baked),
                 **hand_controls(avatar, side),
-                "seen": _seen(avatar, side),
+                "seen": _seen(avatar, side, len(baked)),
                 "biases": _biases(biases[side]),
-                "trusted": _trusted(weights.get(side)),
+                "trusted": _trusted(weights.get(side), len(baked)),
                 "side": side,
                 "start": samples.start[side].pose.tolist(),
                 "transl": samples.start[side].transl.tolist(),
@@ -172,7 +172,7 @@ def _hand(hand: BakedHand) -> dict[str, Any]:
     }
 
 
-def _seen(avatar: WildGHandAvatar, side: str) -> str | None:
+def _seen(avatar: WildGHandAvatar, side: str, count: int) -> str | None:
     """(N,) uint8: how far the clip has shown each Gaussian; None where the fit did not count.
 
     255 is the share of the frames at which the fit keeps half of an offset from the skin
@@ -187,7 +187,7 @@ def _seen(avatar: WildGHandAvatar, side: str) -> str | None:
     kept = evidence.offsets[side].double().cpu().numpy()
     # Of frames f and their half h a fit keeps k = f / (f + h); f / h is k / (1 - k).
     share = np.clip(kept / np.maximum(1.0 - kept, 1e-9), 0.0, 1.0)
-    return _pack(np.rint(share * 255.0).astype(np.uint8))
+    return _pack(_with_wall(np.rint(share * 255.0), count))
 
 
 def _biases(biases: FrameBiases | None) -> dict[str, Any] | None:
@@ -200,12 +200,18 @@ def _biases(biases: FrameBiases | None) -> dict[str, Any] | None:
     }
 
 
-def _trusted(weights: np.ndarray | None) -> str | None:
+def _trusted(weights: np.ndarray | None, count: int) -> str | None:
     """(N,) uint8 mean weights, 254 = full; 255 where no frame shows the place."""
     if weights is None:
         return None
     shares = np.rint(np.nan_to_num(weights).clip(0.0, 1.0) * 254.0)
-    return _pack(np.where(np.isnan(weights), 255, shares).astype(np.uint8))
+    return _pack(_with_wall(np.where(np.isnan(weights), 255, shares), count))
+
+
+def _with_wall(values: np.ndarray, count: int) -> np.ndarray:
+    """(count,) uint8 of a hand and the wall of its wrist, which is as drawn: no frame is asked."""
+    wall = np.full(count - len(values), 255)
+    return np.concatenate([values, wall]).astype(np.uint8)
 
 
 def _linear(basis: PoseBasis) -> dict[str, Any]:

@@ -14,12 +14,12 @@ import torch
 from tiny_fits import UNJUDGED
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.base.errors import BadInput
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.evidence import OtherHand
-from wildghand.fitting.borrowed_colors import clearly_visible, known_normals
+from wildghand.evidence import ColorChanges
+from wildghand.fitting.borrowed_colors import clearly_visible
 from wildghand.fitting.fit import Fit
+from wildghand.fitting.known_colors import known_normals
 from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.light import KnownLight
 from wildghand.model.settings import read_settings
@@ -49,7 +49,7 @@ def fit(make_training: TrainingMaker) -> Fit:
     return made
 
 
-def sharing(fit: Fit, left: float, right: float) -> OtherHand | None:
+def sharing(fit: Fit, left: float, right: float) -> ColorChanges | None:
     """What is taken if so much of each hand's colours is its own."""
     counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
     own = {"left": left, "right": right}
@@ -139,20 +139,3 @@ def test_an_avatar_keeps_them(fit: Fit, tmp_path: Path) -> None:
     assert np.abs(drawn - before).max() > 0.05
     again = load_avatar(save_avatar(fit.avatar(0), tmp_path / "avatar"))
     np.testing.assert_array_equal(again.render(*where), drawn)
-
-
-@pytest.mark.parametrize(
-    "value",
-    [torch.zeros(40, 2), torch.full((40, 3), 100.0), torch.full((40, 3), float("nan")), None],
-    ids=str,
-)
-def test_hostile_changes_are_refused_by_name(value: torch.Tensor | None) -> None:
-    tensors = OtherHand({side: torch.zeros(40, 3) for side in ("left", "right")}).to_tensors()
-    counts = {"left": 40, "right": 40}
-    if value is None:
-        del tensors["other_hand_left"]
-    else:
-        tensors["other_hand_left"] = value
-    with pytest.raises(BadInput, match="other_hand_left"):
-        OtherHand.from_tensors(tensors, counts, "an avatar")
-    assert OtherHand.from_tensors({}, counts, "an avatar") is None

@@ -1,4 +1,4 @@
-"""The choice of the evidence's strength. Oracles: the avatar's own pictures, drawings as truth."""
+"""The choice of the strengths of evidence and fill. Oracles: the avatar's own pictures as truth."""
 
 from __future__ import annotations
 
@@ -15,10 +15,18 @@ from tiny_fits import UNJUDGED
 from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.evidence import EvidenceSettings, strengths, weigh_evidence
+from wildghand.evidence import (
+    ColorChanges,
+    Evidence,
+    EvidenceSettings,
+    fill_shares,
+    strengths,
+    weigh_evidence,
+)
 from wildghand.fitting.evidence_choice import EvidenceChoice
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.training import load_validation_frames
+from wildghand.light import KnownLight
 from wildghand.model.settings import read_settings
 from wildghand.subject.fit_subject import LEAST_CHOOSING
 
@@ -60,6 +68,17 @@ def drawn_with(fit: Fit, training: TrainingCapture, index: int) -> np.ndarray:
     return np.clip(np.stack(images), 0.0, 1.0)
 
 
+def error_with(
+    choice: EvidenceChoice, evidence: Evidence | None, colors: ColorChanges | None
+) -> float:
+    """The error of all validation frames as they are drawn with both."""
+    drawings = choice.drawings
+    assert drawings is not None
+    features = drawings.features()
+    rows = range(len(drawings.frames))
+    return drawings.error({row: drawings.predict(row, features) for row in rows}, evidence, colors)
+
+
 def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> None:
     fit = begun(training)
     frames = fit.choice.frames
@@ -69,7 +88,9 @@ def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> 
     for index, settings in enumerate(strengths(fit.settings.evidence)):
         off = (drawn_with(fit, training, index) - truth) ** 2 * hand
         expected = off.sum() / hand.sum() / 3.0
-        found = fit.choice.error(weigh_evidence(fit.choice.shown, len(fit.frames), settings))
+        found = error_with(
+            fit.choice, weigh_evidence(fit.choice.shown, len(fit.frames), settings), None
+        )
         assert found == pytest.approx(expected, rel=1e-4)
 
 
@@ -85,12 +106,13 @@ def test_the_strength_that_draws_the_frames_best_is_chosen(
     choice = dataclasses.replace(fit.choice, judges=truth)
     found = choice.best()
     if index == 0:  # the model has it already
-        assert found is None
+        assert found == []
         return
-    assert found is not None
+    (evidence,) = found
+    assert isinstance(evidence, Evidence)
     chosen = strengths(fit.settings.evidence)[index]
     expected = weigh_evidence(fit.choice.shown, len(fit.frames), chosen).to_tensors()
-    for name, shares in found.to_tensors().items():
+    for name, shares in evidence.to_tensors().items():
         assert torch.equal(shares, expected[name])
 
 
@@ -98,6 +120,47 @@ def test_strengths_are_around_the_settings_own() -> None:
     own = EvidenceSettings(offset_share=0.2)
     shares = [(one.offset_share, one.shape_share) for one in strengths(own)]
     assert shares == [(0.2, 0.002), (0.05, 0.002), (0.8, 0.002), (0.0, 0.002)]
+
+
+@pytest.mark.parametrize("index", range(3))
+def test_the_fill_that_draws_the_frames_best_is_chosen(
+    index: int, training: TrainingCapture
+) -> None:
+    fit = begun(training)
+    fit.model.keep(
+        KnownLight(
+            directions=torch.eye(3),
+            strengths=torch.ones(3),
+            ambient=torch.tensor(0.3),
+            axis=torch.tensor([0.0, 0.0, -1.0]),
+            cosine=torch.tensor(0.5),
+        )
+    )
+    # Hardly anything is shown, so that each share changes what the frames show.
+    shown = {side: 0.05 * count for side, count in fit.choice.shown.items()}
+    filled = dataclasses.replace(fit.choice.filled, shown=shown)
+    choice = dataclasses.replace(fit.choice, filled=filled)
+    fills = filled.carried_on(fill_shares(fit.settings.evidence))
+    fit.model.color_changes = fills[index]
+    images = torch.from_numpy((255.0 * drawn_with(fit, training, 0)).round().astype(np.uint8))
+    fit.model.color_changes = None
+    assert choice.frames is not None
+    found = dataclasses.replace(
+        choice, judges=dataclasses.replace(choice.frames, images=images)
+    ).best()
+    if index == 2:  # as they were learnt
+        assert found == []
+        return
+    (colors,) = found
+    expected = fills[index]
+    assert isinstance(colors, ColorChanges)
+    assert expected is not None
+    assert torch.equal(colors.changes["right"], expected.changes["right"])
+
+
+def test_fills_are_around_the_settings_own() -> None:
+    assert fill_shares(EvidenceSettings(fill_share=0.04)) == [0.04, 0.2, 0.0]
+    assert fill_shares(EvidenceSettings(fill_share=0.0)) == [0.0]
 
 
 def test_looking_changes_nothing_and_finishing_keeps_the_best(
@@ -110,7 +173,7 @@ def test_looking_changes_nothing_and_finishing_keeps_the_best(
     assert all(torch.equal(value, before[name]) for name, value in fit.model.state_dict().items())
     # Offsets as they were learnt are made to be the best.
     kept = weigh_evidence(fit.choice.shown, len(fit.frames), strengths(fit.settings.evidence)[3])
-    monkeypatch.setattr(EvidenceChoice, "best", lambda choice: kept)
+    monkeypatch.setattr(EvidenceChoice, "best", lambda choice: [kept])
     fit.finish()
     frame = int(training.validation[0])
     where = training.hand_poses(frame), training.camera(frame)
@@ -131,7 +194,7 @@ def test_nothing_is_chosen_where_it_is_off(
 ) -> None:
     fit = begun(training, **changes)
     assert fit.choice.frames is None
-    assert fit.choice.best() is None
+    assert fit.choice.best() == []
     assert fit.choice.seconds() == 0.0
 
 

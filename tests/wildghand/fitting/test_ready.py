@@ -149,3 +149,22 @@ def test_a_slow_compiler_is_not_in_the_seconds_of_an_evaluation(
     assert 0.0 < facts.fit_seconds < 1e5
     assert facts.ready_seconds is not None
     assert facts.ready_seconds >= 1e6
+
+
+def test_getting_ready_and_a_step_leave_torchs_compiler_out() -> None:
+    # It takes two seconds to import; a step of torch's own optimizers would.
+    program = """
+import sys
+import torch
+from wildghand.fitting.ready import ready_fit
+from wildghand.gaussians.adam import ClippedAdam
+from wildghand.gaussians.fit_loop import repeatable
+with repeatable(ready_fit("cpu")):
+    value = torch.ones(3, requires_grad=True)
+    value.sum().backward()
+    ClippedAdam([{"params": [value], "lr": 0.1}]).take_step(torch.ones(()))
+assert float(value.sum()) < 3.0
+print([name for name in ("torch._dynamo", "torch._inductor") if name in sys.modules])
+"""
+    made = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert made.stdout.strip() == "[]", made.stderr

@@ -195,9 +195,32 @@ def test_what_was_baked_from_one_pose_is_that_pose(fitted) -> None:
     baked = bake_hand(avatar, "right", hand.pose[None], geometry_rank=6, color_rank=12)
     means, _, colors = baked.posed(hand.pose, hand.transl)
     # Without a camera, since the light beyond known normals depends on it and is not baked.
-    truth = avatar.pose({"right": hand})
+    truth = avatar.pose({"right": hand}, closed=True)
     np.testing.assert_allclose(means, truth.means, atol=1e-5)
     np.testing.assert_allclose(colors, truth.colors, atol=1e-5)
+
+
+def test_the_wall_of_the_wrist_follows_the_hand(fitted) -> None:
+    avatar, capture = fitted
+    hands = [capture.hand_poses(frame)["right"] for frame in avatar.record.frames[::4]]
+    baked = bake_hand(
+        avatar, "right", np.stack([hand.pose for hand in hands]), geometry_rank=6, color_rank=12
+    )
+    skin, wall = len(avatar.model.rigs["right"]), len(avatar.model.wall("right"))
+    assert len(baked) == skin + wall
+    for hand in hands:
+        means, covariances, _ = baked.posed(hand.pose, hand.transl)
+        truth = avatar.pose({"right": hand}, closed=True)
+        np.testing.assert_allclose(means[skin:], truth.means[skin:], atol=2e-4)
+        # Discs lie in the plane that their centres span, and are as thin.
+        outwards = np.linalg.svd(means[skin:] - means[skin:].mean(axis=0))[2][2]
+        thickness = np.sqrt(outwards @ covariances[skin:] @ outwards)
+        np.testing.assert_allclose(thickness, truth.scales[skin:].min(axis=1), rtol=0.5)
+        turns, _ = baked.motions(hand.pose, hand.transl)
+        normals = np.einsum("nij,nj->ni", turns, baked.normals)[skin:]
+        assert (np.abs(normals @ outwards) > 0.95).all()
+        # They point away from the hand.
+        assert ((means[:skin].mean(axis=0) - means[skin:]) * normals).sum(axis=1).max() < 0.0
 
 
 def test_the_command_says_what_it_wrote(fitted, folder: Path, tmp_path: Path, capsys) -> None:
@@ -207,7 +230,8 @@ def test_the_command_says_what_it_wrote(fitted, folder: Path, tmp_path: Path, ca
     facts = json.loads(capsys.readouterr().out)
     assert facts["bytes"] == out.stat().st_size
     assert facts["frames"] == 0
-    assert facts["gaussians"] == len(fitted[0].model.rigs["right"])
+    model = fitted[0].model
+    assert facts["gaussians"] == len(model.rigs["right"]) + len(model.wall("right"))
     assert "http" not in out.read_text("utf-8").replace("http://www.w3.org/2000/svg", "").replace(
         "http-equiv", ""
     )

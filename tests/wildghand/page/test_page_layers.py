@@ -116,7 +116,10 @@ def test_baked_biases_are_the_models(fitted) -> None:
     given = avatar.posed({"right": hands[4]})["right"]
     with torch.no_grad():
         truth, _ = avatar.model.gaussians("right", *given, rows=torch.tensor([4]))
-    added = found.at(4)
+    skin = len(avatar.model.rigs["right"])
+    added, wall = np.split(found.at(4), [skin])
+    assert len(wall) == len(avatar.model.wall("right"))
+    assert not wall.any()
     np.testing.assert_allclose(added[:, 3:6], truth.colors[0].numpy() - clean.colors, atol=0.01)
     np.testing.assert_allclose(
         added[:, 6], truth.opacities.reshape(-1).numpy() - clean.opacities, atol=0.01

@@ -1,4 +1,4 @@
-"""Colours that a hand takes from the other one, where frames have shown that one alone."""
+"""Changes of colours in free poses: what the other hand and the skin around a place say of it."""
 
 from __future__ import annotations
 
@@ -10,20 +10,22 @@ from torch import Tensor
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.kept_tensors import kept_tensor
 
-_PREFIX = "other_hand_"
+_PREFIX = "color_changes_"
+# Of avatars from before places that are seldom seen took the colours around them.
+_FORMER = "other_hand_"
 # Largest change of a colour that is read, in logits.
 _LARGEST = 20.0
 
 
 @dataclass(frozen=True, eq=False)
-class OtherHand:
+class ColorChanges:
     """Changes of the colours of Gaussians, in logits of sRGB."""
 
-    #: (N, 3) by side, of two hands.
+    #: (N, 3) by side.
     changes: Mapping[str, Tensor]
 
     def color(self, side: str, raw: RawAttributes) -> RawAttributes:
-        """Gaussians in the colours of both hands.
+        """Gaussians in their changed colours.
 
         Args:
             side: which hand.
@@ -38,7 +40,7 @@ class OtherHand:
     @classmethod
     def from_tensors(
         cls, tensors: Mapping[str, Tensor], counts: Mapping[str, int], where: str
-    ) -> OtherHand | None:
+    ) -> ColorChanges | None:
         """Read what `to_tensors` made.
 
         Args:
@@ -61,3 +63,11 @@ class OtherHand:
                 for side, count in counts.items()
             }
         )
+
+
+def rename_former(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of an avatar by their names of today."""
+    return {
+        _PREFIX + name.removeprefix(_FORMER) if name.startswith(_FORMER) else name: value
+        for name, value in tensors.items()
+    }

