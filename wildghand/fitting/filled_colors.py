@@ -31,7 +31,7 @@ _MEAN = 1e-6
 
 @dataclass(frozen=True, eq=False)
 class FilledColors:
-    """What is known of the colours at the end of a fit, and how it is carried on."""
+    """The colours that are known at the end of a fit, and how they are carried on."""
 
     #: What is read, with the colours that hands take from each other.
     model: WildGHandModel

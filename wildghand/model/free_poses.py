@@ -7,18 +7,46 @@ shadows and the refined pose make of it comes second, so that it can be tried in
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import Protocol
 
-from torch import Tensor
+from torch import Tensor, nn
 
-from wildghand.gaussians.rig import AnchorPoses
+from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal
+from wildghand.evidence import ColorChanges, Evidence
+from wildghand.gaussians.rig import AnchorPoses, HandRig
+from wildghand.light import KnownLight
 from wildghand.model.dress import Gaussians, dress
 from wildghand.model.relight import relit
-from wildghand.network import HandFeatures, NetworkOutput
+from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
 from wildghand.shadows.hand_shadows import Hand
 
-if TYPE_CHECKING:
-    from wildghand.model.model import WildGHandModel
+
+class HandModel(Protocol):
+    """The parts of `wildghand.model.model.WildGHandModel` that draw free poses; see there."""
+
+    rigs: dict[str, HandRig]
+    network: PredictionNetwork
+    light: KnownLight | None
+    evidence: Evidence | None
+    color_changes: ColorChanges | None
+    perturbation: nn.ModuleDict
+    log_gains: nn.Parameter
+
+    def predict(
+        self, side: str, anchors: AnchorPoses, pose: Tensor, features: HandFeatures | None = None
+    ) -> NetworkOutput:
+        """Predict the attributes of one hand."""
+
+    def shaded(self, prediction: NetworkOutput, normals: Tensor) -> NetworkOutput:
+        """A prediction in the light that casts shadows."""
+
+    def biases_of(self, side: str) -> DynamicPerturbation:
+        """The perturbation module of one hand."""
+
+    def perturbation_in(
+        self, side: str, temporal: Temporal, anchors: AnchorPoses, kept: Tensor | None
+    ) -> Perturbation:
+        """The perturbation of one hand in B frames."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,7 +62,7 @@ class HandPrediction:
 
 
 def predict_hand(
-    model: WildGHandModel,
+    model: HandModel,
     side: str,
     hand: Hand,
     viewmats: Tensor | None,
@@ -65,7 +93,7 @@ def predict_hand(
 
 
 def dressed(
-    model: WildGHandModel,
+    model: HandModel,
     side: str,
     predicted: HandPrediction,
     *,
