@@ -8,9 +8,12 @@ import torch
 
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Avatar, Budget, Report
-from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Guard, batches, repeatable, spent
 from wildghand.plain.hooks import Batch, Recipe
+
+# Adam's epsilon: gradients of a mean over all pixels are small.
+_EPSILON = 1e-15
+_BETAS = (0.9, 0.99)
 
 
 def run_fit(recipe: Recipe[Any], budget: Budget, report: Report) -> Avatar:
@@ -30,8 +33,11 @@ def run_fit(recipe: Recipe[Any], budget: Budget, report: Report) -> Avatar:
     settings, frames, device = recipe.settings, recipe.material.frames, recipe.material.device
     steps = settings.steps if budget.steps is None else budget.steps
     parameters = recipe.parameters()
-    optimizer = ClippedAdam(
-        {"params": [tensor.requires_grad_()], "lr": 0.0} for tensor in parameters.values()
+    optimizer = torch.optim.Adam(
+        [{"params": [tensor.requires_grad_()], "lr": 0.0} for tensor in parameters.values()],
+        eps=_EPSILON,
+        betas=_BETAS,
+        fused=True,
     )
     order = batches(len(frames), settings.batch, recipe.material.seed)
     images, masks = frames.images_on(device), frames.masks_on(device)
@@ -51,9 +57,9 @@ def run_fit(recipe: Recipe[Any], budget: Budget, report: Report) -> Avatar:
                 notice(f"The fit diverged at step {step}; the state of step {guard.step} is kept.")
                 step = guard.step
                 break
-            optimizer.clear()
+            optimizer.zero_grad()
             loss.backward()
-            optimizer.take_step(loss)
+            optimizer.step()
             recipe.after_step(batch)
             step += 1
             report.progress(step, steps)
