@@ -2,7 +2,13 @@
 
 from wildghand.evidence.color_changes import ColorChanges, rename_former
 from wildghand.evidence.count import shown_frames
-from wildghand.evidence.evidence import Evidence, fill_shares, strengths, weigh_evidence
+from wildghand.evidence.evidence import (
+    Evidence,
+    fill_shares,
+    kept_share,
+    strengths,
+    weigh_evidence,
+)
 from wildghand.evidence.settings import EvidenceSettings
 
 __all__ = [
@@ -10,6 +16,7 @@ __all__ = [
     "Evidence",
     "EvidenceSettings",
     "fill_shares",
+    "kept_share",
     "rename_former",
     "shown_frames",
     "strengths",

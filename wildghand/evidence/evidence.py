@@ -108,16 +108,22 @@ def weigh_evidence(shown: Mapping[str, Tensor], count: int, settings: EvidenceSe
         count: of all training frames, at least 1.
         settings: which share outweighs the prior.
     """
-
-    def shares(frames: Tensor, half: float) -> Tensor:
-        if half <= 0.0:
-            return torch.ones_like(frames)
-        return frames / (frames + half * count).clamp(min=1e-12)
-
+    halves = settings.offset_share * count, settings.shape_share * count
     return Evidence(
-        {side: shares(frames, settings.offset_share) for side, frames in shown.items()},
-        {side: shares(frames, settings.shape_share) for side, frames in shown.items()},
+        *({side: kept_share(frames, half) for side, frames in shown.items()} for half in halves)
     )
+
+
+def kept_share(frames: Tensor, half: float) -> Tensor:
+    """The share n / (n + half) of what n frames say that outweighs a prior; ones without a prior.
+
+    Args:
+        frames: (N,) n of each Gaussian.
+        half: how many frames the prior weighs.
+    """
+    if half <= 0.0:
+        return torch.ones_like(frames)
+    return frames / (frames + half).clamp(min=1e-12)
 
 
 def strengths(settings: EvidenceSettings) -> list[EvidenceSettings]:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from wildghand.evidence import ColorChanges, EvidenceSettings, shown_frames
+from wildghand.evidence import ColorChanges, EvidenceSettings, kept_share, shown_frames
 from wildghand.fitting.known_colors import changes_to, known_logits, log_linear
 from wildghand.fitting.weighting import Weighting
 from wildghand.gaussians.training import TrainingClip
@@ -64,7 +64,7 @@ class BorrowedColors:
         half = settings.color_share * count
 
         def shares(half: float) -> dict[str, np.ndarray]:
-            return {side: (n / (n + half)).cpu().double().numpy() for side, n in shown.items()}
+            return {side: kept_share(n, half).cpu().double().numpy() for side, n in shown.items()}
 
         return cls(model, clip, own=shares(half), lent=shares(_LENT * half))
 

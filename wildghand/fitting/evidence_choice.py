@@ -74,9 +74,7 @@ class EvidenceChoice:
 
     def _judged(self, drawings: JudgedDrawings) -> tuple[Evidence | None, ColorChanges | None]:
         """The evidence, None where it is the model's own, and with it the changes of colours."""
-        features = drawings.features()
-        rows = range(len(drawings.frames))
-        predicted = {row: drawings.predict(row, features) for row in rows}
+        predicted = drawings.predict_all()
         changes = self.model.color_changes
         several = [self._evidence(index) for index in range(len(self._strengths))]
         # Of equal ones min takes the first, which is the settings' own.

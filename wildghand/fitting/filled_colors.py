@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from torch import Tensor
 
-from wildghand.evidence import ColorChanges
+from wildghand.evidence import ColorChanges, kept_share
 from wildghand.fitting.borrowed_colors import BorrowedColors
 from wildghand.fitting.known_colors import changes_to, known_logits, log_linear
 from wildghand.gaussians.laplacian import nearest_on_surface, rest_anchors
@@ -83,11 +83,11 @@ class FilledColors:
 
     def _known(self, side: str, share: float) -> np.ndarray:
         """(N,) in [0, 1), how far a Gaussian's colour is known, from either hand."""
-        frames = self.shown[side].double().cpu().numpy()
-        known = frames / (frames + share * self.frame_count)
+        frames = self.shown[side].double().cpu()
+        known: np.ndarray = kept_share(frames, share * self.frame_count).numpy()
         if self.borrowed.own:
             known = 1.0 - (1.0 - known) * (1.0 - self.borrowed.taken(side))
-        return np.asarray(known)
+        return known
 
 
 def roughness(rig: HandRig) -> Any:

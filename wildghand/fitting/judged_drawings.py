@@ -59,6 +59,11 @@ class JudgedDrawings:
             for side, (pose, betas, transl) in self._clip.parameters.items()
         }
 
+    def predict_all(self) -> dict[int, Predicted]:
+        """What network and light say of the hands in all frames, by row."""
+        features = self.features()
+        return {row: self.predict(row, features) for row in range(len(self.frames))}
+
     @torch.no_grad()
     def error(
         self,

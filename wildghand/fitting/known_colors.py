@@ -16,9 +16,9 @@ from wildghand.light import KnownLight
 from wildghand.light.sphere import ring_around
 from wildghand.model.model import WildGHandModel
 
-# Poses and normals at which colours are read: normals of the cap that the light knows, at this
-# share of its angle around its axis.
-_POSES, _RING, _INSIDE = 5, 4, 0.6
+# Normals at which colours are read: the axis of the cap that the light knows, and so many around it
+# at this share of the cap's angle.
+_RING, _INSIDE = 4, 0.6
 # sRGB nearer to 0 or 1, and linear light below this, say nothing.
 _EDGE, _DARKEST = 0.005, 1e-3
 

@@ -1,4 +1,4 @@
-"""Adam, with the norm of the gradient clipped: two passes over everything that is fitted.
+"""Adam with the norm of the gradient clipped: two passes over everything that is fitted.
 
 On the CPU a step of torch's optimizer and of its clipping starts some two hundred operations on
 tensors that are mostly tiny. Here all tensors are cut into pieces that compiled code goes through,
@@ -51,7 +51,7 @@ class ClippedAdam(torch.optim.Adam):
         epsilon: float = 1e-15,
     ) -> None:
         super().__init__(list(groups), eps=epsilon, betas=betas, fused=True)
-        self.limit, self._betas, self._epsilon = limit, betas, epsilon
+        self.limit = limit
         #: By which parameters have a gradient: not all of them have one at every step.
         self._tables: list[_Tables] = []
 
@@ -109,7 +109,8 @@ class ClippedAdam(torch.optim.Adam):
         gradients = [_laid_out_alike(parameter) for _, parameter in chosen]
         tables = next((made for made in self._tables if made.are_of(chosen)), None)
         if tables is None:
-            tables = _Tables([(p, self._moments(p)) for _, p in chosen], self._betas, self._epsilon)
+            moments = [(p, self._moments(p)) for _, p in chosen]
+            tables = _Tables(moments, self.defaults["betas"], self.defaults["eps"])
             self._tables = [tables, *self._tables[: _TABLES - 1]]
         clipped = np.array([group.get("clipped", True) for group, _ in chosen])
         rates = np.array([float(group["lr"]) for group, _ in chosen])

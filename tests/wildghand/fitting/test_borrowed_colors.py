@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from odd_fits import a_light
 from tiny_fits import UNJUDGED
 
 from hwp_bench.base.colors import srgb_to_linear
@@ -21,23 +22,12 @@ from wildghand.fitting.borrowed_colors import clearly_visible
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.known_colors import known_normals
 from wildghand.gaussians.attributes import CHANNELS, SIZES
-from wildghand.light import KnownLight
 from wildghand.model.settings import read_settings
 
 PLAIN: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False, "start_colors": False}
 # Channels of the colours in the attributes and in the map.
 COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
 TrainingMaker = Callable[..., TrainingCapture]
-
-
-def a_light(cosine: float = 0.5) -> KnownLight:
-    return KnownLight(
-        directions=torch.eye(3),
-        strengths=torch.ones(3),
-        ambient=torch.tensor(0.3),
-        axis=torch.tensor([0.0, 0.0, -1.0]),
-        cosine=torch.tensor(cosine),
-    )
 
 
 @pytest.fixture

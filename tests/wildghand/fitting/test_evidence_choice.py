@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from odd_fits import a_light, odd_fit
 from tiny_fits import UNJUDGED
 
 from hwp_bench.capture.splits import Split
@@ -26,8 +27,6 @@ from wildghand.evidence import (
 from wildghand.fitting.evidence_choice import EvidenceChoice
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.training import load_validation_frames
-from wildghand.light import KnownLight
-from wildghand.model.settings import read_settings
 from wildghand.subject.fit_subject import LEAST_CHOOSING
 
 QUICK: dict[str, Any] = {**UNJUDGED, "light.enabled": False}
@@ -36,12 +35,7 @@ TrainingMaker = Callable[..., TrainingCapture]
 
 def begun(training: TrainingCapture, **changes: Any) -> Fit:
     """A fit whose Gaussians stand off the skin, as chance wills."""
-    fit = Fit(training, read_settings({**QUICK, **changes}), 0, torch.device("cpu"))
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for value in fit.model.network.parameters():
-            value.add_(0.1 * torch.randn(value.shape, generator=generator))
-    return fit
+    return odd_fit(training, {**QUICK, **changes})
 
 
 @pytest.fixture
@@ -74,9 +68,7 @@ def error_with(
     """The error of all validation frames as they are drawn with both."""
     drawings = choice.drawings
     assert drawings is not None
-    features = drawings.features()
-    rows = range(len(drawings.frames))
-    return drawings.error({row: drawings.predict(row, features) for row in rows}, evidence, colors)
+    return drawings.error(drawings.predict_all(), evidence, colors)
 
 
 def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> None:
@@ -127,15 +119,7 @@ def test_the_fill_that_draws_the_frames_best_is_chosen(
     index: int, training: TrainingCapture
 ) -> None:
     fit = begun(training)
-    fit.model.keep(
-        KnownLight(
-            directions=torch.eye(3),
-            strengths=torch.ones(3),
-            ambient=torch.tensor(0.3),
-            axis=torch.tensor([0.0, 0.0, -1.0]),
-            cosine=torch.tensor(0.5),
-        )
-    )
+    fit.model.keep(a_light())
     # Hardly anything is shown, so that each share changes what the frames show.
     shown = {side: 0.05 * count for side, count in fit.choice.shown.items()}
     filled = dataclasses.replace(fit.choice.filled, shown=shown)

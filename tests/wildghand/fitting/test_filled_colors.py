@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from odd_fits import a_light, odd_fit
 from tiny_fits import UNJUDGED
 
 from hwp_bench.hands import load_template
@@ -20,8 +21,6 @@ from wildghand.fitting.fit import Fit
 from wildghand.fitting.known_colors import known_logits, log_linear
 from wildghand.gaussians.laplacian import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig, make_rig
-from wildghand.light import KnownLight
-from wildghand.model.settings import read_settings
 
 PLAIN: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False, "start_colors": False}
 TrainingMaker = Callable[..., TrainingCapture]
@@ -32,23 +31,9 @@ def rig() -> HandRig:
     return make_rig(load_template("anny", "right"), 300)
 
 
-def a_light() -> KnownLight:
-    return KnownLight(
-        directions=torch.eye(3),
-        strengths=torch.ones(3),
-        ambient=torch.tensor(0.3),
-        axis=torch.tensor([0.0, 0.0, -1.0]),
-        cosine=torch.tensor(0.5),
-    )
-
-
 def begun(training: TrainingCapture, **changes: Any) -> Fit:
     """A fit whose colours differ from place to place, under a light."""
-    fit = Fit(training, read_settings({**PLAIN, **changes}), 0, torch.device("cpu"))
-    generator = torch.Generator().manual_seed(1)
-    with torch.no_grad():
-        for value in fit.model.network.parameters():
-            value.add_(0.1 * torch.randn(value.shape, generator=generator))
+    fit = odd_fit(training, {**PLAIN, **changes})
     fit.model.keep(a_light())
     return fit
 
