@@ -16,6 +16,7 @@ _TABLES = (
     "robustness",
     "severity",
     "novelty",
+    "outline",
     "free-view",
     "bias",
     "seeds",
@@ -29,6 +30,7 @@ _EXAMPLES = """examples:
   hwp-bench table runs/mine-mini runs/mine-mini-clean runs/plain-mini --by robustness --base plain
   hwp-bench table runs/mine-seed* --by seeds
   hwp-bench table runs/plain-mini runs/mine-mini --by novelty   # where training showed little
+  hwp-bench table runs/plain-mini runs/mine-mini --by outline   # what is drawn outside of the hand
   hwp-bench table runs/plain-mini runs/mine-mini --by free-view   # from all around
   hwp-bench table runs/mine-mini runs/plain-mini --paper 5 --published   # layout of table 5
   hwp-bench table --published                                            # the paper's numbers
@@ -73,7 +75,8 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="FOLDER",
-        help="capture folders, for severities and novelty (simulated ones are found in the cache)",
+        help="capture folders, for severities, novelty and outlines (simulated ones are found in "
+        "the cache)",
     )
     parser.add_argument(
         "--format",

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -13,13 +12,12 @@ from hwp_bench.base.images import read_rgb
 from hwp_bench.base.progress import track
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.capture import Capture
-from hwp_bench.capture.schema import frame_name
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.metrics.psnr_ssim import decibels, squared_error
 from hwp_bench.report.evaluation_tables import labels
-from hwp_bench.report.sources import ResultsSource
+from hwp_bench.report.sources import ResultsSource, stored_predictions
 from hwp_bench.results import CaptureResult
 
 #: Upper ends of the classes of angles, degrees; the last class was never seen.
@@ -103,12 +101,12 @@ def _pooled(
     totals = [(np.zeros(len(CLASSES)), np.zeros(len(CLASSES))) for _ in sources]
     for digest, capture in track(captures.items(), "Novelty", len(captures)):
         split = split_for(capture.info.id, len(capture))
-        runs = [
-            (_scored_files(source, item, split), total)
-            for source, total in zip(sources, totals, strict=True)
-            for item in source.results.captures
-            if item.digest == digest
-        ]
+        runs = []
+        for source, total in zip(sources, totals, strict=True):
+            for item in source.results.captures:
+                if item.digest == digest:
+                    _check_split(item, split)
+                    runs.append((stored_predictions(source, item), total))
         frames = sorted({frame for files, _ in runs for frame in files})
         if not frames:
             continue
@@ -128,29 +126,14 @@ def _pooled(
     return totals
 
 
-def _scored_files(source: ResultsSource, item: CaptureResult, split: Split) -> dict[int, Path]:
-    """The stored predictions of the frames that were scored, by frame.
-
-    Raises:
-        UsageError: the split is not the usual one.
-    """
+def _check_split(item: CaptureResult, split: Split) -> None:
+    """Refuse a split whose training frames are not known here."""
     if split.digest != item.split_digest:
         raise UsageError(
             "was not split by the 80/10/10 rule; novelty needs its training frames",
             where=item.id,
             field="RESULTS",
         )
-    folder = source.place(item.id, "predictions")
-    if folder is None:
-        return {}
-    files = {
-        frame.frame: folder / frame_name(frame.frame)
-        for frame in item.frames
-        if frame.failure is None
-    }
-    return {
-        frame: path for frame, path in files.items() if path.is_file() and not path.is_symlink()
-    }
 
 
 def classes_of(novelty: Novelty, region: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,6 +15,7 @@ from hwp_bench.report.data_groups import DataGroup, data_groups, stacked
 from hwp_bench.report.evaluation_tables import all_tables, same_data
 from hwp_bench.report.free_view_table import free_view_table
 from hwp_bench.report.novelty_table import novelty_table
+from hwp_bench.report.outline_table import outline_table
 from hwp_bench.report.over_seeds import over_seeds
 from hwp_bench.report.paper_layouts import (
     DISTANCE,
@@ -66,7 +67,7 @@ class TableRequest:
     published: bool = False
     #: Name of the method that the robustness table counts from.
     base: str | None = None
-    #: Capture folders, for severities and novelty.
+    #: Capture folders, for severities, novelty and outlines.
     captures: Sequence[str | os.PathLike[str]] = ()
 
 
@@ -134,6 +135,9 @@ def _group_table(sources: Sequence[ResultsSource], request: TableRequest) -> Tab
             return over_seeds(found, results)
         case "novelty":
             found = novelty_table(sources, open_captures_of(results, request.captures))
+            return over_seeds(found, results)
+        case "outline":
+            found = outline_table(sources, open_captures_of(results, request.captures))
             return over_seeds(found, results)
         case "free-view":
             return free_view_table(results)

@@ -17,8 +17,8 @@ from hwp_bench.base.files import cache_root, inside, read_json, sha256_json
 from hwp_bench.base.progress import notice
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.schema import CaptureInfo
-from hwp_bench.results import Results, read_results, results_among
+from hwp_bench.capture.schema import CaptureInfo, frame_name
+from hwp_bench.results import CaptureResult, Results, read_results, results_among
 from hwp_bench.results.bounds import MAX_FRAMES
 
 #: Largest file of temporal weights that is read, bytes.
@@ -79,6 +79,26 @@ def read_sources(
         if kept is not source:
             notice(f"left out: {source.folder} repeats {kept.folder} (same method, settings, seed)")
     return list(first.values())
+
+
+def stored_predictions(source: ResultsSource, item: CaptureResult) -> dict[int, Path]:
+    """The predictions of the frames that were scored, by frame; empty where none are kept.
+
+    Args:
+        source: the evaluation.
+        item: its result on a capture.
+    """
+    folder = source.place(item.id, "predictions")
+    if folder is None:
+        return {}
+    files = {
+        frame.frame: folder / frame_name(frame.frame)
+        for frame in item.frames
+        if frame.failure is None
+    }
+    return {
+        frame: path for frame, path in files.items() if path.is_file() and not path.is_symlink()
+    }
 
 
 def temporal_weights(source: ResultsSource, capture: str) -> dict[str, TemporalWeights]:

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from drawn_results import drawn_results
 
 from hwp_bench.analysis.novelty import Novelty
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
-from hwp_bench.capture.schema import frame_name
-from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.metrics.protocol import PSNR_CAP
 from hwp_bench.report.novelty_table import CLASSES, classes_of
 from hwp_bench.report.requested_table import TableRequest, make_table
-from hwp_bench.results import FrameResult, Results, write_results
+from hwp_bench.results import Results
 
 
 def test_classes_are_those_of_the_edges() -> None:
@@ -36,36 +33,17 @@ def test_classes_are_those_of_the_edges() -> None:
     ]  # fmt: skip
 
 
-def results_of(
-    capture: Capture, folder: Path, example: Results, pixels: Callable[[np.ndarray], np.ndarray]
-) -> Path:
-    """A result whose predictions are made of the truth."""
-    split = contiguous_split(capture.info.id, len(capture))
-    scored = replace(
-        example.captures[0],
-        id=capture.info.id,
-        digest=capture.digest,
-        split_digest=split.digest,
-        frames=[FrameResult(frame, {"psnr": 20.0}, None) for frame in split.test.tolist()],
-    )
-    for frame in split.test.tolist():
-        target = folder / "captures" / capture.info.id / "predictions" / frame_name(frame)
-        write_image(target, pixels(capture.frame(frame)))
-    write_results(folder / "results.json", replace(example, captures=[scored]))
-    return folder
-
-
 def test_errors_are_pooled_by_class(
     make_painted: Callable[..., Capture], make_results: Callable[..., Results], tmp_path: Path
 ) -> None:
     capture = make_painted()
-    perfect = results_of(capture, tmp_path / "a", make_results("perfect"), lambda image: image)
-    off = results_of(
-        capture,
-        tmp_path / "b",
-        make_results("off"),
-        lambda image: (image + (image < 128) * 20 - (image >= 128) * 20).astype(np.uint8),
-    )
+    perfect = drawn_results(capture, tmp_path / "a", make_results("perfect"), capture.frame)
+
+    def off_by_20(frame: int) -> np.ndarray:
+        image = capture.frame(frame)
+        return (image + (image < 128) * 20 - (image >= 128) * 20).astype(np.uint8)
+
+    off = drawn_results(capture, tmp_path / "b", make_results("off"), off_by_20)
     table = make_table(TableRequest([perfect, off], by="novelty", captures=[capture.root]))
     for what in dict.fromkeys(name for name, _ in CLASSES):
         rows = [row for row in table.rows if row[0] == what]
@@ -83,6 +61,6 @@ def test_it_needs_captures_and_predictions(
     make_painted: Callable[..., Capture], make_results: Callable[..., Results], tmp_path: Path
 ) -> None:
     capture = make_painted()
-    folder = results_of(capture, tmp_path / "a", make_results("perfect"), lambda image: image)
+    folder = drawn_results(capture, tmp_path / "a", make_results("perfect"), capture.frame)
     with pytest.raises(UsageError, match="none of these captures"):
         make_table(TableRequest([folder], by="novelty"))
