@@ -13,7 +13,13 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hwp_bench.metrics.pixels import check_prediction, check_truth, hand_pixels, scored_pixels
+from hwp_bench.metrics.pixels import (
+    check_prediction,
+    check_truth,
+    composite,
+    hand_pixels,
+    scored_pixels,
+)
 from hwp_bench.metrics.protocol import HWP_V1
 from hwp_bench.metrics.psnr_ssim import decibels, squared_error
 
@@ -21,7 +27,7 @@ from hwp_bench.metrics.psnr_ssim import decibels, squared_error
 LIT = 12
 #: Where a mask does not know each pixel's coverage, its outline is uncertain by this much, px.
 UNCERTAIN = 2
-# The outermost pixels of a drawing mix its colours with black.
+# A pixel with those around it. The outermost pixels of a drawing mix its colours with black.
 _RIM = np.ones((3, 3), np.uint8)
 
 
@@ -66,15 +72,18 @@ def outline_scores(
         return None
     outside = _untouched(mask, coverage=coverage)
     lit = prediction.max(axis=2) > LIT
-    drawn, true = prediction / 255.0, target / 255.0
-    error = float(squared_error(drawn, true)[region].sum())
-    spill = float(squared_error(drawn, np.zeros_like(drawn))[outside].sum())
-    spread = squared_error(spread_outwards(prediction, lit) / 255.0, true)[region]
+    black = composite(target, ~outside)
+    error = squared_error(prediction, black)
+    spread = squared_error(spread_outwards(prediction, lit), black)
+
+    def score(errors: np.ndarray, pixels: np.ndarray) -> float:
+        return decibels(float(errors[pixels].sum()) / (count * 255.0**2))
+
     return OutlineScores(
-        psnr=decibels(error / count),
+        psnr=score(error, region),
         drawn_outside=float(np.count_nonzero(lit & outside)) / count,
-        psnr_with_outside=decibels((error + spill) / count),
-        psnr_spread=decibels(float(spread.sum()) / count),
+        psnr_with_outside=score(error, region | outside),
+        psnr_spread=score(spread, region),
     )
 
 

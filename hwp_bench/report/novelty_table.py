@@ -103,10 +103,9 @@ def _pooled(
         split = split_for(capture.info.id, len(capture))
         runs = []
         for source, total in zip(sources, totals, strict=True):
-            for item in source.results.captures:
-                if item.digest == digest:
-                    _check_split(item, split)
-                    runs.append((stored_predictions(source, item), total))
+            for item in source.on(digest):
+                _check_split(item, split)
+                runs.append((stored_predictions(source, item), total))
         frames = sorted({frame for files, _ in runs for frame in files})
         if not frames:
             continue

@@ -38,10 +38,9 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     """
     found: list[list[OutlineScores]] = [[] for _ in sources]
     for digest, capture in track(captures.items(), "Outlines", len(captures)):
-        means = [_mean_scores(source, digest, capture) for source in sources]
-        known = [mean for mean in means if mean is not None]
-        if len(known) == len(sources):
-            for scores, mean in zip(found, known, strict=True):
+        means = _means(sources, digest, capture)
+        if means:
+            for scores, mean in zip(found, means, strict=True):
                 scores.append(mean)
     if not found or not found[0]:
         raise UsageError(
@@ -65,20 +64,30 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
     return Table("By outline", columns, tuple(rows), _NOTES)
 
 
-def _mean_scores(source: ResultsSource, digest: str, capture: Capture) -> OutlineScores | None:
-    """The means over the test frames of a capture; None where no prediction is at hand."""
-    scores = []
-    for item in source.results.captures:
-        if item.digest != digest:
-            continue
-        for frame, path in stored_predictions(source, item).items():
-            mask, exact = capture.scoring_mask(frame)
-            one = outline_scores(
-                read_rgb(path, capture.size), capture.frame(frame), mask, coverage=exact
-            )
+def _means(sources: Sequence[ResultsSource], digest: str, capture: Capture) -> list[OutlineScores]:
+    """Each method's means over the test frames of a capture; empty where one has none to score."""
+    runs = [
+        {
+            frame: path
+            for item in source.on(digest)
+            for frame, path in stored_predictions(source, item).items()
+        }
+        for source in sources
+    ]
+    if not all(runs):
+        return []
+    scores: list[list[OutlineScores]] = [[] for _ in sources]
+    # Each frame is read once for all methods.
+    for frame in sorted({frame for files in runs for frame in files}):
+        target, (mask, exact) = capture.frame(frame), capture.scoring_mask(frame)
+        for files, mine in zip(runs, scores, strict=True):
+            if frame not in files:
+                continue
+            prediction = read_rgb(files[frame], capture.size)
+            one = outline_scores(prediction, target, mask, coverage=exact)
             if one is not None:
-                scores.append(one)
-    return _mean(scores) if scores else None
+                mine.append(one)
+    return [_mean(mine) for mine in scores] if all(scores) else []
 
 
 def _mean(scores: Sequence[OutlineScores]) -> OutlineScores:

@@ -34,6 +34,10 @@ class ResultsSource:
     #: Its folder, with `captures/ID/`; None where only the result itself is at hand.
     folder: Path | None
 
+    def on(self, digest: str) -> list[CaptureResult]:
+        """Return what it holds on the capture of a digest."""
+        return [item for item in self.results.captures if item.digest == digest]
+
     def place(self, capture: str, *parts: str) -> Path | None:
         """Return a path inside the folder of a capture; None where the folder is not known.
 
