@@ -23,6 +23,11 @@ _PALM_LINES = (
     ((0.80, 1.14), (0.62, 0.80), (0.40, 0.62), (0.16, 0.55), (0.02, 0.55)),
 )
 
+# exp(-x) of a larger x is lost in any sum of the numbers here, so that it need not be computed.
+_LOST = 48.0
+# Places that are compared with a whole line at once: what they need stays in the processor's cache.
+_BLOCK = 8192
+
 
 @dataclass(frozen=True, eq=False)
 class Anatomy:
@@ -60,26 +65,32 @@ class Anatomy:
             for step in range(3):
                 joint = chain[step + 1]
                 along = unit(unit(chain[step + 2] - joint) + unit(joint - chain[step]))
-                offset = self.points - joint
-                s = offset @ along
-                owned = self.weights[:, first : first + 3].sum(axis=1)
-                near = np.exp(-((np.linalg.norm(offset, axis=1) / 0.017) ** 4))
+                rows, near = self._around(joint, 0.017)
+                s = (self.points[rows] - joint) @ along
                 knuckle = step == 0
-                swell += np.exp(-((s / 0.008) ** 2)) * near * (0.7 if knuckle else 1.0)
+                swell[rows] += np.exp(-((s / 0.008) ** 2)) * near * (0.7 if knuckle else 1.0)
                 count = 2 if knuckle else 5
                 places = np.linspace(-0.0045, 0.0045, count) + rng.normal(0, 0.0004, count)
                 for place in places:
                     depth = rng.uniform(0.4, 1.0) * (0.35 if knuckle else 1.0)
-                    line = np.exp(-(((s - place + wobble) / 0.00042) ** 2))
-                    lines += depth * line * near * back
+                    line = np.exp(-(((s - place + wobble[rows]) / 0.00042) ** 2))
+                    lines[rows] += depth * line * near * back[rows]
                 if knuckle and finger != "thumb":
                     # The palm side folds at the finger's root, beyond the joint.
+                    rows, near = self._around(joint + 0.02 * along, 0.02)
+                    s = (self.points[rows] - joint) @ along
                     s = s - 0.42 * np.linalg.norm(chain[2] - joint)
-                    near = np.exp(-((np.linalg.norm(offset - 0.02 * along, axis=1) / 0.02) ** 4))
+                owned = self.weights[rows, first : first + 3].sum(axis=1)
                 for place in (-0.0011, 0.0013) if step == 1 else (0.0,):
-                    line = np.exp(-(((s - place + 0.7 * wobble) / 0.0005) ** 2))
-                    lines += 1.3 * line * near * (1.0 - back) * np.clip(owned * 2, 0, 1)
+                    line = np.exp(-(((s - place + 0.7 * wobble[rows]) / 0.0005) ** 2))
+                    lines[rows] += 1.3 * line * near * (1.0 - back[rows]) * np.clip(owned * 2, 0, 1)
         return np.clip(lines, 0.0, 1.5), np.clip(swell, 0.0, 1.0)
+
+    def _around(self, middle: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray]:
+        """Indices of the places around one, and there 1 in its middle, which fades at a radius."""
+        power = (np.linalg.norm(self.points - middle, axis=1) / radius) ** 4
+        rows = np.flatnonzero(power < _LOST)
+        return rows, np.exp(-power[rows])
 
     def palm_creases(self, rng: np.random.Generator) -> np.ndarray:
         """The three lines of the palm and finer ones: (N,), 0-1."""
@@ -90,13 +101,11 @@ class Anatomy:
         width = 0.011
         for line in _PALM_LINES:
             bends = np.array(line) + rng.normal(0.0, 0.02, (len(line), 2))
-            total += np.exp(-((_distance_to_line(place, _rounded(bends)) / width) ** 2))
+            total += _drawn(place, _rounded(bends), width)
         for _ in range(14):
             start = rng.uniform([0.1, 0.0], [0.95, 1.0])
             end = start + rng.normal(0.0, 0.16, 2)
-            total += 0.35 * np.exp(
-                -((_distance_to_line(place, np.array([start, end])) / (0.6 * width)) ** 2)
-            )
+            total += 0.35 * _drawn(place, np.array([start, end]), 0.6 * width)
         owned = self.weights[:, 0] + 0.6 * self.weights[:, [1, 4, 7, 10, 13]].sum(axis=1)
         return np.clip(total, 0.0, 1.3) * np.clip(1.6 * owned - 0.3, 0.0, 1.0)
 
@@ -107,7 +116,7 @@ class Anatomy:
         for finger in FINGERS:
             knuckle = self.joints[FIRST_JOINT[finger] + (1 if finger == "thumb" else 0)]
             start = wrist + 0.3 * (knuckle - wrist) * np.array([0.6, 0.0, 1.0])
-            distance, through = _to_segment(self.points, start, knuckle, flat=1)
+            distance, through = _to_segment(self.points[:, [0, 2]], start[[0, 2]], knuckle[[0, 2]])
             fade = np.clip(4.0 * through, 0.0, 1.0) * np.clip(6.0 * (1.05 - through), 0.0, 1.0)
             total += np.exp(-((distance / 0.0023) ** 2)) * fade
         return np.clip(total, 0.0, 1.0)
@@ -123,7 +132,7 @@ class Anatomy:
                 [[x, 0.5 + (lane - 0.5) * (0.55 + 0.6 * x)] for x in (-0.1, 0.2, 0.45, 0.7, 0.95)]
             )
             bends[:, 1] += rng.normal(0.0, 0.06, len(bends))
-            line = np.exp(-((_distance_to_line(place, _rounded(bends)) / 0.022) ** 2))
+            line = _drawn(place, _rounded(bends), 0.022)
             total = np.maximum(total, rng.uniform(0.5, 1.0) * line)
         owned = np.clip(2.0 * self.weights[:, 0] - 0.2, 0.0, 1.0)
         return total * owned
@@ -208,21 +217,36 @@ def _rounded(bends: np.ndarray, samples: int = 24) -> np.ndarray:
     return PchipInterpolator(knots, bends, axis=0)(np.linspace(0, len(bends) - 1, samples))
 
 
-def _distance_to_line(places: np.ndarray, line: np.ndarray) -> np.ndarray:
-    """Distance of (N, 2) places to a row of (K, 2) points joined by segments."""
-    nearest = np.full(len(places), np.inf)
-    for start, end in pairwise(line):
-        nearest = np.minimum(nearest, _to_segment(places, start, end)[0])
-    return nearest
+def _drawn(places: np.ndarray, line: np.ndarray, width: float) -> np.ndarray:
+    """A line with soft borders: 1 on it, exp(-1) at `width` from it: (N,).
+
+    Args:
+        places: (N, 2).
+        line: (K, 2) points joined by segments.
+        width: in the unit of both.
+    """
+    reach = width * np.sqrt(_LOST)
+    low, high = line.min(axis=0) - reach, line.max(axis=0) + reach
+    found = np.zeros(len(places))
+    rows = np.flatnonzero(((places > low) & (places < high)).all(axis=1))
+    for first in range(0, len(rows), _BLOCK):
+        block = rows[first : first + _BLOCK]
+        x, y = places[block].T.copy()
+        nearest = np.full(len(block), np.inf)
+        for (x0, y0), (x1, y1) in pairwise(line):
+            dx, dy = x1 - x0, y1 - y0
+            along = ((x - x0) * dx + (y - y0) * dy) / max(dx * dx + dy * dy, 1e-18)
+            along = np.clip(along, 0.0, 1.0)
+            off_x, off_y = x - (x0 + along * dx), y - (y0 + along * dy)
+            nearest = np.minimum(nearest, off_x * off_x + off_y * off_y)
+        found[block] = np.exp(-nearest / width**2)
+    return found
 
 
 def _to_segment(
-    places: np.ndarray, start: np.ndarray, end: np.ndarray, flat: int | None = None
+    places: np.ndarray, start: np.ndarray, end: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Distance to a segment, and how far along it; `flat` names an axis that does not count."""
-    if flat is not None:
-        keep = [axis for axis in range(places.shape[1]) if axis != flat]
-        places, start, end = places[:, keep], start[keep], end[keep]
+    """Distance of (N, D) places to a segment, and how far along it: (N,) each."""
     direction = end - start
     through = (places - start) @ direction / max(float(direction @ direction), 1e-18)
     nearest = start + np.clip(through, 0.0, 1.0)[:, None] * direction
