@@ -8,6 +8,7 @@ import torch
 
 from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Avatar, Budget, Report
+from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Guard, batches, repeatable, spent
 from wildghand.plain.hooks import Batch, Recipe
 
@@ -33,11 +34,10 @@ def run_fit(recipe: Recipe[Any], budget: Budget, report: Report) -> Avatar:
     settings, frames, device = recipe.settings, recipe.material.frames, recipe.material.device
     steps = settings.steps if budget.steps is None else budget.steps
     parameters = recipe.parameters()
-    optimizer = torch.optim.Adam(
+    optimizer = ClippedAdam(
         [{"params": [tensor.requires_grad_()], "lr": 0.0} for tensor in parameters.values()],
-        eps=_EPSILON,
         betas=_BETAS,
-        fused=True,
+        epsilon=_EPSILON,
     )
     order = batches(len(frames), settings.batch, recipe.material.seed)
     images, masks = frames.images_on(device), frames.masks_on(device)
@@ -57,9 +57,9 @@ def run_fit(recipe: Recipe[Any], budget: Budget, report: Report) -> Avatar:
                 notice(f"The fit diverged at step {step}; the state of step {guard.step} is kept.")
                 step = guard.step
                 break
-            optimizer.zero_grad()
+            optimizer.clear()
             loss.backward()
-            optimizer.step()
+            optimizer.take_step(loss)
             recipe.after_step(batch)
             step += 1
             report.progress(step, steps)
