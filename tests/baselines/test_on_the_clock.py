@@ -1,0 +1,62 @@
+"""Equal seconds: no baseline spends its own on an import that WildGHand has left out."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+from painted import FRAMES, QUICK
+
+from hwp_bench.capture import Capture
+from hwp_bench.capture.splits import contiguous_split
+from hwp_bench.methods.contract import Budget, RunSettings
+from hwp_bench.methods.request import write_request
+
+BASELINES = Path(__file__).resolve().parents[2] / "baselines"
+#: Fits with every baseline in one process, and prints what each has imported meanwhile.
+PROGRAM = """
+import json, sys
+from pathlib import Path
+from painted import SilentReport
+from hwp_bench.methods.contract import Budget
+from hwp_bench.methods.manifest import read_manifest
+from hwp_bench.methods.request import open_request
+from hwp_bench.run.worker import load_entry
+
+training = open_request(Path(sys.argv[1]))
+found = {}
+for folder in map(Path, sys.argv[2:]):
+    settings = {**read_manifest(folder).presets["default"], "device": "cpu"}
+    if "gaussians" in settings:
+        settings["gaussians"] = 400
+    method = load_entry(folder, read_manifest(folder).entry)(settings, 0)
+    before = set(sys.modules)
+    method.fit(training, Budget(steps=1), SilentReport())
+    found[folder.name] = sorted({name.split(".")[1] for name in set(sys.modules) - before
+                                 if name.startswith("torch.")})
+print(json.dumps(found))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("machine_code")
+def test_no_baseline_imports_parts_of_torch_within_its_fit(
+    make_painted: Any, tmp_path: Path
+) -> None:
+    """Torch's compiler takes one to two seconds, of a budget of 16."""
+    capture: Capture = make_painted("right")
+    split = contiguous_split(capture.info.id, FRAMES)
+    run = RunSettings(dict(QUICK), 0, Budget())
+    request = write_request(tmp_path / "request", capture, split, run)
+    methods = sorted(str(path.parent) for path in BASELINES.glob("*/method.toml"))
+    assert len(methods) >= 11
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, str(request), *methods],
+        capture_output=True, text=True, check=False, cwd=Path(__file__).resolve().parents[1],
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == {Path(method).name: [] for method in methods}
