@@ -17,7 +17,7 @@ def test_results_come_in_order(cores: int, monkeypatch: pytest.MonkeyPatch) -> N
 
     def work(frame: int) -> int:
         if frame == 0 and cores > 1:
-            assert later.wait()  # the first result is ready after the second
+            assert later.wait(300.0)  # the first result is ready after the second
         later.set()
         return frame * frame
 
