@@ -103,7 +103,7 @@ def test_an_empty_folder_is_filled_and_a_link_stays_one(tmp_path: Path) -> None:
 
 def test_many_makers_of_one_folder_end_with_one_that_is_whole(tmp_path: Path) -> None:
     """Oracle: without `overwrite` exactly one maker succeeds, and its content is what stays."""
-    # Threads that wait for ever would outlast the suite's time limit, which ends the main one alone.
+    # Threads that wait for ever would outlast the time limit of a test, which ends the main one.
     target, start = tmp_path / "made", threading.Barrier(8, timeout=300.0)
 
     def make(number: int) -> bool:
