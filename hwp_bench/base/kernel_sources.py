@@ -76,16 +76,24 @@ def source_of(module: str, root: Path = PACKAGES) -> Path | None:
 def _imports(path: Path, module: str, root: Path) -> Iterator[str]:
     """The toolkit's modules that a file imports, wherever in it."""
     package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for node in ast.walk(ast.parse(path.read_bytes())):
+    for source, member in _imported_names(path.read_bytes(), package):
+        # A name is a module of a package, or stands in the file itself.
+        inner = f"{source}.{member}"
+        yield inner if member and source_of(inner, root) else source
+
+
+@functools.cache
+def _imported_names(text: bytes, package: str) -> tuple[tuple[str, str], ...]:
+    """The toolkit's modules that a file of a package imports, each with a name in it or with none.
+
+    Parsing takes most of the time, and many kernels import the same files.
+    """
+    found = []
+    for node in ast.walk(ast.parse(text)):
         if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
+            found += [(alias.name, "") for alias in node.names]
         elif isinstance(node, ast.ImportFrom):
             above = package.split(".")[: len(package.split(".")) - node.level + 1]
             parts = [*(above if node.level else []), *([node.module] if node.module else [])]
-            source = ".".join(parts)
-            members = [f"{source}.{alias.name}" for alias in node.names]
-            # A name is a module of a package, or stands in the file itself.
-            names = [name if source_of(name, root) else source for name in members]
-        else:
-            continue
-        yield from (name for name in names if name.partition(".")[0] in OURS)
+            found += [(".".join(parts), alias.name) for alias in node.names]
+    return tuple(pair for pair in found if pair[0].partition(".")[0] in OURS)
