@@ -193,15 +193,27 @@ def run_in_world(choose: Callable[[], torch.device], work: Callable[[World], int
         world = join(choose())
         status = work(world)
     except (Exception, KeyboardInterrupt) as error:
-        # Before the processes have met, they fail alike: the first of them speaks for all.
-        first = os.environ.get("WORLD_SIZE", "1") == "1" or os.environ.get("RANK", "0") == "0"
-        if first if world is None else world.speaks_first():
+        speaks = False
+        # `torchrun` stops all others as soon as one has ended: those have nothing to say either.
+        with contextlib.suppress(KeyboardInterrupt):
+            speaks = _speaks_first(world)
+            if not speaks:
+                _leave()
+        if speaks:
             raise
         stopped = 130 if isinstance(error, KeyboardInterrupt) else 1
         return error.exit_status if isinstance(error, HwpError) else stopped
     finally:
         _leave()
     return status
+
+
+def _speaks_first(world: World | None) -> bool:
+    """Whether this process says why all of them fail; None before they have met."""
+    if world is not None:
+        return world.speaks_first()
+    # They fail alike: the first of them speaks for all.
+    return os.environ.get("WORLD_SIZE", "1") == "1" or os.environ.get("RANK", "0") == "0"
 
 
 def join(device: torch.device) -> World:

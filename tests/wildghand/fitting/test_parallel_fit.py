@@ -284,6 +284,29 @@ def test_the_first_to_fail_speaks_and_the_others_are_silent(
     assert run_in_world(lambda: CPU, fail) == status
 
 
+def test_one_that_is_stopped_while_it_ends_silently_stays_silent(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """As `torchrun` does to all others as soon as the first one has ended."""
+    store = torch.distributed.HashStore()
+    world = World(1, 2, "cpu", store)
+    monkeypatch.setattr(parallel, "join", lambda device: world)
+    assert world.speaks_first()
+    left = []
+
+    def leave() -> None:
+        left.append(len(left))
+        if len(left) == 1:
+            raise KeyboardInterrupt
+
+    def fail(world: World) -> int:
+        raise UsageError("x")
+
+    monkeypatch.setattr(parallel, "_leave", leave)
+    assert run_in_world(lambda: CPU, fail) == 2
+    assert len(left) == 2
+
+
 def test_an_evaluation_is_one_process_whatever_torchrun_says(
     make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:

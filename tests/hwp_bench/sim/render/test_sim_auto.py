@@ -146,7 +146,9 @@ def test_sharpening_steepens_and_keeps_the_mean(seed: int, strength: float) -> N
     image = np.clip(np.round(128.0 + noise), 0, 255).astype(np.uint8)
     found = sharpened(image, strength).astype(float)
     assert abs(found.mean() - image.mean()) < 1.0
-    assert np.square(np.diff(found, axis=0)).sum() > np.square(np.diff(image * 1.0, axis=0)).sum()
+    steepness = [np.square(np.diff(pixels * 1.0, axis=0)).sum() for pixels in (image, found)]
+    # A weak strength may change less than half a level anywhere, which rounds to nothing.
+    assert steepness[1] > steepness[0] or (strength < 0.5 and (found == image).all())
     # Only the luma moves: all channels of a pixel by the same.
     change = found - image
     assert np.ptp(change, axis=2).max() <= 1.0
