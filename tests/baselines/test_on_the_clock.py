@@ -6,15 +6,9 @@ import json
 import subprocess
 import sys
 from pathlib import Path
-from typing import Any
 
 import pytest
-from painted import FRAMES, QUICK
-
-from hwp_bench.capture import Capture
-from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.methods.contract import Budget, RunSettings
-from hwp_bench.methods.request import write_request
+from painted import TrainingMaker
 
 BASELINES = Path(__file__).resolve().parents[2] / "baselines"
 #: Fits with every baseline in one process, and prints what each has imported meanwhile.
@@ -45,13 +39,10 @@ print(json.dumps(found))
 @pytest.mark.slow
 @pytest.mark.usefixtures("machine_code")
 def test_no_baseline_imports_parts_of_torch_within_its_fit(
-    make_painted: Any, tmp_path: Path
+    make_training: TrainingMaker,
 ) -> None:
     """Torch's compiler takes one to two seconds, of a budget of 16."""
-    capture: Capture = make_painted("right")
-    split = contiguous_split(capture.info.id, FRAMES)
-    run = RunSettings(dict(QUICK), 0, Budget())
-    request = write_request(tmp_path / "request", capture, split, run)
+    request = make_training().root
     methods = sorted(str(path.parent) for path in BASELINES.glob("*/method.toml"))
     assert len(methods) >= 11
     done = subprocess.run(
