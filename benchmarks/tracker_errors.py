@@ -34,10 +34,11 @@ from benchmarks.tracker_clips import (
 from hwp_bench.capture import open_capture
 from hwp_bench.hands import load_template
 from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.posed_skeleton import hand_extent, posed_skeleton, rest_skeleton, turned
 from hwp_bench.hands.skeleton import JOINT_NAMES
 from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES
-from hwp_bench.sim.produce.tracker import GAIN, hand_extent, parameter_errors, turned
-from hwp_bench.sim.produce.tracker_geometry import curl, posed_skeleton, rest_skeleton
+from hwp_bench.sim.produce.tracker import GAIN, parameter_errors
+from hwp_bench.sim.produce.tracker_geometry import curl
 from hwp_bench.sim.produce.tracker_noise import landmark_noise
 
 #: Distances in time at which errors are correlated, s.

@@ -10,8 +10,7 @@ from benchmarks.tracker_clips import RealClip, landmark_errors
 from benchmarks.tracker_errors import correlation, gathered, habit, main, pose_error
 from hwp_bench.hands import load_template
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.sim.produce.tracker import turned
-from hwp_bench.sim.produce.tracker_geometry import posed_skeleton, rest_skeleton
+from hwp_bench.hands.posed_skeleton import posed_skeleton, rest_skeleton, turned
 
 
 def _hand(frames: int) -> HandParameters:

@@ -259,6 +259,16 @@ class TrainingCapture:
         fewer._train = self._train[picks]
         return fewer
 
+    def with_hands(self, hands: Mapping[str, HandParameters]) -> TrainingCapture:
+        """Return the same capture with other hand parameters of every frame.
+
+        Args:
+            hands: by side.
+        """
+        other = copy.copy(self)
+        other.hands = dict(hands)
+        return other
+
     @property
     def validation(self) -> np.ndarray:
         """Indices of the validation frames."""

@@ -211,6 +211,22 @@ class WildGHandAvatar(HandAvatar):
         """The Gaussians in the rest pose of the hand model, one hand after the other."""
         return self.pose(self.rest_poses())
 
+    def posed(self, hands: Mapping[str, HandPose]) -> PosedHands:
+        """Return the hands as tensors; one in a pose of the clip in that which the fit believes.
+
+        Raises:
+            UsageError: no hand, or one that was not fitted.
+        """
+        return super().posed(self.believed(hands))
+
+    def believed(self, hands: Mapping[str, HandPose]) -> dict[str, HandPose]:
+        """The hands; one in a pose that the clip gave is in the pose that the fit believes in.
+
+        `render` and `pose` do this by themselves.
+        """
+        poses = self.model.clip_poses
+        return dict(hands) if poses is None else poses.corrected(hands)
+
     def rest_poses(self) -> dict[str, HandPose]:
         """Return every hand at rest; two hands lie side by side."""
         hands = {}

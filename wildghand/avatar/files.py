@@ -29,6 +29,7 @@ from wildghand.evidence import ColorChanges, Evidence, rename_former
 from wildghand.light import KnownLight
 from wildghand.model.assemble import make_model
 from wildghand.model.settings import read_stored, read_version_1
+from wildghand.poses import ClipPoses
 from wildghand.shadows import CastLight
 from wildghand.subject import SubjectShape
 
@@ -138,7 +139,8 @@ def load_avatar(
         )
         light = KnownLight.from_tensors(tensors, str(file))
         cast = CastLight.from_tensors(tensors, str(file))
-        for found in (light, cast):
+        poses = ClipPoses.from_tensors(tensors, tuple(value.sides), str(file))
+        for found in (light, cast, poses):
             if found is not None:
                 model.keep(found)
         counts = {side: len(rig) for side, rig in model.rigs.items()}

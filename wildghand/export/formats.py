@@ -160,6 +160,6 @@ def _write_mesh(
     if capture is None:
         motion = closing_motion(layouts, rest)
     else:
-        motion = capture_motion(capture, tuple(rest))
+        motion = capture_motion(avatar, capture, tuple(rest))
     atomic_write(path, skinned_glb_bytes(skinned, motion, _GENERATOR))
     return {"hands": len(skinned), "keys": len(motion.times)}

@@ -14,6 +14,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.articulation import joint_axes, pose_from_joint_angles
 from hwp_bench.methods.contract import HandPose
+from wildghand.avatar import WildGHandAvatar
 
 #: Length and rate of the motion that needs no capture.
 SECONDS, FPS = 2.0, 24.0
@@ -35,10 +36,11 @@ class Motion:
     down: bool
 
 
-def capture_motion(capture: Capture, sides: tuple[str, ...]) -> Motion:
+def capture_motion(avatar: WildGHandAvatar, capture: Capture, sides: tuple[str, ...]) -> Motion:
     """Return the motion of a capture; frames in which a hand was not found are left out.
 
     Args:
+        avatar: what moves, in the poses that it believes in.
         capture: whose hand parameters are taken.
         sides: the hands.
 
@@ -49,10 +51,14 @@ def capture_motion(capture: Capture, sides: tuple[str, ...]) -> Motion:
     kept = np.flatnonzero(np.all([hand.valid for hand in hands.values()], axis=0))
     if not len(kept):
         raise UsageError("has no frame in which all hands were found", where=capture.root)
+    frames = [
+        avatar.believed({side: hand.at(frame, side) for side, hand in hands.items()})
+        for frame in kept.tolist()
+    ]
     return Motion(
         times=(kept - kept[0]) / capture.info.fps,
-        poses={side: hand.pose[kept] for side, hand in hands.items()},
-        transls={side: hand.transl[kept] for side, hand in hands.items()},
+        poses={side: np.stack([frame[side].pose for frame in frames]) for side in sides},
+        transls={side: np.stack([frame[side].transl for frame in frames]) for side in sides},
         down=True,
     )
 

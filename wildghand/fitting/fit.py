@@ -19,6 +19,7 @@ from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.evidence import shown_frames, weigh_evidence
 from wildghand.fitting.averaging import StepAverage
+from wildghand.fitting.believed_poses import in_believed_poses
 from wildghand.fitting.borrowed_colors import BorrowedColors
 from wildghand.fitting.cast_shadows import cast_shadows, shadows_in
 from wildghand.fitting.closing import MOST_OF_BUDGET, LightFit, weight_masks
@@ -68,6 +69,8 @@ class Fit:
         device: torch.device,
         world: World = SINGLE_PROCESS,
     ) -> None:
+        templates = {side: training.template(side) for side in training.sides}
+        training, clip_poses = in_believed_poses(training, templates, settings.poses)
         self.training = training
         self.settings = settings
         self.seed = seed
@@ -75,12 +78,13 @@ class Fit:
         self.world = world
         self.frames = load_frames(training)
         self.mean_color = self.frames.mean_color()
-        templates = {side: training.template(side) for side in training.sides}
         judges = judging_frames(training, settings)
         subject = subject_of(training, self.frames, templates, settings, judges)
         self.model = make_model(
             templates, settings, self.mean_color, len(self.frames), seed, device, subject
         )
+        if clip_poses is not None:
+            self.model.keep(clip_poses)
         self.source = {"capture": training.id}
         self.source |= start_from_prior(self.model, settings, training.hand_model)
         self.clip = TrainingClip(training, self.frames.indices, self.model.rigs, device)

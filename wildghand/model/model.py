@@ -22,6 +22,7 @@ from wildghand.model.rasterize_hands import rasterize_hands
 from wildghand.model.rendered import HandState, RenderedFrames, largest
 from wildghand.model.wrist import WristWall
 from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
+from wildghand.poses import ClipPoses
 from wildghand.shadows import CastLight, HandShadows, ShadowSettings
 from wildghand.shadows.hand_shadows import Hand, Hands
 from wildghand.subject import SubjectShape
@@ -44,6 +45,7 @@ class WildGHandModel(nn.Module):
         log_gains: (R, 3) log of the gain on the sRGB image of each frame.
         light: by which unknown normals are drawn in free poses; None: as the network says.
         evidence: by which free poses are drawn; None: as they were learnt.
+        clip_poses: what is believed of the poses that the clip gives; None: what it gives.
         color_changes: of places that few frames have shown, in free poses; None: none.
         shadows: the hands in the light that casts shadows; None: the network alone says how bright
             skin is.
@@ -70,6 +72,7 @@ class WildGHandModel(nn.Module):
         self.light: KnownLight | None = None
         self.evidence: Evidence | None = None
         self.color_changes: ColorChanges | None = None
+        self.clip_poses: ClipPoses | None = None
         self._walls: dict[str, WristWall] = {}
         self.rigs = dict(rigs)
         self.network = network
@@ -84,7 +87,9 @@ class WildGHandModel(nn.Module):
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
 
-    def keep(self, found: SubjectShape | KnownLight | Evidence | ColorChanges | CastLight) -> None:
+    def keep(
+        self, found: SubjectShape | ClipPoses | KnownLight | Evidence | ColorChanges | CastLight
+    ) -> None:
         """Keep what was fitted next to the network, so that it is saved with it.
 
         Args:
@@ -100,6 +105,8 @@ class WildGHandModel(nn.Module):
             self.evidence = Evidence.from_tensors(dict(self.named_buffers()), counts, "evidence")
             walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
             self._walls = {side: wall for side, wall in walls.items() if wall is not None}
+        if isinstance(found, ClipPoses):
+            self.clip_poses = found
         if isinstance(found, ColorChanges):
             self.color_changes = found
         if isinstance(found, CastLight):

@@ -23,6 +23,7 @@ from wildghand.model.former_settings import current_names
 from wildghand.model.terms import PAPER_TERMS, TermWeights
 from wildghand.network.settings import NetworkSettings, network_settings
 from wildghand.pao.pao import PAPER_PAO, PaoSettings
+from wildghand.poses.settings import PoseSettings
 from wildghand.prepass import PrepassSettings
 from wildghand.shadows import ShadowSettings
 from wildghand.subject import SubjectSettings
@@ -125,6 +126,8 @@ class WildGHandSettings:
     pao: PaoSettings = field(default_factory=PaoSettings)
     #: Component: heads iii and iv.
     heads: HeadSettings = field(default_factory=HeadSettings)
+    #: Addition: given poses are corrected by what the clip's poses have in common.
+    poses: PoseSettings = field(default_factory=PoseSettings)
     #: Addition: the template is bent to the person before the fit.
     subject: SubjectSettings = field(default_factory=SubjectSettings)
     #: Addition: a light for normals that no frame has shown.
@@ -168,6 +171,7 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
             "spare_clean": False,
         },
         "start_colors": False,
+        "poses": {"enabled": False},
         "subject": {"enabled": False},
         "light": {"enabled": False},
         "shadows": {"enabled": False},
@@ -205,6 +209,7 @@ MODES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
 _PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
     {
         "dpd": {"gains": False},
+        "poses": {"enabled": False},
         "subject": {"enabled": False},
         "light": {"enabled": False},
         "shadows": {"enabled": False},
@@ -223,6 +228,7 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
         "start_colors": False,
         "dpd": {"rank": 0},
         "pao": {"errors": "median", "mismatch": 0.0, "spare_clean": False},
+        "poses": {"enabled": False},
         "subject": {"enabled": False},
         "light": {"enabled": False},
         "shadows": {"enabled": False},

@@ -47,7 +47,7 @@ def fidelity(
     errors: dict[str, list[float]] = {"baked": [], "joints_only": []}
     for frame in frames:
         poses, camera = capture.hand_poses(frame), capture.camera(frame)
-        poses = {side: poses[side] for side in avatar.sides}
+        poses = avatar.believed({side: poses[side] for side in avatar.sides})
         truth = avatar.render(poses, camera)
         seen = np.argwhere(truth[..., 3] > 0.5)
         if not len(seen):

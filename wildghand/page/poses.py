@@ -65,10 +65,10 @@ def sample_poses(
         held_out = [fitted[pick] for pick in _spread(len(fitted), _HELD_OUT + 2)[1:-1]]
         rest = [frame for frame in fitted if frame not in held_out] or fitted
         drawn = [rest[pick] for pick in _spread(len(rest), settings.clip_samples)]
-        start = capture.hand_poses(fitted[0])
+        start = avatar.believed(capture.hand_poses(fitted[0]))
         clip, motion = {}, {}
         for side in avatar.sides:
-            poses = {frame: capture.hand_poses(frame)[side] for frame in fitted}
+            poses = {f: avatar.believed(capture.hand_poses(f))[side] for f in fitted}
             clip[side] = np.stack([start[side].pose, *(poses[frame].pose for frame in drawn)])
             motion[side] = np.stack(
                 [np.append(poses[frame].pose.ravel(), poses[frame].transl) for frame in frames]

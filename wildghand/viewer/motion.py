@@ -24,15 +24,16 @@ class Motion:
     """
 
     def __init__(self, avatar: WildGHandAvatar, capture: Capture) -> None:
-        self._capture, self._sides = capture, shown_sides(avatar, capture)
+        self._avatar, self._capture = avatar, capture
+        self._sides = shown_sides(avatar, capture)
         self.fps = capture.info.fps
 
     def __len__(self) -> int:
         return self._capture.info.frame_count
 
     def hands(self, frame: int) -> dict[str, HandPose]:
-        """Return the hands of a frame, by side."""
-        poses = self._capture.hand_poses(frame)
+        """Return the hands of a frame, by side, in the poses that the avatar believes in."""
+        poses = self._avatar.believed(self._capture.hand_poses(frame))
         return {side: poses[side] for side in self._sides}
 
     def camera(self, frame: int) -> Camera:

@@ -13,17 +13,18 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.produce.tracker_geometry import (
+from hwp_bench.hands.posed_skeleton import (
     DEGREES,
     PosedSkeleton,
     RestSkeleton,
-    curl,
-    edge_on,
+    hand_extent,
     movement,
     posed_skeleton,
     rest_skeleton,
+    turned,
 )
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.produce.tracker_geometry import curl, edge_on
 from hwp_bench.sim.produce.tracker_noise import (
     IMAGE_SPREAD,
     WORLD_AXES,
@@ -119,31 +120,6 @@ def parameter_errors(
         some = PosedSkeleton(posed.turns[rows], posed.joints[rows], posed.landmarks[rows])
         found[rows] = _solved(some, grown[rows], extent, noise[rows])
     return ParameterErrors(found[:, :48].reshape(-1, 16, 3), found[:, 48:])
-
-
-def hand_extent(landmarks: np.ndarray) -> float:
-    """Median over frames of the larger side of the landmarks' box, in slopes of the camera.
-
-    Args:
-        landmarks: (F, 21, 3) m, camera axes.
-    """
-    slopes = landmarks[..., :2] / landmarks[..., 2:]
-    return float(np.median((slopes.max(axis=1) - slopes.min(axis=1)).max(axis=1)))
-
-
-def turned(pose: np.ndarray, turn: np.ndarray) -> np.ndarray:
-    """Rotation vectors (F, 16, 3) followed by small turns about their own axes.
-
-    Of the two vectors of a rotation the one near `pose` is taken, so that nothing jumps.
-    """
-    from scipy.spatial.transform import Rotation
-
-    before = Rotation.from_rotvec(pose.reshape(-1, 3))
-    vectors = (before * Rotation.from_rotvec(turn.reshape(-1, 3))).as_rotvec().reshape(pose.shape)
-    angles = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    other = vectors * (1.0 - 2.0 * np.pi / np.maximum(angles, 1e-9))
-    nearer = np.linalg.norm(other - pose, axis=-1) < np.linalg.norm(vectors - pose, axis=-1)
-    return np.where(nearer[..., None], other, vectors)
 
 
 def _solved(

@@ -307,6 +307,7 @@ def test_stored_settings_of_version_1_say_what_ran(
     stored = stored | {"weights": stored["weights"] | changes.pop("weights", {}), **changes}
     later = {"dpd.rank": 0, "subject.enabled": False, "light.enabled": False}
     later |= {"evidence.enabled": False, "evidence.validated": False, "start_colors": False}
+    later |= {"poses.enabled": False}
     later |= {"shadows.enabled": False, "evidence.color_share": 0.0, "evidence.fill_share": 0.0}
     later |= {"schedule.root_steps": 0.0, "schedule.average_share": 0.0}
     expected = read_settings({"pao.errors": "batch", **today, **later})

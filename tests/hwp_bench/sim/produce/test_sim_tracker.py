@@ -16,18 +16,18 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template, pose_hand
-from hwp_bench.sim.effects.plan import plan
-from hwp_bench.sim.produce.estimates import estimate_hands
-from hwp_bench.sim.produce.production import true_hands
-from hwp_bench.sim.produce.tracker import ParameterErrors, parameter_errors, turned
-from hwp_bench.sim.produce.tracker_geometry import (
+from hwp_bench.hands.posed_skeleton import (
     RestSkeleton,
-    curl,
-    edge_on,
     movement,
     posed_skeleton,
     rest_skeleton,
+    turned,
 )
+from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.produce.estimates import estimate_hands
+from hwp_bench.sim.produce.production import true_hands
+from hwp_bench.sim.produce.tracker import ParameterErrors, parameter_errors
+from hwp_bench.sim.produce.tracker_geometry import curl, edge_on
 from hwp_bench.sim.produce.tracker_noise import HABIT, MEMORY, growth, landmark_noise, wandering
 from hwp_bench.sim.scene.motion import hand_parameters, moment_of_key
 from hwp_bench.sim.scene.optics import focus_point

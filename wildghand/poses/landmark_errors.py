@@ -1,0 +1,75 @@
+"""The form of a pose's errors: which joints err together, where an estimator goes by landmarks."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from hwp_bench.hands import HandParameters, HandTemplate
+from hwp_bench.hands.posed_skeleton import (
+    DEGREES,
+    PosedSkeleton,
+    hand_extent,
+    movement,
+    posed_skeleton,
+    rest_skeleton,
+)
+from wildghand.poses.settings import PoseSettings
+
+
+def pose_covariances(
+    template: HandTemplate, hand: HandParameters, viewmats: np.ndarray, settings: PoseSettings
+) -> np.ndarray:
+    """Covariance of the errors of each frame's pose, up to a factor that all frames share.
+
+    A pose that is fitted to 21 landmarks, in the image and in space, answers to their errors to
+    first order by least squares next to what the estimator expects. So a joint errs where landmarks
+    say little of it, and the joints of a finger make up for each other.
+
+    Args:
+        template: of the hand.
+        hand: given parameters of F frames.
+        viewmats: (F, 4, 4) world to camera.
+        settings: errors of landmarks, and what is expected.
+
+    Returns:
+        (F, 51, 51): 16 joints about their own axes, rad, then the place in camera axes, m.
+    """
+    rest = rest_skeleton(template, hand.betas)
+    posed = posed_skeleton(rest, hand.pose, hand.transl).seen_by(viewmats)
+    rows = _rows(posed, settings)
+    told = np.einsum("fnk,fnl->fkl", rows, rows)
+    turn, shift = settings.expected_turn, settings.expected_shift
+    expected = np.repeat([turn, shift], [DEGREES - 3, 3]) ** -2.0
+    answer = np.linalg.inv(told + np.diag(expected))
+    return np.asarray(answer @ told @ answer)
+
+
+def _rows(posed: PosedSkeleton, settings: PoseSettings) -> np.ndarray:
+    """How landmarks move with the parameters, in units of their errors: (F, 21 x 5, 51)."""
+    moves, points = movement(posed), posed.landmarks
+    depth = points[..., 2, None, None]
+    slopes = points[..., :2, None] / depth
+    in_image = (moves[..., :2, :] - slopes * moves[..., 2:, :]) / depth
+    in_space = moves - moves.mean(axis=1, keepdims=True)
+    spread = settings.image_error * hand_extent(points)
+    rows = np.concatenate([in_image / spread, in_space / settings.space_error], axis=2)
+    return rows.reshape(len(points), -1, DEGREES)
+
+
+def vector_changes(pose: np.ndarray) -> np.ndarray:
+    """How rotation vectors change with small turns about the joints' own axes.
+
+    Args:
+        pose: (..., 3) axis-angle, rad, shorter than a full turn.
+
+    Returns:
+        (..., 3, 3): the vector of R(v) exp(d) is v plus this times d, to first order.
+
+    Source: the inverse of the right Jacobian of SO(3), Sola et al. 2018, eq. 144.
+    """
+    angle = np.maximum(np.linalg.norm(pose, axis=-1), 1e-4)[..., None, None]
+    cross = np.cross(np.eye(3), pose[..., None, :])
+    half = 0.5 * angle
+    return np.asarray(
+        np.eye(3) + 0.5 * cross + (1.0 - half / np.tan(half)) / angle**2 * (cross @ cross)
+    )
