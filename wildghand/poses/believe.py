@@ -10,7 +10,7 @@ import numpy as np
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
 from hwp_bench.hands.posed_skeleton import turned
-from wildghand.poses.landmark_errors import pose_covariances, vector_changes
+from wildghand.poses.landmark_errors import in_front, pose_covariances, vector_changes
 from wildghand.poses.settings import PoseSettings
 from wildghand.poses.spread import error_size, spread_of
 
@@ -52,13 +52,14 @@ def believed_hands(
 def _believed(
     template: HandTemplate, hand: HandParameters, viewmats: np.ndarray, settings: PoseSettings
 ) -> HandParameters:
-    valid = np.flatnonzero(hand.valid)
+    valid = np.flatnonzero(hand.valid & in_front(template, hand, viewmats))
     some = valid
     if len(valid) > settings.frames:
         some = valid[np.linspace(0, len(valid) - 1, settings.frames).round().astype(int)]
     if len(some) <= _FINGERS.stop - _FINGERS.start:
         return hand
-    poses, errors = _fingers(template, _rows(hand, some), viewmats[some], settings)
+    told = _rows(hand, some)
+    poses, errors = _in_vectors(told, pose_covariances(template, told, viewmats[some], settings))
     size = error_size(poses, errors)
     mean_square = np.trace(errors, axis1=1, axis2=2).mean() / errors.shape[1]
     if size * np.sqrt(mean_square) < settings.least_error:
@@ -84,24 +85,31 @@ def _rows(hand: HandParameters, rows: np.ndarray) -> HandParameters:
     return replace(hand, pose=hand.pose[rows], transl=hand.transl[rows], valid=hand.valid[rows])
 
 
-def _fingers(
-    template: HandTemplate, hand: HandParameters, viewmats: np.ndarray, settings: PoseSettings
-) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation vectors of the fingers (F, 45), and covariances of their errors (F, 45, 45)."""
-    return _in_vectors(hand, pose_covariances(template, hand, viewmats, settings))
-
-
 def _in_vectors(hand: HandParameters, together: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The same of errors (F, 51, 51) about the joints' own axes."""
-    frames = len(hand.pose)
+    """Rotation vectors of the fingers (F, 45), and covariances of their errors (F, 45, 45).
+
+    Args:
+        hand: F frames.
+        together: (F, 51, 51) covariances about the joints' own axes.
+    """
+    frames, changes = len(hand.pose), _changes(hand)
     parts = together[:, _FINGERS, _FINGERS].reshape(frames, 15, 3, 15, 3)
-    changes = _changes(hand)
     errors = np.einsum("fiab,fibjc,fjdc->fiajd", changes, parts, changes, optimize=True)
-    return hand.pose[:, 1:].reshape(frames, 45), errors.reshape(frames, 45, 45)
+    return _shortest(hand).reshape(frames, 45), errors.reshape(frames, 45, 45)
 
 
 def _changes(hand: HandParameters) -> np.ndarray:
-    return vector_changes(hand.pose[:, 1:])
+    return vector_changes(_shortest(hand))
+
+
+def _shortest(hand: HandParameters) -> np.ndarray:
+    """(F, 15, 3) rad, the rotation vectors of the fingers without whole turns."""
+    from scipy.spatial.transform import Rotation
+
+    vectors = hand.pose[:, 1:]
+    return np.asarray(Rotation.from_rotvec(vectors.reshape(-1, 3)).as_rotvec()).reshape(
+        vectors.shape
+    )
 
 
 def _along(together: np.ndarray, turn: np.ndarray) -> np.ndarray:

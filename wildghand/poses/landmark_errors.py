@@ -15,6 +15,16 @@ from hwp_bench.hands.posed_skeleton import (
 )
 from wildghand.poses.settings import PoseSettings
 
+# A landmark nearer to the camera says nothing of where it lies in the image, m.
+_NEAREST = 0.01
+
+
+def in_front(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray) -> np.ndarray:
+    """(F,) bool: in which frames a camera sees all landmarks of a hand; see `pose_covariances`."""
+    rest = rest_skeleton(template, hand.betas)
+    posed = posed_skeleton(rest, hand.pose, hand.transl).seen_by(viewmats)
+    return np.asarray((posed.landmarks[..., 2] > _NEAREST).all(axis=1))
+
 
 def pose_covariances(
     template: HandTemplate, hand: HandParameters, viewmats: np.ndarray, settings: PoseSettings
@@ -27,7 +37,7 @@ def pose_covariances(
 
     Args:
         template: of the hand.
-        hand: given parameters of F frames.
+        hand: given parameters of F frames, in front of the cameras.
         viewmats: (F, 4, 4) world to camera.
         settings: errors of landmarks, and what is expected.
 
@@ -60,7 +70,7 @@ def vector_changes(pose: np.ndarray) -> np.ndarray:
     """How rotation vectors change with small turns about the joints' own axes.
 
     Args:
-        pose: (..., 3) axis-angle, rad, shorter than a full turn.
+        pose: (..., 3) axis-angle, rad, of at most half a turn.
 
     Returns:
         (..., 3, 3): the vector of R(v) exp(d) is v plus this times d, to first order.

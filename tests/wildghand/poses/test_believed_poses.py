@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
@@ -52,9 +52,9 @@ def _with_errors(truth: HandParameters, size: float, seed: int = 1) -> HandParam
 
 
 def _believed(hand: HandParameters, **changes: float) -> HandParameters:
-    settings = replace(PoseSettings(), **changes)  # type: ignore[arg-type]
+    chosen = replace(PoseSettings(), **changes)  # type: ignore[arg-type]
     cameras = _cameras(hand.frame_count)
-    return believed_hands({"right": TEMPLATE}, {"right": hand}, cameras, settings)["right"]
+    return believed_hands({"right": TEMPLATE}, {"right": hand}, cameras, chosen)["right"]
 
 
 def _turns(hand: HandParameters, truth: HandParameters) -> float:
@@ -132,6 +132,40 @@ def test_the_same_pose_in_every_frame_is_kept() -> None:
     assert _believed(still) is still
 
 
+def test_whole_turns_of_a_joint_change_nothing() -> None:
+    given = _with_errors(_truth(), 1.0)
+    pose = given.pose.copy()
+    length = np.linalg.norm(pose[::3, 4], axis=1, keepdims=True)
+    pose[::3, 4] *= 1.0 + 2.0 * np.pi / length
+    found, told = _believed(replace(given, pose=pose)), _believed(given)
+    assert _turns(found, told) < 1e-6
+
+
+def test_a_hand_behind_the_camera_is_left_alone() -> None:
+    given = _with_errors(_truth(), 1.0)
+    transl = given.transl.copy()
+    transl[3:6, 2] = [-0.4, -0.3, -0.2]
+    given = replace(given, transl=transl)
+    found = _believed(given)
+    np.testing.assert_array_equal(found.pose[3:6], given.pose[3:6])
+    assert np.isfinite(found.pose).all()
+    assert (found.pose[6:] != given.pose[6:]).any()
+    away = replace(given, transl=-np.abs(transl))
+    assert _believed(away) is away
+
+
+@pytest.mark.parametrize("size", [1e6, 2.0 * np.pi, np.pi])
+def test_poses_of_any_length_are_finite(size: float) -> None:
+    rng = np.random.default_rng(0)
+    pose = rng.normal(size=(FRAMES, 16, 3))
+    pose *= size / np.linalg.norm(pose, axis=-1, keepdims=True)
+    found = _believed(replace(_truth(), pose=pose))
+    assert np.isfinite(found.pose).all()
+    far = replace(_truth(), pose=pose, transl=np.tile([1e6, -1e6, 1e6], (FRAMES, 1)))
+    assert np.isfinite(_believed(far).pose).all()
+
+
+@settings(max_examples=20, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1))
 def test_corrected_poses_are_finite_and_near(seed: int) -> None:
     rng = np.random.default_rng(seed)
