@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 
@@ -28,12 +29,13 @@ class ClipPoses:
     given: Mapping[str, np.ndarray]
     believed: Mapping[str, np.ndarray]
 
-    def __post_init__(self) -> None:
-        rows = {
+    @functools.cached_property
+    def _rows(self) -> dict[str, dict[bytes, int]]:
+        """The row of each given pose, by side."""
+        return {
             side: {row.tobytes(): number for number, row in enumerate(poses)}
             for side, poses in self.given.items()
         }
-        object.__setattr__(self, "_rows", rows)
 
     @classmethod
     def of(
@@ -53,10 +55,8 @@ class ClipPoses:
         return {side: self._corrected(side, hand) for side, hand in hands.items()}
 
     def _corrected(self, side: str, hand: HandPose) -> HandPose:
-        rows: Mapping[str, Mapping[bytes, int]] = getattr(self, "_rows")  # noqa: B009
-        if side not in rows:
-            return hand
-        row = rows[side].get(_numbers(hand.pose[None], hand.transl[None])[0].tobytes())
+        numbers = _numbers(hand.pose[None], hand.transl[None])[0]
+        row = self._rows.get(side, {}).get(numbers.tobytes())
         if row is None:
             return hand
         numbers = self.believed[side][row].astype(np.float64)
@@ -82,7 +82,7 @@ class ClipPoses:
         found: dict[str, dict[str, np.ndarray]] = {_GIVEN: {}, _BELIEVED: {}}
         for side in sides:
             kept = [tensors.get(f"{name}{side}") for name in found]
-            if kept == [None, None]:
+            if all(tensor is None for tensor in kept):
                 continue
             shapes = {None if tensor is None else tuple(tensor.shape) for tensor in kept}
             if len(shapes) > 1 or not all(shape and shape[1:] == (_NUMBERS,) for shape in shapes):
