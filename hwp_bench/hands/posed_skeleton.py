@@ -94,6 +94,29 @@ def movement(posed: PosedSkeleton) -> np.ndarray:
     return moves
 
 
+def landmark_rows(
+    posed: PosedSkeleton, image_spread: np.ndarray | float, space_spread: np.ndarray | float
+) -> np.ndarray:
+    """How landmarks move with the parameters, in units of their errors: (F, 105, 51).
+
+    Args:
+        posed: in camera axes.
+        image_spread: error of each landmark in the image, slopes: (F, 21), or one for all.
+        space_spread: error of each in space against the hand's centre, m: (F, 21, 3), or one.
+
+    Returns:
+        For each landmark two rows of the image and three of space.
+    """
+    moves, points = movement(posed), posed.landmarks
+    depth = points[..., 2]
+    slopes = moves[..., :2, :] - points[..., :2, None] / depth[..., None, None] * moves[..., 2:, :]
+    in_image = slopes / depth[..., None, None]
+    in_space = moves - moves.mean(axis=1, keepdims=True)
+    image, space = np.asarray(image_spread), np.asarray(space_spread)
+    rows = [in_image / image[..., None, None], in_space / space[..., None]]
+    return np.concatenate(rows, axis=2).reshape(len(points), -1, DEGREES)
+
+
 def hand_extent(landmarks: np.ndarray) -> float:
     """Median over frames of the larger side of the landmarks' box, in slopes of the camera.
 

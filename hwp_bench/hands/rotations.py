@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 
 # Below this squared angle the series is exact to float64 and the closed form starts to cancel.
@@ -76,6 +77,21 @@ def cross_matrix(vector: torch.Tensor) -> torch.Tensor:
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(
         *vector.shape[:-1], 3, 3
     )
+
+
+def right_jacobian(vectors: np.ndarray) -> np.ndarray:
+    """Rate J of R(v + d) = R(v) exp(J d), for axis-angle vectors (..., 3): (..., 3, 3).
+
+    Source: Sola, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics",
+    2018, equation 143.
+    """
+    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
+    small = angle < 1e-4
+    safe = np.where(small, 1.0, angle)
+    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
+    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
+    cross = cross_matrix(torch.from_numpy(vectors)).numpy()
+    return np.asarray(np.eye(3) - first * cross + second * (cross @ cross))
 
 
 def matrix_to_axis_angle(matrix: torch.Tensor) -> torch.Tensor:

@@ -10,6 +10,7 @@ import numpy as np
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
 from hwp_bench.hands.posed_skeleton import turned
+from hwp_bench.hands.rotations import right_jacobian
 from wildghand.poses.landmark_errors import in_front, pose_covariances, vector_changes
 from wildghand.poses.settings import PoseSettings
 from wildghand.poses.spread import error_size, spread_of
@@ -72,7 +73,7 @@ def _believed(
         together = size**2 * pose_covariances(template, given, viewmats[rows], settings)
         poses, errors = _in_vectors(given, together)
         change = spread.expected(poses, errors) - poses
-        turn = np.linalg.solve(_changes(given), change.reshape(-1, 15, 3)[..., None])[..., 0]
+        turn = (right_jacobian(_shortest(given)) @ change.reshape(-1, 15, 3, 1))[..., 0]
         moved = _along(together, turn.reshape(len(rows), -1))
         turns = np.concatenate([moved[:, None, :3], turn], axis=1)
         pose[rows] = turned(given.pose, turns)
@@ -92,14 +93,11 @@ def _in_vectors(hand: HandParameters, together: np.ndarray) -> tuple[np.ndarray,
         hand: F frames.
         together: (F, 51, 51) covariances about the joints' own axes.
     """
-    frames, changes = len(hand.pose), _changes(hand)
+    vectors = _shortest(hand)
+    frames, changes = len(vectors), vector_changes(vectors)
     parts = together[:, _FINGERS, _FINGERS].reshape(frames, 15, 3, 15, 3)
     errors = np.einsum("fiab,fibjc,fjdc->fiajd", changes, parts, changes, optimize=True)
-    return _shortest(hand).reshape(frames, 45), errors.reshape(frames, 45, 45)
-
-
-def _changes(hand: HandParameters) -> np.ndarray:
-    return vector_changes(_shortest(hand))
+    return vectors.reshape(frames, 45), errors.reshape(frames, 45, 45)
 
 
 def _shortest(hand: HandParameters) -> np.ndarray:

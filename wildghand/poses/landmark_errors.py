@@ -7,12 +7,12 @@ import numpy as np
 from hwp_bench.hands import HandParameters, HandTemplate
 from hwp_bench.hands.posed_skeleton import (
     DEGREES,
-    PosedSkeleton,
     hand_extent,
-    movement,
+    landmark_rows,
     posed_skeleton,
     rest_skeleton,
 )
+from hwp_bench.hands.rotations import right_jacobian
 from wildghand.poses.settings import PoseSettings
 
 # A landmark nearer to the camera says nothing of where it lies in the image, m.
@@ -46,24 +46,13 @@ def pose_covariances(
     """
     rest = rest_skeleton(template, hand.betas)
     posed = posed_skeleton(rest, hand.pose, hand.transl).seen_by(viewmats)
-    rows = _rows(posed, settings)
+    image_error = settings.image_error * hand_extent(posed.landmarks)
+    rows = landmark_rows(posed, image_error, settings.space_error)
     told = np.einsum("fnk,fnl->fkl", rows, rows)
     turn, shift = settings.expected_turn, settings.expected_shift
     expected = np.repeat([turn, shift], [DEGREES - 3, 3]) ** -2.0
     answer = np.linalg.inv(told + np.diag(expected))
     return np.asarray(answer @ told @ answer)
-
-
-def _rows(posed: PosedSkeleton, settings: PoseSettings) -> np.ndarray:
-    """How landmarks move with the parameters, in units of their errors: (F, 21 x 5, 51)."""
-    moves, points = movement(posed), posed.landmarks
-    depth = points[..., 2, None, None]
-    slopes = points[..., :2, None] / depth
-    in_image = (moves[..., :2, :] - slopes * moves[..., 2:, :]) / depth
-    in_space = moves - moves.mean(axis=1, keepdims=True)
-    spread = settings.image_error * hand_extent(points)
-    rows = np.concatenate([in_image / spread, in_space / settings.space_error], axis=2)
-    return rows.reshape(len(points), -1, DEGREES)
 
 
 def vector_changes(pose: np.ndarray) -> np.ndarray:
@@ -77,9 +66,4 @@ def vector_changes(pose: np.ndarray) -> np.ndarray:
 
     Source: the inverse of the right Jacobian of SO(3), Sola et al. 2018, eq. 144.
     """
-    angle = np.maximum(np.linalg.norm(pose, axis=-1), 1e-4)[..., None, None]
-    cross = np.cross(np.eye(3), pose[..., None, :])
-    half = 0.5 * angle
-    return np.asarray(
-        np.eye(3) + 0.5 * cross + (1.0 - half / np.tan(half)) / angle**2 * (cross @ cross)
-    )
+    return np.asarray(np.linalg.inv(right_jacobian(pose)))

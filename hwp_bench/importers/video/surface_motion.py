@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from hwp_bench.hands.rotations import cross_matrix
+from hwp_bench.hands.rotations import cross_matrix, right_jacobian
 from hwp_bench.hands.skeleton import moved_joints
 from hwp_bench.importers.video.clip_model import ANCHOR_UNIT, ClipModel, ClipVariables
 
@@ -95,21 +95,6 @@ class SurfaceMotion:
             turns = Rotation.from_rotvec(self._fingers[frame]).as_matrix() - np.eye(3)
             rest = rest + self._correctives[vertices] @ turns.ravel()
         return np.asarray(rest)
-
-
-def right_jacobian(vectors: np.ndarray) -> np.ndarray:
-    """Rate J of R(v + d) = R(v) exp(J d), for axis-angle vectors (..., 3): (..., 3, 3).
-
-    Source: Sola, Deray and Atchuthan, "A micro Lie theory for state estimation in robotics",
-    2018, equation 143.
-    """
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    small = angle < 1e-4
-    safe = np.where(small, 1.0, angle)
-    first = np.where(small, 0.5, (1.0 - np.cos(safe)) / safe**2)
-    second = np.where(small, 1.0 / 6.0, (safe - np.sin(safe)) / safe**3)
-    cross = _cross(vectors)
-    return np.asarray(np.eye(3) - first * cross + second * (cross @ cross))
 
 
 def _cross(vectors: np.ndarray) -> np.ndarray:

@@ -18,7 +18,7 @@ from hwp_bench.hands.posed_skeleton import (
     PosedSkeleton,
     RestSkeleton,
     hand_extent,
-    movement,
+    landmark_rows,
     posed_skeleton,
     rest_skeleton,
     turned,
@@ -126,19 +126,11 @@ def _solved(
     posed: PosedSkeleton, grown: np.ndarray, extent: float, noise: np.ndarray
 ) -> np.ndarray:
     """Parameters that explain the landmarks' errors best: (F, 51)."""
-    moves = movement(posed)
-    points = posed.landmarks
-    depth = points[..., 2]
-    slopes = moves[..., :2, :] - points[..., :2, None] / depth[..., None, None] * moves[..., 2:, :]
-    in_image = slopes / depth[..., None, None]
-    in_world = moves - moves.mean(axis=1, keepdims=True)
     image_spread = extent * grown[:, None] * np.array(IMAGE_SPREAD)
     world_spread = grown[:, None, None] * np.outer(WORLD_SPREAD, WORLD_AXES)
-    rows = np.concatenate(
-        [in_image / image_spread[..., None, None], in_world / world_spread[..., None]], axis=2
-    ).reshape(len(points), -1, DEGREES)
+    rows = landmark_rows(posed, image_spread, world_spread)
     # Divided by its spread every error is the unit noise itself.
-    seen = noise.reshape(len(points), -1)
+    seen = noise.reshape(len(rows), -1)
     turn, shift = EXPECTED
     held = np.diag(np.repeat([turn, shift], [48, 3]) ** -2.0)
     normal = np.einsum("fnk,fnl->fkl", rows, rows) + held

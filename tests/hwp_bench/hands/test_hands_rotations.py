@@ -5,11 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
 from scipy.spatial.transform import Rotation
 
-from hwp_bench.hands.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from hwp_bench.hands.rotations import axis_angle_to_matrix, matrix_to_axis_angle, right_jacobian
 
 LENGTHS = (0.0, 1e-300, 1e-20, 1e-8, 1e-4, 0.0999, 0.1, 0.1001, 1.0, 3.0, np.pi, 6.0, 50.0)
 
@@ -90,4 +91,15 @@ def test_inverse_gradients_agree_with_finite_differences(length: float) -> None:
     # Through both maps, so that the differences stay on the rotation group.
     assert torch.autograd.gradcheck(
         lambda v: matrix_to_axis_angle(axis_angle_to_matrix(v)), (vector,)
+    )
+
+
+@settings(max_examples=30, deadline=None)
+@given(arrays(float, 3, elements=st.floats(-2.5, 2.5)), arrays(float, 3, elements=st.floats(-1, 1)))
+def test_rates_of_rotations_are_those_of_scipy(vector: np.ndarray, direction: np.ndarray) -> None:
+    # Central differences of 1e-5: 1e-8.
+    step = 1e-5 * direction
+    turn = Rotation.from_rotvec(vector - step).inv() * Rotation.from_rotvec(vector + step)
+    np.testing.assert_allclose(
+        right_jacobian(vector) @ direction, turn.as_rotvec() / 2e-5, atol=1e-7
     )

@@ -5,10 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from hypothesis.extra.numpy import arrays
-from scipy.spatial.transform import Rotation
 from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip
 
 from hwp_bench.hands.template import rebuilt
@@ -18,7 +14,6 @@ from hwp_bench.importers.video.surface_motion import (
     FRAME_VARIABLES,
     SurfaceMotion,
     frame_variables,
-    right_jacobian,
 )
 
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
@@ -71,14 +66,3 @@ def test_pixels_move_as_the_derivatives_say(correctives: bool) -> None:
         ahead, behind = pixels_at(model, start + step), pixels_at(model, start - step)
         expected = (ahead - behind)[:, some] / 0.008
         np.testing.assert_allclose(found[..., column], expected, atol=0.1)
-
-
-@settings(max_examples=30, deadline=None)
-@given(arrays(float, 3, elements=st.floats(-2.5, 2.5)), arrays(float, 3, elements=st.floats(-1, 1)))
-def test_rates_of_rotations_are_those_of_scipy(vector: np.ndarray, direction: np.ndarray) -> None:
-    # Central differences of 1e-5: 1e-8.
-    step = 1e-5 * direction
-    turn = Rotation.from_rotvec(vector - step).inv() * Rotation.from_rotvec(vector + step)
-    np.testing.assert_allclose(
-        right_jacobian(vector) @ direction, turn.as_rotvec() / 2e-5, atol=1e-7
-    )
