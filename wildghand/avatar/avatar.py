@@ -47,6 +47,8 @@ class FitRecord:
     frame_weights: Annotated[list[float], _PER_FRAME] = field(default_factory=list)
     #: Optimizer steps.
     steps: int = 0
+    #: Steps behind the state that validation frames chose; None: behind the last one.
+    chosen_steps: int | None = None
     #: Seconds of fitting.
     seconds: float = 0.0
     #: The avatar's origin, such as a capture's id.

@@ -61,6 +61,18 @@ class StepAverage:
         if self._means:
             _copy(self._means, self._tensors)
 
+    def values(self) -> list[Tensor]:
+        """Copies of what `put` would put in place."""
+        return [value.detach().clone() for value in self._means or self._tensors]
+
+    def now(self) -> list[Tensor]:
+        """Copies of the tensors as they are."""
+        return [tensor.detach().clone() for tensor in self._tensors]
+
+    def restore(self, values: Iterable[Tensor]) -> None:
+        """Put what `values` or `now` returned in place of the tensors."""
+        _copy(values, self._tensors)
+
     def forget(self) -> None:
         """Begin again, as before the first step."""
         self._steps, self._means = 0, []
@@ -68,12 +80,12 @@ class StepAverage:
     @contextlib.contextmanager
     def in_place(self) -> Iterator[None]:
         """Within this, the tensors are their means; a step may not be taken meanwhile."""
-        kept = [tensor.detach().clone() for tensor in self._tensors]
+        kept = self.now()
         self.put()
         try:
             yield
         finally:
-            _copy(kept, self._tensors)
+            self.restore(kept)
 
     def state_dict(self) -> dict[str, Any]:
         """The state for `load_state_dict`."""

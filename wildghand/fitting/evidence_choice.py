@@ -15,7 +15,6 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
-from hwp_bench.methods.contract import TrainingCapture
 from wildghand.evidence import (
     ColorChanges,
     Evidence,
@@ -26,7 +25,6 @@ from wildghand.evidence import (
 )
 from wildghand.fitting.filled_colors import FilledColors
 from wildghand.fitting.judged_drawings import JudgedDrawings
-from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 
@@ -37,21 +35,19 @@ class EvidenceChoice:
 
     #: What is drawn; its evidence and colours are put back.
     model: WildGHandModel
-    #: What may be seen of the capture.
-    training: TrainingCapture
     #: Of the fit.
     settings: WildGHandSettings
     #: (N,) by side, how many training frames show each Gaussian.
     shown: Mapping[str, Tensor]
     #: Training frames that are fitted.
     frame_count: int
-    #: Validation frames; None where they are too few.
-    judges: TrainingFrames | None
+    #: Validation frames; None where they are too few, or judge nothing.
+    judges: JudgedDrawings | None
     #: The colours of places that few frames have shown.
     filled: FilledColors
 
     @property
-    def frames(self) -> TrainingFrames | None:
+    def drawings(self) -> JudgedDrawings | None:
         """The validation frames that judge; None also where nothing is chosen."""
         evidence = self.settings.evidence
         return self.judges if evidence.enabled and evidence.validated else None
@@ -94,21 +90,11 @@ class EvidenceChoice:
         drawings = self.drawings
         if drawings is None:
             return 0.0
-        evidence, changes = self._evidence(0), self.model.color_changes
-        # The first time takes longer than others.
-        drawings.error({0: drawings.predict(0, drawings.features())}, evidence, changes)
-        begun = time.perf_counter()
-        features = drawings.features()
-        shared = time.perf_counter()
-        predicted = {0: drawings.predict(0, features)}
-        asked = time.perf_counter()
-        drawings.error(predicted, evidence, changes)
-        drawn = time.perf_counter()
+        took = drawings.seconds
         # With a light, which there is at the end alone, the network is asked twice.
-        times = 2.0 if self.settings.light.enabled else 1.0
-        each = times * (asked - shared)
-        each += (len(self._strengths) + len(self._fills)) * (drawn - asked)
-        return shared - begun + each * len(drawings.frames)
+        each = (2.0 if self.settings.light.enabled else 1.0) * took.predict
+        each += (len(self._strengths) + len(self._fills)) * took.draw
+        return took.features + each * len(drawings.frames)
 
     def _seconds_of_fills(self) -> float:
         """About how long the fills take; without a light there are none."""
@@ -117,14 +103,6 @@ class EvidenceChoice:
         begun = time.perf_counter()
         self.filled.rehearse()
         return (time.perf_counter() - begun) * sum(share > 0.0 for share in self._fills)
-
-    @functools.cached_property
-    def drawings(self) -> JudgedDrawings | None:
-        """The validation frames as they are drawn; None where nothing is chosen."""
-        if self.frames is None:
-            return None
-        refine = self.settings.heads.refinement
-        return JudgedDrawings(self.model, self.training, refine, self.frames)
 
     @functools.cached_property
     def _strengths(self) -> list[EvidenceSettings]:

@@ -23,9 +23,11 @@ from wildghand.fitting.believed_poses import in_believed_poses
 from wildghand.fitting.borrowed_colors import BorrowedColors
 from wildghand.fitting.cast_shadows import cast_shadows, shadows_in
 from wildghand.fitting.closing import MOST_OF_BUDGET, LightFit, weight_masks
+from wildghand.fitting.earlier_states import EarlierStates
 from wildghand.fitting.evidence_choice import EvidenceChoice
 from wildghand.fitting.filled_colors import FilledColors
 from wildghand.fitting.hand_masks import hand_masks
+from wildghand.fitting.judged_drawings import JudgedDrawings
 from wildghand.fitting.judging_frames import judging_frames
 from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
@@ -112,19 +114,26 @@ class Fit:
             start_from_colors(self.model, self.clip, self.frames, self.weighting, self.dark)
         #: The colours that one of two hands takes from the other, which come last.
         self.borrowed = BorrowedColors.of(self.model, self.clip, self.weighting, settings.evidence)
+        #: Validation frames; None where they are too few, or judge nothing.
+        self.judges = (
+            JudgedDrawings(self.model, training, settings.heads.refinement, judges)
+            if judges is not None
+            else None
+        )
         self.choice = EvidenceChoice(
             self.model,
-            training,
             settings,
             shown,
             count,
-            judges,
+            self.judges,
             FilledColors(self.model, self.borrowed, shown, count),
         )
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal, device)
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
         self.average = StepAverage.of_optimizer(self.optimizer, settings.schedule.average_share)
+        #: Where the fit may go back to after its last step.
+        self.earlier = EarlierStates.of_epochs(self.average, count, settings.schedule.batch)
         #: Steps behind it.
         self.steps = 0
         self.generator = torch.Generator().manual_seed(seed)
@@ -207,6 +216,7 @@ class Fit:
             "generator": self.generator.get_state(),
             "shared": self.shared.state_dict(),
             "average": self.average.state_dict(),
+            "earlier": self.earlier.state_dict(),
             "steps": self.steps,
         }
 
@@ -216,9 +226,12 @@ class Fit:
         self.weighting.load_state_dict(state)
         self.optimizer.load_state_dict(state["optimizer"])
         self.generator.set_state(state["generator"].cpu())
-        # States of before have none of these: their steps shared nothing and were not averaged.
+        # States of before have none of these: their steps shared nothing, were not averaged, and
+        # kept no earlier state.
         self.shared.load_state_dict(state.get("shared", {"steps": 0}))
         self.average.load_state_dict(state.get("average", {"steps": 0, "means": []}))
+        if "earlier" in state:
+            self.earlier.load_state_dict(state["earlier"])
         self.steps = int(state.get("steps", 0))
 
     def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -274,25 +287,47 @@ class Fit:
         needed = self.light.seconds() + self.choice.seconds()
         return seconds - min(needed, MOST_OF_BUDGET * seconds)
 
-    def finish(self) -> None:
-        """Find what follows from the fitted model: the last step is behind.
+    def seconds_for_states(self) -> float:
+        """Return about how long it takes to judge the states that the fit may go back to now."""
+        judges, candidates = self.judges, self.earlier.candidates
+        if not self._goes_back or judges is None or not candidates:
+            return 0.0
+        took = judges.seconds
+        each = took.features + (took.predict + took.draw) * len(judges.frames)
+        return (1 + len(candidates)) * each
+
+    def finish(self) -> int | None:
+        """Choose the state that the fit ends with, and find what follows from it.
 
         That is the light, colours that hands take from each other, how strongly evidence acts, and
         colours that places take from the skin around them.
+
+        Returns:
+            Steps behind the state, if it is an earlier one than the last.
         """
+        chosen = self.earlier.choose(self._error) if self._goes_back else None
         for find in (self.light.learn, self.borrowed.learn):
             found = find()
             if found is not None:
                 self.model.keep(found)
-        for chosen in self.choice.best():
-            self.model.keep(chosen)
+        for best in self.choice.best():
+            self.model.keep(best)
+        return chosen
 
-    def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
+    def avatar(
+        self,
+        steps: int,
+        seconds: float = 0.0,
+        *,
+        chosen: int | None = None,
+        final: bool = False,
+    ) -> WildGHandAvatar:
         """The avatar as it stands; it goes on changing with the fit.
 
         Args:
             steps: optimizer steps behind it.
             seconds: of fitting.
+            chosen: steps behind the state that is kept, if it is an earlier one.
             final: also record the temporal weights, and tell the weight masks.
         """
         hands = self.training.hands
@@ -307,10 +342,21 @@ class Fit:
                 self._record,
                 temporal=self._temporal() if final else {},
                 steps=steps,
+                chosen_steps=chosen,
                 seconds=seconds,
             ),
             self._weight_masks if final else dict,
         )
+
+    @property
+    def _goes_back(self) -> bool:
+        return self.settings.schedule.validated and self.judges is not None
+
+    def _error(self) -> float:
+        """Mean squared error of the validation frames as the model draws them now."""
+        assert self.judges is not None
+        predicted = self.judges.predict_all()
+        return self.judges.error(predicted, self.model.evidence, self.model.color_changes)
 
     def _weight_masks(self) -> dict[int, np.ndarray]:
         pao = self.settings.pao

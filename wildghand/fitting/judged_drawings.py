@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import time
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -19,6 +20,18 @@ from wildghand.network import HandFeatures
 
 #: What network and light say of the hands in a frame, by side.
 Predicted = Mapping[str, HandPrediction]
+
+
+@dataclass(frozen=True)
+class DrawingSeconds:
+    """How long it takes to draw validation frames."""
+
+    #: The network's features, which all frames share.
+    features: float
+    #: What network and light say of one frame.
+    predict: float
+    #: Drawing one frame and comparing it.
+    draw: float
 
 
 @dataclass(frozen=True, eq=False)
@@ -91,6 +104,20 @@ class JudgedDrawings:
         finally:
             model.evidence, model.color_changes = before
         return squares / pixels
+
+    @functools.cached_property
+    def seconds(self) -> DrawingSeconds:
+        """About how long things take, measured once; nothing of the model changes."""
+        evidence, changes = self.model.evidence, self.model.color_changes
+        # The first time takes longer than others.
+        self.error({0: self.predict(0, self.features())}, evidence, changes)
+        begun = time.perf_counter()
+        features = self.features()
+        shared = time.perf_counter()
+        predicted = {0: self.predict(0, features)}
+        asked = time.perf_counter()
+        self.error(predicted, evidence, changes)
+        return DrawingSeconds(shared - begun, asked - shared, time.perf_counter() - asked)
 
     @functools.cached_property
     def _clip(self) -> TrainingClip:

@@ -20,7 +20,7 @@ def judging_frames(training: TrainingCapture, settings: WildGHandSettings) -> Tr
     """
     subject, evidence = settings.subject, settings.evidence
     bends, weighs = subject.enabled and subject.validated, evidence.enabled and evidence.validated
-    if not (bends or weighs):
+    if not (bends or weighs or settings.schedule.validated):
         return None
     frames = load_validation_frames(training, MOST_CHOOSING)
     return frames if len(frames) >= LEAST_CHOOSING else None

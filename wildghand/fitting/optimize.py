@@ -67,7 +67,8 @@ def optimize(
         watch: looks at the fit after each step, and changes nothing of it.
 
     Returns:
-        The mean of the last states; the best one if the fit diverged later. Of several processes,
+        The mean of the last states, or of earlier ones where validation frames chose them; the best
+        one if the fit diverged later. Of several processes,
         rank 0's has the record of the weights.
 
     Raises:
@@ -86,7 +87,7 @@ def optimize(
     with repeatable(fit.device):
         while step < steps:
             # All processes go by the clock of rank 0, or some would stop a step before the others.
-            fraction = world.broadcast(spent(step, steps, budget, report))
+            fraction = world.broadcast(spent(step, steps, _for_steps(budget, fit), report))
             if fraction >= 1.0:
                 break
             loss = fit.step(next(order), fraction)
@@ -96,6 +97,7 @@ def optimize(
             step += 1
             report.progress(step, steps)
             fit.average.take()
+            fit.earlier.take()
             report(step, AveragedAvatar(fit.avatar(step), fit.average))
             if after_step is not None:
                 after_step(step, watchers)
@@ -108,14 +110,24 @@ def optimize(
         if not watchers.guard.sound():
             step = _go_back(fit, watchers, step)
     fit.average.put()
-    fit.finish()
-    return fit.avatar(step, report.elapsed, final=world.is_main)
+    chosen = fit.finish()
+    if chosen is not None:
+        _tell(world, f"The state of step {chosen} draws the validation frames best; it is kept.")
+    return fit.avatar(step, report.elapsed, chosen=chosen, final=world.is_main)
+
+
+def _for_steps(budget: Budget, fit: Fit) -> Budget:
+    """The budget without the seconds in which the states so far will be judged."""
+    if budget.seconds is None:
+        return budget
+    return dataclasses.replace(budget, seconds=budget.seconds - fit.seconds_for_states())
 
 
 def _go_back(fit: Fit, watchers: Watchers, step: int) -> int:
     """Bring a fit that diverged back to its best state; returns the steps behind that."""
     fit.model.load_state_dict(watchers.guard.best())
     fit.average.forget()
+    fit.earlier.forget()
     kept = watchers.guard.step
     _tell(fit.world, f"The fit diverged at step {step}; the state of step {kept} is kept.")
     return kept

@@ -94,6 +94,9 @@ class ScheduleSettings:
     #: The fit ends with a mean of its steps, nearly all of it from this share of them, the last
     #: ones; 0: with the last step.
     average_share: float = number(0.1, 0.0, 1.0)
+    #: Addition: after the last step, go back to an earlier state of the fit where that draws the
+    #: validation frames better. With fewer than four of these frames it ends with the last state.
+    validated: bool = True
     #: Most training frames for each second of a budget in seconds, evenly spread; 0: all. Every
     #: frame is judged before the first step, at a cost.
     frames_per_second: float = number(4.0, 0.0, 1e6)
@@ -183,6 +186,7 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
             "decay": "halving",
             "root_steps": 0.0,
             "average_share": 0.0,
+            "validated": False,
             "rates": {"dpd": 1e-4},
         },
         "terms": {
@@ -239,7 +243,7 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
             "fill_share": 0.0,
         },
         "prepass": {"clean_scale": 1.0},
-        "schedule": {"root_steps": 0.0, "average_share": 0.0},
+        "schedule": {"root_steps": 0.0, "average_share": 0.0, "validated": False},
         "terms": {"surface": 0.0, "leave_hidden": False},
     }
 )

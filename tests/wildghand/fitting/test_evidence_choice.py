@@ -71,10 +71,18 @@ def error_with(
     return drawings.error(drawings.predict_all(), evidence, colors)
 
 
+def judged_by(choice: EvidenceChoice, images: torch.Tensor) -> EvidenceChoice:
+    """The same choice, with (F, H, W, 3) uint8 images as the truth."""
+    drawings = choice.drawings
+    assert drawings is not None
+    frames = dataclasses.replace(drawings.frames, images=images)
+    return dataclasses.replace(choice, judges=dataclasses.replace(drawings, frames=frames))
+
+
 def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> None:
     fit = begun(training)
-    frames = fit.choice.frames
-    assert frames is not None
+    assert fit.choice.drawings is not None
+    frames = fit.choice.drawings.frames
     hand = frames.masks.numpy()[..., None] / 255.0
     truth = frames.images.numpy() / 255.0
     for index, settings in enumerate(strengths(fit.settings.evidence)):
@@ -91,11 +99,8 @@ def test_the_strength_that_draws_the_frames_best_is_chosen(
     index: int, training: TrainingCapture
 ) -> None:
     fit = begun(training)
-    frames = fit.choice.frames
-    assert frames is not None
     images = torch.from_numpy((255.0 * drawn_with(fit, training, index)).round().astype(np.uint8))
-    truth = dataclasses.replace(frames, images=images)
-    choice = dataclasses.replace(fit.choice, judges=truth)
+    choice = judged_by(fit.choice, images)
     found = choice.best()
     if index == 0:  # the model has it already
         assert found == []
@@ -128,10 +133,7 @@ def test_the_fill_that_draws_the_frames_best_is_chosen(
     fit.model.color_changes = fills[index]
     images = torch.from_numpy((255.0 * drawn_with(fit, training, 0)).round().astype(np.uint8))
     fit.model.color_changes = None
-    assert choice.frames is not None
-    found = dataclasses.replace(
-        choice, judges=dataclasses.replace(choice.frames, images=images)
-    ).best()
+    found = judged_by(choice, images).best()
     if index == 2:  # as they were learnt
         assert found == []
         return
@@ -177,7 +179,7 @@ def test_nothing_is_chosen_where_it_is_off(
     changes: dict[str, Any], training: TrainingCapture
 ) -> None:
     fit = begun(training, **changes)
-    assert fit.choice.frames is None
+    assert fit.choice.drawings is None
     assert fit.choice.best() == []
     assert fit.choice.seconds() == 0.0
 
@@ -187,7 +189,7 @@ def test_a_frame_or_two_do_not_judge(training: TrainingCapture) -> None:
     few = first - LEAST_CHOOSING + 1
     training.split = Split(training.id, last + 1, (0, few), (few, first), (first, last + 1))
     training._train = training.split.train
-    assert begun(training).choice.frames is None
+    assert begun(training).choice.drawings is None
 
 
 def test_validation_frames_are_spread_and_never_fitted_ones(training: TrainingCapture) -> None:

@@ -310,6 +310,7 @@ def test_stored_settings_of_version_1_say_what_ran(
     later |= {"poses.enabled": False}
     later |= {"shadows.enabled": False, "evidence.color_share": 0.0, "evidence.fill_share": 0.0}
     later |= {"schedule.root_steps": 0.0, "schedule.average_share": 0.0}
+    later |= {"schedule.validated": False}
     expected = read_settings({"pao.errors": "batch", **today, **later})
     assert read_version_1(stored) == expected
 
