@@ -11,7 +11,12 @@ from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
 from hwp_bench.hands.posed_skeleton import turned
 from hwp_bench.hands.rotations import right_jacobian
-from wildghand.poses.landmark_errors import in_front, pose_covariances, vector_changes
+from wildghand.poses.landmark_errors import (
+    extent_in,
+    in_front,
+    pose_covariances,
+    vector_changes,
+)
 from wildghand.poses.settings import PoseSettings
 from wildghand.poses.spread import error_size, spread_of
 
@@ -59,8 +64,12 @@ def _believed(
         some = valid[np.linspace(0, len(valid) - 1, settings.frames).round().astype(int)]
     if len(some) <= _FINGERS.stop - _FINGERS.start:
         return hand
-    told = _rows(hand, some)
-    poses, errors = _in_vectors(told, pose_covariances(template, told, viewmats[some], settings))
+    extent = extent_in(template, _rows(hand, valid), viewmats[valid])
+
+    def covariances(rows: np.ndarray) -> np.ndarray:
+        return pose_covariances(template, _rows(hand, rows), viewmats[rows], extent, settings)
+
+    poses, errors = _in_vectors(_rows(hand, some), covariances(some))
     size = error_size(poses, errors)
     mean_square = np.trace(errors, axis1=1, axis2=2).mean() / errors.shape[1]
     if size * np.sqrt(mean_square) < settings.least_error:
@@ -70,7 +79,7 @@ def _believed(
     for start in range(0, len(valid), _CHUNK):
         rows = valid[start : start + _CHUNK]
         given = _rows(hand, rows)
-        together = size**2 * pose_covariances(template, given, viewmats[rows], settings)
+        together = size**2 * covariances(rows)
         poses, errors = _in_vectors(given, together)
         change = spread.expected(poses, errors) - poses
         turn = (right_jacobian(_shortest(given)) @ change.reshape(-1, 15, 3, 1))[..., 0]

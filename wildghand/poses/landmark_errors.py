@@ -26,8 +26,22 @@ def in_front(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray)
     return np.asarray((posed.landmarks[..., 2] > _NEAREST).all(axis=1))
 
 
+def extent_in(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray) -> float:
+    """How large a hand is in the image, by which landmarks err; see `pose_covariances`.
+
+    Returns:
+        Median over frames of the larger side of its box, in slopes of the camera.
+    """
+    rest = rest_skeleton(template, hand.betas)
+    return hand_extent(posed_skeleton(rest, hand.pose, hand.transl).seen_by(viewmats).landmarks)
+
+
 def pose_covariances(
-    template: HandTemplate, hand: HandParameters, viewmats: np.ndarray, settings: PoseSettings
+    template: HandTemplate,
+    hand: HandParameters,
+    viewmats: np.ndarray,
+    extent: float,
+    settings: PoseSettings,
 ) -> np.ndarray:
     """Covariance of the errors of each frame's pose, up to a factor that all frames share.
 
@@ -39,6 +53,7 @@ def pose_covariances(
         template: of the hand.
         hand: given parameters of F frames, in front of the cameras.
         viewmats: (F, 4, 4) world to camera.
+        extent: of the hand in the clip, by `extent_in`: all its frames have one.
         settings: errors of landmarks, and what is expected.
 
     Returns:
@@ -46,8 +61,7 @@ def pose_covariances(
     """
     rest = rest_skeleton(template, hand.betas)
     posed = posed_skeleton(rest, hand.pose, hand.transl).seen_by(viewmats)
-    image_error = settings.image_error * hand_extent(posed.landmarks)
-    rows = landmark_rows(posed, image_error, settings.space_error)
+    rows = landmark_rows(posed, settings.image_error * extent, settings.space_error)
     told = np.einsum("fnk,fnl->fkl", rows, rows)
     turn, shift = settings.expected_turn, settings.expected_shift
     expected = np.repeat([turn, shift], [DEGREES - 3, 3]) ** -2.0

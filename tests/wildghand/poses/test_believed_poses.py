@@ -15,8 +15,8 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.posed_skeleton import posed_skeleton, rest_skeleton, turned
-from wildghand.poses import ClipPoses, PoseSettings, believed_hands
-from wildghand.poses.landmark_errors import pose_covariances, vector_changes
+from wildghand.poses import ClipPoses, PoseSettings, believe, believed_hands
+from wildghand.poses.landmark_errors import extent_in, pose_covariances, vector_changes
 from wildghand.poses.spread import error_size, spread_of
 
 FRAMES = 80
@@ -40,11 +40,17 @@ def _truth(seed: int = 0, frames: int = FRAMES) -> HandParameters:
     return HandParameters(pose, np.zeros(10), transl, np.ones(frames, dtype=bool))
 
 
+def _covariances(hand: HandParameters) -> np.ndarray:
+    viewmats = _cameras(len(hand.pose)).viewmats
+    extent = extent_in(TEMPLATE, hand, viewmats)
+    return pose_covariances(TEMPLATE, hand, viewmats, extent, PoseSettings())
+
+
 def _with_errors(truth: HandParameters, size: float, seed: int = 1) -> HandParameters:
     """The hand as an estimator that goes by landmarks gives it."""
     rng = np.random.default_rng(seed)
     frames = truth.frame_count
-    covariances = pose_covariances(TEMPLATE, truth, _cameras(frames).viewmats, PoseSettings())
+    covariances = _covariances(truth)
     roots = np.linalg.cholesky(covariances + 1e-10 * np.eye(51))
     errors = size * (roots @ rng.normal(size=(frames, 51, 1)))[..., 0]
     pose = turned(truth.pose, errors[:, :48].reshape(-1, 16, 3))
@@ -108,6 +114,21 @@ def test_frames_without_the_hand_keep_their_numbers() -> None:
     np.testing.assert_array_equal(found.pose[[0, 7]], given.pose[[0, 7]])
     np.testing.assert_array_equal(found.transl[~valid], given.transl[~valid])
     assert (found.pose[valid] != given.pose[valid]).any()
+
+
+def test_a_frame_is_corrected_alike_whichever_frames_come_with_it(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Oracle: all frames at once. The hand of the second half is twice as far away."""
+    truth = _truth(frames=2 * FRAMES)
+    truth.transl[FRAMES:, 2] *= 2.0
+    given = _with_errors(truth, 1.0)
+    expected = _believed(given)
+    monkeypatch.setattr(believe, "_CHUNK", 32)
+    found = _believed(given)
+    assert not np.array_equal(found.pose, given.pose)
+    np.testing.assert_allclose(found.pose, expected.pose, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(found.transl, expected.transl, rtol=0, atol=1e-9)
 
 
 def test_a_long_clip_is_corrected_in_all_of_its_frames() -> None:
@@ -223,7 +244,7 @@ def test_vectors_change_as_finite_differences_say(length: float) -> None:
 def test_the_joints_of_a_finger_make_up_for_each_other() -> None:
     """As the importer's errors do on simulated clips (docs/simulation.md): -0.4 for neighbours."""
     truth = replace(_truth(), pose=np.zeros((FRAMES, 16, 3)))
-    covariances = pose_covariances(TEMPLATE, truth, _cameras(FRAMES).viewmats, PoseSettings())
+    covariances = _covariances(truth)
     flexion = [3 * joint + 2 for joint in (1, 2, 3)]
     part = covariances[0][np.ix_(flexion, flexion)]
     deviations = np.sqrt(np.diag(part))
