@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 
 from hwp_bench.base.drawing import fitted, labelled, outlined, sheet
+from hwp_bench.base.evenly import evenly
 from hwp_bench.capture.reader import Capture
 
 #: Colour of the projected hand, by side.
@@ -32,8 +33,7 @@ def contact_sheet(capture: Capture, *, count: int = 24, edge: int = 256) -> np.n
         (H, W, 3) uint8. Green outline: the mask that methods are given; coloured skeleton: the
         estimated hand (orange right, blue left), left out where it is not valid.
     """
-    frames = np.unique(np.linspace(0, len(capture) - 1, min(count, len(capture))).round())
-    chosen = [int(frame) for frame in frames]
+    chosen = evenly(len(capture), count).tolist()
     tiles = [
         labelled(
             fitted(draw_hands(outlined(capture.frame(f), capture.mask(f)), points), edge),

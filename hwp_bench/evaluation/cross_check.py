@@ -10,6 +10,7 @@ import math
 
 import numpy as np
 
+from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import as_float
 from hwp_bench.metrics.protocol import HWP_V1, Protocol
 
@@ -22,7 +23,7 @@ SAMPLE = 4
 
 def sample_frames(count: int) -> list[int]:
     """Return the positions of at most `SAMPLE` frames, evenly spaced from the first to the last."""
-    return sorted({round(place) for place in np.linspace(0, count - 1, min(SAMPLE, count))})
+    return evenly(count, SAMPLE).tolist()
 
 
 def reference_scores(

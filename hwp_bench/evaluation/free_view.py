@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.drawing import fitted, labelled, sheet
+from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.artifacts import keep_predictions
@@ -98,9 +99,8 @@ def free_view_picture(scores: FreeViewScores) -> np.ndarray:
     Returns:
         (H, W, 3) uint8: a column a view.
     """
-    picks = np.linspace(0, len(scores.targets) - 1, min(SHOWN, len(scores.targets)))
     truths, drawn = [], []
-    for place in picks.round().astype(int).tolist():
+    for place in evenly(len(scores.targets), SHOWN).tolist():
         target, prediction = scores.targets[place], scores.predictions[place]
         inside = scored_pixels(target.mask, erosion=HWP_V1.mask_erosion, coverage=target.exact)[
             :, :, None

@@ -13,6 +13,7 @@ import numpy as np
 from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.record_types import brief
 from hwp_bench.base.records import MAX_COUNT, MAX_SECONDS, MAX_SEED, Line
@@ -254,9 +255,8 @@ class TrainingCapture:
         """
         if len(self._train) <= most:
             return self
-        picks = np.unique(np.linspace(0, len(self._train) - 1, max(1, most)).round().astype(int))
         fewer = copy.copy(self)
-        fewer._train = self._train[picks]
+        fewer._train = self._train[evenly(len(self._train), max(1, most))]
         return fewer
 
     def with_hands(self, hands: Mapping[str, HandParameters]) -> TrainingCapture:

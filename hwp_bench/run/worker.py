@@ -19,6 +19,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
+from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.progress import notice
@@ -164,9 +165,7 @@ def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path) -
 
 def checkpoint_frames(validation: np.ndarray) -> list[int]:
     """Return at most eight validation frames, evenly spaced."""
-    count = min(CHECKPOINT_FRAMES, len(validation))
-    picks = np.linspace(0, len(validation) - 1, count).round().astype(int)
-    return validation[picks].tolist()
+    return validation[evenly(len(validation), CHECKPOINT_FRAMES)].tolist()
 
 
 def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from hwp_bench.base.evenly import evenly
 from wildghand.fitting.light_samples import CHUNK, light_samples
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight, LightSettings, fit_light
@@ -88,8 +89,8 @@ def weight_masks(
         (H, W) uint8 by frame, for `MAX_MASKS` frames at most.
     """
     masks = {}
-    for row in np.unique(np.linspace(0, len(frames) - 1, min(MAX_MASKS, len(frames))).round()):
-        weights = weigh(torch.tensor([int(row)]))[0]
+    for row in evenly(len(frames), MAX_MASKS).tolist():
+        weights = weigh(torch.tensor([row]))[0]
         largest = weights.max().clamp(min=1e-12 if unbounded else 1.0)
-        masks[frames[int(row)]] = (255.0 * weights / largest).byte().cpu().numpy()
+        masks[frames[row]] = (255.0 * weights / largest).byte().cpu().numpy()
     return masks

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.drawing import fitted, labelled, sheet
+from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import as_uint8, read_gray, write_image
 from hwp_bench.capture import Capture, open_capture
 from wildghand.avatar.avatar import WildGHandAvatar
@@ -57,8 +58,7 @@ def avatar_sheet(avatar: WildGHandAvatar, capture: Capture, weights: Path) -> np
 
 
 def _spread(frames: list[int]) -> list[int]:
-    picks = np.linspace(0, len(frames) - 1, min(COLUMNS, len(frames))).round().astype(int)
-    return [frames[pick] for pick in picks]
+    return [frames[pick] for pick in evenly(len(frames), COLUMNS)]
 
 
 def _tile(image: np.ndarray, text: str) -> np.ndarray:

@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadInput
+from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters
 from hwp_bench.methods.contract import TrainingCapture
@@ -109,9 +110,7 @@ def load_validation_frames(training: TrainingCapture, most: int) -> TrainingFram
         BadImage: an image is missing or damaged.
     """
     apart = np.setdiff1d(training.validation, training.train)
-    if len(apart) > most:
-        apart = apart[np.linspace(0, len(apart) - 1, most).round().astype(int)]
-    return _read_frames(training, apart)
+    return _read_frames(training, apart[evenly(len(apart), most)])
 
 
 def _read_frames(training: TrainingCapture, numbers: np.ndarray) -> TrainingFrames:

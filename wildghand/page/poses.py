@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Capture
 from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
 from hwp_bench.methods.contract import HandPose
@@ -61,10 +62,10 @@ def sample_poses(
         fitted = [frame for frame in avatar.record.frames if _shown(avatar, capture, frame)]
         if not fitted:
             raise UsageError("has no fitted frame that shows every hand", where=capture.root)
-        frames = [fitted[pick] for pick in _spread(len(fitted), settings.most_frames)]
-        held_out = [fitted[pick] for pick in _spread(len(fitted), _HELD_OUT + 2)[1:-1]]
+        frames = [fitted[pick] for pick in evenly(len(fitted), settings.most_frames)]
+        held_out = [fitted[pick] for pick in evenly(len(fitted), _HELD_OUT + 2)[1:-1]]
         rest = [frame for frame in fitted if frame not in held_out] or fitted
-        drawn = [rest[pick] for pick in _spread(len(rest), settings.clip_samples)]
+        drawn = [rest[pick] for pick in evenly(len(rest), settings.clip_samples)]
         start = avatar.believed(capture.hand_poses(fitted[0]))
         clip, motion = {}, {}
         for side in avatar.sides:
@@ -118,8 +119,3 @@ def _check(avatar: WildGHandAvatar, capture: Capture) -> None:
 
 def _shown(avatar: WildGHandAvatar, capture: Capture, frame: int) -> bool:
     return all(bool(capture.hands[side].valid[frame]) for side in avatar.sides)
-
-
-def _spread(count: int, most: int) -> list[int]:
-    picks = np.linspace(0, count - 1, min(count, most)).round().astype(int)
-    return list(dict.fromkeys(picks.tolist()))

@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
 from hwp_bench.hands.posed_skeleton import turned
@@ -59,9 +60,7 @@ def _believed(
     template: HandTemplate, hand: HandParameters, viewmats: np.ndarray, settings: PoseSettings
 ) -> HandParameters:
     valid = np.flatnonzero(hand.valid & in_front(template, hand, viewmats))
-    some = valid
-    if len(valid) > settings.frames:
-        some = valid[np.linspace(0, len(valid) - 1, settings.frames).round().astype(int)]
+    some = valid[evenly(len(valid), settings.frames)]
     if len(some) <= _FINGERS.stop - _FINGERS.start:
         return hand
     extent = extent_in(template, _rows(hand, valid), viewmats[valid])

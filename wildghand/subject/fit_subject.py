@@ -14,6 +14,7 @@ from collections.abc import Mapping
 import numpy as np
 from scipy.linalg import solve
 
+from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
 from wildghand.subject.compared_frames import ComparedFrames
@@ -65,12 +66,13 @@ def fit_subject(
         return ComparedFrames(templates, hands, cameras, frames[rows], masks[rows] > 127)
 
     every = np.arange(len(frames))
-    rows = _spread(every, settings.frames)
+    rows = every[evenly(len(every), settings.frames)]
     if not settings.validated:
         judges = None
     elif judges is None:
         others = np.setdiff1d(every, rows)
-        judges = compared(_spread(others, MOST_CHOOSING)) if len(others) >= LEAST_CHOOSING else None
+        few = others[evenly(len(others), MOST_CHOOSING)]
+        judges = compared(few) if len(others) >= LEAST_CHOOSING else None
     bending = _Bending(compared(rows), settings)
     shape = bending.begin(FIXED_STIFFNESS) if judges is None else _chosen(bending, judges)
     # An avatar keeps float32: it is drawn with what is read again.
@@ -78,12 +80,6 @@ def fit_subject(
         shape.vertices.astype(np.float32).astype(np.float64),
         shape.joints.astype(np.float32).astype(np.float64),
     )
-
-
-def _spread(rows: np.ndarray, most: int) -> np.ndarray:
-    """Some of the rows, evenly spread, at most so many."""
-    places = np.unique(np.linspace(0, len(rows) - 1, most).round().astype(int))
-    return rows[places]
 
 
 def _chosen(bending: _Bending, judges: ComparedFrames) -> SubjectShape:

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from hwp_bench.base.drawing import labelled, outlined, sheet
+from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate, pose_hand, project
 from hwp_bench.importers.shared.landmarks import LANDMARK_EDGES
@@ -64,7 +65,7 @@ def project_hand(template: HandTemplate, hand: HandParameters, cameras: Cameras)
 
 def sheet_frames(count: int, most: int = SHEET_FRAMES) -> list[int]:
     """Return evenly spaced frames for a sheet, at most `most` of `count`."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round()).astype(int).tolist()
+    return evenly(count, most).tolist()
 
 
 def posed_sheet(

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 import torch
 
+from hwp_bench.base.evenly import evenly
 from hwp_bench.base.progress import notice
 from hwp_bench.hands import load_template, pose_hand
 from hwp_bench.importers.shared.hand_tracks import SIDES
@@ -67,7 +68,7 @@ def side_scores(landmarks: Landmarks, hand_model: str, footage: Footage) -> Side
         footage: of these frames.
     """
     seen = np.flatnonzero(landmarks.detected)
-    chosen = np.unique(np.linspace(0, len(seen) - 1, min(len(seen), _FRAMES)).round().astype(int))
+    chosen = evenly(len(seen), _FRAMES)
     few = landmarks.select(seen[chosen])
     right, left = (_remaining(few, side, hand_model, footage) for side in SIDES)
     return SideScores(right, left, len(chosen))

@@ -11,6 +11,7 @@ import numpy as np
 
 from hwp_bench.base.drawing import fitted, labelled, sheet
 from hwp_bench.base.errors import HwpError
+from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import read_rgb
 from hwp_bench.report.sources import ResultsSource
 
@@ -81,9 +82,8 @@ def mask_sheet(source: ResultsSource, capture: str, album: Album) -> tuple[str, 
     files = sorted(path for path in folder.iterdir() if re.fullmatch(r"\d{6}\.png", path.name))
     if not files:
         return None
-    picks = np.unique(np.linspace(0, len(files) - 1, min(MASKS, len(files))).round().astype(int))
     tiles = []
-    for path in (files[index] for index in picks):
+    for path in (files[index] for index in evenly(len(files), MASKS)):
         pixels = _read(path)
         if pixels is not None:
             tiles.append(labelled(fitted(pixels, MASK_EDGE), f"frame {int(path.stem)}"))

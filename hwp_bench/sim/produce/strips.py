@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import write_image
 from hwp_bench.base.progress import track
@@ -110,7 +111,7 @@ def free_view_strip(scene: Scene) -> np.ndarray:
     """Two rows of frames of the free-view clip, with their numbers."""
     cost = RenderCost()
     gain = steady_gain(scene, cost)
-    picks = np.linspace(0, FRAMES - 1, 2 * STRIP_FRAMES).round().astype(int).tolist()
+    picks = evenly(FRAMES, 2 * STRIP_FRAMES).tolist()
     views = free_views(scene)
     cells = []
     for frame in picks:
