@@ -23,7 +23,6 @@ from wildghand.fitting.believed_poses import in_believed_poses
 from wildghand.fitting.borrowed_colors import BorrowedColors
 from wildghand.fitting.cast_shadows import cast_shadows, shadows_in
 from wildghand.fitting.closing import MOST_OF_BUDGET, LightFit, weight_masks
-from wildghand.fitting.earlier_states import EarlierStates
 from wildghand.fitting.evidence_choice import EvidenceChoice
 from wildghand.fitting.filled_colors import FilledColors
 from wildghand.fitting.hand_masks import hand_masks
@@ -35,6 +34,7 @@ from wildghand.fitting.rates import make_optimizer, set_rates
 from wildghand.fitting.shared_features import SharedFeatures
 from wildghand.fitting.skin_places import skin_places
 from wildghand.fitting.start_colors import start_from_colors
+from wildghand.fitting.state_choice import StateChoice
 from wildghand.fitting.subject_shape import bent_templates, subject_of
 from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
 from wildghand.gaussians.fit_loop import Loss, repeatable
@@ -114,18 +114,13 @@ class Fit:
             start_from_colors(self.model, self.clip, self.frames, self.weighting, self.dark)
         #: The colours that one of two hands takes from the other, which come last.
         self.borrowed = BorrowedColors.of(self.model, self.clip, self.weighting, settings.evidence)
-        #: Validation frames; None where they are too few, or judge nothing.
-        self.judges = (
-            JudgedDrawings(self.model, training, settings.heads.refinement, judges)
-            if judges is not None
-            else None
-        )
+        judged = JudgedDrawings.of(self.model, training, settings, judges)
         self.choice = EvidenceChoice(
             self.model,
             settings,
             shown,
             count,
-            self.judges,
+            judged,
             FilledColors(self.model, self.borrowed, shown, count),
         )
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
@@ -133,7 +128,7 @@ class Fit:
         self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
         self.average = StepAverage.of_optimizer(self.optimizer, settings.schedule.average_share)
         #: Where the fit may go back to after its last step.
-        self.earlier = EarlierStates.of_epochs(self.average, count, settings.schedule.batch)
+        self.state_choice = StateChoice.of(self.average, count, settings.schedule, judged)
         #: Steps behind it.
         self.steps = 0
         self.generator = torch.Generator().manual_seed(seed)
@@ -216,7 +211,7 @@ class Fit:
             "generator": self.generator.get_state(),
             "shared": self.shared.state_dict(),
             "average": self.average.state_dict(),
-            "earlier": self.earlier.state_dict(),
+            "earlier": self.state_choice.states.state_dict(),
             "steps": self.steps,
         }
 
@@ -231,7 +226,7 @@ class Fit:
         self.shared.load_state_dict(state.get("shared", {"steps": 0}))
         self.average.load_state_dict(state.get("average", {"steps": 0, "means": []}))
         if "earlier" in state:
-            self.earlier.load_state_dict(state["earlier"])
+            self.state_choice.states.load_state_dict(state["earlier"])
         self.steps = int(state.get("steps", 0))
 
     def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
@@ -287,15 +282,6 @@ class Fit:
         needed = self.light.seconds() + self.choice.seconds()
         return seconds - min(needed, MOST_OF_BUDGET * seconds)
 
-    def seconds_for_states(self) -> float:
-        """Return about how long it takes to judge the states that the fit may go back to now."""
-        judges, candidates = self.judges, self.earlier.candidates
-        if not self._goes_back or judges is None or not candidates:
-            return 0.0
-        took = judges.seconds
-        each = took.features + (took.predict + took.draw) * len(judges.frames)
-        return (1 + len(candidates)) * each
-
     def finish(self) -> int | None:
         """Choose the state that the fit ends with, and find what follows from it.
 
@@ -305,7 +291,7 @@ class Fit:
         Returns:
             Steps behind the state, if it is an earlier one than the last.
         """
-        chosen = self.earlier.choose(self._error) if self._goes_back else None
+        chosen = self.state_choice.choose()
         for find in (self.light.learn, self.borrowed.learn):
             found = find()
             if found is not None:
@@ -347,16 +333,6 @@ class Fit:
             ),
             self._weight_masks if final else dict,
         )
-
-    @property
-    def _goes_back(self) -> bool:
-        return self.settings.schedule.validated and self.judges is not None
-
-    def _error(self) -> float:
-        """Mean squared error of the validation frames as the model draws them now."""
-        assert self.judges is not None
-        predicted = self.judges.predict_all()
-        return self.judges.error(predicted, self.model.evidence, self.model.color_changes)
 
     def _weight_masks(self) -> dict[int, np.ndarray]:
         pao = self.settings.pao

@@ -16,6 +16,7 @@ from wildghand.fitting.cast_shadows import Dark, shadows_in
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
 from wildghand.model.free_poses import HandPrediction, dressed, predict_hand
 from wildghand.model.model import WildGHandModel
+from wildghand.model.settings import WildGHandSettings
 from wildghand.network import HandFeatures
 
 #: What network and light say of the hands in a frame, by side.
@@ -46,6 +47,19 @@ class JudgedDrawings:
     refine: bool
     #: Validation frames.
     frames: TrainingFrames
+
+    @classmethod
+    def of(
+        cls,
+        model: WildGHandModel,
+        training: TrainingCapture,
+        settings: WildGHandSettings,
+        frames: TrainingFrames | None,
+    ) -> JudgedDrawings | None:
+        """As the settings of a fit say; None where there are no frames."""
+        if frames is None:
+            return None
+        return cls(model, training, settings.heads.refinement, frames)
 
     @torch.no_grad()
     def features(self) -> dict[str, HandFeatures]:

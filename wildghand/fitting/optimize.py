@@ -97,7 +97,7 @@ def optimize(
             step += 1
             report.progress(step, steps)
             fit.average.take()
-            fit.earlier.take()
+            fit.state_choice.states.take()
             report(step, AveragedAvatar(fit.avatar(step), fit.average))
             if after_step is not None:
                 after_step(step, watchers)
@@ -120,14 +120,14 @@ def _for_steps(budget: Budget, fit: Fit) -> Budget:
     """The budget without the seconds in which the states so far will be judged."""
     if budget.seconds is None:
         return budget
-    return dataclasses.replace(budget, seconds=budget.seconds - fit.seconds_for_states())
+    return dataclasses.replace(budget, seconds=budget.seconds - fit.state_choice.seconds())
 
 
 def _go_back(fit: Fit, watchers: Watchers, step: int) -> int:
     """Bring a fit that diverged back to its best state; returns the steps behind that."""
     fit.model.load_state_dict(watchers.guard.best())
     fit.average.forget()
-    fit.earlier.forget()
+    fit.state_choice.states.forget()
     kept = watchers.guard.step
     _tell(fit.world, f"The fit diverged at step {step}; the state of step {kept} is kept.")
     return kept

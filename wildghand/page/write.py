@@ -136,7 +136,10 @@ def _html(
         "weights": _weights(avatar, samples.frames),
     }
     facts = [f"{sum(len(baked) for baked in hands.values()):,} Gaussians"]
-    facts.append(f"{avatar.record.steps:,} steps on {len(avatar.record.frames)} frames")
+    steps = f"{avatar.record.steps:,} steps"
+    if avatar.record.chosen_steps is not None:
+        steps = f"the state of step {avatar.record.chosen_steps:,} of {avatar.record.steps:,}"
+    facts.append(f"{steps} on {len(avatar.record.frames)} frames")
     if measured is not None:
         facts.append(f"{measured.baked:.1f} dB from the avatar's own drawing")
     return render_template(

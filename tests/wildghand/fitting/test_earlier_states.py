@@ -25,6 +25,7 @@ from wildghand.fitting.averaging import StepAverage
 from wildghand.fitting.earlier_states import EarlierStates
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import optimize
+from wildghand.fitting.state_choice import StateChoice
 from wildghand.model.settings import read_settings
 
 TrainingMaker = Callable[..., TrainingCapture]
@@ -121,7 +122,11 @@ def training(make_training: TrainingMaker) -> TrainingCapture:
 
 
 def fitted(
-    training: TrainingCapture, wanted: int, budget: Budget | None = None, **changes: Any
+    training: TrainingCapture,
+    monkeypatch: pytest.MonkeyPatch,
+    wanted: int,
+    budget: Budget | None = None,
+    **changes: Any,
 ) -> tuple[Fit, Any, dict[int, list[torch.Tensor]]]:
     """A fit in which a state draws the validation frames best, its avatar, and its means."""
     fit = Fit(training, read_settings({**FIT, **changes}), 0, CPU)
@@ -137,16 +142,19 @@ def fitted(
     def watch(fit: Fit, step: int, loss: object) -> None:
         means[step] = fit.average.values()
 
-    fit._error = error  # type: ignore[method-assign]
+    monkeypatch.setattr(StateChoice, "error", lambda choice: error())
     report = SilentReport()
     return fit, optimize(fit, budget or Budget(), report, watch=watch), means
 
 
 def test_a_fit_ends_with_the_state_that_draws_validation_frames_best(
-    training: TrainingCapture, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    training: TrainingCapture,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    fit, avatar, means = fitted(training, 5)
-    assert fit.earlier.candidates == [10, 5]
+    fit, avatar, means = fitted(training, monkeypatch, 5)
+    assert fit.state_choice.states.candidates == [10, 5]
     assert all(torch.equal(a, b) for a, b in zip(fit.average.now(), means[5], strict=True))
     assert (avatar.record.steps, avatar.record.chosen_steps) == (20, 5)
     assert "The state of step 5 draws the validation frames best" in capsys.readouterr().err
@@ -156,20 +164,22 @@ def test_a_fit_ends_with_the_state_that_draws_validation_frames_best(
 
 def test_the_error_is_that_of_the_validation_frames(training: TrainingCapture) -> None:
     fit = Fit(training, read_settings(FIT), 0, CPU)
-    assert fit.judges is not None
-    assert fit.judges.frames.indices.tolist() == training.validation.tolist()
-    expected = fit.judges.error(fit.judges.predict_all(), fit.model.evidence, None)
-    assert fit._error() == expected > 0.0
+    judges = fit.state_choice.judges
+    assert judges is not None
+    assert judges.frames.indices.tolist() == training.validation.tolist()
+    expected = judges.error(judges.predict_all(), fit.model.evidence, None)
+    assert fit.state_choice.error() == expected > 0.0
 
 
 @pytest.mark.parametrize("changes", [{"schedule.validated": False}, {"mode": "paper"}])
 def test_without_the_choice_a_fit_ends_with_its_last_state(
-    changes: dict[str, Any], training: TrainingCapture
+    changes: dict[str, Any], training: TrainingCapture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fit, avatar, means = fitted(training, 5, **{**changes, "schedule.batch": 1})
+    changes = {**changes, "schedule.batch": 1}
+    fit, avatar, means = fitted(training, monkeypatch, 5, **changes)
     assert avatar.record.chosen_steps is None
     assert all(torch.equal(a, b) for a, b in zip(fit.average.now(), means[20], strict=True))
-    assert fit.seconds_for_states() == 0.0
+    assert fit.state_choice.seconds() == 0.0
 
 
 def test_the_seconds_of_the_choice_are_left_out_of_the_steps(
@@ -178,19 +188,19 @@ def test_the_seconds_of_the_choice_are_left_out_of_the_steps(
     """The report's clock runs one second for each step, and one for the start."""
     monkeypatch.setattr(Fit, "seconds_for_steps", lambda fit, seconds: seconds)
     monkeypatch.setattr(
-        Fit, "seconds_for_states", lambda fit: 3.0 * (len(fit.earlier.candidates) > 0)
+        StateChoice, "seconds", lambda choice: 3.0 * (len(choice.states.candidates) > 0)
     )
-    _, avatar, _ = fitted(training, 20, Budget(seconds=16.0))
+    _, avatar, _ = fitted(training, monkeypatch, 20, Budget(seconds=16.0))
     assert avatar.record.steps == 16 - 1 - 3
 
 
 def test_seconds_are_asked_for_once_there_are_states(training: TrainingCapture) -> None:
     fit = Fit(training, read_settings(FIT), 0, CPU)
-    assert fit.seconds_for_states() == 0.0
+    assert fit.state_choice.seconds() == 0.0
     for _ in range(10):
         fit.average.take()
-        fit.earlier.take()
-    assert fit.earlier.candidates == [5]
+        fit.state_choice.states.take()
+    assert fit.state_choice.states.candidates == [5]
     before = {name: value.clone() for name, value in fit.model.state_dict().items()}
-    assert fit.seconds_for_states() > 0.0
+    assert fit.state_choice.seconds() > 0.0
     assert all(torch.equal(value, before[name]) for name, value in fit.model.state_dict().items())
