@@ -27,7 +27,7 @@ class StateChoice:
         schedule: ScheduleSettings,
         judges: JudgedDrawings | None,
     ) -> StateChoice:
-        """As the schedule of a fit says.
+        """As the schedule of a fit says; where nothing judges, no state is kept.
 
         Args:
             average: the mean of the steps so far.
@@ -35,8 +35,9 @@ class StateChoice:
             schedule: of the fit.
             judges: validation frames; None where they are too few.
         """
-        states = EarlierStates.of_epochs(average, frames, schedule.batch)
-        return cls(states, judges if schedule.validated else None)
+        if judges is None or not schedule.validated:
+            return cls(EarlierStates(average, 0), None)
+        return cls(EarlierStates.of_epochs(average, frames, schedule.batch), judges)
 
     def choose(self) -> int | None:
         """Bring the model to the state that draws the validation frames best.

@@ -49,8 +49,11 @@ class JointFit:
         device: torch.device,
     ) -> None:
         # Between two steps on a capture others move the texture branch, which they share. Its last
-        # steps are thousands, at low rates: nothing is gained by their mean.
-        schedule = dataclasses.replace(settings.schedule, texture_every=1, average_share=0.0)
+        # steps are thousands, at low rates: nothing is gained by their mean. All of its frames are
+        # fitted, so that none is there to choose a state.
+        schedule = dataclasses.replace(
+            settings.schedule, texture_every=1, average_share=0.0, validated=False
+        )
         settings = dataclasses.replace(settings, schedule=schedule)
         self.settings = settings
         self.device = device

@@ -180,6 +180,7 @@ def test_without_the_choice_a_fit_ends_with_its_last_state(
     assert avatar.record.chosen_steps is None
     assert all(torch.equal(a, b) for a, b in zip(fit.average.now(), means[20], strict=True))
     assert fit.state_choice.seconds() == 0.0
+    assert fit.state_choice.states.state_dict()["kept"] == {}
 
 
 def test_the_seconds_of_the_choice_are_left_out_of_the_steps(
