@@ -93,8 +93,13 @@ class Tally:
     faults: tuple[str, ...]
 
 
-def make_targets(work: Path) -> list[Target]:
-    """Make the inputs in a folder and return the commands; one capture is rendered for it."""
+def make_targets(work: Path, seeds: int = 2) -> list[Target]:
+    """Make the inputs in a folder and return the commands; one capture is rendered for it.
+
+    Args:
+        work: the folder.
+        seeds: of the ablation, each of which is two evaluations.
+    """
     method = work / "gray"
     method.mkdir(parents=True)
     (method / "gray_method.py").write_text(_METHOD)
@@ -117,7 +122,8 @@ def make_targets(work: Path) -> list[Target]:
         Target(
             "ablate",
             lambda out: [
-                *bench, "ablate", *scored, "--without", "bright", "--seeds", "2", "-o", str(out),
+                *bench, "ablate", *scored, "--without", "bright", "--seeds", str(seeds),
+                "-o", str(out),
             ],
             results_digest,
             False,

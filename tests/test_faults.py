@@ -22,7 +22,9 @@ KILLS = 2
 
 @pytest.fixture(scope="module")
 def targets(tmp_path_factory: pytest.TempPathFactory, machine_code: None) -> dict[str, Target]:
-    return {target.name: target for target in make_targets(tmp_path_factory.mktemp("faults"))}
+    # One seed: an ablation of two evaluations, between which it can be killed.
+    made = make_targets(tmp_path_factory.mktemp("faults"), seeds=1)
+    return {target.name: target for target in made}
 
 
 @pytest.mark.slow

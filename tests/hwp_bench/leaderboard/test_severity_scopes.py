@@ -29,7 +29,7 @@ def entry():
 @pytest.mark.slow
 def test_scenes_say_what_captures_say(tmp_path, monkeypatch) -> None:
     """Oracle: the severities that a rendered capture holds."""
-    scene = load_scene("capture4")
+    scene = load_scene("capture0")
     item = SuiteItem(scene, 20, 32, scene.seed)
     monkeypatch.setattr(severity_scopes, "suite", lambda name: (item,))
     capture = render_capture(
