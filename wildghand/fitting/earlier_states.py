@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from wildghand.fitting.averaging import StepAverage
@@ -30,7 +29,7 @@ class EarlierStates:
     def __init__(self, average: StepAverage, first: int) -> None:
         self._average = average
         self._first = first
-        self._steps, self._next = 0, first
+        self._steps = 0
         self._kept: dict[int, list[Tensor]] = {}
 
     @classmethod
@@ -47,9 +46,8 @@ class EarlierStates:
     def take(self) -> None:
         """Take note of a step, after the average has."""
         self._steps += 1
-        if self._steps == self._next:
+        if self._steps == self._first * 2 ** len(self._kept):
             self._kept[self._steps] = self._average.values()
-            self._next *= 2
 
     @property
     def candidates(self) -> list[int]:
@@ -84,16 +82,15 @@ class EarlierStates:
 
     def forget(self) -> None:
         """Begin again, as before the first step."""
-        self._steps, self._next, self._kept = 0, self._first, {}
+        self._steps, self._kept = 0, {}
 
     def state_dict(self) -> dict[str, Any]:
         """The state for `load_state_dict`."""
-        return {"steps": self._steps, "next": self._next, "kept": dict(self._kept)}
+        return {"steps": self._steps, "kept": dict(self._kept)}
 
     def load_state_dict(self, state: Mapping[str, Any]) -> None:
         """Go on from a saved state."""
-        self._steps, self._next = int(state["steps"]), int(state["next"])
+        self._steps = int(state["steps"])
         self._kept = {
-            int(step): [torch.as_tensor(value).clone() for value in values]
-            for step, values in state["kept"].items()
+            int(step): [value.clone() for value in values] for step, values in state["kept"].items()
         }

@@ -98,6 +98,7 @@ def load_state(
         RuntimeError,
         pickle.UnpicklingError,
         EOFError,
+        AttributeError,
         KeyError,
         TypeError,
         ValueError,

@@ -7,6 +7,7 @@ import numpy as np
 from hwp_bench.hands import HandParameters, HandTemplate
 from hwp_bench.hands.posed_skeleton import (
     DEGREES,
+    PosedSkeleton,
     hand_extent,
     landmark_rows,
     posed_skeleton,
@@ -21,9 +22,8 @@ _NEAREST = 0.01
 
 def in_front(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray) -> np.ndarray:
     """(F,) bool: in which frames a camera sees all landmarks of a hand; see `pose_covariances`."""
-    rest = rest_skeleton(template, hand.betas)
-    posed = posed_skeleton(rest, hand.pose, hand.transl).seen_by(viewmats)
-    return np.asarray((posed.landmarks[..., 2] > _NEAREST).all(axis=1))
+    landmarks = _seen(template, hand, viewmats).landmarks
+    return np.asarray((landmarks[..., 2] > _NEAREST).all(axis=1))
 
 
 def extent_in(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray) -> float:
@@ -32,8 +32,7 @@ def extent_in(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray
     Returns:
         Median over frames of the larger side of its box, in slopes of the camera.
     """
-    rest = rest_skeleton(template, hand.betas)
-    return hand_extent(posed_skeleton(rest, hand.pose, hand.transl).seen_by(viewmats).landmarks)
+    return hand_extent(_seen(template, hand, viewmats).landmarks)
 
 
 def pose_covariances(
@@ -59,14 +58,19 @@ def pose_covariances(
     Returns:
         (F, 51, 51): 16 joints about their own axes, rad, then the place in camera axes, m.
     """
-    rest = rest_skeleton(template, hand.betas)
-    posed = posed_skeleton(rest, hand.pose, hand.transl).seen_by(viewmats)
+    posed = _seen(template, hand, viewmats)
     rows = landmark_rows(posed, settings.image_error * extent, settings.space_error)
     told = np.einsum("fnk,fnl->fkl", rows, rows)
     turn, shift = settings.expected_turn, settings.expected_shift
     expected = np.repeat([turn, shift], [DEGREES - 3, 3]) ** -2.0
     answer = np.linalg.inv(told + np.diag(expected))
     return np.asarray(answer @ told @ answer)
+
+
+def _seen(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray) -> PosedSkeleton:
+    """The skeleton of a hand in camera axes."""
+    rest = rest_skeleton(template, hand.betas)
+    return posed_skeleton(rest, hand.pose, hand.transl).seen_by(viewmats)
 
 
 def vector_changes(pose: np.ndarray) -> np.ndarray:

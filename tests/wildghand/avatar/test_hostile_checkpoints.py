@@ -14,6 +14,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from hwp_bench.base.errors import BadInput
+from wildghand.fitting.averaging import StepAverage
+from wildghand.fitting.earlier_states import EarlierStates
 from wildghand.fitting.saved_state import SCHEMA, load_state
 from wildghand.gaussians.perceptual import Vgg19
 
@@ -52,6 +54,17 @@ def test_damaged_states_are_one_kind_of_error(tmp_path: Path, content: bytes) ->
     with pytest.raises(BadInput, match="is damaged") as caught:
         load_state(file, SimpleNamespace(device="cpu"), None, "d")  # type: ignore[arg-type]
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kept", [[1], {5: [1.0]}, None])
+def test_a_state_that_keeps_no_tensors_is_damaged(tmp_path: Path, kept: Any) -> None:
+    file = tmp_path / "state.pt"
+    parts = {"fit": {"steps": 9, "kept": kept}, "watchers": {}, "step": 9, "seconds": 1.0}
+    torch.save({"schema": SCHEMA, "digest": "d", **parts}, file)
+    states = EarlierStates(StepAverage([], 0.0), 5)
+    fit = SimpleNamespace(device="cpu", load_state_dict=states.load_state_dict)
+    with pytest.raises(BadInput, match="is damaged"):
+        load_state(file, fit, None, "d")  # type: ignore[arg-type]
 
 
 def _tensors(header: Any, size: int | None = None, body: bytes = b"") -> bytes:

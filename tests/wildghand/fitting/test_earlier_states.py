@@ -30,7 +30,7 @@ from wildghand.model.settings import read_settings
 
 TrainingMaker = Callable[..., TrainingCapture]
 CPU = torch.device("cpu")
-#: Five steps see each frame once; a state is kept after 1, 2, 4, 8 and 16 of them.
+#: Of two frames: a state is kept after 5, 10 and 20 steps.
 FIT: dict[str, Any] = {**UNJUDGED, "schedule.steps": 20}
 
 
