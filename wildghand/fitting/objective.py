@@ -80,8 +80,9 @@ class Objective:
         """
         weights, settings = self.weights, self.settings
         image = drawing.image
+        dssim = weights.dssim_share(exact_poses=model.clip_poses is None)
         total = weights.reconstruction * terms.reconstruction(
-            image, target.image, target.weights, weights.dssim_weight
+            image, target.image, target.weights, dssim
         )
         if self._perceptual is not None:
             found = self._perceptual(image, target.image, target.weights)

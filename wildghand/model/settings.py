@@ -244,7 +244,7 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
         },
         "prepass": {"clean_scale": 1.0},
         "schedule": {"root_steps": 0.0, "average_share": 0.0, "validated": False},
-        "terms": {"surface": 0.0, "leave_hidden": False},
+        "terms": {"surface": 0.0, "leave_hidden": False, "dssim_inexact": 1.0},
     }
 )
 

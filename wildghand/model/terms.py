@@ -27,6 +27,9 @@ class TermWeights:
     reconstruction: float = 1.0
     #: Share of D-SSIM in the reconstruction; the rest is L1.
     dssim_weight: float = number(0.2, 0.0, 1.0)
+    #: That share at most, where the poses of a clip had to be corrected (`wildghand.poses`): what
+    #: lies some pixels off its place has its structure elsewhere.
+    dssim_inexact: float = number(0.05, 0.0, 1.0)
     #: Weight in the reconstruction of a pixel outside the visible-hand mask; inside it is 1.
     outside_weight: float = number(0.03, 0.0, 1.0)
     #: Leave out of the reconstruction what the mask leaves out though the posed hand covers it:
@@ -54,6 +57,10 @@ class TermWeights:
     cross_hand: float = 1e-3
     #: A perceptual distance (`wildghand.gaussians.perceptual`).
     perceptual: float = 0.0
+
+    def dssim_share(self, *, exact_poses: bool) -> float:
+        """Share of D-SSIM in the reconstruction, of clips with exact poses or of others."""
+        return self.dssim_weight if exact_poses else min(self.dssim_weight, self.dssim_inexact)
 
     def __post_init__(self) -> None:
         for item in fields(self):
