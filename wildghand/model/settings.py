@@ -220,7 +220,9 @@ _PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
         "evidence": {"enabled": False},
         "prepass": {"enabled": False},
         "terms": {
-            name: value for name, value in _PUBLISHED["terms"].items() if name != "dssim_weight"
+            name: value
+            for name, value in _PUBLISHED["terms"].items()
+            if name not in ("dssim_weight", "dssim_inexact")
         },
     }
 )

@@ -119,6 +119,14 @@ def test_the_papers_weights() -> None:
     assert (paper.laplacian_offsets, paper.weight_reward) == (0.1, 0.5)
 
 
+def test_inexact_poses_leave_at_most_the_lesser_share_to_dssim() -> None:
+    weights = terms.TermWeights(dssim_weight=0.4, dssim_inexact=0.1)
+    assert weights.dssim_share(exact_poses=True) == 0.4
+    assert weights.dssim_share(exact_poses=False) == 0.1
+    # Whoever asks for less, as the paper does, gets it with any poses.
+    assert terms.PAPER_TERMS.dssim_share(exact_poses=False) == 0.0
+
+
 def test_bad_arguments_are_named() -> None:
     with pytest.raises(UsageError, match="bias"):
         terms.TermWeights(bias=-1.0)

@@ -275,7 +275,7 @@ PAPER_1: dict[str, Any] = {
     **{
         f"terms.{item.name}": getattr(PAPER_TERMS, item.name)
         for item in dataclasses.fields(PAPER_TERMS)
-        if item.name not in ("dssim_weight", "outside_weight")
+        if item.name not in ("dssim_weight", "dssim_inexact", "outside_weight")
     },
 }
 
@@ -332,6 +332,9 @@ def test_avatars_from_before_the_subject_the_light_and_the_places_draw_as_they_d
     del stored["subject"], stored["light"], stored["pao"]["errors"]
     expected = {"subject.enabled": False, "light.enabled": False, "pao.errors": "median"}
     assert read_stored(stored) == read_settings(expected)
+    stored = dataclasses.asdict(read_settings({}))
+    del stored["terms"]["dssim_inexact"]
+    assert read_stored(stored) == read_settings({"terms.dssim_inexact": 1.0})
     today = read_settings({})
     assert (today.subject.enabled, today.light.enabled, today.pao.errors) == (True, True, "place")
     assert read_stored(dataclasses.asdict(today)) == today
