@@ -220,9 +220,7 @@ _PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
         "evidence": {"enabled": False},
         "prepass": {"enabled": False},
         "terms": {
-            name: value
-            for name, value in _PUBLISHED["terms"].items()
-            if name not in ("dssim_weight", "dssim_inexact")
+            name: value for name, value in _PUBLISHED["terms"].items() if name != "dssim_weight"
         },
     }
 )

@@ -275,7 +275,7 @@ PAPER_1: dict[str, Any] = {
     **{
         f"terms.{item.name}": getattr(PAPER_TERMS, item.name)
         for item in dataclasses.fields(PAPER_TERMS)
-        if item.name not in ("dssim_weight", "dssim_inexact", "outside_weight")
+        if item.name not in ("dssim_weight", "outside_weight")
     },
 }
 
