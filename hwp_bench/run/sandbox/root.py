@@ -80,10 +80,7 @@ def _show(place: Place) -> str | None:
     elif kind == "proc":
         os.makedirs(here, exist_ok=True)
         syscalls.mount("proc", here, "proc", syscalls.MS_NOSUID | syscalls.MS_NODEV)
-        # Its files decide by the user's number alone, whatever rights are left: started by root,
-        # the program could write the whole machine's settings. A read-only one in sight also keeps
-        # a user namespace made inside from mounting another that is writable.
-        syscalls.set_attributes(here, syscalls.MOUNT_ATTR_RDONLY)
+        _restrict_machine(here)
     elif kind == "scratch":
         os.makedirs(here, exist_ok=True)
         _tmpfs(here, f"size={SCRATCH_BYTES},mode=1777")
@@ -91,6 +88,20 @@ def _show(place: Place) -> str | None:
         _tmpfs(here, "size=1m,mode=755")
         return here
     return None
+
+
+def _restrict_machine(proc: str) -> None:
+    """Make everything read-only in a process table but its processes.
+
+    Its files decide by the user's number alone, whatever rights are left: started by root, the
+    program could write the whole machine's settings. What covers a part of it also keeps a user
+    namespace made inside from mounting another that is whole. Processes stay writable, because
+    threads are named there, which CUDA cannot begin without.
+    """
+    for entry in os.scandir(proc):
+        if not entry.name.isdigit() and not entry.is_symlink():
+            syscalls.mount(entry.path, entry.path, "", syscalls.MS_BIND | syscalls.MS_REC)
+            syscalls.set_attributes(entry.path, syscalls.MOUNT_ATTR_RDONLY)
 
 
 def _mount_point(path: str, *, folder: bool) -> None:
