@@ -8,7 +8,7 @@ from __future__ import annotations
 #: A splat does not change a pixel where its alpha is below this.
 MIN_ALPHA = 1.0 / 255.0
 #: Alpha is clamped here, so that the transmittance behind a splat is never zero.
-MAX_ALPHA = 0.99
+MAX_ALPHA = 0.999
 #: The splat that would bring the transmittance of a pixel down to this, and all behind it,
 #: are left out.
 MIN_TRANSMITTANCE = 1e-4

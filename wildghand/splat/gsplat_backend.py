@@ -9,8 +9,10 @@ reads one number back, how many tiles its splats cover.
 
 from __future__ import annotations
 
+import functools
 import re
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
 import torch
@@ -21,6 +23,8 @@ from wildghand.splat.scene import FlatScene, channels_with_depth
 
 #: Beyond this, squares of lengths leave float32 inside gsplat.
 _MAX_LENGTH = 1e15
+#: A quaternion's largest number; the gradient of one outside leaves float32.
+_LEAST_QUATERNION, _MAX_QUATERNION = 1e-36, 1e36
 #: gsplat divides by the depth of all that is not nearer than the near plane.
 _LEAST_NEAR_PLANE = 1e-6
 #: gsplat takes leading batch dimensions from this version on; before, sets of Gaussians that
@@ -102,35 +106,11 @@ def _gsplat() -> tuple[Callable[..., Any], bool]:
 
 def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     """The scene's tensors, with everything that gsplat cannot take made invisible."""
-    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks", "backgrounds")
-    tensors = {name: getattr(scene, name) for name in names}
-    tensors = {name: tensor for name, tensor in tensors.items() if tensor is not None}
-
-    def within(tensor: torch.Tensor, bound: float) -> torch.Tensor:
-        return (tensor.detach().abs() <= bound).all(-1)
-
-    def replaced(tensor: torch.Tensor, good: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
-        return torch.where(good.reshape(good.shape + (1,) * value.ndim), tensor, value)
-
-    result = dict(tensors)
-    zero = scene.means.new_zeros(())
-    quats = scene.quats
-    good = {
-        "means": within(scene.means, _MAX_LENGTH),
-        "scales": within(scene.scales, _MAX_LENGTH),
-        "quats": within(quats, _MAX_LENGTH) & (quats.detach().norm(dim=-1) > 0),
-        "colors": within(scene.colors, rules.MAX_COLOR),
-        "opacities": scene.opacities.detach().isfinite(),
-    }
-    values = {
-        "means": zero.expand(3),
-        "scales": zero.expand(3),
-        "quats": torch.eye(4, dtype=zero.dtype, device=zero.device)[0],
-        "colors": zero.expand(scene.colors.shape[-1]),
-        "opacities": zero,
-    }
-    for name, value in values.items():
-        result[name] = replaced(tensors[name], good[name], value)
+    scaled, good = _usable(scene)
+    neutral = _neutral(scene.means.device, scene.means.dtype)
+    result = {name: getattr(scene, name) for name in ("colors", "viewmats", "Ks")} | scaled
+    for name, mask in good.items():
+        result[name] = _replaced(result[name], mask, neutral.of(name, result[name]))
     # An offender in any argument makes the Gaussian vanish: its opacity is zero.
     opacities = result["opacities"]
     colors = good.pop("colors")
@@ -143,19 +123,85 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     visible = torch.ones(finest, scene.gaussians, dtype=torch.bool, device=opacities.device)
     for mask in good.values():
         visible = visible & _repeat(mask, finest)
-    result["opacities"] = torch.where(visible, _repeat(opacities, finest), zero)
+    result["opacities"] = torch.where(visible, _repeat(opacities, finest), neutral.zero)
     if scene.backgrounds is not None:
         fine = scene.backgrounds.detach().abs() <= rules.MAX_COLOR
-        result["backgrounds"] = torch.where(fine, scene.backgrounds, zero)
-    cameras = tensors["viewmats"].detach().flatten(1).isfinite().all(1)
-    cameras &= tensors["Ks"].detach().flatten(1).isfinite().all(1)
-    cameras &= (tensors["Ks"].detach().diagonal(dim1=-2, dim2=-1)[:, :2] > 0).all(1)
-    away = torch.eye(4, device=zero.device, dtype=zero.dtype)
-    away[:3, :3] = 0.0
-    away[2, 3] = -1.0  # all that there is lies behind this camera
-    result["viewmats"] = replaced(tensors["viewmats"], cameras, away)
-    result["Ks"] = replaced(tensors["Ks"], cameras, torch.eye(3, device=zero.device))
+        result["backgrounds"] = torch.where(fine, scene.backgrounds, neutral.zero)
+    cameras = _camera_usable(result["viewmats"].detach(), result["Ks"].detach())
+    for name in ("viewmats", "Ks"):
+        result[name] = _replaced(result[name], cameras, neutral.of(name, result[name]))
     return result
+
+
+def _usable(scene: FlatScene) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
+    """Means, scales, opacities and quaternions as gsplat takes them, and what of all is usable.
+
+    Returns:
+        The tensors by name, and masks (S, N) by name, those of the colours too.
+    """
+    # gsplat squares a quaternion's numbers: those of a very small or large one leave float32.
+    longest = _largest(scene.quats)
+    turns = (longest >= _LEAST_QUATERNION) & (longest <= _MAX_QUATERNION)
+    quats = scene.quats / torch.where(turns, longest, 1.0)[..., None]
+    tensors = {
+        "means": scene.means,
+        "scales": scene.scales,
+        "quats": quats,
+        # More than opaque is opaque, as in `api`; what is not a number stays one.
+        "opacities": scene.opacities,
+    }
+    good = {
+        "means": _largest(scene.means) <= _MAX_LENGTH,
+        "scales": _largest(scene.scales) <= _MAX_LENGTH,
+        "quats": turns,
+        "colors": _largest(scene.colors) <= rules.MAX_COLOR,
+        "opacities": scene.opacities.detach().isfinite(),
+    }
+    return tensors, good
+
+
+def _largest(tensor: torch.Tensor) -> torch.Tensor:
+    """The largest absolute number of each row; NaN where one is NaN."""
+    return torch.linalg.vector_norm(tensor.detach(), ord=torch.inf, dim=-1)
+
+
+def _camera_usable(viewmats: torch.Tensor, Ks: torch.Tensor) -> torch.Tensor:
+    """(I,) bool: cameras with finite numbers and focal lengths that float32 can square."""
+    focal = Ks.diagonal(dim1=-2, dim2=-1)[:, :2]
+    good = (focal > 0.0).all(1) & (_largest(Ks.flatten(1)) <= _MAX_LENGTH)
+    return good & viewmats.flatten(1).isfinite().all(1)
+
+
+def _replaced(tensor: torch.Tensor, good: torch.Tensor, value: torch.Tensor) -> torch.Tensor:
+    return torch.where(good.reshape(good.shape + (1,) * value.ndim), tensor, value)
+
+
+@dataclass(frozen=True)
+class _Neutral:
+    """What stands in for numbers that gsplat cannot take."""
+
+    zero: torch.Tensor
+    quats: torch.Tensor
+    #: A camera that has everything behind it.
+    viewmats: torch.Tensor
+    Ks: torch.Tensor
+
+    def of(self, name: str, tensor: torch.Tensor) -> torch.Tensor:
+        """The value for a row of an argument, or for a camera."""
+        if name in ("quats", "viewmats", "Ks"):
+            value: torch.Tensor = getattr(self, name)
+            return value
+        return self.zero if name == "opacities" else self.zero.expand(tensor.shape[-1])
+
+
+@functools.lru_cache(maxsize=8)
+def _neutral(device: torch.device, dtype: torch.dtype) -> _Neutral:
+    """Made once for a device: each of these would start a kernel in every call."""
+    away = torch.zeros(4, 4, dtype=dtype)
+    away[2, 3], away[3, 3] = -1.0, 1.0
+    quats = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=dtype)
+    made = (torch.zeros((), dtype=dtype), quats, away, torch.eye(3, dtype=dtype))
+    return _Neutral(*(tensor.to(device) for tensor in made))
 
 
 def _repeat(tensor: torch.Tensor, count: int) -> torch.Tensor:

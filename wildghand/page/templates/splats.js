@@ -43,7 +43,7 @@ out vec4 color;
 void main() {
   vec2 d = vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - centre;
   float power = 0.5 * (conic.x * d.x * d.x + conic.z * d.y * d.y) + conic.y * d.x * d.y;
-  float alpha = min(0.99, paint.a * exp(-power));
+  float alpha = min(0.999, paint.a * exp(-power));
   if (power < 0.0 || alpha < 1.0 / 255.0) discard;
   color = vec4(paint.rgb * alpha, alpha);
 }`;
