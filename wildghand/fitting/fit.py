@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import dataclasses
 import functools
 import math
@@ -85,6 +84,7 @@ class Fit:
         self.model = make_model(
             templates, settings, self.mean_color, len(self.frames), seed, device, subject
         )
+        self.model.network.half = settings.mixed_precision and device.type == "cuda"
         if clip_poses is not None:
             self.model.keep(clip_poses)
         self.source = {"capture": training.id}
@@ -253,19 +253,18 @@ class Fit:
             move: refine the poses of the frames; None: if any of them needs it.
             features: of the network by side, where they are at hand already.
         """
-        with self._precision():
-            return self.model.draw_frames(
-                self.clip,
-                upload(rows, self.device),
-                self.training.width,
-                self.training.height,
-                kept=kept,
-                teach=functools.partial(self.weighting.shares, rows),
-                move=self.weighting.moves(rows) if move is None else move,
-                refine=self.settings.heads.refinement,
-                features=features,
-                dark=self.dark(rows),
-            )
+        return self.model.draw_frames(
+            self.clip,
+            upload(rows, self.device),
+            self.training.width,
+            self.training.height,
+            kept=kept,
+            teach=functools.partial(self.weighting.shares, rows),
+            move=self.weighting.moves(rows) if move is None else move,
+            refine=self.settings.heads.refinement,
+            features=features,
+            dark=self.dark(rows),
+        )
 
     @property
     def light(self) -> LightFit:
@@ -343,11 +342,6 @@ class Fit:
             lambda rows: self.weighting(rows, self.draw(rows)).weights,
             unbounded=pao.variant == "printed",
         )
-
-    def _precision(self) -> contextlib.AbstractContextManager[object]:
-        if self.settings.mixed_precision and self.device.type == "cuda":
-            return torch.autocast(self.device.type, dtype=torch.bfloat16)
-        return contextlib.nullcontext()
 
     @torch.no_grad()
     def _temporal(self) -> dict[str, list[float]]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -94,6 +95,8 @@ class PredictionNetwork(nn.Module):
         super().__init__()
         check_sides(surfaces)
         self.settings = settings
+        #: Multiply matrices in bfloat16. What comes out is float32 all the same.
+        self.half = False
         #: Turns raw attributes into drawable ones.
         self.activation = Activation(max_offset=settings.max_offset)
         with torch.random.fork_rng(devices=[]):
@@ -177,16 +180,18 @@ class PredictionNetwork(nn.Module):
         Raises:
             UsageError: no such hand.
         """
-        x_t = self.texture(side)
-        mean = x_t.mean(dim=0)
-        position = self._chart(side).coordinates[:, -POSITION_CHANNELS:]
-        return HandFeatures(
-            texture=x_t,
-            mean=mean,
-            hidden=self.attribute_head.texture(x_t),
-            template_offsets=self.template_head(x_t, position.to(x_t.dtype)),
-            betas=self.refinement_head.shape_change(mean),
-        )
+        with self._precision():
+            x_t = self.texture(side)
+            mean = x_t.mean(dim=0)
+            position = self._chart(side).coordinates[:, -POSITION_CHANNELS:]
+            found = HandFeatures(
+                texture=x_t,
+                mean=mean,
+                hidden=self.attribute_head.texture(x_t),
+                template_offsets=self.template_head(x_t, position.to(x_t.dtype)),
+                betas=self.refinement_head.shape_change(mean),
+            )
+        return found.map(torch.Tensor.float) if self.half else found
 
     def forward(
         self, side: str, normals: Tensor, pose: Tensor, features: HandFeatures | None = None
@@ -204,8 +209,14 @@ class PredictionNetwork(nn.Module):
             ShapeMismatch: not N normals, or not as many poses as frames.
         """
         hand = self.features(side) if features is None else features
-        raw, shadow, mean = self._heads(side, normals, pose, hand.hidden)
-        pose_change, transl_change = self.refinement_head(hand.mean, mean)
+        with self._precision():
+            raw, shadow, mean = self._heads(side, normals, pose, hand.hidden)
+            pose_change, transl_change = self.refinement_head(hand.mean, mean)
+        if self.half:
+            raw = RawAttributes.split(raw.concatenate().float())
+            shadow, pose_change, transl_change = (
+                tensor.float() for tensor in (shadow, pose_change, transl_change)
+            )
         return NetworkOutput(
             raw=raw,
             shadow=shadow,
@@ -214,12 +225,18 @@ class PredictionNetwork(nn.Module):
             texture=hand.texture,
         )
 
+    def _precision(self) -> contextlib.AbstractContextManager[object]:
+        if not self.half:
+            return contextlib.nullcontext()
+        device = next(self.parameters()).device
+        return torch.autocast(device.type, torch.bfloat16)
+
     def _heads(
         self, side: str, normals: Tensor, pose: Tensor, hidden: Tensor
     ) -> tuple[RawAttributes, Tensor, Tensor]:
         """Heads (i) and (ii), and the (B, Fg) mean of the geometry features."""
         branch = self.geometry_branch
-        plain = normals.dtype != torch.float32 or torch.is_autocast_enabled()
+        plain = normals.dtype != torch.float32 or self.half
         if plain or not isinstance(branch, CompactGeometry) or self.settings.head_layers != 1:
             x_g = self.geometry(side, normals, pose)
             raw = self.attribute_head(hidden, x_g, self._latent(side), self._initial(side))

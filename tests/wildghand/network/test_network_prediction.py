@@ -204,6 +204,26 @@ def test_features_at_hand_are_not_computed_again() -> None:
     assert torch.equal(prediction.raw.concatenate(), net("right", *frames(20, 1)).raw.concatenate())
 
 
+@pytest.mark.parametrize("size", SMALL)
+def test_in_half_precision_it_predicts_nearly_the_same_in_float32(size: str) -> None:
+    """Oracle: the network in float32; a bfloat16 has 8 bits, and errors of layers add up to 2 %."""
+    net = stir(network(size))
+    normals, pose = frames(20, 3)
+    whole = net("right", normals, pose)
+    net.half = True
+    half = net("right", normals, pose)
+    pairs = [(half.shadow, whole.shadow), (half.texture, whole.texture)]
+    pairs += [(half.template_offsets, whole.template_offsets)]
+    pairs += [(half.refinement.pose, whole.refinement.pose)]
+    pairs += [(half.raw.concatenate(), whole.raw.concatenate())]
+    for found, expected in pairs:
+        assert found.dtype == torch.float32
+        assert (found - expected).norm() <= 0.02 * expected.norm() + 1e-6
+    assert not torch.equal(half.raw.concatenate(), whole.raw.concatenate())
+    loss_of(half).backward()
+    assert all(p.grad is None or p.grad.isfinite().all() for p in net.parameters())
+
+
 def test_one_hand_has_one_half_of_the_map() -> None:
     net = PredictionNetwork(small("compact"), {"left": surfaces(20)["left"]})
     assert list(net.identity.maps) == ["left"]
