@@ -134,7 +134,7 @@ def anchor_normals(
     """
     corners, mix = _gather(faces, anchors, vertices)
     mixed = _mix(vertex_normals(vertices, faces), corners, mix)
-    return unit_or(mixed, vertices.new_tensor([0.0, 0.0, 1.0]))
+    return unit_or(mixed, _forward(vertices))
 
 
 def anchor_frames(
@@ -184,7 +184,12 @@ def vertex_normals(vertices: torch.Tensor, faces: torch.Tensor) -> torch.Tensor:
     sums = torch.zeros_like(vertices)
     for corner in faces.unbind(dim=1):
         sums = sums.index_add(-2, corner, crosses)
-    return unit_or(sums, vertices.new_tensor([0.0, 0.0, 1.0]))
+    return unit_or(sums, _forward(vertices))
+
+
+def _forward(like: torch.Tensor) -> torch.Tensor:
+    """(0, 0, 1), made where it is needed: handing numbers over to a device would wait for it."""
+    return torch.eye(3, dtype=like.dtype, device=like.device)[2]
 
 
 def unit_or(vectors: torch.Tensor, fallback: torch.Tensor) -> torch.Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from dataclasses import dataclass, replace
 
 import torch
@@ -80,8 +81,19 @@ def pose_hand(
     return PosedHand(
         vertices=vertices,
         joints=joints,
-        landmarks=points[:, list(landmark_order())],
+        landmarks=torch.cat([points[:, rows] for rows in _landmark_rows()], dim=1),
         transforms=_homogeneous(turns, shifts),
+    )
+
+
+@functools.cache
+def _landmark_rows() -> tuple[slice, ...]:
+    """`landmark_order` as slices: numbers would be handed over to a device, which waits for it."""
+    order = landmark_order()
+    starts = [n for n in range(len(order)) if n == 0 or order[n] != order[n - 1] + 1]
+    ends = [*starts[1:], len(order)]
+    return tuple(
+        slice(order[start], order[end - 1] + 1) for start, end in zip(starts, ends, strict=True)
     )
 
 

@@ -1,8 +1,8 @@
 """A step of a fit on a device: nobody waits for the device.
 
 Oracle without a GPU: torch's device `meta`, whose tensors have no values. Whatever reads a value
-raises there, and a mode that sees every operation notes copies that would wait. The code that runs
-is that of CUDA. With a GPU: torch's own debug mode, which raises where the host waits.
+raises there, and modes that see every operation note copies that would wait. The code that runs is
+that of CUDA. With a GPU: torch's own debug mode, which raises where the host waits.
 """
 
 from __future__ import annotations
@@ -12,9 +12,11 @@ import importlib.util
 import sys
 from typing import Any
 
+import numpy as np
 import pytest
 import torch
 from painted import TrainingMaker
+from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
@@ -72,6 +74,34 @@ class Waits(TorchDispatchMode):
         name = str(func)
         if len(kinds) > 1 and not _queued(name, args, kwargs):
             self.found.append(name)
+        return result
+
+
+class HandedOver(TorchFunctionMode):
+    """Notes numbers of the host that are made a tensor of the device, for which it waits.
+
+    On the device `meta` they need no copy, so that `Waits` does not see them.
+
+    Attributes:
+        found: names of the calls.
+    """
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.found: list[str] = []
+
+    def __torch_function__(
+        self, func: Any, types: Any, args: Any = (), kwargs: dict[str, Any] | None = None
+    ) -> Any:
+        result = func(*args, **(kwargs or {}))
+        name = func.__name__
+        made = name in ("new_tensor", "tensor", "as_tensor") and result.device == FAKE
+        if made and not any(isinstance(value, torch.Tensor) for value in args[-1:]):
+            self.found.append(name)
+        if name in ("__getitem__", "__setitem__") and args[0].device == FAKE:
+            index = args[1] if isinstance(args[1], tuple) else (args[1],)
+            if any(isinstance(part, list | np.ndarray) for part in index):
+                self.found.append(name)
         return result
 
 
@@ -160,13 +190,14 @@ def test_a_step_reads_nothing_from_the_device(
     order = batches(len(fit.frames), fit.settings.schedule.batch, 0)
     fit.step(next(order), 0.0)  # tables of targets are made in the first step
     guard, plateau = Guard(), Plateau(10 * WINDOW)
-    with Waits() as waits:
+    with Waits() as waits, HandedOver() as handed:
         for step in range(3):
             loss = fit.step(next(order), 0.5)
             assert guard.watch(step, loss, fit.model)
             assert not plateau.reached(loss)
             fit.avatar(step)
     assert waits.found == []
+    assert handed.found == []
 
 
 def test_the_mode_sees_what_waits() -> None:
@@ -183,6 +214,15 @@ def test_the_mode_sees_what_waits() -> None:
         with pytest.raises((RuntimeError, NotImplementedError)):
             table.nonzero()
     assert waits.found == ["aten._to_copy.default", "aten.index.Tensor"]
+    with HandedOver() as handed:
+        torch.as_tensor(table)
+        torch.tensor([1.0, 2.0])
+        table[1:, None]
+        assert handed.found == []
+        table.new_tensor([1.0])
+        torch.as_tensor(np.zeros(2), device=FAKE)
+        table[:, [1, 0]]
+    assert handed.found == ["new_tensor", "as_tensor", "__getitem__"]
 
 
 @pytest.mark.skipif(not HAS_GPU, reason="needs a GPU and gsplat")
@@ -191,14 +231,14 @@ def test_on_a_gpu_only_the_rasterizer_waits(
     name: str, monkeypatch: pytest.MonkeyPatch, make_training: TrainingMaker
 ) -> None:
     """gsplat itself reads how many tiles its splats cover; for that call the mode is off."""
-    import wildghand.model.model as module
+    import wildghand.model.rasterize_hands as module
 
     rasterize = module.rasterize
 
-    def may_wait(*args: Any) -> Any:
+    def may_wait(*args: Any, **options: Any) -> Any:
         torch.cuda.set_sync_debug_mode("default")
         try:
-            return rasterize(*args)
+            return rasterize(*args, **options)
         finally:
             torch.cuda.set_sync_debug_mode("error")
 
