@@ -84,7 +84,7 @@ class Fit:
         self.model = make_model(
             templates, settings, self.mean_color, len(self.frames), seed, device, subject
         )
-        self.model.network.half = settings.mixed_precision and device.type == "cuda"
+        self.model.network.mixed_precision = settings.mixed_precision and device.type == "cuda"
         if clip_poses is not None:
             self.model.keep(clip_poses)
         self.source = {"capture": training.id}

@@ -96,7 +96,7 @@ class PredictionNetwork(nn.Module):
         check_sides(surfaces)
         self.settings = settings
         #: Multiply matrices in bfloat16. What comes out is float32 all the same.
-        self.half = False
+        self.mixed_precision = False
         #: Turns raw attributes into drawable ones.
         self.activation = Activation(max_offset=settings.max_offset)
         with torch.random.fork_rng(devices=[]):
@@ -191,7 +191,7 @@ class PredictionNetwork(nn.Module):
                 template_offsets=self.template_head(x_t, position.to(x_t.dtype)),
                 betas=self.refinement_head.shape_change(mean),
             )
-        return found.map(torch.Tensor.float) if self.half else found
+        return found.map(torch.Tensor.float) if self.mixed_precision else found
 
     def forward(
         self, side: str, normals: Tensor, pose: Tensor, features: HandFeatures | None = None
@@ -212,7 +212,7 @@ class PredictionNetwork(nn.Module):
         with self._precision():
             raw, shadow, mean = self._heads(side, normals, pose, hand.hidden)
             pose_change, transl_change = self.refinement_head(hand.mean, mean)
-        if self.half:
+        if self.mixed_precision:
             raw = RawAttributes.split(raw.concatenate().float())
             shadow, pose_change, transl_change = (
                 tensor.float() for tensor in (shadow, pose_change, transl_change)
@@ -226,7 +226,7 @@ class PredictionNetwork(nn.Module):
         )
 
     def _precision(self) -> contextlib.AbstractContextManager[object]:
-        if not self.half:
+        if not self.mixed_precision:
             return contextlib.nullcontext()
         device = next(self.parameters()).device
         return torch.autocast(device.type, torch.bfloat16)
@@ -236,7 +236,7 @@ class PredictionNetwork(nn.Module):
     ) -> tuple[RawAttributes, Tensor, Tensor]:
         """Heads (i) and (ii), and the (B, Fg) mean of the geometry features."""
         branch = self.geometry_branch
-        plain = normals.dtype != torch.float32 or self.half
+        plain = normals.dtype != torch.float32 or self.mixed_precision
         if plain or not isinstance(branch, CompactGeometry) or self.settings.head_layers != 1:
             x_g = self.geometry(side, normals, pose)
             raw = self.attribute_head(hidden, x_g, self._latent(side), self._initial(side))

@@ -13,33 +13,27 @@ from collections.abc import Callable, Iterator
 import torch
 
 from hwp_bench.stability import Case, Context, Measured
-from wildghand.splat.hard_scenes import (
-    DIFFERENTIABLE,
-    PER_GAUSSIAN,
-    DrawnScene,
-    HardScene,
-    clear_pixels,
-    difference,
-    draw,
-    gradient_differences,
-    hand_scene,
+from wildghand.splat.hard_runs import (
+    GRADIENT_TOLERANCE,
+    GSPLAT_TOLERANCE,
+    IMAGE_TOLERANCE,
+    NEEDLE_TOLERANCE,
+    NO_CHANGE,
+    VICTIM,
+    run_bad_view,
+    run_doubled,
+    run_exact,
+    run_finite,
+    run_narrow,
+    run_no_effect,
+    run_reordered,
+    run_strided,
 )
-
-#: Largest relative L2 distance from the float64 reference: image, gradients, and gradients of
-#: needles.
-IMAGE_TOLERANCE = 1e-5
-GRADIENT_TOLERANCE = 1e-4
-NEEDLE_TOLERANCE = 1e-3
-#: Gradients of gsplat, which projects in float32 and adds up in float32, in any order.
-GSPLAT_TOLERANCE = 1e-3
-#: Largest change of an image or gradient when a culled Gaussian is taken away.
-NO_CHANGE = 1e-6
+from wildghand.splat.hard_scenes import PER_GAUSSIAN, HardScene, hand_scene
 
 _FLOAT32 = torch.finfo(torch.float32)
 _SUBNORMAL = 1e-42
 _BAD = {"NaN": math.nan, "+inf": math.inf, "-inf": -math.inf}
-#: The Gaussian that is spoilt.
-_VICTIM = 7
 
 
 def cases() -> list[Case]:
@@ -84,7 +78,7 @@ def _culled() -> Iterator[_Entry]:
     }
     for name, z in at.items():
         means = scene.arguments["means"].clone()
-        means[_VICTIM, 2] = z
+        means[VICTIM, 2] = z
         yield _no_effect(f"centre {name}", scene.changed(means=means))
     for value in (0.0, 1e-3, -0.5, -_FLOAT32.max):
         yield _no_effect(f"opacity {value:g}", _spoilt(scene, "opacities", value))
@@ -103,7 +97,7 @@ def _views() -> Iterator[_Entry]:
             yield (
                 f"{kind} in {argument} of one camera",
                 "finite; its image shows the background, black if that is bad; the other as ever",
-                functools.partial(_run_bad_view, scene.changed(**{argument: tensor})),
+                functools.partial(run_bad_view, scene.changed(**{argument: tensor})),
             )
     scene = hand_scene(cameras=2)
     blind = scene.arguments["Ks"].clone()
@@ -111,7 +105,7 @@ def _views() -> Iterator[_Entry]:
     yield (
         "focal length 0 in one camera",
         "finite; its image shows the background; the other as ever",
-        functools.partial(_run_bad_view, scene.changed(Ks=blind)),
+        functools.partial(run_bad_view, scene.changed(Ks=blind)),
     )
 
 
@@ -202,22 +196,22 @@ def _calls() -> Iterator[_Entry]:
             f"arguments in {str(dtype).removeprefix('torch.')}",
             f"image to {IMAGE_TOLERANCE:g} of float64 of the same numbers; gradients to "
             f"{GRADIENT_TOLERANCE:g} and the type's spacing",
-            functools.partial(_run_narrow, dtype),
+            functools.partial(run_narrow, dtype),
         )
     yield (
         "arguments that are not contiguous",
         f"the bits of contiguous ones; gradients of gsplat to {NO_CHANGE:g}",
-        _run_strided,
+        run_strided,
     )
     yield (
         "two equal Gaussians in one place",
         f"alpha 1 - (1 - a)^2 with that of one Gaussian, to {IMAGE_TOLERANCE:g}",
-        _run_doubled,
+        run_doubled,
     )
     yield (
         "two equal hands in one place, in either order",
         f"finite; image and gradients to {GRADIENT_TOLERANCE:g} of the other order",
-        _run_reordered,
+        run_reordered,
     )
 
 
@@ -235,15 +229,15 @@ def _spoilt(scene: HardScene, argument: str, value: float, whole: bool = False) 
     """The scene with one number, or one whole row, of one Gaussian replaced."""
     tensor = scene.arguments[argument].clone()
     if whole or tensor.ndim == 1:
-        tensor[_VICTIM] = value
+        tensor[VICTIM] = value
     else:
-        tensor[_VICTIM, 1] = value
+        tensor[VICTIM, 1] = value
     return scene.changed(**{argument: tensor})
 
 
 def _rescaled(scene: HardScene, norm: float) -> HardScene:
     quats = scene.arguments["quats"].clone()
-    quats[_VICTIM] *= norm / quats[_VICTIM].norm()
+    quats[VICTIM] *= norm / quats[VICTIM].norm()
     return scene.changed(quats=quats.float().double())
 
 
@@ -264,7 +258,7 @@ def _exact(
         name,
         f"image to {IMAGE_TOLERANCE:g}, gradients to {tolerance:g} of float64, all finite; "
         f"{others}",
-        functools.partial(_run_exact, scene, tolerance, loose),
+        functools.partial(run_exact, scene, tolerance, loose),
     )
 
 
@@ -272,151 +266,9 @@ def _no_effect(name: str, scene: HardScene) -> _Entry:
     return (
         name,
         "finite; its gradient is zero; all else as without it",
-        functools.partial(_run_no_effect, scene),
+        functools.partial(run_no_effect, scene),
     )
 
 
 def _finite(name: str, scene: HardScene) -> _Entry:
-    return name, "image and gradients finite", functools.partial(_run_finite, scene)
-
-
-def _draw(scene: HardScene, context: Context, weights: torch.Tensor | None = None) -> DrawnScene:
-    dtype = torch.float64 if context.backend == "reference" else torch.float32
-    return draw(scene, context.backend, dtype, weights)
-
-
-def _run_exact(scene: HardScene, own: float, gsplat: float, context: Context) -> Measured:
-    tolerance = gsplat if context.backend == "gsplat" else own
-    clear = clear_pixels(scene)
-    truth = draw(scene, "reference", torch.float64, clear)
-    drawing = _draw(scene, context, clear)
-    mask = clear.unsqueeze(-1)
-    image = max(
-        difference(drawing.image * mask, truth.image * mask),
-        difference(drawing.alpha * mask, truth.alpha * mask),
-    )
-    gradients = gradient_differences(drawing.gradients, truth)
-    worst = max(gradients, key=lambda name: gradients[name])
-    near = image <= IMAGE_TOLERANCE and gradients[worst] <= tolerance
-    passed = drawing.finite and (near or math.isinf(tolerance))
-    return Measured(passed, f"image {image:.0e}, gradients {gradients[worst]:.0e} ({worst})")
-
-
-def _run_no_effect(scene: HardScene, context: Context) -> Measured:
-    drawing = _draw(scene, context)
-    without = _draw(scene.without(_VICTIM), context)
-    keep = torch.arange(len(scene.arguments["means"])) != _VICTIM
-    own = max(float(drawing.gradients[name][_VICTIM].abs().max()) for name in PER_GAUSSIAN)
-    others = {
-        name: value[keep] if name in PER_GAUSSIAN else value
-        for name, value in drawing.gradients.items()
-    }
-    change = max(
-        difference(drawing.image, without.image),
-        difference(drawing.alpha, without.alpha),
-        *gradient_differences(others, without).values(),
-    )
-    passed = drawing.finite and own == 0.0 and change <= NO_CHANGE
-    finite = "" if drawing.finite else "not finite, "
-    return Measured(passed, f"{finite}its gradient {own:g}, change elsewhere {change:.0e}")
-
-
-def _run_bad_view(scene: HardScene, context: Context) -> Measured:
-    drawing = _draw(scene, context)
-    good = {
-        name: scene.arguments[name][:1] if name in ("viewmats", "Ks", "backgrounds") else tensor
-        for name, tensor in scene.arguments.items()
-    }
-    single = _draw(HardScene(good), context)
-    change = difference(drawing.image[:1], single.image)
-    bad = drawing.image[1]
-    if scene.arguments["backgrounds"].isfinite().all():
-        shown = difference(bad, scene.arguments["backgrounds"][1].float().double().expand_as(bad))
-    else:
-        shown = float(drawing.gradients["backgrounds"][1, 0].abs())  # black: no gradient there
-    passed = drawing.finite and change <= NO_CHANGE and shown <= NO_CHANGE
-    finite = "" if drawing.finite else "not finite, "
-    return Measured(passed, f"{finite}off by {shown:.0e}, change of the other {change:.0e}")
-
-
-def _run_narrow(dtype: torch.dtype, context: Context) -> Measured:
-    scene = hand_scene()
-    narrow = {name: value.to(dtype) for name, value in scene.arguments.items()}
-    # The same numbers, so that what the type cannot hold does not count.
-    same = scene.changed(**{name: value.double() for name, value in narrow.items()})
-    clear = clear_pixels(same)
-    truth = draw(same, "reference", torch.float64, clear)
-    drawing = draw(same, context.backend, dtype, clear)
-    mask = clear.unsqueeze(-1)
-    off = difference(drawing.image * mask, truth.image * mask)
-    # Half an ulp of the type is added when a gradient is given back in it.
-    allowed = GRADIENT_TOLERANCE + torch.finfo(dtype).eps
-    gradients = gradient_differences(drawing.gradients, truth)
-    worst = max(gradients, key=lambda name: gradients[name])
-    passed = drawing.finite and off <= IMAGE_TOLERANCE and gradients[worst] <= allowed
-    return Measured(passed, f"image {off:.0e}, gradients {gradients[worst]:.0e} ({worst})")
-
-
-def _run_strided(context: Context) -> Measured:
-    scene = hand_scene(cameras=2)
-    strided = {
-        name: value.movedim(-1, 0).contiguous().movedim(0, -1)
-        if value.ndim > 1
-        else torch.stack([value, value], dim=-1)[:, 0]
-        for name, value in scene.arguments.items()
-    }
-    plain, other = _draw(scene, context), _draw(scene.changed(**strided), context)
-    away = max(gradient_differences(other.gradients, plain).values())
-    # Its gradients are sums of atomic additions, which are not the same twice.
-    allowed = NO_CHANGE if context.backend == "gsplat" else 0.0
-    same = torch.equal(plain.image, other.image) and away <= allowed
-    image = difference(other.image, plain.image)
-    return Measured(same, f"image off by {image:.0e}, gradients by {away:.0e}")
-
-
-def _run_doubled(context: Context) -> Measured:
-    scene = hand_scene(count=1)
-    single = scene.changed(
-        means=torch.zeros(1, 3).double(),
-        scales=torch.full((1, 3), 0.02).float().double(),
-        opacities=torch.tensor([0.9]).double(),
-        backgrounds=torch.zeros(1, 3).double(),
-    )
-    pair = {name: single.arguments[name].repeat_interleave(2, dim=0) for name in PER_GAUSSIAN}
-    one, two = _draw(single, context), _draw(single.changed(**pair), context)
-    expected = 1.0 - (1.0 - one.alpha).square()
-    colors = single.arguments["colors"][0]
-    off = max(
-        difference(two.alpha, expected),
-        difference(two.image, expected * colors),
-    )
-    passed = two.finite and off <= IMAGE_TOLERANCE and float(one.alpha.max()) > 0.8
-    return Measured(passed, f"off by {off:.0e}, alpha of one up to {float(one.alpha.max()):.2f}")
-
-
-def _run_reordered(context: Context) -> Measured:
-    scene = hand_scene()
-    count = len(scene.arguments["means"])
-    # Hand after hand, and pair after pair.
-    apart, paired = torch.arange(count).repeat(2), torch.arange(count).repeat_interleave(2)
-    made = [
-        _draw(
-            scene.changed(**{name: scene.arguments[name][order] for name in PER_GAUSSIAN}), context
-        )
-        for order in (apart, paired)
-    ]
-    off = difference(made[0].image, made[1].image)
-    for name in PER_GAUSSIAN:
-        # The nearer of two equal Gaussians is the one of lower index, in both orders.
-        first = made[0].gradients[name].unflatten(0, (2, count))
-        second = made[1].gradients[name].unflatten(0, (count, 2)).transpose(0, 1)
-        off = max(off, difference(first, second))
-    passed = made[0].finite and made[1].finite and off <= GRADIENT_TOLERANCE
-    return Measured(passed, f"off by {off:.0e}")
-
-
-def _run_finite(scene: HardScene, context: Context) -> Measured:
-    drawing = _draw(scene, context)
-    sizes = [float(drawing.gradients[name].abs().max()) for name in DIFFERENTIABLE
-             if drawing.gradients[name].numel()]  # fmt: skip
-    return Measured(drawing.finite, f"largest gradient {max(sizes):.0e}")
+    return name, "image and gradients finite", functools.partial(run_finite, scene)

@@ -210,7 +210,7 @@ def test_in_half_precision_it_predicts_nearly_the_same_in_float32(size: str) -> 
     net = stir(network(size))
     normals, pose = frames(20, 3)
     whole = net("right", normals, pose)
-    net.half = True
+    net.mixed_precision = True
     half = net("right", normals, pose)
     pairs = [(half.shadow, whole.shadow), (half.texture, whole.texture)]
     pairs += [(half.template_offsets, whole.template_offsets)]
