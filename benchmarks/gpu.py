@@ -16,7 +16,6 @@ import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from torch.profiler import ProfilerActivity, profile
 from benchmarks.small_capture import opened_request, small_capture
 from hwp_bench.base.tables import Column, Table, print_table
 from hwp_bench.methods.contract import TrainingCapture
-from hwp_bench.methods.manifest import read_manifest
+from hwp_bench.methods.manifest import find_method, read_manifest
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.ready import ready_fit
 from wildghand.gaussians.fit_loop import batches
@@ -37,7 +36,6 @@ from wildghand.splat.threads import denormals_flushed
 BLOCK = 8
 #: Of a fit's budget, used up: every term of the loss acts.
 _FRACTION = 0.5
-_MANIFEST = Path(__file__).parents[1] / "wildghand"
 
 
 @dataclass(frozen=True)
@@ -53,7 +51,7 @@ class Row:
 
     def settings(self, device: str) -> dict[str, Any]:
         """What a fit on a device reads."""
-        preset = read_manifest(_MANIFEST).presets[self.preset]
+        preset = read_manifest(find_method("wildghand")).presets[self.preset]
         return {**preset, **self.changes, "device": device}
 
 

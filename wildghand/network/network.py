@@ -213,7 +213,7 @@ class PredictionNetwork(nn.Module):
             raw, shadow, mean = self._heads(side, normals, pose, hand.hidden)
             pose_change, transl_change = self.refinement_head(hand.mean, mean)
         if self.mixed_precision:
-            raw = RawAttributes.split(raw.concatenate().float())
+            raw = raw.map(torch.Tensor.float)
             shadow, pose_change, transl_change = (
                 tensor.float() for tensor in (shadow, pose_change, transl_change)
             )

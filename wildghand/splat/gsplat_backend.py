@@ -106,9 +106,10 @@ def _gsplat() -> tuple[Callable[..., Any], bool]:
 
 def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     """The scene's tensors, with everything that gsplat cannot take made invisible."""
-    scaled, good = _usable(scene)
+    names = ("means", "quats", "scales", "opacities", "colors", "viewmats", "Ks")
+    result = {name: getattr(scene, name) for name in names}
+    result["quats"], good = _usable(scene)
     neutral = _neutral(scene.means.device, scene.means.dtype)
-    result = {name: getattr(scene, name) for name in ("colors", "viewmats", "Ks")} | scaled
     for name, mask in good.items():
         result[name] = _replaced(result[name], mask, neutral.of(name, result[name]))
     # An offender in any argument makes the Gaussian vanish: its opacity is zero.
@@ -133,23 +134,14 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
     return result
 
 
-def _usable(scene: FlatScene) -> tuple[dict[str, torch.Tensor], dict[str, torch.Tensor]]:
-    """Means, scales, opacities and quaternions as gsplat takes them, and what of all is usable.
+def _usable(scene: FlatScene) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
+    """Quaternions whose squares stay in float32, and what of all arguments is usable.
 
     Returns:
-        The tensors by name, and masks (S, N) by name, those of the colours too.
+        (S, N, 4), and masks (S, N) by name.
     """
-    # gsplat squares a quaternion's numbers: those of a very small or large one leave float32.
     longest = _largest(scene.quats)
     turns = (longest >= _LEAST_QUATERNION) & (longest <= _MAX_QUATERNION)
-    quats = scene.quats / torch.where(turns, longest, 1.0)[..., None]
-    tensors = {
-        "means": scene.means,
-        "scales": scene.scales,
-        "quats": quats,
-        # More than opaque is opaque, as in `api`; what is not a number stays one.
-        "opacities": scene.opacities,
-    }
     good = {
         "means": _largest(scene.means) <= _MAX_LENGTH,
         "scales": _largest(scene.scales) <= _MAX_LENGTH,
@@ -157,7 +149,7 @@ def _usable(scene: FlatScene) -> tuple[dict[str, torch.Tensor], dict[str, torch.
         "colors": _largest(scene.colors) <= rules.MAX_COLOR,
         "opacities": scene.opacities.detach().isfinite(),
     }
-    return tensors, good
+    return scene.quats / torch.where(turns, longest, 1.0)[..., None], good
 
 
 def _largest(tensor: torch.Tensor) -> torch.Tensor:

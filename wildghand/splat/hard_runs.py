@@ -24,7 +24,7 @@ from wildghand.splat.hard_scenes import (
 IMAGE_TOLERANCE = 1e-5
 GRADIENT_TOLERANCE = 1e-4
 NEEDLE_TOLERANCE = 1e-3
-#: Gradients of gsplat, which projects in float32 and adds up in float32, in any order.
+#: Gradients of gsplat in piles and at tiny focal lengths: it adds up in float32, in any order.
 GSPLAT_TOLERANCE = 1e-3
 #: Largest change of an image or gradient when a culled Gaussian is taken away.
 NO_CHANGE = 1e-6

@@ -6,13 +6,12 @@ elsewhere; pictures of one avatar within one grey level in 99 of 100 numbers.
 
 from __future__ import annotations
 
-import importlib.util
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-import torch
+from painted import QUICK as SMALL
 from painted import SilentReport, TrainingMaker
 from tiny_fits import QUICK
 
@@ -24,10 +23,10 @@ from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.saved_state import load_state, save_state
-from wildghand.gaussians.fit_loop import ready_device
+from wildghand.gaussians.fit_loop import choose_device, ready_device
 from wildghand.model.settings import read_settings
 
-HAS_GPU = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+HAS_GPU = choose_device("auto").type == "cuda"
 pytestmark = pytest.mark.skipif(not HAS_GPU, reason="needs a GPU and gsplat")
 
 STEPS = 60
@@ -107,8 +106,6 @@ def test_a_stopped_fit_goes_on(make_training: TrainingMaker, tmp_path: Path) -> 
 
 @pytest.mark.parametrize("hands", ["right", "both"])
 def test_the_plain_fit_scores_as_on_the_cpu(hands: str, make_training: TrainingMaker) -> None:
-    from painted import QUICK as SMALL
-
     training = make_training(hands)
     scores = [
         psnr(

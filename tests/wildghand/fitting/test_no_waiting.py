@@ -8,7 +8,6 @@ that of CUDA. With a GPU: torch's own debug mode, which raises where the host wa
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import sys
 from typing import Any
 
@@ -26,12 +25,12 @@ from wildghand.fitting.optimize import Plateau
 from wildghand.fitting.rates import make_optimizer
 from wildghand.fitting.skin_places import skin_places
 from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
-from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, ready_device
+from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, choose_device, ready_device
 from wildghand.model.settings import read_settings
 from wildghand.shadows import ShadowTable
 
 FAKE = torch.device("meta")
-HAS_GPU = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+HAS_GPU = choose_device("auto").type == "cuda"
 QUICK: dict[str, Any] = {
     "gaussians": 200,
     "network.identity_resolution": 40,
@@ -96,7 +95,7 @@ class HandedOver(TorchFunctionMode):
         result = func(*args, **(kwargs or {}))
         name = func.__name__
         made = name in ("new_tensor", "tensor", "as_tensor") and result.device == FAKE
-        if made and not any(isinstance(value, torch.Tensor) for value in args[-1:]):
+        if made and not isinstance(args[-1], torch.Tensor):
             self.found.append(name)
         if name in ("__getitem__", "__setitem__") and args[0].device == FAKE:
             index = args[1] if isinstance(args[1], tuple) else (args[1],)

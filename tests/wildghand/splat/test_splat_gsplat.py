@@ -7,7 +7,6 @@ one: gsplat itself against the reference, tolerance 1e-4.
 
 from __future__ import annotations
 
-import importlib.util
 import math
 import sys
 import types
@@ -17,12 +16,13 @@ import pytest
 import torch
 
 from hwp_bench.base.errors import MissingDependency
+from wildghand.gaussians.fit_loop import choose_device
 from wildghand.splat import gsplat_backend, rasterize
 from wildghand.splat.hard_scenes import difference, draw, hand_scene
 from wildghand.splat.layout import flatten
 from wildghand.splat.scene import Options
 
-HAS_GPU = torch.cuda.is_available() and importlib.util.find_spec("gsplat") is not None
+HAS_GPU = choose_device("auto").type == "cuda"
 
 
 class StandIn(types.ModuleType):
