@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 import torch
 from painted import FRAMES, SilentReport
-from tiny_fits import TINY
+from tiny_fits import TINY, UNJUDGED
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
 from hwp_bench.capture import Capture
@@ -38,7 +38,8 @@ SHORT: dict[str, Any] = {**TINY, "schedule.steps": 4, "schedule.batch": 2}
 VARIANTS: dict[str, dict[str, Any]] = {
     # Every other frame keeps its biases: processes must draw the same chances.
     "default": {"dpd.omega_dropout": 0.5},
-    "pay back": {"dpd.pay_back": 1.5},
+    # What precedes the first step is the same in all processes, and compared in the default.
+    "pay back": {**UNJUDGED, "dpd.pay_back": 1.5},
     # The weights compare the frames of a batch, and omega learns from their size.
     "paper": {"mode": "paper", "dpd.omega_dropout": 0.5},
 }
@@ -47,11 +48,13 @@ State = dict[str, torch.Tensor]
 CPU = torch.device("cpu")
 
 
-def fitted(request: Path, changes: dict[str, Any], world: World) -> State:
+def fitted(request: Path, changes: dict[str, Any], world: World) -> tuple[State, State]:
+    """Return the parameters before the first step and after the last."""
     settings = read_settings({**SHORT, **changes})
     fit = Fit(open_request(request), settings, 0, CPU, world)
     fit.require_same(0)
-    return optimize(fit, Budget(), SilentReport()).model.snapshot()
+    start = fit.model.snapshot()
+    return start, optimize(fit, Budget(), SilentReport()).model.snapshot()
 
 
 def resumed(request: Path, world: World, state: Path) -> State:
@@ -115,8 +118,8 @@ def process(rank: int, ports: tuple[int, int], folder: Path) -> None:
 
     def work(world: World) -> int:
         request = folder / "request"
-        found = {name: fitted(request, changes, world) for name, changes in VARIANTS.items()}
-        found["again"] = fitted(request, VARIANTS["default"], world)
+        found = {name: fitted(request, changes, world)[1] for name, changes in VARIANTS.items()}
+        found["again"] = fitted(request, VARIANTS["default"], world)[1]
         found["resumed"] = resumed(request, world, folder / "state")
         check_spoiled(request, world)
         with pytest.raises(HwpError, match="process 1 of 2 starts from another state"):
@@ -172,11 +175,8 @@ def test_two_processes_fit_as_one_with_the_whole_batch(name: str, folder: Path) 
     Sums in another order differ in the last bits, and Adam makes full steps of gradients that
     are nothing but rounding: a few parameters end elsewhere.
     """
-    changes = VARIANTS[name]
-    start = Fit(
-        open_request(folder / "request"), read_settings({**SHORT, **changes}), 0, CPU
-    ).model.snapshot()
-    alone, together = fitted(folder / "request", changes, SINGLE_PROCESS), found(folder)[name]
+    start, alone = fitted(folder / "request", VARIANTS[name], SINGLE_PROCESS)
+    together = found(folder)[name]
     change = max(float((alone[key] - start[key]).abs().max()) for key in start)
     apart = torch.cat([(together[key] - alone[key]).abs().flatten() for key in alone])
     assert float((apart > 1e-4 * change).float().mean()) < 1e-3

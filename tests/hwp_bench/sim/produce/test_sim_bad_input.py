@@ -95,7 +95,7 @@ def test_a_killed_render_leaves_no_capture_and_goes_on(tmp_path: Path) -> None:
     path, out = tmp_path / "tiny.toml", tmp_path / "capture"
     path.write_text(SINGLE)
     extent = ["--frames", str(FRAMES), "--size", str(SIZE), "--workers", "2"]
-    command = ["sim", "render", str(path), "-o", str(out), *extent]
+    command = ["sim", "render", str(path), "-o", str(out), *extent, "--no-free-view"]
     with subprocess.Popen([sys.executable, "-m", "hwp_bench.cli.main", *command]) as process:
         _wait_for(lambda: _finished(tmp_path) >= 2 or process.poll() is not None)
         workers = psutil.Process(process.pid).children()
@@ -108,8 +108,10 @@ def test_a_killed_render_leaves_no_capture_and_goes_on(tmp_path: Path) -> None:
     psutil.wait_procs(workers)
     assert 2 <= _finished(tmp_path) < FRAMES
     assert main(command) == 0
-    assert len(open_capture(out)) == FRAMES
     assert {entry.name for entry in tmp_path.iterdir()} == {"tiny.toml", "capture"}
+    # Oracle: a render that was left in peace, in one process.
+    assert main([*command, "-o", str(tmp_path / "peace"), "--workers", "1"]) == 0
+    assert open_capture(out).info.digests == open_capture(tmp_path / "peace").info.digests
 
 
 @pytest.mark.slow
