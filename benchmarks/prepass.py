@@ -1,15 +1,17 @@
 """How well and how fast the pre-pass judges frames, against the truth of simulated captures.
 
-Run from the repository: `python -m benchmarks.prepass CAPTURE... [--pictures FOLDER]`, with
-captures made by `hwp-bench sim render`. The truth is read here and never by the pre-pass.
+Run from the repository: `python -m benchmarks.prepass CAPTURE... [--known 8] [--pictures FOLDER]`,
+with captures made by `hwp-bench sim render`. The truth is read here and never by the pre-pass.
+With `--known` so many validation frames are judged too, as a fit does it, known to be clean.
 
 For every capture: processor seconds of the second call (the first compiles), images in memory;
-Spearman correlation of 1 - clean with the true severity (the largest of its perturbations) and
-the area under the ROC curve of clean against perturbed frames; the share of clean frames judged
-clean and of frames of severity 3 to 5 judged not; median absolute error of the log
-gains; and, over pixels of the hand in frames with objects, the area under the curve of the pixel
-weights for visible against covered pixels, next to that of the estimated mask. A second table
-compares the estimated severity of every perturbation that the capture carries with the true one.
+Spearman correlation of 1 - clean with the true severity (the largest of its perturbations) and the
+area under the ROC curve of clean against perturbed frames; the share of all frames judged clean,
+of clean frames judged so, and of frames of severity 3 to 5 judged not; median absolute error of
+the log gains; and, over pixels of the hand in frames with objects, the area under the curve of the
+pixel weights for visible against covered pixels, next to that of the estimated mask. A second
+table compares the estimated severity of every perturbation that the capture carries with the true
+one.
 """
 
 from __future__ import annotations
@@ -24,6 +26,7 @@ import numpy as np
 import torch
 from scipy.stats import rankdata, spearmanr
 
+from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from wildghand.prepass import (
@@ -36,10 +39,13 @@ from wildghand.prepass import (
 from wildghand.prepass.intensity import log_light_table
 
 
-def load(capture: Capture) -> PrepassInput:
-    """The training frames of a capture, without its truth."""
-    train = contiguous_split(capture.info.id, len(capture)).train
-    return capture_input(capture, train)
+def load(capture: Capture, known: int) -> tuple[PrepassInput, PrepassInput | None]:
+    """The training frames of a capture and some of its validation frames, without its truth."""
+    split = contiguous_split(capture.info.id, len(capture))
+    given = capture_input(capture, split.train)
+    if not known:
+        return given, None
+    return given, capture_input(capture, split.validation[evenly(len(split.validation), known)])
 
 
 def severities(capture: Capture, frames: np.ndarray) -> dict[str, np.ndarray]:
@@ -168,6 +174,7 @@ def draw(capture: Capture, given: PrepassInput, judgement: FrameAssessment, fold
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("captures", nargs="+", type=Path, help="capture folders")
+    parser.add_argument("--known", type=int, default=0, help="validation frames (0)")
     parser.add_argument("--pictures", type=Path, help="folder for images")
     parser.add_argument("--threads", type=int, default=1, help="threads (1)")
     args = parser.parse_args()
@@ -177,19 +184,20 @@ def main() -> None:
         args.pictures.mkdir(parents=True, exist_ok=True)
 
     print(
-        "| capture | frames | px | perturbed | s | Spearman | AUC | clean kept | strong caught "
-        "| gain error (90 %) | pixel AUC (mask only) |"
+        "| capture | frames | px | perturbed | s | judged clean | Spearman | AUC | clean kept "
+        "| strong caught | gain error (90 %) | pixel AUC (mask only) |"
     )
-    print("| --- |" + " ---: |" * 10)
+    print("| --- |" + " ---: |" * 11)
     levels = []
     for path in args.captures:
         capture = open_capture(path)
-        given = load(capture)
-        judge_frames(given)
+        given, known = load(capture, args.known)
+        judge_frames(given, known_clean=known)
         start = time.process_time()
-        judgement = judge_frames(given)
+        judgement = judge_frames(given, known_clean=known)
         seconds = time.process_time() - start
         row = [capture.info.id, str(len(judgement)), str(given.size[0])]
+        kept = f"{np.mean(judgement.clean > 0.5):.0%}"
         truth = severities(capture, judgement.indices)
         if truth and capture.has_clean:
             worst = np.max(list(truth.values()), axis=0)
@@ -200,6 +208,7 @@ def main() -> None:
             row += [
                 str(int((worst > 0).sum())),
                 f"{seconds:.2f}",
+                kept,
                 f"{spearmanr(1 - judgement.clean, worst).statistic:.2f}",
                 f"{area_under_curve(1 - judgement.clean, worst > 0):.2f}",
                 f"{np.mean(judgement.clean[worst == 0] > 0.5):.0%}",
@@ -208,7 +217,7 @@ def main() -> None:
                 "" if np.isnan(pixels[0]) else f"{pixels[0]:.2f} ({pixels[1]:.2f})",
             ]
         else:
-            row += ["?", f"{seconds:.2f}", "", "", "", "", "", ""]
+            row += ["?", f"{seconds:.2f}", kept, *[""] * 6]
         print(f"| {' | '.join(row)} |", flush=True)
         if args.pictures:
             draw(capture, given, judgement, args.pictures)

@@ -92,7 +92,7 @@ class Fit:
         self.clip = TrainingClip(training, self.frames.indices, self.model.rigs, device)
         # Frames are compared with the person, not with a template that fits none of them.
         bent = bent_templates(templates, subject)
-        assessment = assess_frames(training, self.frames, bent, settings)
+        assessment = assess_frames(training, self.frames, bent, settings, judges)
         masks = hand_masks(training, self.frames, settings.pao.hand, device)
         self.frames = dataclasses.replace(self.frames, masks=masks)
         self.weighting = Weighting(

@@ -18,9 +18,9 @@ def judging_frames(training: TrainingCapture, settings: WildGHandSettings) -> Tr
     Raises:
         BadImage: an image is missing or damaged.
     """
-    subject, evidence = settings.subject, settings.evidence
-    bends, weighs = subject.enabled and subject.validated, evidence.enabled and evidence.validated
-    if not (bends or weighs or settings.schedule.validated):
+    parts = (settings.prepass, settings.subject, settings.evidence)
+    asked = any(part.enabled and part.validated for part in parts)
+    if not (asked or settings.schedule.validated):
         return None
     frames = load_validation_frames(training, MOST_CHOOSING)
     return frames if len(frames) >= LEAST_CHOOSING else None

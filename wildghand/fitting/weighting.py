@@ -58,6 +58,7 @@ def assess_frames(
     frames: TrainingFrames,
     templates: Mapping[str, HandTemplate],
     settings: WildGHandSettings,
+    judges: TrainingFrames | None = None,
 ) -> FrameAssessment | None:
     """Run the pre-pass on the frames that are fitted; None where the settings have none.
 
@@ -66,20 +67,23 @@ def assess_frames(
         frames: the frames.
         templates: of the person's hands, by side.
         settings: of the fit.
+        judges: validation frames, which are clean.
     """
     if not settings.prepass.enabled:
         return None
-    return judge_frames(
-        PrepassInput(
-            indices=frames.indices,
-            images=np.asarray(frames.images),
-            masks=np.asarray(frames.masks),
+
+    def given(each: TrainingFrames) -> PrepassInput:
+        return PrepassInput(
+            indices=each.indices,
+            images=np.asarray(each.images),
+            masks=np.asarray(each.masks),
             hands=training.hands,
             cameras=training.cameras,
             templates=templates,
-        ),
-        settings.prepass,
-    )
+        )
+
+    clean = given(judges) if judges is not None and settings.prepass.validated else None
+    return judge_frames(given(frames), settings.prepass, clean)
 
 
 class Weighting:

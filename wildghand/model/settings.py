@@ -242,7 +242,7 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
             "color_share": 0.0,
             "fill_share": 0.0,
         },
-        "prepass": {"clean_scale": 1.0},
+        "prepass": {"clean_scale": 1.0, "validated": False},
         "schedule": {"root_steps": 0.0, "average_share": 0.0, "validated": False},
         "terms": {"surface": 0.0, "leave_hidden": False, "dssim_inexact": 1.0},
     }

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -22,6 +23,7 @@ def classify_frames(
     size: tuple[int, int],
     measured: Mapping[int, FrameMeasurements],
     settings: PrepassSettings,
+    tolerance: float | None = None,
 ) -> FrameAssessment:
     """Compare the frames with each other and assess them; every pixel has full weight.
 
@@ -30,14 +32,12 @@ def classify_frames(
         size: height and width of the frames.
         measured: by row; rows that are missing cannot be used. Not empty.
         settings: floors and thresholds.
+        tolerance: evidence at which a frame is as likely clean as not; the settings' if None.
     """
-    count, share = len(indices), settings.clean_share
+    count = len(indices)
     rows = np.array(sorted(measured))
     usable = np.zeros(count, dtype=bool)
     usable[rows] = True
-
-    def gathered(values: list[float] | list[np.ndarray]) -> np.ndarray:
-        return np.array(values, dtype=np.float64)
 
     def spread(values: np.ndarray, missing: float = 0.0) -> np.ndarray:
         result = np.full((count, *values.shape[1:]), missing)
@@ -45,27 +45,15 @@ def classify_frames(
         return result
 
     found = [measured[row] for row in rows.tolist()]
-    gains = gathered([one.gain for one in found])
-    gains = gains - densest(gains, share)[0]
-    level = gathered([one.level for one in found])
-    texture = gathered([one.texture for one in found])
-    border = gathered([one.border for one in found])
-    misplaced = gathered([one.misplacement for one in found])
-    hidden = gathered([one.hidden for one in found])
-
-    off_gain = excess(np.linalg.norm(gains, axis=1), share, settings.gain_floor)
-    off_level = excess(np.log(np.maximum(level, 1e-4)), share, settings.residual_floor)
-    off_texture = excess(-texture, share, settings.texture_floor)
-    off_border = excess(np.log(border), share, settings.border_floor)
-    off_place = excess(misplaced, share, settings.misplacement_floor)
-    off_hidden = excess(hidden, share, settings.hidden_floor)
-    cues = (off_gain, off_level, off_texture, off_border, off_place, off_hidden)
-
-    found_evidence = evidence(cues, indices[rows], settings.tolerance)
-    clean = spread(clean_probability(found_evidence, settings.tolerance))
-    sharp_border = float(np.exp(normal_value(np.log(border), share)[0]))
+    cues = _compare(found, settings)
+    tolerance = settings.tolerance if tolerance is None else tolerance
+    found_evidence = evidence(cues.deviations, indices[rows], settings.tolerance)
+    clean = spread(clean_probability(found_evidence, tolerance))
+    border, texture = _gathered(found, "border"), _gathered(found, "texture")
+    sharp_border = float(np.exp(normal_value(np.log(border), settings.clean_share)[0]))
     extent = np.sqrt(np.maximum(np.nan_to_num(border) ** 2 - sharp_border**2, 0.0))
-    refine = (off_place > settings.clear_deviation) & (off_border < settings.clear_deviation)
+    clear = settings.clear_deviation
+    refine = (cues.misplacement > clear) & (cues.border < clear)
     return FrameAssessment(
         indices=indices,
         usable=usable,
@@ -73,19 +61,91 @@ def classify_frames(
         frame_weights=settings.weight_floor + (1.0 - settings.weight_floor) * clean,
         omega_dropout=np.where(clean >= settings.clean_threshold, settings.omega_dropout, 0.0),
         refine_pose=spread(refine.astype(np.float64)) > 0.5,
-        log_gains=spread(gains),
-        gain_deviation=spread(off_gain),
-        residual=spread(level),
-        residual_deviation=spread(off_level),
+        log_gains=spread(cues.gains),
+        gain_deviation=spread(cues.gain),
+        residual=spread(_gathered(found, "level")),
+        residual_deviation=spread(cues.level),
         sharpness=spread(np.nan_to_num(texture, nan=1.0), missing=1.0),
-        blur_deviation=spread(np.maximum(off_border, off_texture)),
+        blur_deviation=spread(np.maximum(cues.border, cues.texture)),
         blur_extent=spread(extent),
-        misplacement=spread(misplaced),
-        misplacement_deviation=spread(off_place),
-        hidden=spread(hidden),
-        hidden_deviation=spread(off_hidden),
-        motion=spread(gathered([one.motion for one in found])),
+        misplacement=spread(_gathered(found, "misplacement")),
+        misplacement_deviation=spread(cues.misplacement),
+        hidden=spread(_gathered(found, "hidden")),
+        hidden_deviation=spread(cues.hidden),
+        motion=spread(_gathered(found, "motion")),
         pixel_weights=np.full((count, *size), 255, dtype=np.uint8),
+    )
+
+
+def clip_tolerance(found: np.ndarray, settings: PrepassSettings) -> float:
+    """Evidence at which a frame of a clip is as likely clean as not.
+
+    Where poses or masks are poor, cues differ from frame to frame though nothing perturbs any. Most
+    frames that are known to be clean must be judged so: they raise the settings' tolerance to the
+    median of what is found against them.
+
+    Args:
+        found: (K,) evidence of frames of which it is known that nothing perturbs them.
+        settings: with the least tolerance, and the frames below which they say nothing.
+    """
+    if len(found) < settings.least_frames:
+        return settings.tolerance
+    return max(settings.tolerance, float(np.median(found)))
+
+
+def evidence_against(
+    indices: np.ndarray, measured: Sequence[FrameMeasurements], settings: PrepassSettings
+) -> np.ndarray:
+    """Compare frames with each other; returns what speaks against each, (R,), not negative.
+
+    Args:
+        indices: (R,) frame numbers.
+        measured: R frames; at least one.
+        settings: floors and thresholds.
+    """
+    return evidence(_compare(measured, settings).deviations, indices, settings.tolerance)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cues:
+    """R frames compared with each other: how far each is off, one-sided, in robust deviations."""
+
+    #: (R, 3) log gains, relative to their mode.
+    gains: np.ndarray
+    #: (R,) each.
+    gain: np.ndarray
+    level: np.ndarray
+    texture: np.ndarray
+    border: np.ndarray
+    misplacement: np.ndarray
+    hidden: np.ndarray
+
+    @property
+    def deviations(self) -> tuple[np.ndarray, ...]:
+        """All that speaks against a frame, (R,) each."""
+        place = (self.misplacement, self.hidden)
+        return (self.gain, self.level, self.texture, self.border, *place)
+
+
+def _gathered(found: Sequence[FrameMeasurements], name: str) -> np.ndarray:
+    """A measurement of all frames, (R, ...)."""
+    return np.array([getattr(one, name) for one in found], dtype=np.float64)
+
+
+def _compare(found: Sequence[FrameMeasurements], settings: PrepassSettings) -> _Cues:
+    share = settings.clean_share
+    gains = _gathered(found, "gain")
+    gains = gains - densest(gains, share)[0]
+    level = np.log(np.maximum(_gathered(found, "level"), 1e-4))
+    misplaced, hidden = _gathered(found, "misplacement"), _gathered(found, "hidden")
+    return _Cues(
+        gains=gains,
+        gain=excess(np.linalg.norm(gains, axis=1), share, settings.gain_floor),
+        level=excess(level, share, settings.residual_floor),
+        texture=excess(-_gathered(found, "texture"), share, settings.texture_floor),
+        border=excess(np.log(_gathered(found, "border")), share, settings.border_floor),
+        misplacement=excess(misplaced, share, settings.misplacement_floor),
+        hidden=excess(hidden, share, settings.hidden_floor),
     )
 
 

@@ -18,7 +18,7 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.footprint import Footprint, HandSurfaces
 from wildghand.prepass.assessment import FrameAssessment, enlarged, neutral_assessment
 from wildghand.prepass.borders import ShownCells, border_width, misplacement
-from wildghand.prepass.classify import classify_frames
+from wildghand.prepass.classify import classify_frames, clip_tolerance, evidence_against
 from wildghand.prepass.inputs import PrepassInput
 from wildghand.prepass.intensity import (
     LOWEST,
@@ -39,12 +39,22 @@ from wildghand.prepass.settings import PrepassSettings
 from wildghand.prepass.weights import weigh_pixels
 
 
-def judge_frames(given: PrepassInput, settings: PrepassSettings | None = None) -> FrameAssessment:
+def judge_frames(
+    given: PrepassInput,
+    settings: PrepassSettings | None = None,
+    known_clean: PrepassInput | None = None,
+) -> FrameAssessment:
     """Judge frames that are already in memory; deterministic.
 
     Beyond `settings.pixel_budget` pixels the frames are judged at a lower resolution; weights
     and lengths are brought back to the full one. Fewer usable frames than
     `settings.least_frames` cannot be compared: all of them are judged clean.
+
+    Args:
+        given: the frames.
+        settings: how.
+        known_clean: other frames of the clip, of which it is known that nothing perturbs them.
+            They say how much evidence a clean frame has here (`classify.clip_tolerance`).
 
     Raises:
         BadInput: no frame can be used: no hand is valid and lies in the image and in the mask.
@@ -52,12 +62,15 @@ def judge_frames(given: PrepassInput, settings: PrepassSettings | None = None) -
     settings = settings or PrepassSettings()
     excess_pixels = given.masks.size / settings.pixel_budget
     if excess_pixels <= 1.0:
-        return _judge(given, settings)
+        return _judge(given, settings, known_clean)
     factor = math.ceil(math.sqrt(excess_pixels))
-    return enlarged(_judge(given.shrunk(factor), settings), factor, given.size)
+    known = None if known_clean is None else known_clean.shrunk(factor)
+    return enlarged(_judge(given.shrunk(factor), settings, known), factor, given.size)
 
 
-def _judge(given: PrepassInput, settings: PrepassSettings) -> FrameAssessment:
+def _judge(
+    given: PrepassInput, settings: PrepassSettings, known_clean: PrepassInput | None
+) -> FrameAssessment:
     surfaces = HandSurfaces(given.templates, settings.patch_size)
     usable = _measurable(given)
     drawn = list(_footprints(given, surfaces, usable))
@@ -75,9 +88,12 @@ def _judge(given: PrepassInput, settings: PrepassSettings) -> FrameAssessment:
     drawn = [(row, footprint) for row, footprint in drawn if usable[row]]
     cell_normals = surfaces.cell_normals
     model = fit_intensity(survey.samples, cell_normals, settings)
-    judged = classify_frames(
-        given.indices, given.size, _measured(given, survey, model, drawn), settings
-    )
+    measured = _measured(given, survey, model, drawn)
+    tolerance = settings.tolerance
+    if known_clean is not None:
+        clean = _measured_alike(known_clean, surfaces, survey, model, settings)
+        tolerance = _tolerance(given, measured, known_clean, clean, settings)
+    judged = classify_frames(given.indices, given.size, measured, settings, tolerance)
     # Pixels are compared with what clean frames show, which is known only now.
     verdict = Verdict(judged.clean[usable], model.gains)
     model = fit_intensity(survey.samples, cell_normals, settings, verdict)
@@ -121,6 +137,34 @@ def _measured(
         )
         for row, footprint in drawn
     }
+
+
+def _measured_alike(
+    known: PrepassInput,
+    surfaces: HandSurfaces,
+    survey: _Survey,
+    model: IntensityModel,
+    settings: PrepassSettings,
+) -> dict[int, FrameMeasurements]:
+    """Compare other frames of the clip, by row, with the model, which was made without them."""
+    drawn = list(_footprints(known, surfaces, _measurable(known)))
+    own = _survey(known, drawn, len(surfaces.cell_normals), settings)
+    readable = [(row, footprint) for row, footprint in drawn if own.readable[row]]
+    return _measured(known, replace(own, shown=survey.shown), model, readable)
+
+
+def _tolerance(
+    given: PrepassInput,
+    measured: dict[int, FrameMeasurements],
+    known_clean: PrepassInput,
+    clean: dict[int, FrameMeasurements],
+    settings: PrepassSettings,
+) -> float:
+    """The tolerance of the clip, from measurements of its frames and of those that are clean."""
+    rows, known = sorted(measured), sorted(clean)
+    indices = np.concatenate([given.indices[rows], known_clean.indices[known]])
+    found = [measured[row] for row in rows] + [clean[row] for row in known]
+    return clip_tolerance(evidence_against(indices, found, settings)[len(rows) :], settings)
 
 
 def _measurable(given: PrepassInput) -> np.ndarray:

@@ -40,6 +40,8 @@ class PrepassSettings:
     hidden_floor: float = 0.02
     #: Evidence (`wildghand.prepass.classify.evidence`) at which a frame is as likely clean as not.
     tolerance: float = 1.2
+    #: Validation frames, which are clean, raise it to the median of what is found against them.
+    validated: bool = True
     #: Deviation from which a cue by itself calls a frame blurred or misplaced.
     clear_deviation: float = 3.0
     #: Least weight of a frame in the fit.
@@ -59,5 +61,6 @@ class PrepassSettings:
     clean_scale: float = 4.0
     #: Pixels that what is normal in the clean frames is worth in what is normal at a place.
     residual_prior: float = 20.0
-    #: Fewer usable frames than this cannot be compared: all are judged clean.
+    #: Fewer usable frames than this cannot be compared: all are judged clean. Nor do fewer
+    #: validation frames raise the tolerance.
     least_frames: int = 4

@@ -112,12 +112,35 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
     judges = judging_frames(training, fit.settings)
     subject = subject_of(training, fit.frames, templates, fit.settings, judges)
     bent = bent_templates(templates, subject)
-    assessment = assess_frames(training, fit.frames, bent, fit.settings)
+    assessment = assess_frames(training, fit.frames, bent, fit.settings, judges)
     assert assessment is not None
     drawing = fit.draw(ROWS)
     weights, whole = fit.weighting(ROWS, drawing).weights, bare.weighting(ROWS, drawing).weights
     expected = whole * torch.from_numpy(assessment.pixel_weights[ROWS.numpy()]).float() / 255.0
     torch.testing.assert_close(weights.detach(), expected.detach(), rtol=1e-5, atol=1e-6)
+
+
+def test_validation_frames_are_known_to_be_clean(make_training: TrainingMaker) -> None:
+    # Oracle: the pre-pass with the validation frames and without; a clip that tolerates nothing.
+    training = make_training()
+    believing, alone = (
+        fit_of(training, **{"prepass.validated": on, "prepass.tolerance": 1e-3})
+        for on in (True, False)
+    )
+    judges = judging_frames(training, believing.settings)
+    assert judges is not None
+    assert set(judges.indices.tolist()) <= set(training.validation.tolist())
+    templates = {side: training.template(side) for side in training.sides}
+    subject = subject_of(training, alone.frames, templates, alone.settings, judges)
+    bent = bent_templates(templates, subject)
+    for fit, known in ((believing, judges), (alone, None)):
+        expected = assess_frames(training, fit.frames, bent, believing.settings, known)
+        assert expected is not None
+        np.testing.assert_array_equal(fit.weighting.clean, np.float32(expected.clean))
+    assert (believing.weighting.clean >= alone.weighting.clean).all()
+    assert not torch.equal(believing.weighting.clean, alone.weighting.clean)
+    # They teach nothing: a fit has the rows of its training frames alone.
+    assert believing.frames.indices.tolist() == alone.frames.indices.tolist()
 
 
 def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 
 import numpy as np
 
@@ -11,7 +11,7 @@ from hwp_bench.capture import Cameras
 from hwp_bench.hands import load_template
 from hwp_bench.hands.footprint import HandSurfaces
 from hwp_bench.hands.parameters import HandParameters
-from wildghand.prepass import PrepassInput
+from wildghand.prepass import FrameAssessment, PrepassInput
 
 FRAMES, SIZE = 24, 96
 BACKGROUND = 0.02
@@ -79,3 +79,15 @@ def only(given: PrepassInput, frames: np.ndarray) -> PrepassInput:
     return replace(
         given, indices=given.indices[frames], images=given.images[frames], masks=given.masks[frames]
     )
+
+
+def check_ranges(judgement: FrameAssessment, count: int) -> None:
+    """Every field is finite and in its range."""
+    for field in fields(FrameAssessment):
+        values = getattr(judgement, field.name)
+        assert len(values) == count, field.name
+        assert np.isfinite(values.astype(np.float64)).all(), field.name
+    assert ((judgement.clean >= 0) & (judgement.clean <= 1)).all()
+    assert ((judgement.frame_weights >= 0.1) & (judgement.frame_weights <= 1)).all()
+    assert set(judgement.omega_dropout.tolist()) <= {0.0, 0.3}
+    assert judgement.pixel_weights.dtype == np.uint8

@@ -8,7 +8,16 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from lit_hand import FRAMES, SIZE, as_input, cameras, developed, hand_parameters, only
+from lit_hand import (
+    FRAMES,
+    SIZE,
+    as_input,
+    cameras,
+    check_ranges,
+    developed,
+    hand_parameters,
+    only,
+)
 from painted import painted_info
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch
@@ -29,18 +38,6 @@ Lit = tuple[np.ndarray, np.ndarray]
 #: Frames that the tests perturb.
 HIT = np.arange(8, 14)
 SPARED = np.setdiff1d(np.arange(FRAMES), np.arange(7, 15))
-
-
-def check_ranges(judgement: FrameAssessment, count: int) -> None:
-    """Every field is finite and in its range."""
-    for field in fields(FrameAssessment):
-        values = getattr(judgement, field.name)
-        assert len(values) == count, field.name
-        assert np.isfinite(values.astype(np.float64)).all(), field.name
-    assert ((judgement.clean >= 0) & (judgement.clean <= 1)).all()
-    assert ((judgement.frame_weights >= 0.1) & (judgement.frame_weights <= 1)).all()
-    assert set(judgement.omega_dropout.tolist()) <= {0.0, 0.3}
-    assert judgement.pixel_weights.dtype == np.uint8
 
 
 def test_clean_frames_are_judged_clean(lit_frames: Lit) -> None:

@@ -10,8 +10,9 @@ from hypothesis.extra.numpy import arrays
 
 from hwp_bench.base.colors import linear_to_srgb
 from wildghand.prepass.borders import border_width, misplacement
-from wildghand.prepass.classify import clean_probability, evidence
+from wildghand.prepass.classify import clean_probability, clip_tolerance, evidence
 from wildghand.prepass.robust_location import densest, excess, normal_value
+from wildghand.prepass.settings import PrepassSettings
 
 
 def test_normal_values_of_a_normal_distribution() -> None:
@@ -91,3 +92,15 @@ def test_evidence_is_shared_with_neighbours_only() -> None:
     apart = evidence([deviation], np.array([0, 4, 8, 12]), 1.2)
     np.testing.assert_allclose(apart, alone * np.array([0.0, 1.0, 0.0, 0.0]))
     assert clean_probability(np.array([0.0, 1.2]), 1.2).tolist() == [1.0, 0.5]
+
+
+@given(arrays(np.float64, st.integers(0, 12), elements=st.floats(0.0, 1e6)))
+def test_most_frames_that_are_known_to_be_clean_are_judged_so(found: np.ndarray) -> None:
+    settings = PrepassSettings()
+    tolerance = clip_tolerance(found, settings)
+    if len(found) < settings.least_frames:
+        assert tolerance == settings.tolerance
+        return
+    assert 2 * (clean_probability(found, tolerance) >= 0.5).sum() >= len(found)
+    # It is no larger than it must be: as many are at it or above.
+    assert tolerance == settings.tolerance or 2 * (found >= tolerance).sum() >= len(found)
