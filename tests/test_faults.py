@@ -27,9 +27,8 @@ def targets(tmp_path_factory: pytest.TempPathFactory, machine_code: None) -> dic
     return {target.name: target for target in made}
 
 
-# A killed `sim render` is in `test_sim_bad_input`.
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["evaluate", "ablate", "wildghand fit"])
+@pytest.mark.parametrize("name", ["sim render", "evaluate", "ablate", "wildghand fit"])
 def test_a_killed_run_ends_as_one_left_in_peace(
     targets: dict[str, Target], tmp_path: Path, name: str
 ) -> None:

@@ -23,7 +23,7 @@ def classify_frames(
     size: tuple[int, int],
     measured: Mapping[int, FrameMeasurements],
     settings: PrepassSettings,
-    tolerance: float | None = None,
+    tolerance: float,
 ) -> FrameAssessment:
     """Compare the frames with each other and assess them; every pixel has full weight.
 
@@ -32,7 +32,7 @@ def classify_frames(
         size: height and width of the frames.
         measured: by row; rows that are missing cannot be used. Not empty.
         settings: floors and thresholds.
-        tolerance: evidence at which a frame is as likely clean as not; the settings' if None.
+        tolerance: evidence at which a frame is as likely clean as not (`clip_tolerance`).
     """
     count = len(indices)
     rows = np.array(sorted(measured))
@@ -46,7 +46,6 @@ def classify_frames(
 
     found = [measured[row] for row in rows.tolist()]
     cues = _compare(found, settings)
-    tolerance = settings.tolerance if tolerance is None else tolerance
     found_evidence = evidence(cues.deviations, indices[rows], settings.tolerance)
     clean = spread(clean_probability(found_evidence, tolerance))
     border, texture = _gathered(found, "border"), _gathered(found, "texture")

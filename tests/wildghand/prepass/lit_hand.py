@@ -15,6 +15,10 @@ from wildghand.prepass import FrameAssessment, PrepassInput
 
 FRAMES, SIZE = 24, 96
 BACKGROUND = 0.02
+#: Linear light and silhouettes, of `linear_frames`.
+Lit = tuple[np.ndarray, np.ndarray]
+#: Frames that the tests perturb.
+HIT = np.arange(8, 14)
 
 
 def hand_parameters() -> HandParameters:

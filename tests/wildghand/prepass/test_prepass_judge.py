@@ -10,7 +10,9 @@ import numpy as np
 import pytest
 from lit_hand import (
     FRAMES,
+    HIT,
     SIZE,
+    Lit,
     as_input,
     cameras,
     check_ranges,
@@ -34,9 +36,6 @@ from wildghand.prepass import (
 )
 from wildghand.prepass.borders import interior
 
-Lit = tuple[np.ndarray, np.ndarray]
-#: Frames that the tests perturb.
-HIT = np.arange(8, 14)
 SPARED = np.setdiff1d(np.arange(FRAMES), np.arange(7, 15))
 
 

@@ -6,14 +6,11 @@ from dataclasses import fields
 
 import numpy as np
 import pytest
-from lit_hand import FRAMES, SIZE, as_input, check_ranges, developed, only
+from lit_hand import FRAMES, HIT, SIZE, Lit, as_input, check_ranges, developed, only
 
 from hwp_bench.base.errors import BadInput
 from wildghand.prepass import FrameAssessment, PrepassInput, PrepassSettings, judge_frames
 
-Lit = tuple[np.ndarray, np.ndarray]
-#: Frames that are dark.
-HIT = np.arange(8, 14)
 #: Frames whose verdict is known, amid and after the others.
 KNOWN = np.array([3, 5, 18, 19, 21, 23])
 
