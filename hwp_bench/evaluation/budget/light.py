@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 
 from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
+from hwp_bench.base.harmonics import harmonics
 from hwp_bench.evaluation.budget.least_squares import least_error, least_squares
 from hwp_bench.evaluation.budget.pair import Pair
 
@@ -40,21 +41,6 @@ def gain_map(pair: Pair) -> np.ndarray:
             np.ascontiguousarray(identity[..., start : start + 4]), (int(width), int(height))
         ).reshape(height, width, -1)
     return _relit(pair, basis)
-
-
-def harmonics(normals: np.ndarray) -> np.ndarray:
-    """The nine polynomials of degree 0 to 2 that span the spherical harmonics.
-
-    Args:
-        normals: (..., 3), unit or zero; at zero only the constant is not 0.
-
-    Returns:
-        (..., 9).
-    """
-    x, y, z = np.moveaxis(normals, -1, 0)
-    known = (normals**2).sum(axis=-1) > 0.5
-    second = np.where(known, 3.0 * z * z - 1.0, 0.0)
-    return np.stack([np.ones_like(x), x, y, z, x * y, y * z, z * x, x * x - y * y, second], axis=-1)
 
 
 def _relit(pair: Pair, basis: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""Fitting a hand to a whole clip: first its landmarks, then its outline too."""
+"""Fitting a hand to a whole clip: its landmarks, then its outline too, then whole pictures."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, Landmarks
 from hwp_bench.importers.video.clip_model import ClipModel, PosedClip
 from hwp_bench.importers.video.contour import ContourEnergy
 from hwp_bench.importers.video.fit_terms import LandmarkEnergy
+from hwp_bench.importers.video.picture_energy import PictureEnergy
 from hwp_bench.importers.video.rigid_start import rigid_start
 from hwp_bench.importers.video.texture_energy import TextureEnergy
 from hwp_bench.importers.video.video_settings import FitSettings
@@ -27,6 +28,9 @@ LIKELY_FOCAL = 0.8
 CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
 # Variables that the outline does not determine reliably.
 _HELD_BY_LANDMARKS = ("log_focal", "log_size")
+# Those that whole pictures would move to hide what else is wrong with them: the outline knows
+# how large a hand is and how far away.
+_HELD_BY_OUTLINE = (*CONSTANTS, "log_depth")
 #: First step of each variable, in its own unit; constants move slower than poses.
 LEARNING_RATES = {
     "turn": 0.02,
@@ -198,6 +202,33 @@ def fit_outline(
         )
         if update is not None:
             update((done + 1) * settings.contour_steps)
+
+
+def fit_picture(
+    fitted: FittedClip,
+    picture: PictureEnergy,
+    update: Callable[[int], None] | None = None,
+) -> None:
+    """Refine the poses of a fit, in place, so that the lit hand, as it is drawn, meets the frames.
+
+    Shape, size and distance of the hand stay.
+    """
+    settings = fitted.settings
+
+    def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        return fitted.energy(model, posed) + picture(model, posed)
+
+    for done in range(settings.picture_rounds):
+        picture.rematch(fitted.model)
+        descend(
+            fitted.model,
+            energy,
+            settings.picture_steps,
+            rate=settings.contour_rate,
+            hold=_HELD_BY_OUTLINE,
+        )
+        if update is not None:
+            update((done + 1) * settings.picture_steps)
 
 
 def reprojection_error(fitted: FittedClip, landmarks: Landmarks) -> ReprojectionError:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,12 +21,14 @@ from hwp_bench.importers.video.fit_clip import (
     Footage,
     fit_landmarks,
     fit_outline,
+    fit_picture,
     reprojection_error,
     share_camera,
 )
 from hwp_bench.importers.video.fit_terms import hand_size
 from hwp_bench.importers.video.imported_clip import ImportedClip, ImportedHand, store_clip
-from hwp_bench.importers.video.segmentation import NARROW, WIDE
+from hwp_bench.importers.video.picture_energy import PictureEnergy
+from hwp_bench.importers.video.segmentation import NARROW, WIDE, MaskSettings
 from hwp_bench.importers.video.source import VideoSource, read_source
 from hwp_bench.importers.video.texture_energy import TextureEnergy
 from hwp_bench.importers.video.two_hands import ProjectedHands, project_hands
@@ -67,63 +70,111 @@ def import_video(
 def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
     """Fit the hands and cut the masks in turns.
 
-    Landmarks, masks, outline, masks, outline and texture, masks. Two hands are fitted one after
-    the other and share their camera and their masks.
+    Landmarks, masks, outline, masks, outline and texture, masks, whole pictures, masks. Two hands
+    are fitted one after the other and share their camera and their masks.
     """
-    windows, settings = source.windows, options.fit
+    settings = options.fit
     hands = list(source.hands.values())
     fits = _fit_hands(source, options)
     first_errors = [
         reprojection_error(fitted, hand) for fitted, hand in zip(fits, hands, strict=True)
     ]
-    sizes = [hand_size(hand) for hand in hands]
-    scale = source.images.working.shape[1] / windows.side
-    size = sum(sizes) / len(sizes)
+    size = sum(hand_size(hand) for hand in hands) / len(hands)
+    scale = source.images.working.shape[1] / source.windows.side
     masking = Masking(source.images, source.detected, size * scale, source.own_masks)
-    overlaps = []
-    frames = len(source.indices)
-    steps = settings.contour_rounds * settings.contour_steps
-    for turn, trust, reduction in ((1, WIDE, 2), (2, NARROW, 1)):
-        with progress(f"cutting masks ({turn} of 3)", frames) as update:
+    pictures = settings.picture_weight > 0 and settings.picture_rounds > 0
+    turns = 4 if pictures else 3
+
+    def cut(turn: int, trust: MaskSettings, reduction: int = 1) -> _Cut:
+        with progress(f"cutting masks ({turn} of {turns})", len(source.indices)) as update:
             pair = _pair(source, fits)
-            projected = pair or project_clip(fits[0].model, windows)
+            projected = pair or project_clip(fits[0].model, source.windows)
             masks = masking.masks(projected, trust, reduction=reduction, update=update)
-        overlaps.append(float(masks.overlap[source.detected].mean()))
-        coverages = [masks.coverage] if pair is None else pair.coverage(masks.coverage)
-        if pair is not None and turn == 1:
-            for hand, fitted in enumerate(fits):
-                fitted.energy.trust(pair.trust(hand))
-        with progress(f"fitting outlines ({turn} of 2)", steps * len(hands)) as update:
-            for hand, (fitted, landmarks) in enumerate(zip(fits, hands, strict=True)):
-                contour = _contour(source, options, hand, masks, pair)
-                texture = None
-                if settings.texture_weight > 0 and turn == 2:
-                    texture = TextureEnergy(
-                        source.images.frames,
-                        coverages[hand],
-                        landmarks.detected,
-                        windows,
-                        settings,
-                        sizes[hand],
-                        fitted.model,
-                    )
-                fit_outline(fitted, contour, _after(update, hand * steps), texture)
-    clips = [project_clip(fitted.model, windows) for fitted in fits]
-    with progress("cutting masks (3 of 3)", frames) as update:
-        masks = masking.masks(_pair(source, fits) or clips[0], NARROW, update=update)
+        coverages = [masks.coverage] if pair is None else list(pair.coverage(masks.coverage))
+        return _Cut(masks, pair, coverages)
+
+    found = cut(1, WIDE, reduction=2)
+    overlap_landmarks_only = float(found.masks.overlap[source.detected].mean())
+    if found.pair is not None:
+        for hand, fitted in enumerate(fits):
+            fitted.energy.trust(found.pair.trust(hand))
+    _fit_outlines(source, options, fits, found, turn=1)
+    _fit_outlines(source, options, fits, cut(2, NARROW), turn=2)
+    if pictures:
+        _fit_pictures(source, options, fits, cut(3, NARROW))
+    masks = cut(turns, NARROW).masks
     imported = {}
-    for hand, (side, landmarks) in enumerate(source.hands.items()):
-        error = reprojection_error(fits[hand], landmarks)
-        missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * sizes[hand]
+    for (side, landmarks), fitted, first in zip(
+        source.hands.items(), fits, first_errors, strict=True
+    ):
+        error = reprojection_error(fitted, landmarks)
+        missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * hand_size(landmarks)
         imported[side] = ImportedHand(
             landmarks=landmarks,
-            parameters=fits[hand].model.parameters(landmarks.detected & ~missed),
-            fitted=fits[hand],
-            projected=clips[hand],
+            parameters=fitted.model.parameters(landmarks.detected & ~missed),
+            fitted=fitted,
+            projected=project_clip(fitted.model, source.windows),
             error=error,
-            error_landmarks_only=first_errors[hand],
+            error_landmarks_only=first,
         )
-    return ImportedClip(source, imported, masks, overlaps[0])
+    return ImportedClip(source, imported, masks, overlap_landmarks_only)
+
+
+@dataclass(frozen=True, eq=False)
+class _Cut:
+    """Masks of all hands, two projected hands or None, and the visible part of each hand."""
+
+    masks: ClipMasks
+    pair: ProjectedHands | None
+    coverages: list[np.ndarray]
+
+
+def _fit_outlines(
+    source: VideoSource,
+    options: VideoImport,
+    fits: list[FittedClip],
+    found: _Cut,
+    turn: int,
+) -> None:
+    """Refine the hands by their outlines; in the second turn by their textures too."""
+    settings = options.fit
+    steps = settings.contour_rounds * settings.contour_steps
+    with progress(f"fitting outlines ({turn} of 2)", steps * len(fits)) as update:
+        for hand, (fitted, landmarks) in enumerate(zip(fits, source.hands.values(), strict=True)):
+            contour = _contour(source, options, hand, found.masks, found.pair)
+            texture = None
+            if turn == 2 and settings.texture_weight > 0:
+                texture = TextureEnergy(
+                    source.images.frames,
+                    found.coverages[hand],
+                    landmarks.detected,
+                    source.windows,
+                    settings,
+                    hand_size(landmarks),
+                    fitted.model,
+                )
+            fit_outline(fitted, contour, _after(update, hand * steps), texture)
+
+
+def _fit_pictures(
+    source: VideoSource, options: VideoImport, fits: list[FittedClip], found: _Cut
+) -> None:
+    """Refine the hands' poses by whole pictures."""
+    settings = options.fit
+    steps = settings.picture_rounds * settings.picture_steps
+    with progress("fitting pictures", steps * len(fits)) as update:
+        for hand, (fitted, landmarks) in enumerate(zip(fits, source.hands.values(), strict=True)):
+            picture = PictureEnergy(
+                source.images.frames,
+                found.coverages[hand],
+                landmarks.detected,
+                source.windows,
+                settings,
+                hand_size(landmarks),
+                fitted.model,
+                other=found.coverages[1 - hand] if len(fits) == 2 else None,
+            )
+            fit_picture(fitted, picture, _after(update, hand * steps))
 
 
 def _fit_hands(source: VideoSource, options: VideoImport) -> list[FittedClip]:

@@ -22,7 +22,7 @@ from hwp_bench.importers.video.video_settings import VideoImport
 
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
 #: because scores on captures of two versions do not compare.
-IMPORTER_VERSION = 2
+IMPORTER_VERSION = 3
 #: Frames on the overlay sheet.
 SHEET_FRAMES = 24
 

@@ -9,6 +9,8 @@ import numpy as np
 
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.raster import draw_faces, mix_corners
+from hwp_bench.importers.video.atlas import Atlas, sample
+from hwp_bench.importers.video.within import smooth_within
 
 #: Edge of the atlas, texels.
 ATLAS = 384
@@ -61,17 +63,9 @@ class SkinTexture:
     def __init__(self, template: HandTemplate, breadth: float) -> None:
         self._faces = template.faces
         self._breadth = breadth
-        # Corners of faces have their own places in the atlas; its seams need no care then.
-        self._corners = (template.uv[template.face_uv].reshape(-1, 2) * ATLAS).astype(np.float32)
-        self._corner_faces = np.arange(len(self._corners)).reshape(-1, 3)
-        face, mix = draw_faces(
-            self._corners, np.ones(len(self._corners)), self._corner_faces, (ATLAS, ATLAS)
-        )
-        self._texels = np.flatnonzero(face.ravel() >= 0)
-        self._texel_face = face.ravel()[self._texels]
-        self._texel_mix = mix.reshape(-1, 2)[self._texels]
+        self._atlas = Atlas(template, ATLAS)
         self._mean: np.ndarray | None = None
-        self._sum, self._weight = (np.zeros(len(self._texels)) for _ in range(2))
+        self._sum, self._weight = (np.zeros(len(self._atlas)) for _ in range(2))
 
     def view(
         self, image: np.ndarray, mask: np.ndarray, vertices: np.ndarray, pixels: np.ndarray
@@ -107,14 +101,14 @@ class SkinTexture:
         self, view: View, vertices: np.ndarray, pixels: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Read a frame at each texel: (K,) log grey, and (K,) weights, zero where it is hidden."""
-        places = mix_corners(pixels, self._faces, self._texel_face, self._texel_mix)
-        depths = mix_corners(vertices[:, 2:], self._faces, self._texel_face, self._texel_mix)
-        facing = view.facing[self._texel_face]
-        here = np.abs(_sample(view.depth, places, cv2.INTER_NEAREST) - depths[:, 0]) < _SEEN
-        here &= (_sample(view.core.astype(np.float32), places, cv2.INTER_NEAREST) > 0) & (
+        places = self._atlas.on_surface(pixels)
+        depths = self._atlas.on_surface(vertices[:, 2:])
+        facing = view.facing[self._atlas.face]
+        here = np.abs(sample(view.depth, places, cv2.INTER_NEAREST) - depths[:, 0]) < _SEEN
+        here &= (sample(view.core.astype(np.float32), places, cv2.INTER_NEAREST) > 0) & (
             facing > _LEAST_FACING
         )
-        return _sample(view.detail, places, cv2.INTER_LINEAR), np.where(here, facing**2, 0.0)
+        return sample(view.detail, places), np.where(here, facing**2, 0.0)
 
     def add(self, values: np.ndarray, weights: np.ndarray) -> None:
         """Count a frame's texels; those far from the last mean count less."""
@@ -127,36 +121,21 @@ class SkinTexture:
         """Form the mean of the frames added, and start again without any."""
         mean = self._sum / (self._weight + 1.0)
         self._mean = mean.astype(np.float32)
-        drawn, weight, inside = (np.zeros(ATLAS * ATLAS, np.float32) for _ in range(3))
-        drawn[self._texels], weight[self._texels], inside[self._texels] = mean, self._weight, 1.0
-        square = (ATLAS, ATLAS)
-        within = inside.reshape(square) > 0
-        # Next to a chart the nearest texels go on, so that interpolation reads no border.
-        around = smooth_within(drawn.reshape(square), within, 1.5)
-        self._atlas = np.where(within, drawn.reshape(square), around).astype(np.float32)
-        spread = cv2.dilate(weight.reshape(square), np.ones((3, 3), np.uint8))
-        self._known = np.where(within, weight.reshape(square), spread)
-        self._sum, self._weight = (np.zeros(len(self._texels)) for _ in range(2))
+        self._drawn = self._atlas.drawn(self._mean)
+        self._known = self._atlas.drawn_weights(self._weight)
+        self._sum, self._weight = (np.zeros(len(self._atlas)) for _ in range(2))
 
     def expected(self, view: View) -> tuple[np.ndarray, np.ndarray]:
         """Draw the mean texture as a frame sees it: (S, S) log grey, and (S, S) bool, is known."""
         inside = view.region
         face = view.face[inside]
-        places = mix_corners(self._corners, self._corner_faces, face, view.mix[inside])
+        places = self._atlas.places(face, view.mix[inside])
         drawn, known = np.zeros(inside.shape, np.float32), np.zeros(inside.shape, bool)
-        drawn[inside] = _sample(self._atlas, places, cv2.INTER_LINEAR)
-        known[inside] = (_sample(self._known, places, cv2.INTER_LINEAR) > _LEAST_WEIGHT) & (
+        drawn[inside] = sample(self._drawn, places)
+        known[inside] = (sample(self._known, places) > _LEAST_WEIGHT) & (
             view.facing[face] > _LEAST_FACING
         )
         return drawn, known & view.core
-
-
-def smooth_within(values: np.ndarray, region: np.ndarray, breadth: float) -> np.ndarray:
-    """Gaussian mean over the pixels of a region alone: (S, S) float32."""
-    inside = region.astype(np.float32)
-    weight = cv2.GaussianBlur(inside, (0, 0), breadth)
-    total = cv2.GaussianBlur(np.where(region, values, 0.0).astype(np.float32), (0, 0), breadth)
-    return np.asarray(total / np.maximum(weight, 1e-3))
 
 
 def _facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -165,13 +144,3 @@ def _facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     middle = first + second + third
     length = np.linalg.norm(normal, axis=1) * np.linalg.norm(middle, axis=1)
     return np.asarray(np.maximum(-(normal * middle).sum(axis=1) / np.maximum(length, 1e-12), 0.0))
-
-
-def _sample(image: np.ndarray, places: np.ndarray, how: int) -> np.ndarray:
-    """Samples (P,) at (P, 2) px, pixel centres at +0.5; zero outside."""
-    # OpenCV takes at most 32,767 places in a row.
-    width = 1024
-    padded = np.zeros((-(-max(len(places), 1) // width) * width, 2), np.float32)
-    padded[: len(places)] = places - 0.5
-    x, y = (np.ascontiguousarray(part.reshape(-1, width)) for part in padded.T)
-    return np.asarray(cv2.remap(image, x, y, how).ravel()[: len(places)])

@@ -102,6 +102,15 @@ class FitSettings:
     texture_scale: float = 0.06
     #: Changes wider than this count as light, not as texture, as a share of the hand's size.
     light_breadth: float = 0.05
+    #: Rounds after the outline's: draw the lit hand, lay it onto the frames.
+    picture_rounds: int = 6
+    #: Steps of Adam in each of them, at the rates of `contour_rate`.
+    picture_steps: int = 40
+    #: Weight of the whole picture, shared among as many pixels as the hand's size squared; 0
+    #: leaves it out.
+    picture_weight: float = 1000.0
+    #: Difference of a pixel from the drawn hand, sRGB in [0, 1].
+    picture_scale: float = 0.06
 
 
 #: The hands that can be asked for, as the person sees them; `auto` is what the landmarks show.

@@ -9,9 +9,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
+from hwp_bench.base.harmonics import harmonics
 from hwp_bench.evaluation.budget.budget import gained
 from hwp_bench.evaluation.budget.corrections import CORRECTIONS
-from hwp_bench.evaluation.budget.light import harmonics
 from hwp_bench.evaluation.budget.pair import Pair
 
 SIZE = 48
@@ -94,10 +94,3 @@ def test_no_prediction_gives_a_nan_or_a_loss(kind: str, seed: int, name: str) ->
     assert image.min() >= 0.0
     assert image.max() <= 1.0 + 1e-6
     assert gained(image, pair) >= 0.0
-
-
-def test_pixels_without_a_normal_get_the_constant_alone() -> None:
-    flat = harmonics(np.zeros((2, 3)))
-    assert flat[0].tolist() == [1.0, *[0.0] * 8]
-    unit = np.array([0.0, 0.0, 1.0])
-    assert harmonics(unit)[-1] == pytest.approx(2.0)

@@ -16,10 +16,11 @@ from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hands
 from hwp_bench.importers.video.clip_model import posed_vertices
 from hwp_bench.importers.video.contour import ContourEnergy, signed_distance
 from hwp_bench.importers.video.fit_clip import FittedClip, Footage, fit_landmarks, fit_outline
-from hwp_bench.importers.video.skin_texture import SkinTexture, smooth_within
+from hwp_bench.importers.video.skin_texture import SkinTexture
 from hwp_bench.importers.video.surface_motion import frame_variables
 from hwp_bench.importers.video.texture_energy import TextureEnergy
 from hwp_bench.importers.video.video_settings import FitSettings
+from hwp_bench.importers.video.within import smooth_within
 
 SETTINGS = FitSettings(start_steps=40, landmark_steps=80, contour_steps=50)
 FRAMES, SIZE, HAND = 20, 160, 150.0
