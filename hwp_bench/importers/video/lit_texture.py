@@ -10,6 +10,7 @@ import numpy as np
 from hwp_bench.base.harmonics import COUNT, harmonics
 from hwp_bench.hands import HandTemplate
 from hwp_bench.importers.video.atlas import Atlas, sample
+from hwp_bench.importers.video.frame_quadratic import row_products
 
 # Edge of the map, texels; twice as many change nothing.
 _EDGE = 256
@@ -118,4 +119,4 @@ class LitTexture:
 
 
 def _trust(shown: SeenTexels, error: np.ndarray) -> np.ndarray:
-    return np.asarray(shown.weights / (1.0 + (error**2).mean(axis=1) / _ODD**2))
+    return np.asarray(shown.weights / (1.0 + row_products(error, error) / (3.0 * _ODD**2)))

@@ -20,6 +20,7 @@ from hwp_bench.importers.video.frame_quadratic import (
     Quadratic,
     linearised,
     no_quadratic,
+    row_products,
 )
 from hwp_bench.importers.video.lit_texture import DARK, LitTexture, SeenTexels
 from hwp_bench.importers.video.surface_motion import SurfaceMotion
@@ -130,7 +131,7 @@ class PictureEnergy:
         atlas = self.texture.atlas
         places, points = atlas.on_surface(drawn.pixels), atlas.on_surface(drawn.vertices)
         normals = _unit(atlas.on_surface(drawn.normals))
-        facing = -(normals * _unit(points)).sum(axis=1)
+        facing = -row_products(normals, _unit(points))
         nearest = sample(cv2.erode(depth, _BORDER), places, cv2.INTER_NEAREST)
         here = (facing > _LEAST_FACING) & (np.abs(nearest - points[:, 2]) < _SEEN)
         shown = np.flatnonzero(here & (sample(core, places, cv2.INTER_NEAREST) > 0))
@@ -160,18 +161,18 @@ class PictureEnergy:
         near = cv2.dilate((inside | (coverage > 0.5)).astype(np.uint8), _REACH) > 0
         if self._other is not None:
             near &= cv2.dilate(self._other[frame], _REACH) == 0
-        error = image - expected
-        squared = (error**2).mean(axis=-1) / (2.0 * self._scale) ** 2
+        error = (image - expected)[near]
+        squared = row_products(error, error) / (3.0 * (2.0 * self._scale) ** 2)
         # Pixels off the hand move as the nearest pixel on it: its border moves with it.
         nearest = _nearest(inside)[near]
-        trust = known.ravel()[nearest] / (1.0 + squared[near]) ** 2 / self._scale**2
+        trust = known.ravel()[nearest] / (1.0 + squared) ** 2 / self._scale**2
         # The mean of both pictures' slopes, as in the texture's term.
         both = 0.5 * (image + expected)
         across, down = (cv2.Scharr(both, cv2.CV_32F, *axis) / 32.0 for axis in ((1, 0), (0, 1)))
         return Differences(
             face=drawn.face.ravel()[nearest],
             mix=drawn.mix.reshape(-1, 2)[nearest],
-            error=error[near],
+            error=error,
             across=across[near],
             down=down[near],
             trust=trust,
@@ -192,5 +193,5 @@ def _nearest(inside: np.ndarray) -> np.ndarray:
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:
-    length = np.linalg.norm(vectors, axis=1, keepdims=True)
-    return np.asarray(vectors / np.maximum(length, 1e-9))
+    length = np.sqrt(row_products(vectors, vectors))
+    return np.asarray(vectors / np.maximum(length, 1e-9)[:, None])

@@ -52,7 +52,12 @@ SETTINGS: dict[str, Any] = {
 }
 #: An import that is only as good as the perfect landmarks of the clip.
 IMPORT = FitSettings(
-    start_steps=30, landmark_steps=30, contour_steps=3, contour_rounds=1, texture_weight=0.0
+    start_steps=30,
+    landmark_steps=30,
+    contour_steps=3,
+    contour_rounds=1,
+    texture_weight=0.0,
+    picture_weight=0.0,
 )
 #: Edge, px, and frames of turntables that are drawn again; the first one has full size.
 SMALL = 96, 12

@@ -22,7 +22,12 @@ from hwp_bench.importers.video.video_settings import FitSettings, VideoImport
 REAL = Path(__file__).resolve().parents[5] / "shared" / "data" / "real_hand"
 FOOTAGE = Footage(WIDTH, HEIGHT, FPS, None)
 FEW = FitSettings(
-    start_steps=5, landmark_steps=5, contour_steps=1, contour_rounds=1, texture_weight=0.0
+    start_steps=5,
+    landmark_steps=5,
+    contour_steps=1,
+    contour_rounds=1,
+    texture_weight=0.0,
+    picture_weight=0.0,
 )
 
 

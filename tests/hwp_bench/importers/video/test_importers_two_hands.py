@@ -24,7 +24,12 @@ from hwp_bench.importers.video.source import read_source
 
 FRAMES, SWAPS, GAP = 16, (4, 9, 13), range(7, 9)
 QUICK = FitSettings(
-    start_steps=60, landmark_steps=90, contour_steps=20, contour_rounds=1, texture_weight=0.0
+    start_steps=60,
+    landmark_steps=90,
+    contour_steps=20,
+    contour_rounds=1,
+    texture_weight=0.0,
+    picture_rounds=2,
 )
 
 

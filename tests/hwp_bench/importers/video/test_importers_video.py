@@ -24,7 +24,9 @@ from hwp_bench.importers.video.imported_clip import IMPORTER_VERSION
 from hwp_bench.importers.video.video_settings import FitSettings, FrameRange, VideoImport
 
 FRAMES = 16
-QUICK = FitSettings(start_steps=60, landmark_steps=120, contour_steps=30, contour_rounds=1)
+QUICK = FitSettings(
+    start_steps=60, landmark_steps=120, contour_steps=30, contour_rounds=1, picture_rounds=1
+)
 REAL = Path(__file__).resolve().parents[5] / "shared" / "data" / "real_hand"
 
 
@@ -223,7 +225,7 @@ def test_a_part_of_the_real_video(tmp_path: Path) -> None:
     # Frames 590 to 621 open and make a fist, fast; the bound is 8 px at 1280x720.
     options = VideoImport(
         frames=FrameRange(590, 621),
-        fit=FitSettings(start_steps=80, landmark_steps=200, contour_steps=60),
+        fit=FitSettings(start_steps=80, landmark_steps=200, contour_steps=60, picture_rounds=2),
     )
     result = import_video(
         REAL / "human_hand_video.mp4", REAL / "landmarks.npz", tmp_path / "real", options
