@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import functools
+from collections.abc import Sequence
 
 import cv2
 import numpy as np
@@ -16,6 +17,9 @@ from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hands
 from hwp_bench.importers.video.clip_model import posed_vertices
 from hwp_bench.importers.video.fit_clip import FittedClip, Footage, fit_landmarks
+from hwp_bench.importers.video.hand_pictures import HandPictures
+from hwp_bench.importers.video.picture_energy import PictureEnergy
+from hwp_bench.importers.video.texture_energy import TextureEnergy
 from hwp_bench.importers.video.video_settings import FitSettings
 
 SETTINGS = FitSettings(
@@ -76,6 +80,12 @@ def footage(*, lit: bool = False) -> tuple[SyntheticClip, CropWindows, np.ndarra
     return clip, windows, images, masks
 
 
+def pictures(*, lit: bool = False) -> HandPictures:
+    """The same as the fit sees it."""
+    clip, windows, images, masks = footage(lit=lit)
+    return HandPictures(images, masks, clip.landmarks.detected, windows, HAND)
+
+
 def true_pixels() -> np.ndarray:
     """(FRAMES, V, 2) where the vertices truly lie in the images, px."""
     clip, windows = footage()[:2]
@@ -104,3 +114,31 @@ def pixel_error(fitted: FittedClip) -> float:
     with torch.no_grad():
         pixels = fitted.model.pixels(torch.as_tensor(posed_vertices(fitted.model))).numpy()
     return float(np.linalg.norm(pixels - footage()[0].vertex_pixels, axis=-1).mean())
+
+
+def assert_slopes_lead_down(
+    fitted: FittedClip, energies: Sequence[TextureEnergy | PictureEnergy]
+) -> None:
+    """Two energies alike: zero where linearised, lower a step down the slope, bit for bit equal."""
+    first, second = energies
+    for energy in (first, second):
+        energy.rematch(fitted.model)
+    posed = fitted.model.posed()
+    value = first(fitted.model, posed)
+    assert float(value.detach()) == 0.0
+    value.backward()
+    slope = fitted.model.variables.turn.grad
+    assert slope is not None
+    assert float(slope.abs().max()) > 0
+    with torch.no_grad():
+        fitted.model.variables.turn.sub_(1e-3 * slope / slope.norm())
+        assert float(first(fitted.model, posed)) < 0
+        assert float(first(fitted.model, posed)) == float(second(fitted.model, posed))
+
+
+def assert_says_nothing(fitted: FittedClip, energy: TextureEnergy | PictureEnergy) -> None:
+    """The energy is zero wherever the hand goes."""
+    energy.rematch(fitted.model)
+    with torch.no_grad():
+        fitted.model.variables.turn.add_(0.1)
+    assert float(energy(fitted.model, fitted.model.posed()).detach()) == 0.0

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
+from hwp_bench.importers.shared.row_products import row_products
 from hwp_bench.importers.video.clip_model import ClipModel
 from hwp_bench.importers.video.surface_motion import (
     FRAME_VARIABLES,
@@ -83,12 +84,6 @@ def linearised(
     return _summed(rates, weighed), np.einsum("pak,pa->k", rates, pull)
 
 
-def row_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the (P,) scalar products of the rows of (P, C) and (P, C), for small C."""
-    # NumPy's sum over a short last axis takes several times as long.
-    return np.asarray((first * second) @ np.ones(first.shape[1], first.dtype))
-
-
 class FrameQuadratic:
     """An energy that is quadratic in the variables of each frame; zero where it was linearised.
 
@@ -100,7 +95,7 @@ class FrameQuadratic:
     """
 
     def __init__(
-        self, model: ClipModel, usable: np.ndarray, found: Iterable[Quadratic], weight: float
+        self, model: ClipModel, usable: Sequence[int], found: Iterable[Quadratic], weight: float
     ) -> None:
         self._weight = weight
         self._start = frame_variables(model.variables).detach().clone()

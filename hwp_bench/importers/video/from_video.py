@@ -26,6 +26,7 @@ from hwp_bench.importers.video.fit_clip import (
     share_camera,
 )
 from hwp_bench.importers.video.fit_terms import hand_size
+from hwp_bench.importers.video.hand_pictures import HandPictures
 from hwp_bench.importers.video.imported_clip import ImportedClip, ImportedHand, store_clip
 from hwp_bench.importers.video.picture_energy import PictureEnergy
 from hwp_bench.importers.video.segmentation import NARROW, WIDE, MaskSettings
@@ -130,29 +131,18 @@ class _Cut:
 
 
 def _fit_outlines(
-    source: VideoSource,
-    options: VideoImport,
-    fits: list[FittedClip],
-    found: _Cut,
-    turn: int,
+    source: VideoSource, options: VideoImport, fits: list[FittedClip], found: _Cut, turn: int
 ) -> None:
     """Refine the hands by their outlines; in the second turn by their textures too."""
     settings = options.fit
     steps = settings.contour_rounds * settings.contour_steps
     with progress(f"fitting outlines ({turn} of 2)", steps * len(fits)) as update:
-        for hand, (fitted, landmarks) in enumerate(zip(fits, source.hands.values(), strict=True)):
+        for hand, fitted in enumerate(fits):
             contour = _contour(source, options, hand, found.masks, found.pair)
             texture = None
             if turn == 2 and settings.texture_weight > 0:
-                texture = TextureEnergy(
-                    source.images.frames,
-                    found.coverages[hand],
-                    landmarks.detected,
-                    source.windows,
-                    settings,
-                    hand_size(landmarks),
-                    fitted.model,
-                )
+                pictures = _pictures(source, hand, found)
+                texture = TextureEnergy(pictures, settings, fitted.model)
             fit_outline(fitted, contour, _after(update, hand * steps), texture)
 
 
@@ -163,18 +153,22 @@ def _fit_pictures(
     settings = options.fit
     steps = settings.picture_rounds * settings.picture_steps
     with progress("fitting pictures", steps * len(fits)) as update:
-        for hand, (fitted, landmarks) in enumerate(zip(fits, source.hands.values(), strict=True)):
-            picture = PictureEnergy(
-                source.images.frames,
-                found.coverages[hand],
-                landmarks.detected,
-                source.windows,
-                settings,
-                hand_size(landmarks),
-                fitted.model,
-                other=found.coverages[1 - hand] if len(fits) == 2 else None,
-            )
+        for hand, fitted in enumerate(fits):
+            picture = PictureEnergy(_pictures(source, hand, found), settings, fitted.model)
             fit_picture(fitted, picture, _after(update, hand * steps))
+
+
+def _pictures(source: VideoSource, hand: int, found: _Cut) -> HandPictures:
+    """What the fit of one hand sees of the frames."""
+    landmarks: Landmarks = list(source.hands.values())[hand]
+    return HandPictures(
+        images=source.images.frames,
+        masks=found.coverages[hand],
+        usable=landmarks.detected,
+        windows=source.windows,
+        hand_size=hand_size(landmarks),
+        other=found.coverages[1 - hand] if len(found.coverages) == 2 else None,
+    )
 
 
 def _fit_hands(source: VideoSource, options: VideoImport) -> list[FittedClip]:

@@ -9,8 +9,8 @@ import numpy as np
 
 from hwp_bench.base.harmonics import COUNT, harmonics
 from hwp_bench.hands import HandTemplate
+from hwp_bench.importers.shared.row_products import row_products
 from hwp_bench.importers.video.atlas import Atlas, sample
-from hwp_bench.importers.video.frame_quadratic import row_products
 
 # Edge of the map, texels; twice as many change nothing.
 _EDGE = 256

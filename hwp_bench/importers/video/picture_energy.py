@@ -11,17 +11,17 @@ import torch
 from hwp_bench.hands.anchors import vertex_normals
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.importers.shared.frames_parallel import each_frame
-from hwp_bench.importers.shared.windows import CropWindows
+from hwp_bench.importers.shared.row_products import row_products
 from hwp_bench.importers.video.atlas import sample
-from hwp_bench.importers.video.clip_model import ClipModel, PosedClip, posed_vertices
+from hwp_bench.importers.video.clip_model import ClipModel, PosedClip
 from hwp_bench.importers.video.frame_quadratic import (
     Differences,
     FrameQuadratic,
     Quadratic,
     linearised,
     no_quadratic,
-    row_products,
 )
+from hwp_bench.importers.video.hand_pictures import HandPictures
 from hwp_bench.importers.video.lit_texture import DARK, LitTexture, SeenTexels
 from hwp_bench.importers.video.surface_motion import SurfaceMotion
 from hwp_bench.importers.video.texture_energy import LEAST_PIXELS
@@ -59,45 +59,24 @@ class PictureEnergy:
     which both are black.
 
     Args:
-        images: (F, S, S, 3) uint8 RGB.
-        masks: (F, S, S) uint8 coverage of the hand.
-        usable: (F,) bool, frames that count.
-        windows: where the images lie in the whole frame.
+        pictures: of the clip; around another hand nothing is compared.
         settings: weight and scale.
-        hand_size: size of the hand in the whole frame, px.
         model: the clip.
-        other: (F, S, S) uint8 coverage of another hand, around which nothing is compared.
     """
 
-    def __init__(
-        self,
-        images: np.ndarray,
-        masks: np.ndarray,
-        usable: np.ndarray,
-        windows: CropWindows,
-        settings: FitSettings,
-        hand_size: float,
-        model: ClipModel,
-        other: np.ndarray | None = None,
-    ) -> None:
-        self._images, self._masks, self._other = images, masks, other
-        self._usable = np.flatnonzero(usable)
-        self._corners = windows.corners[:, None]
-        self._ratio = images.shape[1] / windows.side
+    def __init__(self, pictures: HandPictures, settings: FitSettings, model: ClipModel) -> None:
+        self._pictures = pictures
         self._scale = settings.picture_scale
         # The energy of a whole hand is the same in images of any size.
-        self._weight = settings.picture_weight / (hand_size * self._ratio) ** 2
+        self._weight = settings.picture_weight / (pictures.hand_size * pictures.ratio) ** 2
         self._faces = model.template.faces
-        self.texture = LitTexture(model.template, len(images))
+        self.texture = LitTexture(model.template, len(pictures.images))
 
     def rematch(self, model: ClipModel) -> None:
         """Fit the colours and linearise the differences, with the model as it is now."""
-        vertices = posed_vertices(model)
-        with torch.no_grad():
-            pixels = model.pixels(torch.as_tensor(vertices)).numpy()
-        pixels = ((pixels - self._corners) * self._ratio).astype(np.float32)
+        usable = self._pictures.frames
+        vertices, pixels = self._pictures.placed(model)
         motion = SurfaceMotion(model)
-        usable = self._usable.tolist()
 
         def seen(frame: int) -> SeenTexels:
             return self._seen(frame, self._draw(vertices[frame], pixels[frame]))
@@ -106,18 +85,18 @@ class PictureEnergy:
             found = self._differences(frame, self._draw(vertices[frame], pixels[frame]))
             if found is None:
                 return no_quadratic()
-            return linearised(motion, frame, self._faces, found, self._ratio)
+            return linearised(motion, frame, self._faces, found, self._pictures.ratio)
 
         if usable:
             self.texture.fit(dict(zip(usable, each_frame(seen, usable), strict=True)))
-        self._energy = FrameQuadratic(model, self._usable, each_frame(linear, usable), self._weight)
+        self._energy = FrameQuadratic(model, usable, each_frame(linear, usable), self._weight)
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy, a scalar; zero where it was linearised."""
         return self._energy(model)
 
     def _draw(self, vertices: np.ndarray, pixels: np.ndarray) -> _Drawn:
-        size = self._images.shape[1:3]
+        size = self._pictures.images.shape[1:3]
         face, mix = draw_faces(pixels, vertices[:, 2], self._faces, (size[0], size[1]))
         faces = torch.as_tensor(self._faces, dtype=torch.int64)
         normals = vertex_normals(torch.as_tensor(vertices), faces).numpy()
@@ -127,7 +106,7 @@ class PictureEnergy:
         inside = drawn.face >= 0
         depth = np.full(inside.shape, np.inf, np.float32)
         depth[inside] = self._mixed(drawn.vertices[:, 2:], drawn, inside)[:, 0]
-        core = cv2.erode((inside & (self._masks[frame] > 127)).astype(np.float32), _BORDER)
+        core = cv2.erode((inside & (self._pictures.masks[frame] > 127)).astype(np.float32), _BORDER)
         atlas = self.texture.atlas
         places, points = atlas.on_surface(drawn.pixels), atlas.on_surface(drawn.vertices)
         normals = _unit(atlas.on_surface(drawn.normals))
@@ -135,7 +114,7 @@ class PictureEnergy:
         nearest = sample(cv2.erode(depth, _BORDER), places, cv2.INTER_NEAREST)
         here = (facing > _LEAST_FACING) & (np.abs(nearest - points[:, 2]) < _SEEN)
         shown = np.flatnonzero(here & (sample(core, places, cv2.INTER_NEAREST) > 0))
-        logs = np.log(self._images[frame].astype(np.float32) / 255.0 + DARK)
+        logs = np.log(self._pictures.images[frame].astype(np.float32) / 255.0 + DARK)
         return SeenTexels(
             texels=shown.astype(np.int32),
             logs=sample(logs, places[shown]),
@@ -145,7 +124,7 @@ class PictureEnergy:
 
     def _differences(self, frame: int, drawn: _Drawn) -> Differences | None:
         inside = drawn.face >= 0
-        if np.count_nonzero(inside) < LEAST_PIXELS or not self._masks[frame].any():
+        if np.count_nonzero(inside) < LEAST_PIXELS or not self._pictures.masks[frame].any():
             return None
         expected = np.zeros((*inside.shape, 3), np.float32)
         known = np.zeros(inside.shape, np.float32)
@@ -155,12 +134,12 @@ class PictureEnergy:
             drawn.mix[inside],
             _unit(self._mixed(drawn.normals, drawn, inside)),
         )
-        coverage = self._masks[frame].astype(np.float32) / 255.0
-        image = self._images[frame].astype(np.float32) / 255.0 * coverage[..., None]
+        coverage = self._pictures.masks[frame].astype(np.float32) / 255.0
+        image = self._pictures.images[frame].astype(np.float32) / 255.0 * coverage[..., None]
         expected, image = (cv2.GaussianBlur(each, (0, 0), _SMOOTH) for each in (expected, image))
         near = cv2.dilate((inside | (coverage > 0.5)).astype(np.uint8), _REACH) > 0
-        if self._other is not None:
-            near &= cv2.dilate(self._other[frame], _REACH) == 0
+        if self._pictures.other is not None:
+            near &= cv2.dilate(self._pictures.other[frame], _REACH) == 0
         error = (image - expected)[near]
         squared = row_products(error, error) / (3.0 * (2.0 * self._scale) ** 2)
         # Pixels off the hand move as the nearest pixel on it: its border moves with it.

@@ -7,8 +7,7 @@ import numpy as np
 import torch
 
 from hwp_bench.importers.shared.frames_parallel import each_frame
-from hwp_bench.importers.shared.windows import CropWindows
-from hwp_bench.importers.video.clip_model import ClipModel, PosedClip, posed_vertices
+from hwp_bench.importers.video.clip_model import ClipModel, PosedClip
 from hwp_bench.importers.video.frame_quadratic import (
     Differences,
     FrameQuadratic,
@@ -16,6 +15,7 @@ from hwp_bench.importers.video.frame_quadratic import (
     linearised,
     no_quadratic,
 )
+from hwp_bench.importers.video.hand_pictures import HandPictures
 from hwp_bench.importers.video.skin_texture import SkinTexture, View
 from hwp_bench.importers.video.surface_motion import SurfaceMotion
 from hwp_bench.importers.video.video_settings import FitSettings
@@ -33,30 +33,14 @@ class TextureEnergy:
     its axis, or a palm about an axis in the image; wrinkles, nails and veins can.
 
     Args:
-        images: (F, S, S, 3) uint8 RGB.
-        masks: (F, S, S) uint8 coverage of the hand.
-        usable: (F,) bool, frames that count.
-        windows: where the images lie in the whole frame.
+        pictures: of the clip.
         settings: weights and scales.
-        hand_size: size of the hand in the whole frame, px.
         model: the clip.
     """
 
-    def __init__(
-        self,
-        images: np.ndarray,
-        masks: np.ndarray,
-        usable: np.ndarray,
-        windows: CropWindows,
-        settings: FitSettings,
-        hand_size: float,
-        model: ClipModel,
-    ) -> None:
-        self._images, self._masks = images, masks
-        self._usable = np.flatnonzero(usable)
-        self._corners = windows.corners[:, None]
-        self._ratio = images.shape[1] / windows.side
-        size = hand_size * self._ratio
+    def __init__(self, pictures: HandPictures, settings: FitSettings, model: ClipModel) -> None:
+        self._pictures = pictures
+        size = pictures.hand_size * pictures.ratio
         self._scale = settings.texture_scale
         self._faces = model.template.faces
         # The energy of a whole hand is the same in images of any size.
@@ -65,29 +49,25 @@ class TextureEnergy:
 
     def rematch(self, model: ClipModel) -> None:
         """Collect the texture and linearise the differences, with the model as it is now."""
-        vertices = posed_vertices(model)
-        with torch.no_grad():
-            pixels = model.pixels(torch.as_tensor(vertices)).numpy()
-        pixels = ((pixels - self._corners) * self._ratio).astype(np.float32)
+        images, masks, usable = self._pictures.images, self._pictures.masks, self._pictures.frames
+        vertices, pixels = self._pictures.placed(model)
         motion = SurfaceMotion(model)
 
         def view(frame: int) -> View:
-            return self.texture.view(
-                self._images[frame], self._masks[frame], vertices[frame], pixels[frame]
-            )
+            return self.texture.view(images[frame], masks[frame], vertices[frame], pixels[frame])
 
         def seen(frame: int) -> tuple[np.ndarray, np.ndarray]:
             return self.texture.seen(view(frame), vertices[frame], pixels[frame])
 
-        for values, weights in each_frame(seen, self._usable.tolist()):
+        for values, weights in each_frame(seen, usable):
             self.texture.add(values, weights)
         self.texture.finish()
 
         def linear(frame: int) -> Quadratic:
             return self._linearised(motion, frame, view(frame))
 
-        found = each_frame(linear, self._usable.tolist())
-        self._energy = FrameQuadratic(model, self._usable, found, self._weight)
+        found = each_frame(linear, usable)
+        self._energy = FrameQuadratic(model, usable, found, self._weight)
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy, a scalar; zero where it was linearised."""
@@ -114,4 +94,4 @@ class TextureEnergy:
             down=down[:, None],
             trust=trust,
         )
-        return linearised(motion, frame, self._faces, found, self._ratio)
+        return linearised(motion, frame, self._faces, found, self._pictures.ratio)

@@ -3,6 +3,8 @@ differences of the model."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -11,9 +13,12 @@ from painted_clip import (
     HAND,
     SETTINGS,
     TINT,
+    assert_says_nothing,
+    assert_slopes_lead_down,
     fit_to_errors,
     footage,
     lamp,
+    pictures,
     pixel_error,
     true_pixels,
 )
@@ -30,21 +35,16 @@ from hwp_bench.importers.video.surface_motion import SurfaceMotion
 from hwp_bench.importers.video.texture_energy import TextureEnergy
 
 
-def picture_of(fitted: FittedClip, other: np.ndarray | None = None) -> PictureEnergy:
-    clip, windows, images, masks = footage(lit=True)
-    return PictureEnergy(
-        images, masks, clip.landmarks.detected, windows, SETTINGS, HAND, fitted.model, other
-    )
+def picture_of(fitted: FittedClip) -> PictureEnergy:
+    return PictureEnergy(pictures(lit=True), SETTINGS, fitted.model)
 
 
 def test_a_lit_hand_comes_nearer_to_its_truth_than_by_outline_and_texture() -> None:
-    clip, windows, images, masks = footage(lit=True)
+    clip, windows, _, masks = footage(lit=True)
     fields = np.stack([signed_distance(mask) for mask in masks])
     fitted = fit_to_errors()
     contour = ContourEnergy(fields, clip.landmarks.detected, windows, SETTINGS, HAND)
-    texture = TextureEnergy(
-        images, masks, clip.landmarks.detected, windows, SETTINGS, HAND, fitted.model
-    )
+    texture = TextureEnergy(pictures(lit=True), SETTINGS, fitted.model)
     fit_outline(fitted, contour, texture=texture)
     before, free = pixel_error(fitted), fitted.model.variables
     held = {name: getattr(free, name).detach().clone() for name in ("betas", "log_depth")}
@@ -59,45 +59,18 @@ def test_a_lit_hand_comes_nearer_to_its_truth_than_by_outline_and_texture() -> N
 
 def test_the_energy_is_zero_where_it_is_linearised_and_repeats() -> None:
     fitted = fit_to_errors()
-    first, second = picture_of(fitted), picture_of(fitted)
-    for energy in (first, second):
-        energy.rematch(fitted.model)
-    posed = fitted.model.posed()
-    value = first(fitted.model, posed)
-    assert float(value.detach()) == 0.0
-    value.backward()
-    slope = fitted.model.variables.turn.grad
-    assert slope is not None
-    with torch.no_grad():
-        fitted.model.variables.turn.sub_(1e-3 * slope / slope.norm())
-        assert float(first(fitted.model, posed)) < 0
-        assert float(first(fitted.model, posed)) == float(second(fitted.model, posed))
+    assert_slopes_lead_down(fitted, [picture_of(fitted), picture_of(fitted)])
 
 
-def test_nothing_is_compared_around_another_hand_or_without_a_hand() -> None:
-    clip, windows, images, masks = footage(lit=True)
-    fitted = fit_to_errors()
-    nowhere, everywhere = np.zeros_like(masks), np.full_like(masks, 255)
-    for shown, other in ((masks, everywhere), (nowhere, None)):
-        energy = PictureEnergy(
-            images, shown, clip.landmarks.detected, windows, SETTINGS, HAND, fitted.model, other
-        )
-        energy.rematch(fitted.model)
-        with torch.no_grad():
-            fitted.model.variables.turn.add_(0.1)
-        assert float(energy(fitted.model, fitted.model.posed()).detach()) == 0.0
-
-
-def test_frames_without_a_detection_do_not_count() -> None:
-    _, windows, images, masks = footage(lit=True)
-    fitted = fit_to_errors()
-    energy = PictureEnergy(
-        images, masks, np.zeros(FRAMES, bool), windows, SETTINGS, HAND, fitted.model
-    )
-    energy.rematch(fitted.model)
-    with torch.no_grad():
-        fitted.model.variables.turn.add_(0.1)
-    assert float(energy(fitted.model, fitted.model.posed()).detach()) == 0.0
+@pytest.mark.parametrize("case", ["another hand everywhere", "no mask", "no detection"])
+def test_where_nothing_can_be_compared_nothing_is(case: str) -> None:
+    given, fitted = pictures(lit=True), fit_to_errors()
+    changed = {
+        "another hand everywhere": replace(given, other=np.full_like(given.masks, 255)),
+        "no mask": replace(given, masks=np.zeros_like(given.masks)),
+        "no detection": replace(given, usable=np.zeros(FRAMES, bool)),
+    }
+    assert_says_nothing(fitted, PictureEnergy(changed[case], SETTINGS, fitted.model))
 
 
 def seen_texels(texture: LitTexture, frame: int, colors: np.ndarray) -> SeenTexels:
@@ -193,11 +166,8 @@ def test_the_slope_is_that_of_half_the_weighed_squares(column: int) -> None:
 
 def test_a_true_hand_is_drawn_as_it_was_pictured() -> None:
     # With true poses colours and light explain the picture to 0.03 in the middle of the hand.
-    clip, windows, images, masks = footage(lit=True)
-    fitted = fit_to_errors()
-    energy = PictureEnergy(
-        images, masks, clip.landmarks.detected, windows, SETTINGS, HAND, fitted.model
-    )
+    clip, _, _, masks = footage(lit=True)
+    energy = picture_of(fit_to_errors())
     vertices, pixels = clip.vertices.astype(np.float32), true_pixels()
     drawn = [energy._draw(*parts) for parts in zip(vertices, pixels, strict=True)]
     energy.texture.fit({frame: energy._seen(frame, one) for frame, one in enumerate(drawn)})

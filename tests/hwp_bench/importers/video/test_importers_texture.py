@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
-import torch
 from painted_clip import (
     FRAMES,
     HAND,
     SETTINGS,
+    assert_says_nothing,
+    assert_slopes_lead_down,
     fit_to_errors,
     footage,
+    pictures,
     pixel_error,
     true_pixels,
 )
@@ -23,10 +27,7 @@ from hwp_bench.importers.video.within import smooth_within
 
 
 def texture_of(fitted: FittedClip) -> TextureEnergy:
-    clip, windows, images, masks = footage()
-    return TextureEnergy(
-        images, masks, clip.landmarks.detected, windows, SETTINGS, HAND, fitted.model
-    )
+    return TextureEnergy(pictures(), SETTINGS, fitted.model)
 
 
 def test_a_painted_hand_comes_nearer_to_its_truth_than_by_its_outline() -> None:
@@ -45,20 +46,7 @@ def test_a_painted_hand_comes_nearer_to_its_truth_than_by_its_outline() -> None:
 def test_the_energy_and_its_slope_are_those_of_the_linearisation() -> None:
     # Zero where it was linearised; one step down the slope lowers it. Twice gives the same bits.
     fitted = fit_to_errors()
-    first, second = texture_of(fitted), texture_of(fitted)
-    for energy in (first, second):
-        energy.rematch(fitted.model)
-    posed = fitted.model.posed()
-    value = first(fitted.model, posed)
-    assert float(value.detach()) == 0.0
-    value.backward()
-    slope = fitted.model.variables.turn.grad
-    assert slope is not None
-    assert float(slope.abs().max()) > 0
-    with torch.no_grad():
-        fitted.model.variables.turn.sub_(1e-3 * slope / slope.norm())
-        assert float(first(fitted.model, posed)) < 0
-        assert float(first(fitted.model, posed)) == float(second(fitted.model, posed))
+    assert_slopes_lead_down(fitted, [texture_of(fitted), texture_of(fitted)])
     assert frame_variables(fitted.model.variables).shape == (FRAMES, 51)
 
 
@@ -80,15 +68,9 @@ def test_the_mean_texture_is_what_was_painted() -> None:
 
 
 def test_a_frame_without_a_hand_has_no_energy() -> None:
-    clip, windows, images, masks = footage()
     fitted = fit_to_errors()
-    energy = TextureEnergy(
-        images, np.zeros_like(masks), clip.landmarks.detected, windows, SETTINGS, HAND, fitted.model
-    )
-    energy.rematch(fitted.model)
-    with torch.no_grad():
-        fitted.model.variables.turn.add_(0.1)
-    assert float(energy(fitted.model, fitted.model.posed()).detach()) == 0.0
+    nothing = replace(pictures(), masks=np.zeros_like(pictures().masks))
+    assert_says_nothing(fitted, TextureEnergy(nothing, SETTINGS, fitted.model))
 
 
 def test_smoothing_within_a_region_keeps_a_constant_and_reads_nothing_outside() -> None:
