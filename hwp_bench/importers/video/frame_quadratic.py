@@ -22,7 +22,7 @@ _BLOCK = 24
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """What a frame differs by from what is expected of it, at P pixels; C channels.
+    """A frame compared with what is expected of it, at P pixels; C channels.
 
     Attributes:
         face: (P,) the face that each pixel shows, or that is nearest to it.

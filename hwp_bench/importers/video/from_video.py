@@ -159,7 +159,7 @@ def _fit_pictures(
 
 
 def _pictures(source: VideoSource, hand: int, found: _Cut) -> HandPictures:
-    """What the fit of one hand sees of the frames."""
+    """The frames as the fit of one hand sees them."""
     landmarks: Landmarks = list(source.hands.values())[hand]
     return HandPictures(
         images=source.images.frames,

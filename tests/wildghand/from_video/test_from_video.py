@@ -19,7 +19,7 @@ import numpy as np
 import pytest
 import torch
 from painted import QUICK
-from synthetic_clip import make_clip, write_landmarks, write_video
+from synthetic_clip import landmark_import, make_clip, write_landmarks, write_video
 from two_hand_clip import make_two_hands, write_two_hands
 
 import wildghand
@@ -27,7 +27,6 @@ from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import open_capture
 from hwp_bench.importers.shared.hand_tracks import read_hand_tracks, write_hand_tracks
-from hwp_bench.importers.video import FitSettings
 from hwp_bench.tracking.model_files import HAND, PALM, models_folder
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
@@ -51,14 +50,7 @@ SETTINGS: dict[str, Any] = {
     "shadows.enabled": False,
 }
 #: An import that is only as good as the perfect landmarks of the clip.
-IMPORT = FitSettings(
-    start_steps=30,
-    landmark_steps=30,
-    contour_steps=3,
-    contour_rounds=1,
-    texture_weight=0.0,
-    picture_weight=0.0,
-)
+IMPORT = landmark_import(30, outline_steps=3)
 #: Edge, px, and frames of turntables that are drawn again; the first one has full size.
 SMALL = 96, 12
 CLIP = Path(__file__).resolve().parents[4] / "shared" / "data" / "real_hand"

@@ -6,7 +6,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from synthetic_clip import FPS, HEIGHT, WIDTH, make_clip, write_landmarks, write_video
+from synthetic_clip import (
+    FPS,
+    HEIGHT,
+    WIDTH,
+    landmark_import,
+    make_clip,
+    write_landmarks,
+    write_video,
+)
 
 from hwp_bench.importers.shared.landmarks import Landmarks, read_landmarks
 from hwp_bench.importers.video.fit_clip import Footage
@@ -17,18 +25,11 @@ from hwp_bench.importers.video.side_check import (
     side_scores,
     warn_of_contradiction,
 )
-from hwp_bench.importers.video.video_settings import FitSettings, VideoImport
+from hwp_bench.importers.video.video_settings import VideoImport
 
 REAL = Path(__file__).resolve().parents[5] / "shared" / "data" / "real_hand"
 FOOTAGE = Footage(WIDTH, HEIGHT, FPS, None)
-FEW = FitSettings(
-    start_steps=5,
-    landmark_steps=5,
-    contour_steps=1,
-    contour_rounds=1,
-    texture_weight=0.0,
-    picture_weight=0.0,
-)
+FEW = landmark_import(5, outline_steps=1)
 
 
 def noisy(landmarks: Landmarks) -> Landmarks:
