@@ -24,7 +24,6 @@ class Atlas:
     """
 
     def __init__(self, template: HandTemplate, edge: int) -> None:
-        self._edge = edge
         self._faces = template.faces
         # Corners of faces have their own places in the map; its seams need no care then.
         self._corners = (template.uv[template.face_uv].reshape(-1, 2) * edge).astype(np.float32)
@@ -32,13 +31,13 @@ class Atlas:
         face, mix = draw_faces(
             self._corners, np.ones(len(self._corners)), self._corner_faces, (edge, edge)
         )
-        self._texels = np.flatnonzero(face.ravel() >= 0)
+        self._within = face >= 0
         #: (K,) int32 face of each texel.
-        self.face = face.ravel()[self._texels]
-        self._mix = mix.reshape(-1, 2)[self._texels]
+        self.face = face[self._within]
+        self._mix = mix[self._within]
 
     def __len__(self) -> int:
-        return len(self._texels)
+        return len(self.face)
 
     def on_surface(self, values: np.ndarray) -> np.ndarray:
         """Interpolate values of the vertices (V, C) at each texel: (K, C) float32."""
@@ -55,25 +54,21 @@ class Atlas:
 
     def drawn(self, values: np.ndarray) -> np.ndarray:
         """Draw values of the texels (K,) or (K, C) as a map, borders of charts drawn on."""
-        flat = np.zeros((self._edge**2, *values.shape[1:]), np.float32)
-        flat[self._texels] = values
-        image = flat.reshape(self._edge, self._edge, *values.shape[1:])
-        within = self._within()
-        around = smooth_within(image, within, _MARGIN)
-        inside = within.reshape(*within.shape, *(1,) * (values.ndim - 1))
-        return np.where(inside, image, around).astype(np.float32)
+        image = self._scattered(values)
+        around = smooth_within(image, self._within, _MARGIN)
+        inside = self._within.reshape(*self._within.shape, *(1,) * (values.ndim - 1))
+        return np.where(inside, image, around)
 
     def drawn_weights(self, weights: np.ndarray) -> np.ndarray:
         """Draw weights of the texels (K,) as a map; beyond a chart the largest one next to it."""
-        flat = np.zeros(self._edge**2, np.float32)
-        flat[self._texels] = weights
-        image = flat.reshape(self._edge, self._edge)
-        return np.where(self._within(), image, cv2.dilate(image, np.ones((3, 3), np.uint8)))
+        image = self._scattered(weights)
+        return np.where(self._within, image, cv2.dilate(image, np.ones((3, 3), np.uint8)))
 
-    def _within(self) -> np.ndarray:
-        within = np.zeros(self._edge**2, bool)
-        within[self._texels] = True
-        return within.reshape(self._edge, self._edge)
+    def _scattered(self, values: np.ndarray) -> np.ndarray:
+        """(edge, edge) or (edge, edge, C) float32, zero beyond the charts."""
+        image = np.zeros((*self._within.shape, *values.shape[1:]), np.float32)
+        image[self._within] = values
+        return image
 
 
 def sample(image: np.ndarray, places: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:

@@ -183,25 +183,14 @@ def fit_outline(
 
     With a texture, what lies inside the outline meets the mean of all frames, too.
     """
-    settings = fitted.settings
-
-    def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        value = fitted.energy(model, posed) + contour(model, posed)
-        return value if texture is None else value + texture(model, posed)
-
-    for done in range(settings.contour_rounds):
-        contour.rematch(fitted.model)
-        if texture is not None:
-            texture.rematch(fitted.model)
-        descend(
-            fitted.model,
-            energy,
-            settings.contour_steps,
-            rate=settings.contour_rate,
-            hold=_HELD_BY_LANDMARKS,
-        )
-        if update is not None:
-            update((done + 1) * settings.contour_steps)
+    _refine(
+        fitted,
+        [contour] if texture is None else [contour, texture],
+        rounds=fitted.settings.contour_rounds,
+        steps=fitted.settings.contour_steps,
+        hold=_HELD_BY_LANDMARKS,
+        update=update,
+    )
 
 
 def fit_picture(
@@ -213,22 +202,39 @@ def fit_picture(
 
     Shape, size and distance of the hand stay.
     """
-    settings = fitted.settings
+    _refine(
+        fitted,
+        [picture],
+        rounds=fitted.settings.picture_rounds,
+        steps=fitted.settings.picture_steps,
+        hold=_HELD_BY_OUTLINE,
+        update=update,
+    )
+
+
+def _refine(
+    fitted: FittedClip,
+    terms: Sequence[ContourEnergy | TextureEnergy | PictureEnergy],
+    *,
+    rounds: int,
+    steps: int,
+    hold: tuple[str, ...],
+    update: Callable[[int], None] | None,
+) -> None:
+    """Refine a fit, in place, by terms that are matched to the images again in each round."""
 
     def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        return fitted.energy(model, posed) + picture(model, posed)
+        value = fitted.energy(model, posed)
+        for term in terms:
+            value = value + term(model, posed)
+        return value
 
-    for done in range(settings.picture_rounds):
-        picture.rematch(fitted.model)
-        descend(
-            fitted.model,
-            energy,
-            settings.picture_steps,
-            rate=settings.contour_rate,
-            hold=_HELD_BY_OUTLINE,
-        )
+    for done in range(rounds):
+        for term in terms:
+            term.rematch(fitted.model)
+        descend(fitted.model, energy, steps, rate=fitted.settings.contour_rate, hold=hold)
         if update is not None:
-            update((done + 1) * settings.picture_steps)
+            update((done + 1) * steps)
 
 
 def reprojection_error(fitted: FittedClip, landmarks: Landmarks) -> ReprojectionError:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
@@ -14,7 +15,7 @@ from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import load_template
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.writing import refuse_existing
-from hwp_bench.importers.video.clip_masks import ClipMasks, Masking, project_clip
+from hwp_bench.importers.video.clip_masks import ClipMasks, Masking, ProjectedClip, project_clip
 from hwp_bench.importers.video.contour import FIELD_SIZE, ContourEnergy
 from hwp_bench.importers.video.fit_clip import (
     FittedClip,
@@ -88,11 +89,10 @@ def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
 
     def cut(turn: int, trust: MaskSettings, reduction: int = 1) -> _Cut:
         with progress(f"cutting masks ({turn} of {turns})", len(source.indices)) as update:
-            pair = _pair(source, fits)
-            projected = pair or project_clip(fits[0].model, source.windows)
-            masks = masking.masks(projected, trust, reduction=reduction, update=update)
-        coverages = [masks.coverage] if pair is None else list(pair.coverage(masks.coverage))
-        return _Cut(masks, pair, coverages)
+            clips = [project_clip(fitted.model, source.windows) for fitted in fits]
+            pair = project_hands(clips, hands) if len(clips) == 2 else None
+            masks = masking.masks(pair or clips[0], trust, reduction=reduction, update=update)
+        return _Cut(masks, clips, pair)
 
     found = cut(1, WIDE, reduction=2)
     overlap_landmarks_only = float(found.masks.overlap[source.detected].mean())
@@ -103,10 +103,10 @@ def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
     _fit_outlines(source, options, fits, cut(2, NARROW), turn=2)
     if pictures:
         _fit_pictures(source, options, fits, cut(3, NARROW))
-    masks = cut(turns, NARROW).masks
+    last = cut(turns, NARROW)
     imported = {}
-    for (side, landmarks), fitted, first in zip(
-        source.hands.items(), fits, first_errors, strict=True
+    for (side, landmarks), fitted, projected, first in zip(
+        source.hands.items(), fits, last.clips, first_errors, strict=True
     ):
         error = reprojection_error(fitted, landmarks)
         missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * hand_size(landmarks)
@@ -114,20 +114,27 @@ def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
             landmarks=landmarks,
             parameters=fitted.model.parameters(landmarks.detected & ~missed),
             fitted=fitted,
-            projected=project_clip(fitted.model, source.windows),
+            projected=projected,
             error=error,
             error_landmarks_only=first,
         )
-    return ImportedClip(source, imported, masks, overlap_landmarks_only)
+    return ImportedClip(source, imported, last.masks, overlap_landmarks_only)
 
 
 @dataclass(frozen=True, eq=False)
 class _Cut:
-    """Masks of all hands, two projected hands or None, and the visible part of each hand."""
+    """Masks of all hands, each hand projected, and both together where there are two."""
 
     masks: ClipMasks
+    clips: list[ProjectedClip]
     pair: ProjectedHands | None
-    coverages: list[np.ndarray]
+
+    @cached_property
+    def coverages(self) -> list[np.ndarray]:
+        """The visible part of each hand, (F, S, S) uint8."""
+        if self.pair is None:
+            return [self.masks.coverage]
+        return list(self.pair.coverage(self.masks.coverage))
 
 
 def _fit_outlines(
@@ -185,14 +192,6 @@ def _fit_hands(source: VideoSource, options: VideoImport) -> list[FittedClip]:
     if len(fits) == 2 and options.focal is None:
         share_camera(fits, steps=settings.landmark_steps // 3)
     return fits
-
-
-def _pair(source: VideoSource, fits: list[FittedClip]) -> ProjectedHands | None:
-    """Two projected hands, None where there is one."""
-    if len(fits) == 1:
-        return None
-    clips = [project_clip(fitted.model, source.windows) for fitted in fits]
-    return project_hands(clips, list(source.hands.values()))
 
 
 def _contour(

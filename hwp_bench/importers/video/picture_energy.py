@@ -78,6 +78,7 @@ class PictureEnergy:
         vertices, pixels = self._pictures.placed(model)
         motion = SurfaceMotion(model)
 
+        # Each frame is drawn twice: all drawings together would need 1 MB for each frame.
         def seen(frame: int) -> SeenTexels:
             return self._seen(frame, self._draw(vertices[frame], pixels[frame]))
 
