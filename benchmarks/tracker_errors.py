@@ -23,14 +23,8 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.tracker_clips import (
-    FPS,
-    LandmarkErrors,
-    RoundTrip,
-    landmark_errors,
-    real_clip,
-    round_trip,
-)
+from benchmarks.landmark_errors import LandmarkErrors, landmark_errors, real_clip
+from benchmarks.tracker_clips import FPS, RoundTrip, round_trip
 from hwp_bench.capture import open_capture
 from hwp_bench.hands import load_template
 from hwp_bench.hands.parameters import HandParameters

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from small_captures import CaptureMaker
 
-from benchmarks.tracker_clips import RealClip, landmark_errors
+from benchmarks.landmark_errors import RealClip, landmark_errors
 from benchmarks.tracker_errors import correlation, gathered, habit, main, pose_error
 from hwp_bench.hands import load_template
 from hwp_bench.hands.parameters import HandParameters
