@@ -14,9 +14,9 @@ class ShadowSettings:
     #: Find a light before the first step, and darken Gaussians that the hands keep it from.
     enabled: bool = True
     #: Frames that are read at most, spread over the clip.
-    frames: int = number(24, 1, 1000)
+    frames: int = number(96, 1, 1000)
     #: Places on each hand that are read.
-    places: int = number(1500, 10, 100_000)
+    places: int = number(400, 10, 100_000)
     #: Lamps at most.
     lamps: int = number(4, 0, 32)
     #: Directions, evenly spread over the sphere, among which a lamp is sought.
