@@ -22,7 +22,7 @@ from typing import Annotated, Any, Literal, Union
 import msgspec
 from msgspec import UNSET, Meta
 
-from hwp_bench.base.text import ODD_CHARACTERS, has_odd_characters, shown
+from hwp_bench.base.text import ODD_CHARACTERS, has_odd_characters, is_unicode, shown
 
 # Longest piece of a name or value that a message repeats.
 _SHOWN = 100
@@ -130,6 +130,8 @@ def explain(kind: Any, value: Any, path: str) -> tuple[str, str, str | None]:
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
         if not isinstance(value, Mapping):
             return "must be a table (a JSON object)", path, None
+        if not all(is_unicode(str(name)) for name in value):
+            return "holds a name that is not Unicode", path, None
         known = {item.name: item for item in msgspec.structs.fields(kind)}
         forbidden = kind.__struct_config__.forbid_unknown_fields
         missing = {name for name, item in known.items() if item.required} - value.keys()
@@ -141,7 +143,7 @@ def explain(kind: Any, value: Any, path: str) -> tuple[str, str, str | None]:
     for part, item, place in _parts(kind, value, path):
         try:
             msgspec.convert(item, part)
-        except msgspec.ValidationError:
+        except (msgspec.ValidationError, UnicodeEncodeError):  # half of a surrogate pair
             return explain(part, item, place)
     if isinstance(value, str) and has_odd_characters(value):
         return "holds a control character", path, None

@@ -153,8 +153,8 @@ def parse_record(
         converted = msgspec.convert(value, twin)
     except msgspec.ValidationError as fault:
         raise refuse(*explain(twin, value, start)) from fault
-    except UnicodeEncodeError as fault:  # the name of a field, before `msgspec` looks it up
-        raise refuse("holds a name that is not Unicode", start) from fault
+    except UnicodeEncodeError as fault:  # half of a surrogate pair, where `msgspec` looks a text up
+        raise refuse(*explain(twin, value, start)) from fault
     return build(converted, start)
 
 

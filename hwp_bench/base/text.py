@@ -26,6 +26,15 @@ def has_odd_characters(text: str) -> bool:
     return _ODD.search(text) is not None
 
 
+def is_unicode(text: str) -> bool:
+    """Whether a text can be written as UTF-8: it holds no half of a surrogate pair."""
+    try:
+        text.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
 def check_name(path: str | os.PathLike[str]) -> None:
     """Refuse the name of a file or folder that is not UTF-8.
 
@@ -35,12 +44,8 @@ def check_name(path: str | os.PathLike[str]) -> None:
         UsageError: the name holds bytes that are not UTF-8.
     """
     text = os.fspath(path)
-    try:
-        text.encode()
-    except UnicodeEncodeError as error:
-        raise UsageError(
-            "is not UTF-8", where=shown(text), remedy="Rename the file or folder."
-        ) from error
+    if not is_unicode(text):
+        raise UsageError("is not UTF-8", where=shown(text), remedy="Rename the file or folder.")
 
 
 def shown(text: str) -> str:

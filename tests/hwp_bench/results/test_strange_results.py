@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from made_entries import check_of, complete_results, with_keys
 from strange_values import as_json, edited
 
@@ -125,6 +125,8 @@ def test_strange_entries(tmp_path: Path, capsys, value: dict[str, Any]) -> None:
 
 @_MANY
 @given(edited(CHECK))
+@example({**CHECK, "kind": "\ud800"})
+@example({**CHECK, "kind": "\ud800", "date": "\ud800"})
 def test_strange_checks(tmp_path: Path, capsys, value: dict[str, Any]) -> None:
     folder = tmp_path / "entries"
     write_entry(folder, make_entry(_sound()))
