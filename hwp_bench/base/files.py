@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
+from hwp_bench.base.text import is_unicode
 
 #: Largest JSON file that is read, in bytes; a result of 10,000 frames stays far below it.
 MAX_JSON_BYTES = 256 * 1024 * 1024
@@ -269,22 +270,13 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
         raise BadInput(f"is not valid JSON ({error})", where=path) from error
     if _deeper_than(value, MAX_JSON_DEPTH):
         raise BadInput("is nested too deeply", where=path)
-    if _SURROGATE.search(text) and not _is_unicode(value):
+    if _SURROGATE.search(text) and not is_unicode(json.dumps(value, ensure_ascii=False)):
         raise BadInput(
             "holds text that is not Unicode (half of a surrogate pair)",
             where=path,
             remedy="Look for an escape from \\ud800 to \\udfff that stands alone.",
         )
     return value
-
-
-def _is_unicode(value: Any) -> bool:
-    """Whether every text in a JSON value can be written as UTF-8."""
-    try:
-        json.dumps(value, ensure_ascii=False).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def _read_bounded(path: Path, max_bytes: int) -> bytes:

@@ -151,9 +151,8 @@ def parse_record(
     start = field.rstrip(".")
     try:
         converted = msgspec.convert(value, twin)
-    except msgspec.ValidationError as fault:
-        raise refuse(*explain(twin, value, start)) from fault
-    except UnicodeEncodeError as fault:  # half of a surrogate pair, where `msgspec` looks a text up
+    # The second: half of a surrogate pair, where `msgspec` looks a text up.
+    except (msgspec.ValidationError, UnicodeEncodeError) as fault:
         raise refuse(*explain(twin, value, start)) from fault
     return build(converted, start)
 

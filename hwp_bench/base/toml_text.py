@@ -7,6 +7,7 @@ import tomllib
 from typing import Any
 
 from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.base.text import is_unicode
 
 #: Longest TOML text that is read, characters; the longest scene that ships has 6,000.
 MAX_CHARACTERS = 1_000_000
@@ -43,11 +44,10 @@ def parse_toml(
 
     if len(text) > MAX_CHARACTERS:
         raise refuse(f"holds more than the {MAX_CHARACTERS:,} characters that are read")
+    if not is_unicode(text):
+        raise refuse("holds text that cannot be Unicode")
     try:
-        text.encode()
         content = tomllib.loads(text)
-    except UnicodeEncodeError as fault:
-        raise refuse("holds text that cannot be Unicode") from fault
     except RecursionError as fault:
         raise refuse("is nested too deeply") from fault
     except tomllib.TOMLDecodeError as fault:
