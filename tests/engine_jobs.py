@@ -63,6 +63,13 @@ def write_job(folder: Path, work: Write, *inputs: Path, cpus: float = 1.0) -> Jo
     )
 
 
+def hold(holding: Path, release: Path) -> None:
+    """Takes a processor of a node until `release` is there; `holding` tells that it has it."""
+    holding.touch()
+    while not release.exists():
+        time.sleep(0.1)
+
+
 class Told(JobsView):
     """A view that keeps what it is told."""
 

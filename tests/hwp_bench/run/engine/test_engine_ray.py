@@ -13,7 +13,7 @@ from typing import Any
 
 import psutil
 import pytest
-from engine_jobs import Told, write_gray_method
+from engine_jobs import Told, hold, write_gray_method
 from own_cache import make_own_cache
 from same_results import contents
 from small_captures import CaptureMaker
@@ -40,7 +40,7 @@ class Nodes:
         self._folder = folder
         self._cluster = Cluster()
         head, second = self.NAMES
-        self._add(head, include_dashboard=False)
+        self._head = self._add(head, include_dashboard=False)
         self._second = self._add(second)
 
     def _add(self, name: str, **more: Any) -> Any:
@@ -56,6 +56,22 @@ class Nodes:
     @property
     def second_place(self) -> str:
         return self._second.node_id[:6]
+
+    def hold_head(self, folder: Path) -> Path:
+        """Take the head's processor.
+
+        Returns:
+            The file that gives it back once it is there.
+        """
+        import ray
+        from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
+
+        holding, release = folder / "holding", folder / "release"
+        place = NodeAffinitySchedulingStrategy(self._head.node_id, soft=False)
+        ray.remote(hold).options(num_cpus=1, scheduling_strategy=place).remote(holding, release)
+        while not holding.exists():
+            time.sleep(0.1)
+        return release
 
     def kill_second(self) -> None:
         self._cluster.remove_node(self._second, allow_graceful=False)
@@ -116,11 +132,14 @@ def test_a_node_is_killed_in_the_middle_and_the_results_are_those_without_ray(
         if nodes.second_place in place and not killed:
             killed.append(index)
             nodes.kill_second()
+            release.touch()
 
     view = Told()
     view.on_steps = kill
     # The nodes may not look at the tests' folders: inputs must be fetched.
     with RayEngine(nodes.address, view, shared=False) as engine:
+        # A head that is free may end every job before the second node's worker has started.
+        release = nodes.hold_head(tmp_path)
         run_ablation(manifest, design, captures, tmp_path / "ray", settings, [0], engine=engine)
     assert len(killed) == 1
     assert sum("again, its worker was lost" in text for text in view.said) <= 1
