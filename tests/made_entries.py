@@ -59,7 +59,7 @@ def complete_results(
             replace(
                 base.captures[0],
                 id=item.scene.id,
-                digest=known[item.scene.id].digest,
+                digest=known[item.scene.id].versions[0].digest,
                 hands=item.scene.hands,
                 perturbations=[call.kind for call in item.scene.effects],
                 split_digest=split.digest,

@@ -39,17 +39,19 @@ class EmbreexMesh:
         from embreex.rtcore_scene import EmbreeScene
 
         self._scene = EmbreeScene()
-        self._mesh = TriangleMesh(
-            self._scene,
-            np.ascontiguousarray(vertices, dtype=np.float32),
-            np.ascontiguousarray(faces, dtype=np.int32),
-        )
+        self._vertices = np.ascontiguousarray(vertices, dtype=np.float32)
+        self._faces = np.ascontiguousarray(faces, dtype=np.int32)
+        self._mesh = TriangleMesh(self._scene, self._vertices, self._faces)
 
     def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> Met:
         """The first face on each ray: (ray, face, u, v, distance), each (H,)."""
-        found = self._scene.run(*_rays(origins, directions), output=True)
-        ray = np.flatnonzero(found["primID"] >= 0)
-        return ray, *(found[name][ray] for name in ("primID", "u", "v", "tfar"))
+        from hwp_bench.base.on_face import places_on_faces
+
+        rays = _rays(origins, directions)
+        met = self._scene.run(*rays, output=False)
+        ray = np.flatnonzero(met >= 0)
+        face = met[ray].astype(np.int64)
+        return ray, face, *places_on_faces(self._vertices, self._faces, *rays, ray, face)
 
     def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
         """Whether anything is in each ray's way: (N,) bool."""

@@ -9,6 +9,7 @@ from hwp_bench.analysis.statistics.pairing import same_but_seed
 from hwp_bench.evaluation.completeness import missing
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.records import BADGES, LEVELS
+from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.results import Results
 
 #: The badge of a row is the first of these that one of its entries has.
@@ -26,6 +27,11 @@ class BoardRow:
     def first(self) -> Results:
         """The results of the lowest seed."""
         return self.entries[0].results
+
+    @property
+    def compared(self) -> list[Results]:
+        """The results of every seed, as they are compared with other rows."""
+        return [on_current_data(entry.results) for entry in self.entries]
 
     @property
     def seeds(self) -> tuple[int, ...]:

@@ -12,6 +12,7 @@ from hwp_bench.evaluation.verify import verify_results
 from hwp_bench.leaderboard.entries import Entry, digest
 from hwp_bench.leaderboard.records import Check
 from hwp_bench.leaderboard.rules import HEADLINE, current
+from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.results import Results, read_results
 from hwp_bench.results.environment import environment
 
@@ -123,6 +124,6 @@ def _repeats(entry: Results, results: Results) -> bool:
             item.frames,
             sorted((c.id, c.digest, c.split_digest) for c in item.captures),
         )
-        for item in (entry, results)
+        for item in (on_current_data(entry), on_current_data(results))
     )
     return first == second

@@ -42,7 +42,7 @@ def curve_plot(rows: Sequence[BoardRow]) -> CurvePlot | None:
     """
     whole = sorted((row for row in rows if row.whole), key=lambda row: -row.scores[METRIC])
     try:
-        runs = group_runs([entry.results for row in whole for entry in row.entries])
+        runs = group_runs([results for row in whole for results in row.compared])
         cost = analyse_cost(runs, METRIC) if runs else None
     except UsageError:
         return None

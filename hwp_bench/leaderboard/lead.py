@@ -38,7 +38,7 @@ def reference_lead(rows: Sequence[BoardRow]) -> str:
     if reference is None or not competitors:
         return ""
     best = max(competitors, key=lambda row: row.scores[METRIC])
-    results = [entry.results for row in (reference, best) for entry in row.entries]
+    results = [one for row in (reference, best) for one in row.compared]
     try:
         (found,) = compare(group_runs(results), METRIC, scope=MACRO)
     except UsageError:

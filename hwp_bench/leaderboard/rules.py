@@ -11,6 +11,7 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.evaluation.completeness import missing
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.records import LEVELS
+from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.metrics import HWP_V1, PROTOCOLS
 from hwp_bench.metrics.aggregate import aggregate
 from hwp_bench.results.schema import score_rows
@@ -154,7 +155,7 @@ def off_the_data(entries: Sequence[Entry]) -> list[tuple[Entry, str]]:
     whole = {entry.name: not missing(entry.results) for entry in entries}
     votes: dict[str, dict[tuple[Any, ...], list[Entry]]] = {}
     for entry in entries:
-        for c in entry.results.captures:
+        for c in on_current_data(entry.results).captures:
             data = (c.digest, c.split_digest, tuple(frame.frame for frame in c.frames))
             votes.setdefault(c.id, {}).setdefault(data, []).append(entry)
     found: dict[str, tuple[Entry, str]] = {}

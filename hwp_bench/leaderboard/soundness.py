@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from functools import cache
 from pathlib import Path
 
 from hwp_bench.base.errors import BadResult, HwpError, UsageError
@@ -22,7 +21,7 @@ from hwp_bench.evaluation.evaluation_key import key_of
 from hwp_bench.leaderboard.entries import Entry, entry_files, read_checks, read_entry
 from hwp_bench.leaderboard.records import Check
 from hwp_bench.leaderboard.rules import check_entries, check_revisions, off_the_data, tables_of
-from hwp_bench.leaderboard.suite_data import CaptureData, SuiteData, read_suite_data
+from hwp_bench.leaderboard.suite_data import CaptureData, known_data
 from hwp_bench.metrics import HWP_V1, metric_names, penalty
 from hwp_bench.results import CaptureResult
 from hwp_bench.results.bounds import MAX_BYTES
@@ -31,11 +30,6 @@ from hwp_bench.results.bounds import MAX_BYTES
 _CLOCKS = 1e-3
 #: By how much sums in another order may differ.
 _ROUNDING = 1e-9
-
-
-@cache
-def _suite_data() -> SuiteData:
-    return read_suite_data()
 
 
 def check_bound(entry: Entry) -> None:
@@ -51,7 +45,7 @@ def check_bound(entry: Entry) -> None:
         return
     if problems := wrong_labels(entry.results):
         raise _wrong(entry, "captures", "; ".join(problems))
-    known = _suite_data().suites.get(entry.results.suite, {})
+    known = known_data().suites.get(entry.results.suite, {})
     for capture in entry.results.captures:
         _check_data(entry, capture, known.get(capture.id))
         _check_frames(entry, capture)
@@ -61,12 +55,14 @@ def check_bound(entry: Entry) -> None:
 
 
 def _check_data(entry: Entry, capture: CaptureResult, data: CaptureData | None) -> None:
-    if data is not None and capture.digest != data.digest:
+    version = data.version(capture.digest) if data is not None else None
+    known = data is not None and (version is not None or data.current is not None)
+    if known and version is None:
         raise _wrong(entry, f"{capture.id}.digest", "is not the data of the suite")
-    clips = {data.free_view if data else None, None}
+    clips = {version.free_view if version else None, None}
     if capture.free_view is not None:
         clips = {capture.free_view.digest}
-    elif data is None and capture.isolation is None:
+    elif not known and capture.isolation is None:
         # Predictions that came as files, without the clip: its digest is in the key alone.
         return
     if capture.key not in {key_of(entry.results, capture, clip) for clip in clips}:

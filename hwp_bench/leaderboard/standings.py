@@ -101,13 +101,14 @@ def ranks_of(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
     ranked, left_out = rankable(rows)
     if not ranked:
         return {}, ""
-    runs = group_runs([entry.results for row in ranked for entry in row.entries])
+    compared = {row.entries[0].name: row.compared for row in ranked}
+    runs = group_runs([one for results in compared.values() for one in results])
     ranking = rank_methods(runs, METRIC)
     by_label = {item.standing.label: item for item in ranking.ranks}
     found = {
-        row.entries[0].name: by_label[run.label]
-        for row in ranked
+        name: by_label[run.label]
+        for name, (first, *_) in compared.items()
         for run in runs
-        if any(row.first is results for results in run.seeds.values())
+        if any(first is results for results in run.seeds.values())
     }
     return found, f"{verdict(ranking)} {left_out}".rstrip()

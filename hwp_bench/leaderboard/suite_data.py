@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import argparse
 import os
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
+from typing import Annotated
+
+from msgspec import Meta
 
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import cache_root, read_json, write_json
@@ -12,18 +17,19 @@ from hwp_bench.base.packages import data_folder
 from hwp_bench.base.records import Digest, Line, parse_record, without_schema
 from hwp_bench.capture import open_capture
 from hwp_bench.evaluation.completeness import is_of_suite
+from hwp_bench.results import Results
 from hwp_bench.sim.produce.production import RENDERER
 from hwp_bench.sim.produce.suites import suite_names
 
 #: Version of the file.
-SCHEMA = "hwp-suite-data/1"
+SCHEMA = "hwp-suite-data/2"
 #: The file that ships, next to the entries' folder.
 NAME = "suites.json"
 
 
 @dataclass(frozen=True)
-class CaptureData:
-    """The data of one capture of a suite."""
+class Version:
+    """A capture of a suite as one version of the renderer makes it."""
 
     #: Digest of the capture.
     digest: Digest
@@ -32,11 +38,32 @@ class CaptureData:
 
 
 @dataclass(frozen=True)
+class CaptureData:
+    """The data of one capture of a suite."""
+
+    #: As this version of the renderer makes it; None where that is not known.
+    current: Version | None
+    #: Versions of it that differ in rounding alone, the latest first: results on them stand.
+    former: tuple[Version, ...] = ()
+
+    @property
+    def versions(self) -> tuple[Version, ...]:
+        """All versions that are known, the latest first."""
+        return self.former if self.current is None else (self.current, *self.former)
+
+    def version(self, digest: str) -> Version | None:
+        """Return the version of that digest, or None."""
+        return next((one for one in self.versions if one.digest == digest), None)
+
+
+@dataclass(frozen=True)
 class SuiteData:
     """The data of every suite, as far as it is known."""
 
     #: By suite and capture id.
     suites: dict[Line, dict[Line, CaptureData]]
+    #: Version of the renderer that makes them.
+    renderer: Annotated[int, Meta(ge=1)] = RENDERER
 
 
 def read_suite_data(path: str | os.PathLike[str] | None = None) -> SuiteData:
@@ -54,6 +81,27 @@ def read_suite_data(path: str | os.PathLike[str] | None = None) -> SuiteData:
     return parse_record(SuiteData, value, where=file)
 
 
+@cache
+def known_data() -> SuiteData:
+    """Return what `read_suite_data` reads of the file that ships, read once."""
+    return read_suite_data()
+
+
+def on_current_data(results: Results) -> Results:
+    """Return results with the digests of this version where theirs differ in rounding alone.
+
+    So results of two such versions can be compared. Other digests stay.
+    """
+    known = known_data().suites.get(results.suite, {})
+    captures = []
+    for capture in results.captures:
+        data = known.get(capture.id)
+        if data is not None and data.current is not None and data.version(capture.digest):
+            capture = replace(capture, digest=data.current.digest)
+        captures.append(capture)
+    return replace(results, captures=captures)
+
+
 def rendered_data(cache: Path) -> SuiteData:
     """Return the data of the suites' captures that this version rendered into a folder.
 
@@ -66,25 +114,34 @@ def rendered_data(cache: Path) -> SuiteData:
         if capture.info.source.get("renderer") != RENDERER:
             continue
         clip = capture.free_view
-        data = CaptureData(capture.digest, None if clip is None else clip.digest)
+        data = CaptureData(Version(capture.digest, None if clip is None else clip.digest))
         for name in suite_names():
             if is_of_suite(capture.info, name):
                 found.setdefault(name, {})[capture.info.id] = data
     return SuiteData({name: found[name] for name in suite_names() if name in found})
 
 
-def joined_data(known: SuiteData, rendered: SuiteData) -> SuiteData:
+def joined_data(known: SuiteData, rendered: SuiteData, *, rounding: bool = False) -> SuiteData:
     """Return all captures of both, as rendered where a capture is in both.
 
     Args:
-        known: the data so far, of the same version of the renderer.
+        known: the data so far. Those of another version of the renderer are dropped.
         rendered: the data of captures in a cache, which need not hold every suite.
+        rounding: keep data of another version as former ones: it differs in rounding alone.
     """
-    both = {
-        name: {**known.suites.get(name, {}), **rendered.suites.get(name, {})}
-        for name in suite_names()
-    }
-    return SuiteData({name: captures for name, captures in both.items() if captures})
+    kept = known.suites
+    if known.renderer != rendered.renderer:
+        kept = {
+            name: {key: CaptureData(None, data.versions) for key, data in captures.items()}
+            for name, captures in (known.suites if rounding else {}).items()
+        }
+    both = {name: dict(kept.get(name, {})) for name in suite_names()}
+    for name, captures in rendered.suites.items():
+        for key, data in captures.items():
+            former = both[name][key].former if key in both[name] else ()
+            both[name][key] = replace(data, former=former)
+    suites = {name: captures for name, captures in both.items() if captures}
+    return SuiteData(suites, rendered.renderer)
 
 
 def write_suite_data(path: Path, data: SuiteData) -> Path:
@@ -92,8 +149,20 @@ def write_suite_data(path: Path, data: SuiteData) -> Path:
     return write_json(path, {"schema": SCHEMA, **asdict(data)})
 
 
-if __name__ == "__main__":
-    # After suites were rendered: `python -m hwp_bench.leaderboard.suite_data`. A new version of the
-    # renderer has other pixels: empty `suites` of the file before.
+def main() -> None:
+    """Write the digests of the captures that were rendered here into the file that ships."""
+    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser.add_argument(
+        "--rounding",
+        action="store_true",
+        help="the renderer so far differs from this one in rounding alone, which `python -m "
+        "benchmarks.rounding` measures: results on its captures stand",
+    )
+    rounding = parser.parse_args().rounding
     rendered = rendered_data(cache_root() / "sim" / "captures")
-    write_suite_data(data_folder("leaderboard") / NAME, joined_data(read_suite_data(), rendered))
+    joined = joined_data(read_suite_data(), rendered, rounding=rounding)
+    write_suite_data(data_folder("leaderboard") / NAME, joined)
+
+
+if __name__ == "__main__":
+    main()

@@ -54,7 +54,7 @@ from hwp_bench.sim.subject.painting import of_side
 from hwp_bench.sim.subject.rigs import rig_path
 
 #: Version of the pixels that the renderer makes; part of every render key.
-RENDERER = 9
+RENDERER = 10
 #: Edge of an image where no other is given.
 DEFAULT_SIZE = 256
 #: Terms under which simulated captures may be used.

@@ -25,7 +25,7 @@ from hwp_bench.sim.subject.painting import painted
 #: Edge of the skin atlas in texels; about 0.25 mm of skin each.
 ATLAS = 1024
 #: Version of the skin painting; part of the cache key.
-SKIN_VERSION = 2
+SKIN_VERSION = 3
 #: Version of what looks add to it; part of the key where a subject has looks.
 LOOKS_VERSION = 1
 

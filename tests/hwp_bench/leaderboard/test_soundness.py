@@ -14,19 +14,24 @@ from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import cache_root, sha256_json
 from hwp_bench.base.records import parse_record
 from hwp_bench.cli.main import main
+from hwp_bench.leaderboard.board_rows import board_rows
 from hwp_bench.leaderboard.entries import entry_name, make_entry, read_entries, write_check
 from hwp_bench.leaderboard.rules import off_the_data
 from hwp_bench.leaderboard.soundness import sound_entries
+from hwp_bench.leaderboard.standings import ranks_of
 from hwp_bench.leaderboard.submit import add_entry
 from hwp_bench.leaderboard.suite_data import (
     CaptureData,
     SuiteData,
+    Version,
     joined_data,
+    on_current_data,
     read_suite_data,
     rendered_data,
     write_suite_data,
 )
 from hwp_bench.results import Results, write_results
+from hwp_bench.sim.produce.production import RENDERER
 
 
 def forged(folder: Path, change: Callable[[dict], object], *, keys: bool = False) -> Path:
@@ -213,18 +218,86 @@ def test_a_result_that_was_changed_by_hand_is_not_added(tmp_path: Path, capsys) 
 def test_the_digests_of_suites_are_those_of_rendered_captures(tmp_path: Path) -> None:
     """Oracle: the renderer, as far as captures of suites are in the cache of this machine."""
     known = read_suite_data()
+    assert known.renderer == RENDERER
     assert {"smoke", "mini", "full-lite"} <= known.suites.keys()
     here = rendered_data(cache_root() / "sim" / "captures")
     for suite, captures in here.suites.items():
         for name, data in captures.items():
-            if name in known.suites.get(suite, {}):
-                assert known.suites[suite][name].digest == data.digest, (suite, name)
+            listed = known.suites.get(suite, {}).get(name)
+            if listed is not None and listed.current is not None:
+                assert data.current is not None
+                assert listed.current.digest == data.current.digest, (suite, name)
     assert read_suite_data(write_suite_data(tmp_path / "suites.json", known)) == known
+
+
+def _data(letter: str, *former: str) -> CaptureData:
+    first, *others = (Version(one * 64, one * 64) for one in (letter, *former))
+    return CaptureData(first, tuple(others))
 
 
 def test_a_cache_without_a_suite_takes_nothing_away() -> None:
     known = read_suite_data()
-    new = CaptureData("a" * 64)
-    joined = joined_data(known, SuiteData({"mini": {"capture0": new}})).suites
+    joined = joined_data(known, SuiteData({"mini": {"capture0": _data("a")}})).suites
     assert joined["smoke"] == known.suites["smoke"]
+    new = replace(_data("a"), former=known.suites["mini"]["capture0"].former)
     assert joined["mini"] == {**known.suites["mini"], "capture0": new}
+
+
+def test_data_of_a_renderer_that_rounds_otherwise_become_former() -> None:
+    data = SuiteData({"mini": {"capture0": _data("a"), "capture1": _data("b")}}, renderer=1)
+    for renderer in (2, 2):
+        rendered = SuiteData({"mini": {"capture0": _data("c")}}, renderer)
+        data = joined_data(data, rendered, rounding=True)
+        assert data.suites["mini"]["capture0"] == _data("c", "a")
+        assert data.suites["mini"]["capture1"] == CaptureData(None, _data("b").versions)
+    third = SuiteData({"mini": {"capture1": _data("d")}}, 3)
+    found = joined_data(data, third, rounding=True)
+    assert found.suites["mini"]["capture0"] == CaptureData(None, _data("c", "a").versions)
+    assert found.suites["mini"]["capture1"] == _data("d", "b")
+    # A renderer that makes other pixels leaves nothing of before.
+    assert joined_data(data, third) == third
+
+
+def _renewed(monkeypatch: pytest.MonkeyPatch, *, rendered: bool) -> SuiteData:
+    """The suite `smoke` after a new renderer, which was used or not yet; what ships is former."""
+    renewed = {}
+    for letter, (name, data) in zip("ab", read_suite_data().suites["smoke"].items(), strict=True):
+        current = Version(letter * 64) if rendered else None
+        renewed[name] = CaptureData(current, data.versions)
+    data = SuiteData({"smoke": renewed})
+    for module in ("suite_data", "soundness"):
+        monkeypatch.setattr(f"hwp_bench.leaderboard.{module}.known_data", lambda: data)
+    return data
+
+
+def test_entries_on_data_that_were_rounded_otherwise_stand(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Oracle: the rank that two entries on the same data have."""
+    before, after = complete_results("before", 20.0), complete_results("after", 21.0)
+    data = _renewed(monkeypatch, rendered=True).suites["smoke"]
+    captures = [replace(c, digest=data[c.id].versions[0].digest) for c in after.captures]
+    after = with_keys(replace(after, captures=captures))
+    add_entry(tmp_path, before)
+    add_entry(tmp_path, after)
+    assert on_current_data(before).captures[0].digest == "a" * 64
+    assert on_current_data(after) == after
+    rows = board_rows(sound_entries(tmp_path))
+    ranks, sentence = ranks_of(rows)
+    assert "+1.00 dB against Before" in sentence
+    assert {row.first.method.name: ranks[row.entries[0].name].rank for row in rows} == {
+        "after": 1,
+        "before": 2,
+    }
+
+
+def test_a_suite_that_was_not_rendered_yet_binds_no_new_entry(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    before = complete_results("before")
+    _renewed(monkeypatch, rendered=False)
+    assert on_current_data(before) == before
+    add_entry(tmp_path / "old", before)
+    captures = [replace(c, digest="c" * 64) for c in before.captures]
+    add_entry(tmp_path / "new", with_keys(replace(before, captures=captures)))
+    assert len(sound_entries(tmp_path / "old")) == len(sound_entries(tmp_path / "new")) == 1
