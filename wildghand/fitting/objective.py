@@ -80,7 +80,8 @@ class Objective:
         """
         weights, settings = self.weights, self.settings
         image = drawing.image
-        dssim = weights.dssim_share(exact_poses=model.clip_poses is None)
+        exact = model.clip_poses is None
+        dssim = weights.dssim_share(exact_poses=exact)
         total = weights.reconstruction * terms.reconstruction(
             image, target.image, target.weights, dssim
         )
@@ -99,8 +100,12 @@ class Objective:
             if weights.opacity:
                 total = total + weights.opacity * terms.distance_to_one(hand.opacities)
             if weights.surface:
-                activation = model.network.activation
-                off = off_surface(hand.prediction.raw, activation, self._spacing[side])
+                off = off_surface(
+                    hand.prediction.raw,
+                    model.network.activation,
+                    self._spacing[side],
+                    flatness=weights.flatness(exact_poses=exact),
+                )
                 total = total + weights.surface * off
             rough = self._roughness(side, hand.prediction.raw)
             total = total if rough is None else total + rough

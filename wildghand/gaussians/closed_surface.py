@@ -17,21 +17,26 @@ from wildghand.splat.threads import kernels_take
 
 # What costs nothing. Lengths in spacings of the anchors: how far a Gaussian reaches off the skin
 # (its distance and two standard deviations), how far it lies from its anchor along the skin, its
-# least and largest standard deviation along the skin; and its opacity.
-_REACH, _SHIFT, _NARROW, _WIDE, _OPAQUE = 0.8, 0.5, 0.6, 1.5, 0.98
+# least and largest standard deviation along the skin; and its opacity. Two standard deviations off
+# the skin, where thickness costs.
+_REACH, _SHIFT, _NARROW, _WIDE, _OPAQUE, _THICK = 0.8, 0.5, 0.6, 1.5, 0.98, 0.4
 # Weight of the opacity: a hole in spacings.
 _HOLE = 4.0
 # Squares of lengths below this have no slope, in spacings.
 _TINY = 1e-8
 
 
-def off_surface(raw: RawAttributes, activation: Activation, spacing: float) -> Tensor:
+def off_surface(
+    raw: RawAttributes, activation: Activation, spacing: float, *, flatness: float = 0.0
+) -> Tensor:
     """Mean over Gaussians and frames of what keeps them from closing the surface.
 
     Args:
         raw: (B, N, k) attributes.
         activation: of them.
         spacing: mean distance between neighbouring anchors, m.
+        flatness: weight of what is thicker than a disc, wherever it lies. Where a finger is drawn
+            at wrong places, Gaussians otherwise become needles off its skin, which look like fur.
 
     Returns:
         scalar: the sum of squares beyond what costs nothing, of lengths in spacings, of the log of
@@ -40,7 +45,7 @@ def off_surface(raw: RawAttributes, activation: Activation, spacing: float) -> T
     if kernels_take(*(tensor for _, tensor in raw.items())):
         from wildghand.gaussians.closed_surface_cpu import OffSurfaceCpu
 
-        free = (_REACH, _SHIFT, math.log(_NARROW), _WIDE, _OPAQUE, _HOLE)
+        free = (_REACH, _SHIFT, math.log(_NARROW), _WIDE, _OPAQUE, _HOLE, _THICK, flatness)
         return OffSurfaceCpu.apply(raw.concatenate(), activation, spacing, free, _TINY)
     rows = _tangents(raw.quats)
     drawn = activation(raw)
@@ -52,7 +57,9 @@ def off_surface(raw: RawAttributes, activation: Activation, spacing: float) -> T
     area = (xx * yy - xy * xy).clamp(min=_TINY)
     offsets = drawn.offsets / spacing
     shift = (offsets[..., :2].square().sum(dim=-1) + _TINY).sqrt()
-    cost = relu(offsets[..., 2].abs() + 2.0 * along.sqrt() - _REACH).square()
+    thickness = 2.0 * along.sqrt()
+    cost = relu(offsets[..., 2].abs() + thickness - _REACH).square()
+    cost = cost + flatness * relu(thickness - _THICK).square()
     cost = cost + relu(shift - _SHIFT).square()
     cost = cost + relu(math.log(_NARROW) - 0.25 * area.log()).square()
     cost = cost + relu((across + _TINY).sqrt() - _WIDE).square()

@@ -27,8 +27,9 @@ def off_surface(worker, counters, ends, raw, lengths, log_scales, free, tiny, ma
         raw: (B N, 14) float32.
         lengths: (2,) float32 m: largest displacement, and spacing of the anchors.
         log_scales: (3,) float32: bias, least and greatest of the log scales.
-        free: (6,) float32 what costs nothing: reach, shift, logarithm of the least width, greatest
-            width, opacity; and the weight of the opacity.
+        free: (8,) float32 what costs nothing: reach, shift, logarithm of the least width, greatest
+            width, opacity; the weight of the opacity; the thickness that costs nothing, and the
+            weight of the thickness.
         tiny: float32 below which squares of lengths have no slope.
         made: (B N, 14) float32, filled: gradient of the sum of all costs.
         costs: (pieces,) float64, filled: their sum over a piece.
@@ -68,6 +69,7 @@ def off_surface(worker, counters, ends, raw, lengths, log_scales, free, tiny, ma
             off = bound * moved[2]
             root = np.sqrt(max(along, tiny))
             reaching = max(abs(off) + _TWO * root - reach, _ZERO)
+            thick = max(_TWO * root - free[6], _ZERO)
             right, up = bound * moved[0], bound * moved[1]
             distance = np.sqrt(right * right + up * up + tiny)
             shifted = max(distance - aside, _ZERO)
@@ -77,9 +79,9 @@ def off_surface(worker, counters, ends, raw, lengths, log_scales, free, tiny, ma
             opacity = _ONE / (_ONE + np.float32(math.exp(-given[10])))
             clear = max(free[4] - opacity, _ZERO)
             total += reaching * reaching + shifted * shifted + too_narrow * too_narrow
-            total += too_wide * too_wide + free[5] * clear * clear
+            total += too_wide * too_wide + free[5] * clear * clear + free[7] * thick * thick
             # The gradient, from the costs back to the channels.
-            of_along = _TWO * reaching / root if along >= tiny else _ZERO
+            of_along = _TWO * (reaching + free[7] * thick) / root if along >= tiny else _ZERO
             of_area = -_HALF * too_narrow / area if area >= tiny else _ZERO
             of_across = too_wide / width - of_along
             of_xx, of_yy = of_area * yy + of_across, of_area * xx + of_across

@@ -244,7 +244,12 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
         },
         "prepass": {"clean_scale": 1.0, "validated": False},
         "schedule": {"root_steps": 0.0, "average_share": 0.0, "validated": False},
-        "terms": {"surface": 0.0, "leave_hidden": False, "dssim_inexact": 1.0},
+        "terms": {
+            "surface": 0.0,
+            "surface_inexact": 0.0,
+            "leave_hidden": False,
+            "dssim_inexact": 1.0,
+        },
     }
 )
 

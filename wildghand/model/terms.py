@@ -53,6 +53,9 @@ class TermWeights:
     weight_reward: float = 5e-3
     #: `off_surface`: what keeps Gaussians from being opaque discs that lie on the skin.
     surface: float = 5e-4
+    #: Within that term, weight of what is thicker than a disc (`flatness`), where the poses of a
+    #: clip had to be corrected. Exact poses make no needles.
+    surface_inexact: float = 5.0
     #: `cross_hand`: texture features of the two hands, where there are two.
     cross_hand: float = 1e-3
     #: A perceptual distance (`wildghand.gaussians.perceptual`).
@@ -61,6 +64,10 @@ class TermWeights:
     def dssim_share(self, *, exact_poses: bool) -> float:
         """Share of D-SSIM in the reconstruction, of clips with exact poses or of others."""
         return self.dssim_weight if exact_poses else min(self.dssim_weight, self.dssim_inexact)
+
+    def flatness(self, *, exact_poses: bool) -> float:
+        """Weight of thickness within `off_surface`, of clips with exact poses or of others."""
+        return 0.0 if exact_poses else self.surface_inexact
 
     def __post_init__(self) -> None:
         for item in fields(self):

@@ -31,7 +31,7 @@ def random_raw(count: int) -> torch.Tensor:
     return torch.randn(2, count, 14, generator=random, dtype=torch.float64)
 
 
-def expected(raw: torch.Tensor) -> float:
+def expected(raw: torch.Tensor, flatness: float) -> float:
     """The definition, Gaussian by Gaussian, from whole covariances."""
     drawn, total = Activation()(RawAttributes.split(raw)), []
     for offset, scale, quat, opacity in zip(
@@ -50,23 +50,31 @@ def expected(raw: torch.Tensor) -> float:
             math.log(0.6) - 0.25 * math.log(np.linalg.det(skin)),
             math.sqrt(np.trace(skin)) - 1.5,
             2.0 * (0.98 - float(opacity)),
+            math.sqrt(flatness) * (2.0 * math.sqrt(covariance[2, 2]) - 0.4),
         ]
         total.append(sum(max(0.0, term) ** 2 for term in terms))
     return float(np.mean(total))
 
 
-def test_it_is_its_definition() -> None:
+FLATNESS = pytest.mark.parametrize("flatness", [0.0, 5.0])
+
+
+@FLATNESS
+def test_it_is_its_definition(flatness: float) -> None:
     raw = random_raw(40)
-    found = off_surface(RawAttributes.split(raw), Activation(), SPACING)
+    found = off_surface(RawAttributes.split(raw), Activation(), SPACING, flatness=flatness)
     # The small constants under the roots.
-    assert float(found) == pytest.approx(expected(raw), rel=1e-5)
+    assert float(found) == pytest.approx(expected(raw, flatness), rel=1e-5)
 
 
-def test_its_gradient() -> None:
+@FLATNESS
+def test_its_gradient(flatness: float) -> None:
     raw = random_raw(2).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda x: off_surface(RawAttributes.split(x), Activation(), SPACING), (raw,)
-    )
+
+    def cost(channels: torch.Tensor) -> torch.Tensor:
+        return off_surface(RawAttributes.split(channels), Activation(), SPACING, flatness=flatness)
+
+    assert torch.autograd.gradcheck(cost, (raw,))
 
 
 def hard_raw() -> torch.Tensor:
@@ -82,11 +90,15 @@ def hard_raw() -> torch.Tensor:
     return raw
 
 
-def test_the_compiled_pass() -> None:
+@FLATNESS
+def test_the_compiled_pass(flatness: float) -> None:
     """Oracle: autograd in float64 on the same numbers; 1e-5 of the value, 1e-4 of the gradient."""
     exact, raw = hard_raw().float().double().requires_grad_(), hard_raw().float().requires_grad_()
     activation = Activation(max_offset=0.008)
-    values = [off_surface(RawAttributes.split(one), activation, SPACING) for one in (exact, raw)]
+    values = [
+        off_surface(RawAttributes.split(one), activation, SPACING, flatness=flatness)
+        for one in (exact, raw)
+    ]
     for value in values:
         (3.0 * value).backward()
     assert values[1].item() == pytest.approx(values[0].item(), rel=1e-5)

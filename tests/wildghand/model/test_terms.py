@@ -127,6 +127,12 @@ def test_inexact_poses_leave_at_most_the_lesser_share_to_dssim() -> None:
     assert terms.PAPER_TERMS.dssim_share(exact_poses=False) == 0.0
 
 
+def test_inexact_poses_alone_make_thickness_cost() -> None:
+    weights = terms.TermWeights(surface_inexact=4.0)
+    assert weights.flatness(exact_poses=True) == 0.0
+    assert weights.flatness(exact_poses=False) == 4.0
+
+
 def test_bad_arguments_are_named() -> None:
     with pytest.raises(UsageError, match="bias"):
         terms.TermWeights(bias=-1.0)

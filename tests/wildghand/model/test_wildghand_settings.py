@@ -333,8 +333,9 @@ def test_avatars_from_before_the_subject_the_light_and_the_places_draw_as_they_d
     expected = {"subject.enabled": False, "light.enabled": False, "pao.errors": "median"}
     assert read_stored(stored) == read_settings(expected)
     stored = dataclasses.asdict(read_settings({}))
-    del stored["terms"]["dssim_inexact"]
-    assert read_stored(stored) == read_settings({"terms.dssim_inexact": 1.0})
+    del stored["terms"]["dssim_inexact"], stored["terms"]["surface_inexact"]
+    expected = {"terms.dssim_inexact": 1.0, "terms.surface_inexact": 0.0}
+    assert read_stored(stored) == read_settings(expected)
     today = read_settings({})
     assert (today.subject.enabled, today.light.enabled, today.pao.errors) == (True, True, "place")
     assert read_stored(dataclasses.asdict(today)) == today
