@@ -2,7 +2,7 @@
 
 The package embreex builds a mesh from Python numbers, one coordinate at a time, which takes
 longer than Embree's own work on it. Here Embree reads the arrays themselves. Faces are those of
-embreex, bit for bit; the tests compare them.
+embreex but where a ray passes along an edge; the tests compare them.
 """
 
 from __future__ import annotations

@@ -9,22 +9,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled, helper
+from hwp_bench.base.compiled import compiled
+from hwp_bench.base.vectors import cross, dot
 
 #: (u, v, distance), each (H,) float32: the place is (1 - u - v) a + u b + v c of the corners.
 Places = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-
-@helper
-def _cross(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]
-
-
-@helper
-def _dot(a: np.ndarray, b: np.ndarray) -> float:
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled(nogil=True)
@@ -65,16 +54,16 @@ def places_on_faces(
             second[k] = np.float64(vertices[c, k]) - corner
             start[k] = np.float64(np.float32(origins[origin, k])) - corner
             along[k] = np.float64(np.float32(directions[ray[i], k]))
-        _cross(along, second, across)
-        _cross(start, first, over)
-        determinant = _dot(first, across)
+        cross(along, second, across)
+        cross(start, first, over)
+        determinant = dot(first, across)
         s = t = 0.0
         if determinant != 0.0:
-            s = max(_dot(start, across) / determinant, 0.0)
-            t = max(_dot(along, over) / determinant, 0.0)
+            s = max(dot(start, across) / determinant, 0.0)
+            t = max(dot(along, over) / determinant, 0.0)
             outside = max(s + t, 1.0)
             s, t = s / outside, t / outside
         for k in range(3):
             start[k] = s * first[k] + t * second[k] - start[k]
-        u[i], v[i], distance[i] = s, t, _dot(start, along) / _dot(along, along)
+        u[i], v[i], distance[i] = s, t, dot(start, along) / dot(along, along)
     return u, v, distance

@@ -1,4 +1,4 @@
-"""Compiled helpers of the shading loops: the GGX lobe, gloss at grazing view, dot products."""
+"""Compiled helpers of the shading loops: the GGX lobe, gloss at grazing view."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from hwp_bench.base.compiled import helper
+from hwp_bench.base.vectors import dot
 
 _ONE, _LEAST_ROUGH, _MOST_GLOSS = np.float32(1.0), np.float32(0.05), np.float32(0.8)
 
@@ -57,9 +58,3 @@ def grazing(
 def _fifth(x: float) -> float:
     square = x * x
     return square * square * x
-
-
-@helper
-def dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Scalar product of two vectors (3,)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]

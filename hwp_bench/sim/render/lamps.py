@@ -11,8 +11,9 @@ import math
 import numpy as np
 
 from hwp_bench.base.compiled import compiled
+from hwp_bench.base.vectors import dot
 from hwp_bench.sim.geometry.raycast import LIFT, Tracer
-from hwp_bench.sim.render.gloss import dot, gloss_lobe, grazing
+from hwp_bench.sim.render.gloss import gloss_lobe, grazing
 from hwp_bench.sim.render.samples import Samples
 from hwp_bench.sim.render.translucency import light_through
 from hwp_bench.sim.scene.area_lights import AreaLight, wall_irradiance
