@@ -37,7 +37,7 @@ class Ratio:
     tolerance: float = number(0.25, 0.0, 10.0)
     #: Which direction is better.
     better: Literal["lower", "higher"] = "lower"
-    #: Worst value that is kept, on any machine, in place of the tolerance; None: the tolerance says.
+    #: Worst value that is kept on any machine; None: the tolerance says.
     limit: float | None = None
 
     def bound(self, machine: str) -> float:

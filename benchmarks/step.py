@@ -1,18 +1,18 @@
 """What one step of a fit costs, component by component, next to one of the plain baseline.
 
 Run from the repository: `python -m benchmarks.step [CAPTURE] [--gaussians 5000] [--threads 1 2]
-[--batch 1 4] [--set NAME=VALUE] [--flame FILE.svg] [--json] [--busy]`. Without a capture a small one of 176
-px is rendered. Both methods have as many Gaussians and draw the same frames of one capture; their
-loops take turns in one process, and whole steps (means of blocks) are compared: on one thread the
-median of the processor's seconds, which other work on the machine hardly changes; on several the
-clock on the wall, in the fastest block. The components are the profiler's shares of those times, on
-the first number of threads and with the first size of batch.
+[--batch 1 4] [--set NAME=VALUE] [--flame FILE.svg] [--json] [--busy]`. Without a capture a small
+one of 176 px is rendered. Both methods have as many Gaussians and draw the same frames of one
+capture; their loops take turns in one process, and whole steps (means of blocks) are compared: on
+one thread the median of the processor's seconds, which other work on the machine hardly changes; on
+several the clock on the wall, in the fastest block. The components are the profiler's shares of
+those times, on the first number of threads and with the first size of batch.
 
 `--busy` measures something else: steps of one frame beside one busy process for each core. A fit
 that chooses its threads as a user's does, one on two threads and one on a single thread take turns,
-and medians of their blocks are compared. A step that takes p times the processor seconds of one on a
-single thread takes p times as long as that where both get as much of the processor, so the row is
-that of processor seconds; the clock on the wall stands below it.
+and medians of their blocks are compared. A step that needs p times the processor seconds of one on
+a single thread takes p times as long as that where both get as much of the processor, so the row is
+that of processor seconds; the clock on the wall stands next to it.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """What the environment tells numerical libraries of their threads: how they wait, how many.
 
 A library reads its variables when it is loaded, so they are set before: how threads wait when
-`hwp_bench` is imported, how many there are of BLAS in a process of ours before its work is imported.
+`hwp_bench` is imported, and how many BLAS has before a process of ours imports its work.
 Processes that we start inherit both. What a person has set stays.
 
 Threads that wait for their next piece of work either sleep or spin. Beside another busy process

@@ -87,9 +87,7 @@ def _remedy(number: int | None) -> str:
     if number in (errno.ENOSPC, errno.EDQUOT):
         return ". Make room and start again with the same arguments."
     if number == errno.EAGAIN:
-        return (
-            ". Allow this user more processes and threads (`ulimit -u`, or the container's limit)."
-        )
+        return ". Allow this user more processes and threads (`ulimit -u`, limit of the container)."
     if number in (errno.EMFILE, errno.ENFILE):
         return ". Allow more open files (`ulimit -n`)."
     return ""
