@@ -37,6 +37,8 @@ class Ratio:
     tolerance: float = number(0.25, 0.0, 10.0)
     #: Which direction is better.
     better: Literal["lower", "higher"] = "lower"
+    #: Worst value that is kept on any machine; None: the tolerance says.
+    limit: float | None = None
 
     def bound(self, machine: str) -> float:
         """The worst value that is kept.
@@ -44,6 +46,8 @@ class Ratio:
         Args:
             machine: `same` as the stored ratio's, or `other`.
         """
+        if self.limit is not None:
+            return self.limit
         if self.ratio is None:
             return math.inf if self.better == "lower" else -math.inf
         grown = 1.0 + self.tolerance * (1.0 if machine == "same" else ELSEWHERE)

@@ -1,12 +1,18 @@
 """What one step of a fit costs, component by component, next to one of the plain baseline.
 
 Run from the repository: `python -m benchmarks.step [CAPTURE] [--gaussians 5000] [--threads 1 2]
-[--batch 1 4] [--set NAME=VALUE] [--flame FILE.svg] [--json]`. Without a capture a small one of 176
-px is rendered. Both methods have as many Gaussians and draw the same frames of one capture; their
-loops take turns in one process, and whole steps (means of blocks) are compared: on one thread the
-median of the processor's seconds, which other work on the machine hardly changes; on several the
-clock on the wall, in the fastest block. The components are the profiler's shares of those times, on
-the first number of threads and with the first size of batch.
+[--batch 1 4] [--set NAME=VALUE] [--flame FILE.svg] [--json] [--busy]`. Without a capture a small
+one of 176 px is rendered. Both methods have as many Gaussians and draw the same frames of one
+capture; their loops take turns in one process, and whole steps (means of blocks) are compared: on
+one thread the median of the processor's seconds, which other work on the machine hardly changes; on
+several the clock on the wall, in the fastest block. The components are the profiler's shares of
+those times, on the first number of threads and with the first size of batch.
+
+`--busy` measures something else: steps of one frame beside one busy process for each core. A fit
+that chooses its threads as a user's does, one on two threads and one on a single thread take turns,
+and medians of their blocks are compared. A step that needs p times the processor seconds of one on
+a single thread takes p times as long as that where both get as much of the processor, so the row is
+that of processor seconds; the clock on the wall stands next to it.
 """
 
 from __future__ import annotations
@@ -14,6 +20,7 @@ from __future__ import annotations
 import argparse
 import io
 import json
+import os
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -22,7 +29,7 @@ from typing import Any
 import torch
 
 from benchmarks.small_capture import opened_request, small_capture
-from benchmarks.step_loops import Spent, WildGHandLoop, race, run_plain
+from benchmarks.step_loops import BLOCK, Spent, WildGHandLoop, crowded, race, run_plain
 from benchmarks.step_picture import draw_flames
 from benchmarks.step_shares import Shares, by_component, shares_of
 from benchmarks.step_spans import marked, profiled
@@ -30,6 +37,7 @@ from hwp_bench.base.files import atomic_write
 from hwp_bench.base.tables import Column, Table, print_table
 from hwp_bench.cli.overrides import overrides
 from hwp_bench.methods.contract import TrainingCapture
+from wildghand.gaussians.step_threads import StepThreads, candidates
 
 #: Gaussians of a step that is measured.
 GAUSSIANS = 5_000
@@ -52,10 +60,10 @@ class Workload:
         """Settings of the plain baseline."""
         return {"gaussians": self.gaussians, "batch": batch}
 
-    def loop(self, batch: int) -> WildGHandLoop:
-        """A new fit of WildGHand."""
+    def loop(self, batch: int, threads: StepThreads | None = None) -> WildGHandLoop:
+        """A new fit of WildGHand, on as many threads as torch has unless something chooses."""
         chosen: dict[str, Any] = {"gaussians": self.gaussians, "schedule.batch": batch}
-        return WildGHandLoop(self.training, chosen | dict(self.settings or {}))
+        return WildGHandLoop(self.training, chosen | dict(self.settings or {}), threads)
 
 
 @dataclass(frozen=True)
@@ -109,6 +117,28 @@ def whole_steps(
                     name = f"{method} / {_count(threads[0], 'thread')}, {where}"
                     ratios[name] = medians[method, count].over(fewer, count)
     return steps, ratios
+
+
+def beside_busy(workload: Workload, rounds: int) -> dict[str, float]:
+    """Ratios of steps beside one busy process for each core, to a step on one thread there.
+
+    Args:
+        workload: what is fitted, one frame in a step.
+        rounds: turns of each fit.
+    """
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
+    most = max(2, cores or 1)
+    choice = StepThreads(candidates(most), shared=BLOCK)
+    loops = {"one": workload.loop(1), "two": workload.loop(1), "chosen": workload.loop(1, choice)}
+    found = crowded(loops, {"one": 1, "two": 2, "chosen": most}, rounds, cores or 1)
+    one = Times(*found.pop("one"))
+    ratios = {}
+    for name, spent in found.items():
+        threads = "2 threads" if name == "two" else "chosen threads"
+        wall, processor = spent
+        ratios[f"{threads} / 1 thread, busy, processor"] = processor / one.processor
+        ratios[f"{threads} / 1 thread, busy, wall"] = wall / one.wall
+    return ratios
 
 
 def _count(number: int, word: str) -> str:
@@ -191,9 +221,10 @@ def measure(
     threads: Sequence[int] = (1, 2),
     rounds: int = ROUNDS,
     settings: Mapping[str, Any] | None = None,
+    busy: bool = False,
 ) -> Mapping[str, float]:
     """Ratios of whole steps by name, lower is better: to the plain baseline, to one frame in a
-    step, to one thread.
+    step, to one thread; or those beside busy processes.
 
     Args:
         capture: its folder; None: a small one of 176 px.
@@ -202,11 +233,14 @@ def measure(
         threads: numbers of threads.
         rounds: turns of each fit.
         settings: further settings of WildGHand.
+        busy: measure `beside_busy`, and only that.
     """
     before = torch.get_num_threads()
     try:
         with opened_request(small_capture(capture)) as training:
             workload = Workload(training, gaussians, settings)
+            if busy:
+                return beside_busy(workload, rounds)
             return whole_steps(workload, batches, threads, rounds)[1]
     finally:
         torch.set_num_threads(before)
@@ -220,12 +254,16 @@ def main() -> None:
     parser.add_argument("--batch", type=int, nargs="+", default=[1, 4], help="to compare (1 4)")
     parser.add_argument("--rounds", type=int, default=ROUNDS, help="turns of each fit")
     parser.add_argument("--set", action="append", default=[], metavar="NAME=VALUE")
+    parser.add_argument("--busy", action="store_true", help="beside busy processes, and only that")
     parser.add_argument("--json", action="store_true", help="print numbers for programs")
     parser.add_argument("--flame", type=Path, metavar="FILE", help="draw the components: svg, png")
     args = parser.parse_args()
     capture = small_capture(args.capture)
     with opened_request(capture) as training:
         workload = Workload(training, args.gaussians, overrides(args.set))
+        if args.busy:
+            _print_ratios(beside_busy(workload, args.rounds), args.json)
+            return
         found, ratios = whole_steps(workload, args.batch, args.threads, args.rounds)
         batch, count = args.batch[0], args.threads[0]
         shares = profile(workload, batch, count)
@@ -247,6 +285,13 @@ def main() -> None:
         return
     print_table(component_table(shares, steps, title))
     print_table(steps_table(found))
+    _print_ratios(ratios)
+
+
+def _print_ratios(ratios: Mapping[str, float], as_json: bool = False) -> None:
+    if as_json:
+        print(json.dumps({"ratios": dict(ratios)}, indent=1))
+        return
     rows = tuple(ratios.items())
     print_table(Table("Ratios", (Column("ratio"), Column("", 2)), rows, ranked=False))
 

@@ -8,10 +8,13 @@ runs, with everything that they do between steps.
 from __future__ import annotations
 
 import contextlib
+import os
+import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
+from unittest import mock
 
 import numpy as np
 import torch
@@ -21,6 +24,7 @@ from hwp_bench.methods.manifest import find_method
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.ready import ready_fit
+from wildghand.gaussians.step_threads import StepThreads
 from wildghand.model.settings import read_settings
 from wildghand.splat.threads import denormals_flushed
 
@@ -67,12 +71,19 @@ class WildGHandLoop:
     Args:
         training: what it may see.
         settings: of the method.
+        threads: chooses the number of threads; None: as many as torch has.
     """
 
-    def __init__(self, training: TrainingCapture, settings: Mapping[str, Any]) -> None:
+    def __init__(
+        self,
+        training: TrainingCapture,
+        settings: Mapping[str, Any],
+        threads: StepThreads | None = None,
+    ) -> None:
         chosen = read_settings({"device": "cpu", **settings})
         self._fit = Fit(training, chosen, 0, ready_fit("cpu"))
         self._watchers = Watchers(0)
+        self._threads = threads or StepThreads()
         self._taken = 0
         # Steps may share work, which one of them does: a block has each of them equally often.
         shared: int = getattr(chosen.schedule, "texture_every", 1)
@@ -95,7 +106,14 @@ class WildGHandLoop:
         budget = Budget(steps=BUDGET)
         denormals = denormals_flushed() if flush else contextlib.nullcontext()
         with denormals, contextlib.suppress(_Enough):
-            optimize(self._fit, budget, clock, start=self._taken, watchers=self._watchers)
+            optimize(
+                self._fit,
+                budget,
+                clock,
+                start=self._taken,
+                watchers=self._watchers,
+                threads=self._threads,
+            )
         self._taken += steps
         return clock.seconds
 
@@ -126,7 +144,9 @@ def run_plain(
                 raise _Enough
 
     clock = _Clock(after_step)
-    with contextlib.suppress(_Enough):
+    # As by a person who says how many threads there are: the loop chooses none.
+    said = mock.patch.dict(os.environ, {"OMP_NUM_THREADS": str(torch.get_num_threads())})
+    with said, contextlib.suppress(_Enough):
         PlainMethod({"device": "cpu", **settings}).fit(training, Budget(steps=BUDGET), clock)
 
 
@@ -178,3 +198,45 @@ def typical(blocks: Sequence[Spent]) -> Spent:
     median of the processor seconds."""
     walls, processors = zip(*blocks, strict=True)
     return min(walls), float(np.median(processors))
+
+
+@contextlib.contextmanager
+def busy_processes(count: int) -> Iterator[None]:
+    """Keep processors busy with other processes while this holds.
+
+    Args:
+        count: how many.
+    """
+    # A loop that ends with whoever started it.
+    loop = "import os\nparent = os.getppid()\nwhile os.getppid() == parent: sum(range(100_000))"
+    with contextlib.ExitStack() as stack:
+        for _ in range(count):
+            process = stack.enter_context(subprocess.Popen([sys.executable, "-S", "-c", loop]))
+            stack.callback(process.kill)
+        yield
+
+
+def crowded(
+    loops: Mapping[str, WildGHandLoop], threads: Mapping[str, int], rounds: int, busy: int
+) -> dict[str, Spent]:
+    """Let fits take turns beside busy processes.
+
+    Args:
+        loops: fits by name.
+        threads: of torch, by name.
+        rounds: turns of each that count; one more goes before.
+        busy: number of busy processes.
+
+    Returns:
+        Medians of the mean seconds of a step in a block, by name.
+    """
+    found: dict[str, list[Spent]] = {name: [] for name in loops}
+    with busy_processes(busy):
+        for turn in range(rounds + 1):
+            for name, loop in loops.items():
+                torch.set_num_threads(threads[name])
+                seconds = mean_of(loop.block())
+                if turn > 0:
+                    found[name].append(seconds)
+    medians = {name: np.median(blocks, axis=0).tolist() for name, blocks in found.items()}
+    return {name: (wall, processor) for name, (wall, processor) in medians.items()}

@@ -1,7 +1,7 @@
 """HWP bench: a benchmark for hand avatars learned from perturbed monocular video.
 
 The names below are loaded when they are first used; `import hwp_bench` loads neither numpy nor
-torch. `docs/python.md` shows them at work.
+torch. Their threads are told to sleep while they wait. `docs/python.md` shows the names at work.
 """
 
 from __future__ import annotations
@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from hwp_bench.base.lazy_names import lazy_names
+from hwp_bench.base.threads import wait_passively
 from hwp_bench.base.version import __version__
 
 if TYPE_CHECKING:
@@ -35,5 +36,9 @@ _HOMES = {
 }
 
 __all__ = [*_HOMES, "__version__"]
+
+# Here, since every process of ours comes by, before its first import of torch. Libraries read the
+# variables when they are loaded.
+wait_passively()
 
 __getattr__, __dir__ = lazy_names(__name__, _HOMES)

@@ -17,6 +17,7 @@ from typing import Any
 from hwp_bench.base.denormals import flushed_process
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.text import check_name
+from hwp_bench.base.threads import check_thread_variables, share_processors
 from hwp_bench.base.version import __version__
 
 
@@ -51,6 +52,8 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
     try:
         for word in words:
             check_name(word)
+        check_thread_variables(os.environ)
+        share_processors()
         status = _dispatch(program, tree, words)
         sys.stdout.flush()
         return status
@@ -67,11 +70,27 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
     except OSError as error:
         # A full disc or a read-only folder: the message names the place.
         where = f"{error.filename2 or error.filename}: " if error.filename else ""
-        full = error.errno in (errno.ENOSPC, errno.EDQUOT)
-        remedy = ". Make room and start again with the same arguments." if full else ""
-        text = _one_line(f"{where}{error.strerror or error}{remedy}")
+        text = _one_line(f"{where}{error.strerror or error}{_remedy(error.errno)}")
         print(f"{program}: error: {text}", file=sys.stderr)
         return 1
+    except RuntimeError as error:
+        # Python's own words where the system refuses a thread; there is no class for it.
+        if "can't start new thread" not in str(error):
+            raise
+        text = f"the system starts no more threads{_remedy(errno.EAGAIN)}"
+        print(f"{program}: error: {text}", file=sys.stderr)
+        return 1
+
+
+def _remedy(number: int | None) -> str:
+    """What to do where the system has run out of something, by the number of its error."""
+    if number in (errno.ENOSPC, errno.EDQUOT):
+        return ". Make room and start again with the same arguments."
+    if number == errno.EAGAIN:
+        return ". Allow this user more processes and threads (`ulimit -u`, limit of the container)."
+    if number in (errno.EMFILE, errno.ENFILE):
+        return ". Allow more open files (`ulimit -n`)."
+    return ""
 
 
 def _one_line(text: str) -> str:

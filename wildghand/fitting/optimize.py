@@ -16,6 +16,7 @@ from wildghand.fitting.averaging import AveragedAvatar
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.parallel import World
 from wildghand.gaussians.fit_loop import Guard, Loss, batches, read_losses, repeatable, spent
+from wildghand.gaussians.step_threads import StepThreads
 
 #: Fall of the mean loss from window to window, as a share, that still counts as progress.
 PROGRESS = 1e-3
@@ -54,6 +55,7 @@ def optimize(
     watchers: Watchers | None = None,
     after_step: Callable[[int, Watchers], None] | None = None,
     watch: Watch | None = None,
+    threads: StepThreads | None = None,
 ) -> WildGHandAvatar:
     """Take steps until the budget is spent, the loss stands still, or the fit diverges.
 
@@ -65,6 +67,7 @@ def optimize(
         watchers: those of the fit so far, where it goes on.
         after_step: called with the number of steps after each; saves, for instance.
         watch: looks at the fit after each step, and changes nothing of it.
+        threads: chooses how many threads steps run on; None: by what they gain.
 
     Returns:
         The mean of the last states, or of earlier ones where validation frames chose them; the best
@@ -80,6 +83,7 @@ def optimize(
     for _ in range(start):
         next(order)
     watchers = watchers or Watchers(settings.schedule.plateau_steps)
+    threads = threads or StepThreads.of(fit.device, settings.schedule.texture_every)
     step = start
     report(step, AveragedAvatar(fit.avatar(step), fit.average))
     if budget.seconds is not None:
@@ -90,7 +94,8 @@ def optimize(
             fraction = world.broadcast(spent(step, steps, _for_steps(budget, fit), report))
             if fraction >= 1.0:
                 break
-            loss = fit.step(next(order), fraction)
+            with threads.step():
+                loss = fit.step(next(order), fraction)
             if not watchers.guard.watch(step, loss, fit.model):
                 step = _go_back(fit, watchers, step)
                 break

@@ -10,6 +10,7 @@ from hwp_bench.base.progress import notice
 from hwp_bench.methods.contract import Avatar, Budget, Report
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import Guard, batches, repeatable, spent
+from wildghand.gaussians.step_threads import StepThreads
 from wildghand.plain.hooks import Batch, Recipe
 
 # Adam's epsilon: gradients of a mean over all pixels are small.
@@ -42,25 +43,29 @@ def run_fit(recipe: Recipe[Any], budget: Budget, report: Report) -> Avatar:
     order = batches(len(frames), settings.batch, recipe.material.seed)
     images, masks = frames.images_on(device), frames.masks_on(device)
     guard: Guard[dict[str, torch.Tensor]] = Guard()
+    threads = StepThreads.of(device)
     step = 0
     report(step, recipe.avatar(step))
     with repeatable(device):
         while step < steps and (fraction := spent(step, steps, budget, report)) < 1.0:
             for group, name in zip(optimizer.param_groups, parameters, strict=True):
                 group["lr"] = recipe.rate(name, fraction)
-            rows = next(order)
-            batch = Batch(step, fraction, rows, images(rows), masks(rows))
-            drawing = recipe.draw(batch)
-            loss = recipe.loss(batch, drawing, recipe.weights(batch, drawing))
-            if not guard.watch(step, float(loss.detach()), recipe):
-                recipe.restore(guard.best())
-                notice(f"The fit diverged at step {step}; the state of step {guard.step} is kept.")
-                step = guard.step
-                break
-            optimizer.clear()
-            loss.backward()
-            optimizer.take_step(loss)
-            recipe.after_step(batch)
+            with threads.step():
+                rows = next(order)
+                batch = Batch(step, fraction, rows, images(rows), masks(rows))
+                drawing = recipe.draw(batch)
+                loss = recipe.loss(batch, drawing, recipe.weights(batch, drawing))
+                if not guard.watch(step, float(loss.detach()), recipe):
+                    recipe.restore(guard.best())
+                    notice(
+                        f"The fit diverged at step {step}; the state of step {guard.step} is kept."
+                    )
+                    step = guard.step
+                    break
+                optimizer.clear()
+                loss.backward()
+                optimizer.take_step(loss)
+                recipe.after_step(batch)
             step += 1
             report.progress(step, steps)
             report(step, recipe.avatar(step))

@@ -1,14 +1,15 @@
 """Runs a kernel on several threads.
 
 Kernels release the interpreter lock and share out their jobs themselves (see `kernels.jobs`), so
-any threads do. The best are those of torch's own OpenMP: after an operation of torch they spin
-for some milliseconds to wait for the next one, and threads of ours would have to compete with
-them for the cores. Where torch has no OpenMP, in a forked child, whose OpenMP is dead, and on a
-machine that is busy otherwise, plain threads take their place. Numba's own layers cannot be used:
-they forbid two callers at once or end the process on a fork.
+any threads do. The best are those of torch's own OpenMP, which are there already. In a process
+that loaded torch before `hwp_bench` they spin for some milliseconds after an operation of torch,
+and threads of ours would have to compete with them for the cores. Where torch has no OpenMP, in a
+forked child, whose OpenMP is dead, and on a machine that is busy otherwise, plain threads take
+their place. Numba's own layers cannot be used: they forbid two callers at once or end the process
+on a fork.
 
-How many threads: `torch.get_num_threads()`. Results do not depend on it. All of them treat
-denormal numbers as the calling thread does.
+How many threads: `torch.get_num_threads()`, or fewer where `at_most` says so. Results do not depend
+on it. All of them treat denormal numbers as the calling thread does.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
+from contextvars import ContextVar
 from pathlib import Path
 from typing import Any
 
@@ -35,6 +37,8 @@ WORTH_A_THREAD = 4096
 
 #: The process that imported this; a forked child is another.
 _PROCESS = os.getpid()
+#: Most threads of kernels that are called in a context; None: as many as torch has.
+_MOST: ContextVar[int | None] = ContextVar("most threads", default=None)
 _TEAM_MEMBER = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 
@@ -46,7 +50,23 @@ def thread_count(jobs: int, work: int | None = None) -> int:
         work: how many Gaussians or pairs it is; None if every job is worth a thread.
     """
     worth = jobs if work is None else min(jobs, work // WORTH_A_THREAD)
-    return max(1, min(torch.get_num_threads(), worth))
+    return max(1, min(torch.get_num_threads(), _MOST.get() or worth, worth))
+
+
+@contextmanager
+def at_most(threads: int | None) -> Iterator[None]:
+    """Bound the threads of kernels that are called while this holds; results stay the same.
+
+    torch's own operations keep their number, on which their last bits depend.
+
+    Args:
+        threads: 1 or more; None: as many as torch has.
+    """
+    token = _MOST.set(threads)
+    try:
+        yield
+    finally:
+        _MOST.reset(token)
 
 
 def even_jobs(jobs: int, threads: int) -> np.ndarray:

@@ -12,6 +12,7 @@ from pathlib import Path
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.packages import PACKAGES, data_folder
+from hwp_bench.base.threads import OPENCV_WAITING, OPENMP_WAITING, TORCH_COUNTS
 from hwp_bench.run.sandbox.pythons import checkout, environment_of, of_packages, python_places
 from hwp_bench.run.sandbox.root import Place
 from hwp_bench.run.sandbox.secluded import foreign_folders, secluded_rooms
@@ -28,10 +29,12 @@ INHERITED = (
     "LANG",
     "LC_ALL",
     "LD_LIBRARY_PATH",
-    "MKL_NUM_THREADS",
     "NUMBA_NUM_THREADS",
-    "OMP_NUM_THREADS",
+    *OPENMP_WAITING,
+    *OPENCV_WAITING,
+    *TORCH_COUNTS,
     "OPENBLAS_NUM_THREADS",
+    "GOTO_NUM_THREADS",
     "PATH",
     "PYTHONPATH",
     "VIRTUAL_ENV",

@@ -121,6 +121,8 @@ def run_confined(
         finally:
             _end(process)
             drain.join(timeout=5)
+            if not drain.is_alive():  # what it reads from must not be taken from it
+                process.stdout.close()
         text = report.read()
     lost = log_problems[0] if log_problems else None
     if stopped is not None:

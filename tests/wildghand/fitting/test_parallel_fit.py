@@ -193,11 +193,14 @@ def test_processes_agree_repeat_and_go_on_bit_for_bit(folder: Path) -> None:
 
 def torchrun(arguments: list[str]) -> subprocess.CompletedProcess[str]:
     words = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    # As in a shell of somebody who has not said how threads wait.
+    shell = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"}
+    said = {"OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1", "OMP_DISPLAY_ENV": "VERBOSE"}
     return subprocess.run(
         [sys.executable, *words, "-m", "wildghand.cli.main", *arguments],
         capture_output=True,
         text=True,
-        env={**os.environ, "OMP_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1"},
+        env={**shell, **said},
         check=False,
     )
 
@@ -212,6 +215,8 @@ def test_torchrun_makes_one_avatar_and_one_message(
     made = torchrun(command)
     assert made.returncode == 0, made.stderr
     assert made.stdout.count("2 steps") == 1
+    if "GOMP_SPINCOUNT" in made.stderr:  # GNU's OpenMP tells how often a thread looks again
+        assert made.stderr.count("GOMP_SPINCOUNT = '0'") == 2
     assert made.stderr.count("Fitting painted-right") == 1
     assert load_avatar(avatar).steps == 2
     refused = torchrun([*command, "--overwrite", "--set", "schedule.batch=3"])
