@@ -76,8 +76,8 @@ _CONFIRM = """examples:
   hwp-bench leaderboard confirm runs/second-run --by maintainers --tolerance 0.05
   hwp-bench leaderboard confirm runs/second-run --by maintainers --entry mine-mini-seed0-0123abcd
 
-Checks are never removed. Where checks of an entry contradict each other, the one that differs counts
-until a new check overrules it by name (--overrules, --reason).
+Checks are never removed. Where checks of an entry contradict each other, the one that differs
+counts until a new check overrules it by name (--overrules, --reason).
 
 Verifies the results as `hwp-bench verify` does and writes a check next to the entry. Results of the
 entry itself make its level `rescored`; another run of the same method, settings, seed and budget

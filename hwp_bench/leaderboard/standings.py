@@ -74,13 +74,13 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
             )
         )
     notes = [sentence] if sentence else []
-    if older := sum(len(method.older) for method in methods):
-        notes.append(f"{older} older entries of these methods are on the site's pages of methods.")
     lacking = frozenset(place for place, row in enumerate(order) if not row.whole)
     if lacking:
         notes.append("Rows that lack captures or test frames of the suite have no rank.")
     if protocol != HWP_V1.name:
         notes.append(f"Scored by {protocol}; rows of {HWP_V1.name} stand in another table.")
+    if older := sum(len(method.older) for method in methods):
+        notes.append(f"{older} older or less checked entries of these methods are not shown.")
     return Table(
         f"Suite {suite}, protocol {protocol}",
         columns,
