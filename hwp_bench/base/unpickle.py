@@ -17,7 +17,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -155,7 +155,7 @@ def _check_steps(stream: _Exact, most: int, most_size: int) -> None:
         most_size: largest size of what is hashed, and of any object that is made.
     """
     shape = _Shape(most_size)
-    for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
+    for count, (opcode, argument, _) in enumerate(pickletools.genops(cast("Any", stream))):
         if count >= most:
             raise ValueError(f"more than {most:,} steps")
         # The reader makes room for the largest memo number.
@@ -163,13 +163,13 @@ def _check_steps(stream: _Exact, most: int, most_size: int) -> None:
             raise ValueError(f"memo number {argument} after {count} steps")
         if isinstance(argument, int) and abs(argument) > _LARGEST_INTEGER:
             raise ValueError("an absurdly large integer")
-        if opcode.name == "FRAME" and argument > stream.size:
+        if opcode.name == "FRAME" and (argument or 0) > stream.size:
             raise ValueError(f"it claims {argument:,} bytes of {stream.size:,}")
         shape.take(opcode, argument)
 
 
 class _Made:
-    """What a step will make, as far as its shape goes."""
+    """An object that a step will make: its depth and its size."""
 
     __slots__ = ("depth", "hashed", "size")
 
@@ -389,7 +389,7 @@ class _Unpickler(pickle.Unpickler):
     def _make_of_keys(self, kind: type, *arguments: Any) -> Any:
         """Make a set or table, whose keys `_MOST_ODD_KEYS` bounds."""
         if any(not isinstance(parts, list | tuple | set | frozenset | dict) for parts in arguments):
-            raise TypeError(f"a {kind.__name__} of something that is no list")
+            raise TypeError(f"a {kind.__name__} of something that is not a list")
         for item in itertools.chain(*arguments):
             key = item[:1] if kind is OrderedDict and isinstance(item, list | tuple) else [item]
             self._counted += any(isinstance(part, tuple | frozenset) for part in key)

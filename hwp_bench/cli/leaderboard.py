@@ -348,7 +348,7 @@ def _register(args: argparse.Namespace, folder: Path) -> int:
     entries = {entry.name: entry for entry in readable_entries(folder)}
     for name in args.names:
         if name not in entries:
-            raise UsageError("is no entry", where=folder, field=name)
+            raise UsageError("is not an entry", where=folder, field=name)
     added = register(folder, [entries[name] for name in args.names])
     notice(f"{len(added)} entries added to {folder.parent / NAME}")
     return 0

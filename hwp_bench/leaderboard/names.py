@@ -91,7 +91,7 @@ def check_names(entries: Iterable[Entry], listed: frozenset[str]) -> None:
 @cache
 def _shipped() -> dict[str, str]:
     """Names of methods by their names and titles, as these look."""
-    found = {}
+    found: dict[str, str] = {}
     for manifest in shipped_methods():
         found |= {_look(manifest.name): manifest.name, _look(manifest.title): manifest.name}
     return found

@@ -102,7 +102,7 @@ def _check_overruling(entry: Entry, check: Check) -> None:
     known = {other.digest for other in entry.checks}
     if unknown := [digest for digest in check.overrules if digest not in known]:
         field = f"checks, {check.kind} of {check.date}"
-        raise _wrong(entry, field, f"overrules {unknown[0][:8]}, which is no check of the entry")
+        raise _wrong(entry, field, f"overrules {unknown[0][:8]}, which is not a check of the entry")
 
 
 def without_false_checks(entry: Entry, now: datetime | None = None) -> Entry:
