@@ -17,6 +17,8 @@ from hwp_bench.base.text import shown
 
 #: Largest array file that is read, unpacked, in bytes (a zip can unpack to a thousand times).
 MAX_NPZ_BYTES = 1024 * 1024 * 1024
+#: Most arrays of a file: each takes some 0.1 ms to read, however small it is.
+MAX_MEMBERS = 10_000
 
 
 def read_npz(
@@ -39,6 +41,10 @@ def read_npz(
                     f"unpacks to {unpacked} bytes, more than the {max_bytes} that are read",
                     where=path,
                 )
+            names = [item.filename for item in members]
+            if len(names) > MAX_MEMBERS or len(set(names)) < len(names):
+                twice = f"more than {MAX_MEMBERS:,} arrays, or one twice"
+                raise BadInput(f"holds {twice}", where=path)
             return {item.filename.removesuffix(".npy"): _member(archive, item) for item in members}
     except BadInput:
         raise
@@ -62,6 +68,8 @@ def _member(archive: zipfile.ZipFile, item: zipfile.ZipInfo) -> np.ndarray:
         if version not in readers:
             raise ValueError(f"{item.filename} is an array of version {version}")
         shape, _, dtype = readers[version](stream)
+        if dtype.itemsize == 0:
+            raise ValueError(f"{item.filename} has elements of no bytes")
         claimed = math.prod(shape) * dtype.itemsize
         if claimed > item.file_size:
             raise ValueError(f"{item.filename} claims {claimed} bytes and has {item.file_size}")

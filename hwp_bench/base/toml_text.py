@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import re
 import tomllib
 from typing import Any
 
@@ -16,6 +17,12 @@ MAX_DEPTH = 32
 #: Most bits of an integer. A field has closer bounds, and its reader names it; but Python turns
 #: no integer of more than 4,300 digits into text, not even for a message.
 MAX_BITS = 256
+
+# A name of more parts than tables may be deep. The parser takes its square in steps: a text of a
+# million characters would keep it for an hour.
+_DEEP_NAME = re.compile(
+    r"""(?<![\w"'-])(?:(?:[\w-]++|"[^"\n]*+"|'[^'\n]*+')[ \t]*+\.[ \t]*+){128}"""
+)
 
 
 def parse_toml(
@@ -46,6 +53,8 @@ def parse_toml(
         raise refuse(f"holds more than the {MAX_CHARACTERS:,} characters that are read")
     if not is_unicode(text):
         raise refuse("holds text that cannot be Unicode")
+    if _DEEP_NAME.search(text):
+        raise refuse("is nested too deeply")
     try:
         content = tomllib.loads(text)
     except RecursionError as fault:

@@ -14,14 +14,15 @@ import os
 import pickle
 import pickletools
 from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
 from hwp_bench.base.errors import BadInput, HwpError, UnsafePickle
+from hwp_bench.base.text import shown
 
 #: Largest pickle that is read, in bytes; MANO has 4 MB, a released HWP capture some 100 MB.
 MAX_PICKLE_BYTES = 1024 * 1024 * 1024
@@ -34,13 +35,16 @@ MAX_EXPANDED = 10_000_000
 #: Deepest nesting of containers and objects.
 MAX_DEPTH = 64
 
-# Most values that are keys of a table but no text: equal hashes can be chosen for complex numbers
-# and frozen sets, and a table of n equal hashes takes n^2 steps.
+# Most keys of tables and sets that are tuples or frozen sets: equal hashes can be chosen for them
+# (-1 and -2 have the same), and a table of n equal hashes takes n^2 steps.
 _MOST_ODD_KEYS = 1000
+# Deepest nesting while the steps are taken, where objects count twice or more: hashing a key calls
+# itself once a level without a bound of its own, until the stack of the process is full.
+_DEEPEST_STEPS = 4 * MAX_DEPTH
 # The hash of larger integers repeats.
 _LARGEST_INTEGER = 2**63
 _BYTE_ORDERS = "<>|="
-_KINDS = "biufcSU"
+_KINDS = "biufSU"
 
 
 class StandIn:
@@ -105,7 +109,7 @@ def load_pickle(
         raise BadInput(f"holds {size} bytes, more than the {max_bytes} that are read", where=path)
     try:
         with path.open("rb") as stream:
-            _check_steps(stream, max_steps)
+            _check_steps(_Exact(stream, size), max_steps, MAX_EXPANDED + size)
             stream.seek(0)
             loaded = _Unpickler(stream, path, stand_ins).load()
             _check_expanded(loaded, MAX_EXPANDED + size)
@@ -114,13 +118,44 @@ def load_pickle(
         raise
     # A damaged pickle can raise any exception.
     except Exception as error:
-        raise BadInput(f"is not a readable pickle ({error})", where=path) from error
+        raise BadInput(f"is not a readable pickle ({_reason(error)})", where=path) from error
 
 
-def _check_steps(stream: Any, most: int) -> None:
-    """Refuse steps that no pickler writes, before any is taken."""
-    odd_keys = 0
-    for count, (opcode, argument, _) in enumerate(pickletools.genops(stream)):
+def _reason(error: Exception) -> str:
+    """Say in one line why a pickle cannot be read, whatever the error says."""
+    if isinstance(error, KeyError):
+        return f"it refers to object {error}, which is not there"
+    text = shown(" ".join(str(error).split()))[:200]
+    return text or f"a step of it fails with {type(error).__name__}"
+
+
+class _Exact:
+    """A file that refuses to be read beyond its end, before room is made for what is not there."""
+
+    def __init__(self, stream: Any, size: int) -> None:
+        self._stream = stream
+        self.size = size
+        self.readline = stream.readline
+        self.tell = stream.tell
+
+    def read(self, count: int) -> bytes:
+        """Read some bytes; none at the end of the file."""
+        left = self.size - self._stream.tell()
+        if count > max(left, 1):
+            raise ValueError(f"it claims {count:,} bytes where {left:,} are left")
+        return bytes(self._stream.read(count))
+
+
+def _check_steps(stream: _Exact, most: int, most_size: int) -> None:
+    """Refuse steps that no pickler writes, before any is taken.
+
+    Args:
+        stream: the pickle.
+        most: largest number of steps.
+        most_size: largest size of what is hashed, and of any object that is made.
+    """
+    shape = _Shape(most_size)
+    for count, (opcode, argument, _) in enumerate(pickletools.genops(cast("Any", stream))):
         if count >= most:
             raise ValueError(f"more than {most:,} steps")
         # The reader makes room for the largest memo number.
@@ -128,9 +163,151 @@ def _check_steps(stream: Any, most: int) -> None:
             raise ValueError(f"memo number {argument} after {count} steps")
         if isinstance(argument, int) and abs(argument) > _LARGEST_INTEGER:
             raise ValueError("an absurdly large integer")
-        odd_keys += opcode.name == "FROZENSET"
-        if odd_keys > _MOST_ODD_KEYS:
-            raise ValueError(f"more than {_MOST_ODD_KEYS:,} frozen sets")
+        if opcode.name == "FRAME" and (argument or 0) > stream.size:
+            raise ValueError(f"it claims {argument:,} bytes of {stream.size:,}")
+        shape.take(opcode, argument)
+
+
+class _Made:
+    """An object that a step will make: its depth and its size."""
+
+    __slots__ = ("depth", "hashed", "size")
+
+    def __init__(self, depth: int = 0, size: int = 1, *, hashed: bool = False) -> None:
+        self.depth = depth
+        self.size = size
+        #: Whether it is a tuple or frozen set, whose hash looks at every part.
+        self.hashed = hashed
+
+
+#: What begins a group of parts on the stack.
+_MARK = _Made()
+
+
+class _Shape:
+    """Follows the steps of a pickle without taking them: how deep and large all becomes.
+
+    What is shared counts each time. A list or table that grows after it was put into another one
+    is followed no further: it has no hash, and `_check_expanded` measures it afterwards.
+    """
+
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._stack: list[_Made] = []
+        self._memo: dict[int, _Made] = {}
+        self._hashed = 0
+        self._odd_keys = 0
+
+    def take(self, opcode: pickletools.OpcodeInfo, argument: Any) -> None:
+        """Follow one step.
+
+        Raises:
+            ValueError: it takes what is not there, or makes something too deep or too large.
+        """
+        name = opcode.name
+        if name in _TUPLES:
+            self._make(self._some(_TUPLES[name]), hashed=True)
+        elif name in ("TUPLE", "FROZENSET"):
+            parts = self._group()
+            if name == "FROZENSET":
+                self._hash(parts)
+                self._odd_keys += 1
+            self._make(parts, hashed=True)
+        elif name in ("LIST", "DICT", "OBJ", "INST"):
+            parts = self._group()
+            if name == "DICT":
+                self._hash(parts[::2])
+            self._make(parts)
+        elif name in _ADDED:
+            many, first, step = _ADDED[name]
+            parts = self._group() if many else self._some(step)
+            self._hash(parts[first::step] if first is not None else [])
+            self._grow(parts)
+        elif name in ("REDUCE", "NEWOBJ", "NEWOBJ_EX"):
+            parts = self._some(3 if name == "NEWOBJ_EX" else 2)
+            # The function may make a set or table of them, and counts the odd keys itself.
+            self._hash(parts, odd=False)
+            self._make(parts)
+        elif name == "BUILD":
+            self._grow(self._some(1))
+        elif name in ("PUT", "BINPUT", "LONG_BINPUT"):
+            self._memo[argument] = self._top()
+        elif name == "MEMOIZE":
+            self._memo[len(self._memo)] = self._top()
+        elif name in ("GET", "BINGET", "LONG_BINGET"):
+            if argument not in self._memo:
+                raise ValueError(f"it refers to object {argument}, which is not there")
+            self._stack.append(self._memo[argument])
+        elif name == "MARK":
+            self._stack.append(_MARK)
+        elif name == "POP_MARK":
+            self._group()
+        elif name == "DUP":
+            self._stack.append(self._top())
+        else:
+            # Steps that only take something away or make something without parts.
+            self._some(len(opcode.stack_before))
+            self._stack += [_Made() for _ in opcode.stack_after]
+
+    def _top(self) -> _Made:
+        if not self._stack or self._stack[-1] is _MARK:
+            raise ValueError("a step takes more than is there")
+        return self._stack[-1]
+
+    def _some(self, count: int) -> list[_Made]:
+        if len(self._stack) < count:
+            raise ValueError("a step takes more than is there")
+        found = self._stack[len(self._stack) - count :]
+        del self._stack[len(self._stack) - count :]
+        return found
+
+    def _group(self) -> list[_Made]:
+        """Take the parts since the last mark, and the mark."""
+        found: list[_Made] = []
+        while self._stack:
+            part = self._stack.pop()
+            if part is _MARK:
+                return found[::-1]
+            found.append(part)
+        raise ValueError("a step takes more than is there")
+
+    def _make(self, parts: Sequence[_Made], *, hashed: bool = False) -> None:
+        made = _Made(1, hashed=hashed)
+        self._stack.append(made)
+        self._grow(parts)
+
+    def _grow(self, parts: Sequence[_Made]) -> None:
+        holder = self._top()
+        holder.depth = max([holder.depth, *(1 + part.depth for part in parts)])
+        holder.size += sum(part.size for part in parts)
+        if holder.depth > _DEEPEST_STEPS:
+            raise ValueError("it is nested too deeply")
+        if holder.size > self._most:
+            raise ValueError(f"it comes to more than {self._most:,} numbers and characters")
+
+    def _hash(self, keys: Sequence[_Made], *, odd: bool = True) -> None:
+        for key in keys:
+            self._hashed += key.size
+            self._odd_keys += odd and key.hashed
+        if self._hashed > _HASHED * self._most:
+            raise ValueError(f"its keys come to more than {_HASHED * self._most:,} values")
+        if self._odd_keys > _MOST_ODD_KEYS:
+            raise ValueError(f"more than {_MOST_ODD_KEYS:,} tuples and frozen sets as keys")
+
+
+#: Steps that make a tuple of the last values of the stack, with how many.
+_TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+#: Steps that add to what is there: whether by a group, which of the parts is the first key (None:
+#: none is), and of how many parts each addition is.
+_ADDED: dict[str, tuple[bool, int | None, int]] = {
+    "APPEND": (False, None, 1),
+    "APPENDS": (True, None, 1),
+    "SETITEM": (False, 0, 2),
+    "SETITEMS": (True, 0, 2),
+    "ADDITEMS": (True, 0, 1),
+}
+# Times of the largest size that all keys together may come to.
+_HASHED = 4
 
 
 def _check_expanded(loaded: Any, most: int) -> None:
@@ -196,8 +373,8 @@ class _Unpickler(pickle.Unpickler):
         full = f"{module}.{name}"
         if full in _ADMITTED:
             return _ADMITTED[full]
-        if full in _COUNTED:
-            return _Function(partial(self._make_counted, _COUNTED[full]))
+        if full in _HASHING:
+            return _Function(partial(self._make_of_keys, _HASHING[full]))
         if self._is_stand_in(module, full):
             if full not in self._classes:
                 self._classes[full] = type("StandIn", (StandIn,), {"origin": full})
@@ -209,10 +386,16 @@ class _Unpickler(pickle.Unpickler):
             remedy="Do not open this file with ordinary tools: it may run code.",
         )
 
-    def _make_counted(self, kind: type, *arguments: Any) -> Any:
-        self._counted += 1
+    def _make_of_keys(self, kind: type, *arguments: Any) -> Any:
+        """Make a set or table, whose keys `_MOST_ODD_KEYS` bounds."""
+        if any(not isinstance(parts, list | tuple | set | frozenset | dict) for parts in arguments):
+            raise TypeError(f"a {kind.__name__} of something that is not a list")
+        for item in itertools.chain(*arguments):
+            key = item[:1] if kind is OrderedDict and isinstance(item, list | tuple) else [item]
+            self._counted += any(isinstance(part, tuple | frozenset) for part in key)
+        self._counted += kind is frozenset
         if self._counted > _MOST_ODD_KEYS:
-            raise ValueError(f"more than {_MOST_ODD_KEYS:,} complex numbers and frozen sets")
+            raise ValueError(f"more than {_MOST_ODD_KEYS:,} tuples and frozen sets as keys")
         return kind(*arguments)
 
     def persistent_load(self, pid: Any) -> Any:
@@ -268,6 +451,10 @@ class _Dtype:
 class _Array(np.ndarray):
     """An array that takes its content only from bytes of the right length."""
 
+    def __setitem__(self, key: Any, value: Any) -> None:
+        # Indices that are arrays can come to far more elements than the pickle has.
+        raise TypeError("a pickle may not change parts of an array")
+
     def __setstate__(self, state: Any) -> None:
         _, shape, dtype, fortran, raw = state
         plain = _plain_dtype(dtype)
@@ -314,7 +501,7 @@ def _scalar(dtype: Any, raw: Any = b"") -> Any:
 
 def _from_buffer(buffer: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:
     flat = np.frombuffer(bytearray(_bytes_of(buffer)), dtype=_plain_dtype(dtype))
-    return flat.reshape(shape, order="F" if order == "F" else "C")
+    return flat.reshape(shape, order="F" if order == "F" else "C").view(_Array)
 
 
 def _encode(text: Any, codec: Any = "latin1") -> bytes:
@@ -346,14 +533,12 @@ def _admitted() -> dict[str, Any]:
         "numpy.ndarray": _NDARRAY,
         "numpy.dtype": _Dtype,
         "_codecs.encode": _Function(_encode),
-        "collections.OrderedDict": OrderedDict,
     }
     for core in ("numpy.core", "numpy._core"):  # the name changed in numpy 2
         names[f"{core}.multiarray._reconstruct"] = _Function(_reconstruct)
         names[f"{core}.multiarray.scalar"] = _Function(_scalar)
         names[f"{core}.numeric._frombuffer"] = _Function(_from_buffer)
     for builtins in ("builtins", "__builtin__"):  # Python 3 and 2
-        names[f"{builtins}.set"] = set
         names[f"{builtins}.bytes"] = _Function(_bytes)
         names[f"{builtins}.bytearray"] = _Function(_bytearray)
         names[f"{builtins}.object"] = _OBJECT
@@ -363,9 +548,9 @@ def _admitted() -> dict[str, Any]:
 
 
 _ADMITTED = _admitted()
-# What is made at most a number of times: see `_MOST_ODD_KEYS`.
-_COUNTED: dict[str, type] = {
-    f"{builtins}.{made.__name__}": made
-    for builtins in ("builtins", "__builtin__")
-    for made in (frozenset, complex)
+# What takes the hash of what it is made of.
+_HASHING: dict[str, type] = {
+    "collections.OrderedDict": OrderedDict,
+    **{f"{module}.set": set for module in ("builtins", "__builtin__")},
+    **{f"{module}.frozenset": frozenset for module in ("builtins", "__builtin__")},
 }

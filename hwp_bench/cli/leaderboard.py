@@ -41,8 +41,8 @@ _SHOW = """examples:
   hwp-bench leaderboard show --entries submission/leaderboard/entries
 
 One table for each suite and version of the protocol, best row first: rank with 95 % interval,
-scores, level and badge, and a sentence that says who wins and how surely. Rows that another entry
-revises are left out; rows that lack captures have no rank.
+scores, level and badge, and a sentence that says who wins and how surely. Each method has one row,
+of its newest entries that were checked furthest; rows that lack captures have no rank.
 """
 _SUBMIT = """examples:
   hwp-bench leaderboard submit runs/mine-mini -o submission --by "A. Person"
@@ -64,10 +64,20 @@ Checks schema, digests, protocol version, completeness, revisions, and that the 
 of the same data. Exit status 0: all is sound; 1: a file is damaged, changed or incomplete;
 2: an entry cannot stand with the others.
 """
+_REGISTER = """examples:
+  hwp-bench leaderboard register plain-mini-16s-seed0-0123abcd
+
+For the maintainers of a board. The names and titles of methods that ship with the toolkit belong to
+it: an entry that carries one is left out, and `check` refuses it, until its digest is listed in
+names.json, next to the folder of entries. `leaderboard add` lists what it adds.
+"""
 _CONFIRM = """examples:
   hwp-bench leaderboard confirm runs/mine-mini --by maintainers
   hwp-bench leaderboard confirm runs/second-run --by maintainers --tolerance 0.05
   hwp-bench leaderboard confirm runs/second-run --by maintainers --entry mine-mini-seed0-0123abcd
+
+Checks are never removed. Where checks of an entry contradict each other, the one that differs
+counts until a new check overrules it by name (--overrules, --reason).
 
 Verifies the results as `hwp-bench verify` does and writes a check next to the entry. Results of the
 entry itself make its level `rescored`; another run of the same method, settings, seed and budget
@@ -147,7 +157,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="captures (default: the result's suite)",
     )
+    confirm.add_argument(
+        "--overrules",
+        action="append",
+        default=[],
+        metavar="CHECK",
+        help="digest (8 digits at least) of a check of the entry that no longer counts",
+    )
+    confirm.add_argument("--reason", default="", metavar="TEXT", help="why it does not count")
     confirm.add_argument("--json", action="store_true", help="print the check as JSON")
+    register = action("register", "allow entries the names of methods that ship", _REGISTER)
+    register.add_argument("names", nargs="+", metavar="ENTRY", help="name of an entry")
     build = action("build", "write the static site", _BUILD)
     build.add_argument("-o", "--out", required=True, metavar="DIR", help="folder of the site")
     build.add_argument(
@@ -178,6 +198,7 @@ def run(args: argparse.Namespace) -> int:
         "show": _show,
         "check": _check,
         "confirm": _confirm,
+        "register": _register,
         "build": _build,
     }
     return work[args.action](args, folder)
@@ -237,14 +258,17 @@ def _submission(args: argparse.Namespace) -> Submission:
 
 def _check(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.entries import read_entries
+    from hwp_bench.leaderboard.names import check_names, read_names
     from hwp_bench.leaderboard.rules import check_complete, check_entries, check_unchanged
-    from hwp_bench.leaderboard.soundness import check_bound
+    from hwp_bench.leaderboard.soundness import check_bound, check_dates
 
     _refuse_none(folder)
     entries = check_entries(read_entries(folder))
     for entry in entries:
         check_complete(entry)
         check_bound(entry)
+        check_dates(entry)
+    check_names(entries, read_names(folder))
     new = check_unchanged(folder, Path(args.against)) if args.against else None
     _print_entries(entries, args.json)
     if not args.json:
@@ -297,6 +321,8 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
         by=args.by,
         name=args.entry,
         tolerance=args.tolerance,
+        overrules=args.overrules,
+        reason=args.reason,
     )
     notice(f"check: {write_check(folder, check)}")
     if args.json:
@@ -309,6 +335,23 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
             )
             print(f"  captures with the same predictions: {check.same_predictions}")
     return 0 if check.verdict == "reproduces" else 1
+
+
+def _register(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.progress import notice
+    from hwp_bench.leaderboard.entries import refuse_installed
+    from hwp_bench.leaderboard.names import NAME, register
+    from hwp_bench.leaderboard.soundness import readable_entries
+
+    refuse_installed(folder)
+    entries = {entry.name: entry for entry in readable_entries(folder)}
+    for name in args.names:
+        if name not in entries:
+            raise UsageError("is not an entry", where=folder, field=name)
+    added = register(folder, [entries[name] for name in args.names])
+    notice(f"{len(added)} entries added to {folder.parent / NAME}")
+    return 0
 
 
 def _build(args: argparse.Namespace, folder: Path) -> int:

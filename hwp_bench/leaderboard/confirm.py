@@ -28,6 +28,8 @@ def confirm(
     by: str,
     name: str | None = None,
     tolerance: float = TOLERANCE,
+    overrules: Sequence[str] = (),
+    reason: str = "",
 ) -> Check:
     """Check the entry that a result is of, or is a second run of.
 
@@ -42,15 +44,20 @@ def confirm(
         by: who checks.
         name: name of the entry; None takes the only one that fits.
         tolerance: largest difference in dB of a second run, 0 to 100.
+        overrules: digests, or at least their first eight digits, of checks of the entry that do
+            not count from now on.
+        reason: why they do not.
 
     Raises:
-        UsageError: no entry fits, several do, or the tolerance is out of range.
+        UsageError: no entry fits, several do, the tolerance is out of range, or there is no such
+            check to overrule.
         BadResult: a second run is itself not as it says, so that it cannot speak for the entry.
     """
     if not 0 <= tolerance <= 100:
         raise UsageError(f"{tolerance} is not between 0 and 100 dB", field="--tolerance")
     results = read_results(file)
     entry = entry_of(entries, results, name)
+    overruled = _overruled(entry, overrules)
     own = entry.results == results
     found = verify_results(file, captures)
     differences = len(found.discrepancies)
@@ -84,7 +91,25 @@ def confirm(
         if own
         else sum(theirs[item.id] == item.predictions_digest for item in results.captures),
         tolerance=0.0 if own else tolerance,
+        overrules=overruled,
+        reason=reason,
     )
+
+
+def _overruled(entry: Entry, named: Sequence[str]) -> list[str]:
+    """Return the digests of the checks that are named by their first digits."""
+    found = []
+    for start in named:
+        fitting = [check.digest for check in entry.checks if check.digest.startswith(start)]
+        if len(start) < 8 or len(fitting) != 1:
+            known = ", ".join(check.digest[:8] for check in entry.checks) or "none"
+            raise UsageError(
+                f"{start!r} is not one check of {entry.name}",
+                field="--overrules",
+                remedy=f"Its checks: {known}.",
+            )
+        found += fitting
+    return found
 
 
 def entry_of(entries: Sequence[Entry], results: Results, name: str | None) -> Entry:

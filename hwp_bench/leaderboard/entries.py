@@ -226,7 +226,7 @@ def read_entry(file: Path, checks: Sequence[Check]) -> Entry:
 
 def check_name(check: Check) -> str:
     """Return the name of a check's file: its entry, its kind, and part of its digest."""
-    return f"{check.entry}.{check.kind}-{sha256_json(asdict(check))[:8]}"
+    return f"{check.entry}.{check.kind}-{check.digest[:8]}"
 
 
 def write_check(folder: Path, check: Check) -> Path:
@@ -236,7 +236,7 @@ def write_check(folder: Path, check: Check) -> Path:
         UsageError: the folder belongs to an installed package.
     """
     refuse_installed(folder)
-    value = {"digest": sha256_json(asdict(check)), "check": asdict(check)}
+    value = {"digest": check.digest, "check": check.content}
     text = json.dumps({"schema": CHECK_SCHEMA, **value}, indent=1, allow_nan=False)
     return atomic_write(folder / CHECKS / f"{check_name(check)}.json", text + "\n")
 

@@ -14,6 +14,7 @@ from markupsafe import Markup
 from hwp_bench.leaderboard.board_rows import BoardRow
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.page_row import METRICS, SCOPES, Row
+from hwp_bench.leaderboard.rules import source_of
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.report.page.render import render_template, style_sheet
@@ -37,7 +38,7 @@ class MethodPage:
 
 
 def method_pages(rows: Sequence[tuple[BoardRow, Row]]) -> list[MethodPage]:
-    """Return a page for each method: rows of one name and title.
+    """Return a page for each method: rows of one name and of one who stands for it.
 
     Args:
         rows: rows of the board with what it shows of them.
@@ -45,11 +46,12 @@ def method_pages(rows: Sequence[tuple[BoardRow, Row]]) -> list[MethodPage]:
     found: dict[tuple[str, str], list[tuple[BoardRow, Row]]] = {}
     for row, shown in rows:
         method = row.first.method
-        found.setdefault((method.name, method.title), []).append((row, shown))
+        _, by = source_of(row.entries[0])
+        found.setdefault((method.name, by), []).append((row, shown))
     # Names come from outside: the number keeps two of them apart, whatever is left of them.
     return [
-        MethodPage(f"methods/{number}-{_slug(name)}.html", name, title, own)
-        for number, ((name, title), own) in enumerate(sorted(found.items(), key=lambda x: x[0]))
+        MethodPage(f"methods/{number}-{_slug(name)}.html", name, own[0][1].title, own)
+        for number, ((name, _), own) in enumerate(sorted(found.items(), key=lambda x: x[0]))
     ]
 
 

@@ -6,9 +6,11 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from hwp_bench.evaluation.completeness import missing
 from hwp_bench.leaderboard.board_rows import BoardRow
 from hwp_bench.leaderboard.entries import Entry
-from hwp_bench.leaderboard.rules import history
+from hwp_bench.leaderboard.records import LEVELS
+from hwp_bench.leaderboard.rules import takes_over
 from hwp_bench.leaderboard.severity_scopes import at_severity, suite_severities
 from hwp_bench.metrics.aggregate import CaptureScores, aggregate
 from hwp_bench.results.schema import score_rows
@@ -28,12 +30,32 @@ SEVERITIES = (1, 2, 3, 4, 5)
 
 
 @dataclass(frozen=True)
+class OlderRun:
+    """An entry of a method that does not stand for it any more, or not yet."""
+
+    #: Name of the entry.
+    name: str
+    #: Day of the evaluation, ISO 8601.
+    date: str
+    #: Its budget in words.
+    budget: str
+    #: The seed.
+    seed: int
+    #: PSNR, macro mean, dB.
+    psnr: float
+    #: How far it was checked, one of `records.LEVELS`.
+    level: str
+    #: Why it is not the row, in a few words.
+    why: str
+
+
+@dataclass(frozen=True)
 class Row:
     """One measured row: a method with one budget on one suite, over its seeds."""
 
     #: Name of its first entry, which stands for the row.
     name: str
-    #: Title of the method.
+    #: What the board calls the method.
     title: str
     #: Its suite.
     suite: str
@@ -56,22 +78,23 @@ class Row:
     level: str
     #: Its reproducibility badge, one of `records.BADGES`.
     badge: str
-    #: 1 for a first entry, one more for each correction; the largest of its entries.
-    revision: int
+    #: What the method had on the suite before, the newest first.
+    older: Sequence[OlderRun] = ()
 
 
-def make_row(row: BoardRow, entries: Sequence[Entry] = ()) -> Row:
+def make_row(row: BoardRow, label: str = "", older: Sequence[Entry] = ()) -> Row:
     """Return a row as the page shows it.
 
     Args:
         row: the row.
-        entries: those among which the ones that it revises are found.
+        label: what the board calls the method; empty takes its title.
+        older: other entries of the method on the suite.
     """
     found = [_scopes(entry) for entry in row.entries]
     captures = [capture for entry in row.entries for capture in entry.results.captures]
     return Row(
         name=row.entries[0].name,
-        title=row.first.method.title,
+        title=label or row.first.method.title,
         suite=row.first.suite,
         budget=budget_text(row.first.budget),
         device=", ".join(sorted({one.device for one in captures if one.device})) or "not said",
@@ -85,7 +108,30 @@ def make_row(row: BoardRow, entries: Sequence[Entry] = ()) -> Row:
         failed=sum(capture.failed_frames for capture in captures),
         level=row.level,
         badge=row.badge,
-        revision=max(1 + len(history(entry, entries)) for entry in row.entries),
+        older=[_older_run(entry, row, older) for entry in older],
+    )
+
+
+def _older_run(entry: Entry, row: BoardRow, older: Sequence[Entry]) -> OlderRun:
+    known = [*row.entries, *older]
+    corrections = [e for e in known if e.submission.revises == entry.name and takes_over(e, entry)]
+    if corrections:
+        why = f"replaced: {corrections[0].submission.reason}"
+    elif LEVELS.index(entry.level) < LEVELS.index(row.level):
+        why = "checked less far than the row"
+    elif missing(entry.results):
+        why = "lacks a part of the suite"
+    else:
+        why = "older than the row"
+    results = entry.results
+    return OlderRun(
+        name=entry.name,
+        date=results.started[:10],
+        budget=budget_text(results.budget),
+        seed=results.seed,
+        psnr=results.scores["psnr"],
+        level=entry.level,
+        why=why,
     )
 
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from dataclasses import asdict, dataclass, field
+from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import Count, Digest, Line, number
 from hwp_bench.results.bounds import MAX_CAPTURES, ScoreTable, check_scores
 
@@ -29,12 +30,13 @@ BADGES = {
     "not tried": "nobody has checked this row yet",
     "scores hold": "the predictions have these scores; the method was not run again",
     "reproduces": "a second run of the method had the same score within the tolerance",
-    "differs": "the latest check found other numbers than the row has",
+    "differs": "a check found other numbers than the row has",
+    "disputed": "its checks contradict each other; the one that differs counts",
 }
 #: What a link of a submission can lead to.
 LINKS = ("code", "paper", "predictions", "avatars")
 
-#: A moment, ISO 8601 in UTC: checks are in the order of their dates.
+#: A moment, ISO 8601 in UTC.
 Moment = Annotated[
     str,
     Meta(
@@ -108,6 +110,10 @@ class Check:
     same_predictions: Count = 0
     #: Largest difference of the macro mean of PSNR that still reproduces, dB.
     tolerance: float = number(0.0, 0.0, 100.0)
+    #: Digests of checks of the same entry that this one takes out of force.
+    overrules: Annotated[list[Digest], Meta(max_length=100)] = field(default_factory=list)
+    #: Why it does; empty where it overrules none.
+    reason: Line = ""
 
     def __post_init__(self) -> None:
         check_scores(self.scores)
@@ -117,24 +123,64 @@ class Check:
             raise UsageError("belongs to a second run, and this is none", field="rerun")
         if self.kind == "re-run" and (self.rerun is None or "psnr" not in self.scores):
             raise UsageError("must have the digest and PSNR of the second run", field="rerun")
+        if bool(self.overrules) != bool(self.reason):
+            raise UsageError("who overrules a check gives a reason", field="reason")
+
+    @property
+    def content(self) -> dict[str, Any]:
+        """Its fields as its file holds them; those that are of no use in it are left out."""
+        fields = asdict(self)
+        return fields if self.overrules else _without(fields, "overrules", "reason")
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) of its content, by which another check overrules it."""
+        return sha256_json(self.content)
 
 
-def latest(checks: Iterable[Check]) -> dict[str, Check]:
-    """Return the last check of each kind; a later check overrules an earlier one."""
-    return {check.kind: check for check in sorted(checks, key=lambda item: item.date)}
+def _without(fields: dict[str, Any], *names: str) -> dict[str, Any]:
+    return {name: value for name, value in fields.items() if name not in names}
+
+
+def in_force(checks: Iterable[Check]) -> list[Check]:
+    """Return the checks of an entry that no other one overrules, in the order given.
+
+    A check that is itself overruled overrules none. Dates decide nothing: they can be forged.
+    """
+    waiting = list(checks)
+    everything = list(waiting)
+    kept: dict[str, bool] = {}
+    while waiting:
+        ready = []
+        for check in waiting:
+            above = [other.digest for other in everything if check.digest in other.overrules]
+            if all(digest in kept for digest in above):
+                ready.append((check, not any(kept[digest] for digest in above)))
+        # A digest cannot hold itself, so that there is always one that nothing undecided overrules.
+        for check, stays in ready:
+            kept[check.digest] = stays
+            waiting.remove(check)
+        if not ready:
+            break
+    return [check for check in everything if kept.get(check.digest, False)]
 
 
 def level(checks: Iterable[Check]) -> str:
-    """Return how far a row was checked: the highest of `LEVELS` whose last check found it again."""
-    found = [check.kind for check in latest(checks).values() if check.verdict == "reproduces"]
-    return max(["self-reported", *found], key=LEVELS.index)
+    """Return how far a row was checked: the highest of `LEVELS` that no check in force denies."""
+    found = in_force(checks)
+    denied = {check.kind for check in found if check.verdict == "differs"}
+    held = {check.kind for check in found} - denied
+    return max(["self-reported", *held], key=LEVELS.index)
 
 
 def badge(checks: Iterable[Check]) -> str:
     """Return the reproducibility badge of a row, one of `BADGES`."""
-    last = latest(checks)
-    if any(check.verdict == "differs" for check in last.values()):
+    found = in_force(checks)
+    denied = {check.kind for check in found if check.verdict == "differs"}
+    if any(check.kind in denied and check.verdict == "reproduces" for check in found):
+        return "disputed"
+    if denied:
         return "differs"
     return {"self-reported": "not tried", "rescored": "scores hold", "re-run": "reproduces"}[
-        level(last.values())
+        level(found)
     ]

@@ -10,6 +10,7 @@ from typing import Any
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.evaluation.completeness import missing
 from hwp_bench.leaderboard.entries import Entry
+from hwp_bench.leaderboard.names import is_shipped
 from hwp_bench.leaderboard.records import LEVELS
 from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.metrics import HWP_V1, PROTOCOLS
@@ -51,9 +52,37 @@ def tables_of(entries: Iterable[Entry]) -> dict[tuple[str, str], list[Entry]]:
 
 
 def current(entries: Sequence[Entry]) -> list[Entry]:
-    """Return the entries that no other one revises: those that are ranked."""
-    revised = {entry.submission.revises for entry in entries}
-    return [entry for entry in entries if entry.name not in revised]
+    """Return the entries that no other one takes the place of."""
+    replaced = {
+        former.name
+        for entry in entries
+        for former in history(entry, entries)
+        if takes_over(entry, former)
+    }
+    return [entry for entry in entries if entry.name not in replaced]
+
+
+def takes_over(revision: Entry, revised: Entry) -> bool:
+    """Whether a revision takes the place of an entry that it, or what it revises, names.
+
+    It must be of the same method, submitter and suite, and checked at least as far: a correction
+    of a row that was checked waits for a check of its own.
+    """
+    return (
+        source_of(revision) == source_of(revised)
+        and revision.results.suite == revised.results.suite
+        and LEVELS.index(revision.level) >= LEVELS.index(revised.level)
+    )
+
+
+def source_of(entry: Entry) -> tuple[str, str]:
+    """Return what makes a method of the board: its name, and who stands for it.
+
+    The names of methods that ship are the toolkit's own, whoever ran them: see
+    `names.check_names`.
+    """
+    name = entry.results.method.name
+    return name, "" if is_shipped(name) else entry.submission.by
 
 
 def history(entry: Entry, entries: Sequence[Entry]) -> list[Entry]:
@@ -187,12 +216,16 @@ def check_revisions(entries: Sequence[Entry]) -> None:
         if name is None:
             continue
         problem = None
+        remedy = "Name the latest entry of the method with --revises."
         if name not in named:
             problem = f"revises {name}, which is not there"
         elif named[name].results.method.name != entry.results.method.name or (
             named[name].results.suite != entry.results.suite
         ):
             problem = f"revises {name}, which is of another method or suite"
+        elif source_of(named[name]) != source_of(entry):
+            problem = f"revises {name}, which somebody else stands for"
+            remedy = "Submit it as an entry of its own, without --revises."
         elif name in revised:
             problem = f"revises {name}, which {revised[name]} revises already"
         if problem:
@@ -200,7 +233,7 @@ def check_revisions(entries: Sequence[Entry]) -> None:
                 problem,
                 where=entry.name,
                 field="revises",
-                remedy="Name the latest entry of the method with --revises.",
+                remedy=remedy,
             )
         revised[name] = entry.name
 

@@ -11,7 +11,7 @@ from markupsafe import Markup
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, canonical_json
-from hwp_bench.leaderboard.board_rows import BoardRow, board_rows
+from hwp_bench.leaderboard.board_rows import BoardRow, MethodRow, method_rows
 from hwp_bench.leaderboard.curve_plot import curve_plot
 from hwp_bench.leaderboard.entries import Entry, digest
 from hwp_bench.leaderboard.gallery import write_gallery
@@ -26,7 +26,7 @@ from hwp_bench.leaderboard.page_row import (
     severities_of,
 )
 from hwp_bench.leaderboard.records import BADGES, LEVEL_TEXTS
-from hwp_bench.leaderboard.rules import SUITES, check_entries, current, tables_of
+from hwp_bench.leaderboard.rules import SUITES, check_entries, tables_of
 from hwp_bench.leaderboard.standings import rank_interval, ranks_of
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
@@ -123,15 +123,16 @@ def _title_budget_digest(results: Results) -> str:
 def shown_rows(entries: Sequence[Entry]) -> list[tuple[BoardRow, Row]]:
     """Return the rows of this version's protocol with what the page shows of them, best first."""
     found = [
-        (row, make_row(row, entries))
-        for (_, protocol), rows in tables_of(current(entries)).items()
+        (method.row, make_row(method.row, method.label, method.older))
+        for (_, protocol), rows in tables_of(entries).items()
         if protocol == HWP_V1.name
-        for row in board_rows(rows)
+        for method in method_rows(rows)
     ]
     return sorted(
         found,
         key=lambda pair: (
             SUITES.index(pair[1].suite),
+            not pair[0].whole,
             -(pair[1].scores["macro"]["psnr"] or 0.0),
             pair[1].name,
         ),
@@ -160,7 +161,8 @@ def board_page(
     plots = {}
     for suite in suites:
         table = [row for row, shown in found if shown.suite == suite]
-        placed, verdicts[suite] = ranks_of(table)
+        named = [MethodRow(row, shown.title) for row, shown in found if shown.suite == suite]
+        placed, verdicts[suite] = ranks_of(named)
         ranks |= {name: (rank.rank, rank_interval(rank)) for name, rank in placed.items()}
         leads.append(reference_lead(table))
         plots[suite] = curve_plot(table)

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 from hwp_bench.base.errors import BadResult, HwpError, UsageError
@@ -19,8 +20,15 @@ from hwp_bench.evaluation.capture_evaluation import RESULT
 from hwp_bench.evaluation.completeness import wrong_labels
 from hwp_bench.evaluation.evaluation_key import key_of
 from hwp_bench.leaderboard.entries import Entry, entry_files, read_checks, read_entry
+from hwp_bench.leaderboard.names import check_names, read_names
 from hwp_bench.leaderboard.records import Check
-from hwp_bench.leaderboard.rules import check_entries, check_revisions, off_the_data, tables_of
+from hwp_bench.leaderboard.rules import (
+    check_entries,
+    check_revisions,
+    off_the_data,
+    source_of,
+    tables_of,
+)
 from hwp_bench.leaderboard.suite_data import CaptureData, known_data
 from hwp_bench.metrics import HWP_V1, metric_names, penalty
 from hwp_bench.results import CaptureResult
@@ -28,6 +36,8 @@ from hwp_bench.results.bounds import MAX_BYTES
 
 #: By how much a fit may last longer than the process around it, s: two clocks.
 _CLOCKS = 1e-3
+#: By how much the clocks of two machines may differ.
+_SKEW = timedelta(minutes=10)
 #: By how much sums in another order may differ.
 _ROUNDING = 1e-9
 
@@ -52,6 +62,66 @@ def check_bound(entry: Entry) -> None:
         _check_times(entry, capture)
     for check in entry.checks:
         _check_verdict(entry, check)
+        _check_overruling(entry, check)
+
+
+def check_dates(entry: Entry, now: datetime | None = None) -> None:
+    """Refuse an entry or a check of it that is dated after now, or a check before its entry.
+
+    Args:
+        entry: the entry.
+        now: the time, UTC; None asks the clock.
+
+    Raises:
+        BadResult: a date is false; it is named.
+    """
+    latest = (now or datetime.now(UTC)) + _SKEW
+    started = datetime.fromisoformat(entry.results.started)
+    if started.tzinfo is None:
+        started = started.replace(tzinfo=UTC)
+    if started > latest:
+        raise _wrong(entry, "started", f"is {entry.results.started}, which is not yet")
+    for check in entry.checks:
+        _check_date(entry, check, started, latest)
+
+
+def _check_date(entry: Entry, check: Check, started: datetime, latest: datetime) -> None:
+    date = datetime.fromisoformat(check.date)
+    if date > latest or date < started:
+        problem = "is not yet" if date > latest else f"is before {entry.results.started}, its run"
+        raise BadResult(
+            f"is dated {check.date}, which {problem}",
+            where=entry.name,
+            field=f"checks, {check.kind} {check.digest[:8]}",
+            remedy="Look at the clock of the machine; check again with "
+            "`hwp-bench leaderboard confirm`.",
+        )
+
+
+def _check_overruling(entry: Entry, check: Check) -> None:
+    known = {other.digest for other in entry.checks}
+    if unknown := [digest for digest in check.overrules if digest not in known]:
+        field = f"checks, {check.kind} of {check.date}"
+        raise _wrong(entry, field, f"overrules {unknown[0][:8]}, which is not a check of the entry")
+
+
+def without_false_checks(entry: Entry, now: datetime | None = None) -> Entry:
+    """Return the entry without checks that are false; each of them is said."""
+    kept = []
+    for check in entry.checks:
+        alone = replace(entry, checks=(check,))
+        try:
+            check_dates(alone, now)
+            if entry.protocol == HWP_V1.name:
+                _check_verdict(entry, check)
+                _check_overruling(entry, check)
+        except BadResult as error:
+            if error.field == "started":
+                raise
+            notice(f"left out: {error}")
+        else:
+            kept.append(check)
+    return replace(entry, checks=tuple(kept))
 
 
 def _check_data(entry: Entry, capture: CaptureResult, data: CaptureData | None) -> None:
@@ -160,9 +230,13 @@ def sound_entries(folder: Path) -> list[Entry]:
     `hwp-bench leaderboard check` refuses it.
     """
     entries: list[Entry] = []
+    listed = read_names(folder)
     for entry in readable_entries(folder):
         try:
             check_entries([_alone(entry)])
+            check_names([entry], listed)
+            check_dates(replace(entry, checks=()))
+            entry = without_false_checks(entry)
             check_bound(entry)
         except HwpError as error:
             notice(f"left out: {error}")
@@ -213,7 +287,13 @@ def _without_false_revisions(entries: Sequence[Entry]) -> list[Entry]:
             try:
                 check_revisions([*kept, entry])
             except UsageError as error:
-                notice(f"left out: {error}")
+                revised = [e for e in kept if e.name == entry.submission.revises]
+                if revised and source_of(revised[0]) != source_of(entry):
+                    # Somebody else's row: it stands for itself.
+                    notice(f"{error.where}: {error.problem}: it is a row of its own")
+                    kept.append(_alone(entry))
+                else:
+                    notice(f"left out: {error}")
             else:
                 kept.append(entry)
     for entry in waiting:

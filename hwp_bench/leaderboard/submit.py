@@ -10,6 +10,7 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import atomic_folder, files_digest, sha256_of
 from hwp_bench.evaluation.scoring import predictions_digest, read_predictions
 from hwp_bench.leaderboard.entries import Entry, make_entry, refuse_installed, write_entry
+from hwp_bench.leaderboard.names import register
 from hwp_bench.leaderboard.records import Submission
 from hwp_bench.leaderboard.rules import check_complete, check_current, check_entries
 from hwp_bench.leaderboard.soundness import check_bound, sound_entries
@@ -38,6 +39,8 @@ class Submitted:
 def add_entry(folder: Path, results: Results) -> Path:
     """Write an entry of results without a submission; returns its file.
 
+    An entry under the name of a method that ships is registered: see `names`.
+
     Raises:
         BadResult, UsageError: the results are not fit for the leaderboard, or do not go together
             with the sound entries that are there.
@@ -46,7 +49,9 @@ def add_entry(folder: Path, results: Results) -> Path:
     check_current(entry)
     check_entries([*sound_entries(folder), entry])
     check_bound(entry)
-    return write_entry(folder, entry)
+    file = write_entry(folder, entry)
+    register(folder, [entry])
+    return file
 
 
 def submit(

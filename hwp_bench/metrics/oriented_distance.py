@@ -45,11 +45,11 @@ def oriented_distance(
 ) -> float:
     """Distance of two images on the pixels of `mask`, both black outside it.
 
-    On each of four scales every pixel gets a vector of 18 channels, none negative: the local
-    mean m of red, green and blue and its complement 1 - m, and for brightness and two opponent
-    colours the energy in four directions. Vectors are brought to length 1; half the squared
-    difference of the two images' vectors is averaged over the mask (weighted by its share of
-    the pixel at that scale), then over the scales.
+    On each of four scales every pixel gets a vector of ten channels, none negative: the local
+    mean m of red, green and blue and its complement 1 - m, each divided by sqrt(3), and the
+    energy of brightness in four directions, times `CONTRAST_GAIN`. Vectors are brought to
+    length 1; half the squared difference of the two images' vectors is averaged over the mask
+    (weighted by its share of the pixel at that scale), then over the scales.
 
     Args:
         prediction: (H, W, 3) float in [0, 1], sRGB.

@@ -59,8 +59,10 @@ if (typeof document !== "undefined") {
   (function () {
     var table = document.getElementById("measured");
     if (!table) { return; }
-    var body = table.tBodies[0];
-    var rows = Array.prototype.slice.call(body.rows);
+    var groups = Array.prototype.map.call(table.tBodies, function (body) {
+      return { body: body, rows: Array.prototype.slice.call(body.querySelectorAll("tr[data-suite]")) };
+    });
+    var rows = groups.reduce(function (all, group) { return all.concat(group.rows); }, []);
     var buttons = Array.prototype.slice.call(table.querySelectorAll("th button"));
     var selects = {
       suite: document.getElementById("suite"),
@@ -99,9 +101,13 @@ if (typeof document !== "undefined") {
       Array.prototype.forEach.call(document.querySelectorAll(".suite-plot"), function (plot) {
         plot.hidden = !Board.shown({ suite: plot.dataset.suite }, { suite: state.suite });
       });
-      var cells = rows.map(function (row) { return value(row, state.sort); });
-      Board.order(cells, state.down === "1").forEach(function (index) {
-        body.appendChild(rows[index]);
+      // Rows are compared within their suite alone.
+      groups.forEach(function (group) {
+        var cells = group.rows.map(function (row) { return value(row, state.sort); });
+        Board.order(cells, state.down === "1").forEach(function (index) {
+          group.body.appendChild(group.rows[index]);
+        });
+        group.body.hidden = group.rows.every(function (row) { return row.hidden; });
       });
       buttons.forEach(function (button) {
         var on = button.dataset.sort === state.sort;

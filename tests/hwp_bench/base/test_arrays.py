@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import warnings
 import zipfile
 from pathlib import Path
 
@@ -58,6 +59,10 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
             "claims 8000000000000 bytes",
         ),
         (_header("{'descr': '|O', 'fortran_order': False, 'shape': ()}"), "Object arrays|claims"),
+        (
+            _header("{'descr': '<U0', 'fortran_order': False, 'shape': (2147483647, 2147483647)}"),
+            "elements of no bytes",
+        ),
         (_header("[" * 90), "not a readable array file"),
         (b"plain text", "not a readable array file"),
         (b"", "not a readable array file"),
@@ -67,6 +72,17 @@ def test_a_bomb_is_refused_before_it_is_unpacked(tmp_path: Path) -> None:
 def test_headers_that_lie_are_refused(tmp_path: Path, content: bytes, problem: str) -> None:
     with pytest.raises(BadInput, match=problem):
         read_npz(_archive(tmp_path / "file.npz", "a.npy", content))
+
+
+@pytest.mark.parametrize("names", [["a.npy", "a.npy"], [f"{i}.npy" for i in range(10_001)]])
+def test_arrays_are_there_once_and_not_too_many(tmp_path: Path, names: list[str]) -> None:
+    file = tmp_path / "file.npz"
+    with warnings.catch_warnings(), zipfile.ZipFile(file, "w") as archive:
+        warnings.simplefilter("ignore")
+        for name in names:
+            archive.writestr(name, b"")
+    with pytest.raises(BadInput, match="more than 10,000 arrays, or one twice"):
+        read_npz(file)
 
 
 def test_objects_are_refused_and_not_unpickled(tmp_path: Path) -> None:

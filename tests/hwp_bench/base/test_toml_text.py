@@ -29,6 +29,8 @@ DEEP = "[" * 5000 + "]" * 5000
         ("'" + "x" * MAX_CHARACTERS + "'", "more than"),
         ("1 2", "not valid TOML"),
         ('"\\ud800"', "not valid TOML"),
+        ("1\n" + ".".join("a" * 450_000) + " = 1", "nested too deeply"),
+        ("1\n[" + " . ".join(['"a"'] * 100_000) + "]", "nested too deeply"),
     ],
 )
 def test_what_is_out_of_bounds_is_one_message(value: str, problem: str) -> None:

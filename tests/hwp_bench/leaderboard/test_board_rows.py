@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 from made_entries import check_of, complete_results
 
-from hwp_bench.leaderboard.board_rows import board_rows
+from hwp_bench.leaderboard.board_rows import board_rows, method_rows
 from hwp_bench.leaderboard.entries import make_entry
 from hwp_bench.leaderboard.records import Submission
 from hwp_bench.leaderboard.standings import board_tables
@@ -49,14 +49,67 @@ def test_an_incomplete_entry_and_a_second_one_of_a_seed_stand_alone() -> None:
 def test_a_row_was_checked_as_far_as_every_one_of_its_entries() -> None:
     first, second = (make_entry(results("mine", 24.0, seed)) for seed in (0, 1))
     first = replace(first, checks=(check_of(first, "re-run", "reproduces"),))
-    (row,) = board_rows([first, second])
-    assert (row.level, row.badge) == ("self-reported", "not tried")
-    second = replace(second, checks=(check_of(second, "rescored", "reproduces"),))
-    (row,) = board_rows([first, second])
-    assert (row.level, row.badge) == ("rescored", "scores hold")
-    second = replace(second, checks=(check_of(second, "rescored", "differs"),))
-    (row,) = board_rows([first, second])
-    assert row.badge == "differs"
+    # A seed that was checked less far is no part of a row.
+    assert [(row.level, row.badge) for row in board_rows([first, second])] == [
+        ("re-run", "reproduces"),
+        ("self-reported", "not tried"),
+    ]
+    checks = check_of(second, "rescored", "reproduces"), check_of(second, "re-run", "reproduces")
+    (row,) = board_rows([first, replace(second, checks=checks)])
+    assert (row.level, row.badge) == ("re-run", "reproduces")
+    checks = check_of(second, "rescored", "differs"), check_of(second, "re-run", "reproduces")
+    (row,) = board_rows([first, replace(second, checks=checks)])
+    assert (row.level, row.badge) == ("re-run", "differs")
+
+
+def test_a_stranger_moves_no_row_by_a_seed_or_a_revision() -> None:
+    """A checked row of 24 dB, and entries of 5 dB of others, or of less checked runs."""
+    mine = make_entry(results("mine", 24.0, 0), Submission(by="A"))
+    checked = replace(mine, checks=(check_of(mine),))
+    why = {"revises": mine.name, "reason": "better"}
+    for number, (seed, added) in enumerate(
+        [
+            (7, Submission(by="A")),
+            (0, Submission(by="A", **why)),
+            (7, Submission(by="B")),
+            (0, Submission(by="B", **why)),
+        ]
+    ):
+        other = make_entry(results("mine", 5.0, seed), added)
+        own, *strange = method_rows([other, checked] if number % 2 else [checked, other])
+        if added.by == "B":
+            named = {method.label for method in (own, *strange)}
+            assert named == {"Mine (by A)", "Mine (by B)"}
+            own = next(m for m in (own, *strange) if m.row.entries == (checked,))
+            assert not own.older
+        else:
+            assert own.older == (other,)
+        assert own.row.entries == (checked,)
+        # What was checked as far, and is of the same submitter, does take the place.
+        revised = replace(other, checks=(check_of(other),))
+        taken = any(method.row.entries == (revised,) for method in method_rows([checked, revised]))
+        assert taken == (added.by == "B" or seed == 0)
+
+
+def test_the_row_of_a_method_is_its_newest_and_the_others_are_its_history() -> None:
+    runs = [
+        make_entry(
+            replace(
+                results("mine", 20.0 + day, 0),
+                started=f"2026-01-0{day}T00:00:00+00:00",
+                budget={"seconds": float(day), "steps": None},
+            )
+        )
+        for day in (2, 3, 1)
+    ]
+    (method,) = method_rows(runs)
+    assert method.label == "Mine"
+    assert method.row.entries == (runs[1],)
+    assert method.older == (runs[0], runs[2])
+    # A run that was checked stays ahead of newer ones that were not.
+    checked = replace(runs[2], checks=(check_of(runs[2]),))
+    (method,) = method_rows([*runs[:2], checked])
+    assert method.row.entries == (checked,)
 
 
 def test_seconds_are_means_over_seeds_or_unknown() -> None:

@@ -18,7 +18,15 @@ from hwp_bench.leaderboard.entries import (
     write_check,
     write_entry,
 )
-from hwp_bench.leaderboard.records import BADGES, LEVELS, Check, Submission, badge, level
+from hwp_bench.leaderboard.records import (
+    BADGES,
+    LEVELS,
+    Check,
+    Submission,
+    badge,
+    in_force,
+    level,
+)
 from hwp_bench.leaderboard.rules import check_entries, current, history, tables_of
 
 
@@ -42,21 +50,24 @@ def check_of(entry: Entry, kind: str, verdict: str = "reproduces", day: int = 1)
     )
 
 
-def test_a_row_has_the_level_of_its_last_checks(make_results) -> None:
+def test_a_row_has_the_level_that_none_of_its_checks_denies(make_results) -> None:
     """Every order of two kinds of check with two verdicts, against the rule written out."""
     entry = make_entry(make_results())
     kinds = list(itertools.product(("rescored", "re-run"), ("reproduces", "differs")))
     for count in range(4):
         for chosen in itertools.product(kinds, repeat=count):
             checks = [check_of(entry, *item, day=day + 1) for day, item in enumerate(chosen)]
-            last = dict(chosen)
+            told = {kind: {v for k, v in chosen if k == kind} for kind in ("rescored", "re-run")}
             wanted = "self-reported"
-            if last.get("rescored") == "reproduces":
+            if told["rescored"] == {"reproduces"}:
                 wanted = "rescored"
-            if last.get("re-run") == "reproduces":
+            if told["re-run"] == {"reproduces"}:
                 wanted = "re-run"
+            # Dates and order decide nothing.
             assert level(reversed(checks)) == wanted
-            if "differs" in last.values():
+            if any(len(verdicts) == 2 for verdicts in told.values()):
+                assert badge(checks) == "disputed"
+            elif {"differs"} in told.values():
                 assert badge(checks) == "differs"
             else:
                 assert (
@@ -64,6 +75,26 @@ def test_a_row_has_the_level_of_its_last_checks(make_results) -> None:
                     == ("not tried", "scores hold", "reproduces")[LEVELS.index(wanted)]
                 )
             assert badge(checks) in BADGES
+
+
+def test_a_check_is_overruled_by_name_and_never_by_its_date(make_results, tmp_path: Path) -> None:
+    entry = make_entry(make_results())
+    forged = replace(check_of(entry, "re-run"), date="2099-01-01T00:00:00+00:00")
+    honest = check_of(entry, "re-run", "differs")
+    assert (level([forged, honest]), badge([honest, forged])) == ("self-reported", "disputed")
+    final = replace(honest, overrules=[forged.digest], reason="this run was never made")
+    assert (level([forged, final]), badge([forged, final])) == ("self-reported", "differs")
+    # A check that was wrong itself is overruled in turn, and then overrules none.
+    last = replace(check_of(entry, "re-run"), overrules=[final.digest], reason="wrong camera")
+    assert in_force([final, last, forged]) == [last, forged]
+    assert (level([final, last, forged]), badge([final, last])) == ("re-run", "reproduces")
+    write_entry(tmp_path, entry)
+    for check in (forged, final, last):
+        write_check(tmp_path, check)
+    (read,) = read_entries(tmp_path)
+    assert {check.digest for check in read.checks} == {forged.digest, final.digest, last.digest}
+    with pytest.raises(UsageError, match="gives a reason"):
+        replace(honest, overrules=[forged.digest])
 
 
 def test_a_submission_and_its_checks_come_back(make_results, tmp_path: Path) -> None:

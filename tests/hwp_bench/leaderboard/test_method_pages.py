@@ -23,7 +23,7 @@ EVIL = "</td><script>alert(1)</script>"
 
 
 def rows_of(*entries):
-    return [(row, make_row(row, entries)) for row in board_rows(entries)]
+    return [(row, make_row(row)) for row in board_rows(entries)]
 
 
 def written(folder: Path, *entries, scenes=()) -> dict[str, str]:
@@ -41,7 +41,7 @@ def test_a_page_says_what_its_numbers_were_made_with(tmp_path: Path) -> None:
         results("plain", budget={"seconds": 16.0, "steps": None}),
         Submission(by="A. Person", links={"code": "https://example.org/x"}),
     )
-    second = make_entry(replace(first.results, seed=1))
+    second = make_entry(replace(first.results, seed=1), first.submission)
     page = written(tmp_path, first, second)["Plain"]
     captures = first.results.captures
     for text in (

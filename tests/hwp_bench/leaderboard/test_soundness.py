@@ -10,14 +10,22 @@ from pathlib import Path
 import pytest
 from made_entries import check_of, complete_results, with_keys
 
-from hwp_bench.base.errors import BadResult
+from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import cache_root, sha256_json
 from hwp_bench.base.records import parse_record
 from hwp_bench.cli.main import main
-from hwp_bench.leaderboard.board_rows import board_rows
-from hwp_bench.leaderboard.entries import entry_name, make_entry, read_entries, write_check
+from hwp_bench.leaderboard.board_rows import method_rows
+from hwp_bench.leaderboard.entries import (
+    entry_name,
+    make_entry,
+    read_entries,
+    write_check,
+    write_entry,
+)
+from hwp_bench.leaderboard.names import check_names, register
+from hwp_bench.leaderboard.records import Submission
 from hwp_bench.leaderboard.rules import off_the_data
-from hwp_bench.leaderboard.soundness import sound_entries
+from hwp_bench.leaderboard.soundness import check_dates, sound_entries
 from hwp_bench.leaderboard.standings import ranks_of
 from hwp_bench.leaderboard.submit import add_entry
 from hwp_bench.leaderboard.suite_data import (
@@ -282,8 +290,9 @@ def test_entries_on_data_that_were_rounded_otherwise_stand(
     add_entry(tmp_path, after)
     assert on_current_data(before).captures[0].digest == "a" * 64
     assert on_current_data(after) == after
-    rows = board_rows(sound_entries(tmp_path))
-    ranks, sentence = ranks_of(rows)
+    methods = method_rows(sound_entries(tmp_path))
+    ranks, sentence = ranks_of(methods)
+    rows = [method.row for method in methods]
     assert "+1.00 dB against Before" in sentence
     assert {row.first.method.name: ranks[row.entries[0].name].rank for row in rows} == {
         "after": 1,
@@ -301,3 +310,70 @@ def test_a_suite_that_was_not_rendered_yet_binds_no_new_entry(
     captures = [replace(c, digest="c" * 64) for c in before.captures]
     add_entry(tmp_path / "new", with_keys(replace(before, captures=captures)))
     assert len(sound_entries(tmp_path / "old")) == len(sound_entries(tmp_path / "new")) == 1
+
+
+@pytest.mark.parametrize(
+    ("started", "checked", "problem"),
+    [
+        ("2099-01-01T00:00:00+00:00", None, "which is not yet"),
+        ("2026-01-02T00:00:00+00:00", "2099-01-01T00:00:00+00:00", "which is not yet"),
+        ("2026-01-02T00:00:00+00:00", "2026-01-01T00:00:00+00:00", "its run"),
+    ],
+)
+def test_false_dates_are_refused(started: str, checked: str | None, problem: str) -> None:
+    entry = make_entry(replace(complete_results("mine"), started=started))
+    if checked:
+        entry = replace(entry, checks=(replace(check_of(entry), date=checked),))
+    with pytest.raises(BadResult, match=problem):
+        check_dates(entry)
+    check_dates(make_entry(complete_results("mine")))
+
+
+def test_a_false_check_is_left_out_and_takes_no_row_away(tmp_path: Path, capsys) -> None:
+    file = add_entry(tmp_path, complete_results("mine"))
+    (entry,) = read_entries(tmp_path)
+    for check in (
+        replace(check_of(entry, "re-run"), date="2099-01-01T00:00:00+00:00"),
+        replace(check_of(entry), frames=10**6),
+        replace(check_of(entry), overrules=["0" * 64], reason="none"),
+    ):
+        written = write_check(tmp_path, check)
+        (read,) = sound_entries(tmp_path)
+        assert (read.name, read.checks) == (file.stem, ())
+        assert "left out: " in capsys.readouterr().err
+        assert main(["leaderboard", "check", "--entries", str(tmp_path)]) == 1
+        written.unlink()
+
+
+@pytest.mark.parametrize(
+    ("name", "title"),
+    [("wildghand", "Mine"), ("mine", "WildGHand"), ("mine", "WiIdGHand"), ("Plain", "P"),
+     ("mine", "Wild G-Hand"), ("mine", "PLAIN FIT"), ("w1ldghand", "Mine")],
+)  # fmt: skip
+def test_the_name_of_a_method_that_ships_is_nobody_elses(
+    tmp_path: Path, name: str, title: str
+) -> None:
+    results = complete_results(name, 60.0)
+    results = with_keys(replace(results, method=replace(results.method, title=title)))
+    entry = make_entry(results)
+    folder = tmp_path / "entries"
+    write_entry(folder, entry)
+    assert sound_entries(folder) == []
+    assert main(["leaderboard", "check", "--entries", str(folder)]) == 2
+    with pytest.raises(UsageError, match="a method that ships"):
+        check_names([entry], frozenset())
+    assert register(folder, [entry]) == [entry]
+    assert [one.name for one in sound_entries(folder)] == [entry.name]
+
+
+def test_a_revision_of_somebody_elses_row_is_a_row_of_its_own(tmp_path: Path, capsys) -> None:
+    mine = make_entry(complete_results("mine", 24.0), Submission(by="A"))
+    why = Submission(by="B", revises=mine.name, reason="better")
+    theirs = make_entry(complete_results("mine", 5.0), why)
+    for entry in (mine, theirs):
+        write_entry(tmp_path, entry)
+    write_check(tmp_path, check_of(mine))
+    assert main(["leaderboard", "check", "--entries", str(tmp_path)]) == 2
+    assert "which somebody else stands for" in capsys.readouterr().err
+    labels = {m.label: m.row.level for m in method_rows(sound_entries(tmp_path))}
+    assert labels == {"Mine (by A)": "rescored", "Mine (by B)": "self-reported"}

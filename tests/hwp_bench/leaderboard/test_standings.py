@@ -54,12 +54,13 @@ def test_each_protocol_has_a_table_and_incomplete_rows_no_rank(entries) -> None:
 
 
 def test_a_run_that_was_submitted_twice_is_ranked_once(entries) -> None:
-    plain, _, second, *_ = entries
+    _, _, second, *_ = entries
+    plain = make_entry(complete_results("other", scorer(25.0), suite_name="mini"))
     twin = make_entry(plain.results, Submission(by="B"))
     (table,) = board_tables([plain, second, twin])
     assert [row[1] for row in table.rows] == [1, 2, None]
     assert re.search(
-        r"No rank for a second entry of the same run: plain-mini-\S+\.$", table.notes[0]
+        r"No rank for a second entry of the same run: other-mini-\S+\.$", table.notes[0]
     )
     # The one that was checked stays, whatever its name.
     for one, other in ((plain, twin), (twin, plain)):
@@ -107,10 +108,19 @@ def test_the_command_shows_levels_and_badges_in_80_columns(
     entries, tmp_path: Path, capsys, monkeypatch
 ) -> None:
     monkeypatch.delenv("COLUMNS", raising=False)
+    folder = tmp_path / "entries"
     for entry in entries[:3]:
-        write_entry(tmp_path, entry)
-    write_check(tmp_path, check_of(entries[0]))
-    words = ["leaderboard", "show", "--entries", str(tmp_path)]
+        write_entry(folder, entry)
+    write_check(folder, check_of(entries[0]))
+    words = ["leaderboard", "show", "--entries", str(folder)]
+    # The name of a baseline is not anybody's.
+    assert main(words) == 0
+    assert "carries the name of plain, a method that ships" in capsys.readouterr().err
+    assert main(["leaderboard", "check", "--entries", str(folder)]) == 2
+    register = ["leaderboard", "register", entries[0].name, "--entries", str(folder)]
+    assert main(register) == 0
+    assert main(["leaderboard", "check", "--entries", str(folder)]) == 0
+    capsys.readouterr()
     assert main(words) == 0
     out = capsys.readouterr().out
     assert max(map(len, out.splitlines())) <= 80
@@ -125,9 +135,9 @@ def test_the_command_shows_levels_and_badges_in_80_columns(
 def test_the_site_has_the_ranks_of_the_terminal_and_one_verdict_a_suite(entries) -> None:
     page = page_of(entries)
     assert re.findall(r'data-key="rank" data-number="(\d*)">(.*?)</td>', page) == [
-        ("", "–"),
         ("1", "1"),
         ("2", "2"),
+        ("", "–"),
     ]
     (sentence,) = re.findall(r'class="note verdict">(.*?)</p>', page)
     assert sentence.startswith("mini: Mine wins with PSNR ")
