@@ -63,8 +63,13 @@ _ALL = (
 PERTURBATIONS: tuple[str, ...] = tuple(item.name for item in _ALL)
 
 
-def perturbation(name: str) -> Perturbation:
+def perturbation(name: str, *, where: str | None = None, field: str | None = None) -> Perturbation:
     """Look a perturbation up by name.
+
+    Args:
+        name: its name.
+        where: the file that names it, for the message.
+        field: the field in it.
 
     Raises:
         BadInput: no perturbation has that name; the message lists the four.
@@ -73,7 +78,10 @@ def perturbation(name: str) -> Perturbation:
         if item.name == name:
             return item
     raise BadInput(
-        f"there is no perturbation {name!r}", remedy=f"Known are: {', '.join(PERTURBATIONS)}."
+        f"there is no perturbation {name!r}",
+        where=where,
+        field=field,
+        remedy=f"Known are: {', '.join(PERTURBATIONS)}.",
     )
 
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.errors import HwpError, UsageError, reason_of
 from hwp_bench.base.files import canonical_json, sha256_json
 from hwp_bench.base.locks import exclusive
 from hwp_bench.base.progress import progress
@@ -121,7 +121,7 @@ def render_capture(
         try:
             waiting.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise HwpError(f"cannot be made ({error.strerror})", where=waiting) from error
+            raise HwpError(f"cannot be made ({reason_of(error)})", where=waiting) from error
         try:
             start = time.perf_counter()
             _render_missing(scene, count, edge, waiting, workers, exr)
