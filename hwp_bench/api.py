@@ -19,7 +19,7 @@ from hwp_bench.base.tables import write_tables
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
-from hwp_bench.evaluation.foresight import check_call, check_suite
+from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
 from hwp_bench.evaluation.outcome import outcome_lines
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
@@ -87,13 +87,15 @@ def evaluate(
     )
     folder = Path(out) if out is not None else default_folder(os.fspath(method), plan)
     manifest = read_manifest(find_method(os.fspath(method)))
+    given = _folders(captures) if suite == "captures" else []
+    check_results_place(manifest, folder, {"captures": given}, "out")
     check_call(manifest, plan, folder)
     if suite != "captures":
         check_suite(manifest, plan, folder)
     view = JobsView()
     engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
     with engine, view if engine.in_turn else nullcontext():
-        paths = ensure_suite(suite, engine=engine) if suite != "captures" else _folders(captures)
+        paths = ensure_suite(suite, engine=engine) if suite != "captures" else given
         results = evaluate_method(
             os.fspath(method),
             paths,
