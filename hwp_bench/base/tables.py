@@ -287,8 +287,13 @@ def print_table(table: Table, width: int | None = None) -> None:
     from rich.console import Console
     from rich.text import Text
 
+    class Output(Console):
+        def on_broken_pipe(self) -> None:
+            # Of rich's own it would be the end of the program, with status 1.
+            raise
+
     width = width or shutil.get_terminal_size((WIDTH, 24)).columns
-    console = Console(width=width)
+    console = Output(width=width)
     encoding = encoding_of(sys.stdout)
     for line in table_lines(table, width, marks=not console.is_terminal, encoding=encoding):
         whole = Text.assemble(*line.pieces)
