@@ -207,8 +207,9 @@ def _submit(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.report.sources import read_sources, source_folders
     from hwp_bench.results import results_among
 
+    submission = _submission(args)
     sources = read_sources(args.results)
-    inputs = {"RESULTS": source_folders(sources), "--avatars": args.avatars, "--entries": folder}
+    inputs = {"RESULTS": source_folders(sources), "--avatars": args.avatars}
     check_places({"--out": args.out}, inputs)
     for file in results_among(args.results):
         check_source(file)
@@ -216,7 +217,7 @@ def _submit(args: argparse.Namespace, folder: Path) -> int:
         Path(args.out),
         sources,
         sound_entries(folder),
-        _submission(args),
+        submission,
         Path(args.avatars) if args.avatars else None,
     )
     for entry in done.entries:
