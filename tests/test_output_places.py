@@ -44,7 +44,7 @@ WRONG = [
     ("evaluate M --capture C -o C/runs", "lies in the input --capture"),
     ("evaluate M --capture C -o M/runs", "lies in the input METHOD_DIR"),
     ("evaluate M --capture captures/c -o .", "holds the input --capture"),
-    ("ablate plain --capture C -o C", "is the input --capture too"),
+    ("ablate wildghand --capture C -o C", "is the input --capture too"),
     ("budget M --capture C -o M", "is the input METHOD_DIR too"),
     ("demo --methods M --out M/demo", "lies in the input METHOD_DIR"),
     ("data show C -o C/frames/000000.png", "lies in the input CAPTURE"),
