@@ -145,7 +145,7 @@ def score(
     Raises:
         ShapeMismatch: the three do not describe one image.
         BadInput: a pixel is NaN or out of range, or the mask leaves nothing to score.
-        UsageError: one of them is no array.
+        UsageError: one of them is not an array.
     """
     given = {"prediction": prediction, "target": target, "mask": mask}
     for name, image in given.items():

@@ -24,7 +24,7 @@ def whole_number(value: Any, field: str) -> int:
             return operator.index(value)
         except TypeError:
             pass
-    raise _wrong(value, field, "a whole number")
+    raise _wrong(value, field, "an integer")
 
 
 def real_number(value: Any, field: str) -> float:

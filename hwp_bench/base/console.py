@@ -87,7 +87,7 @@ def in_utf8_mode(program: str) -> None:
     """Start this process again in Python's UTF-8 mode, where the locale is of another encoding.
 
     Python cannot change the encoding of file names while it runs. In another one than UTF-8 a name
-    with an accent is no text (ASCII), or is another name for libraries in C++ (Latin-1). The
+    with an accent cannot be text (ASCII), or is another name for libraries in C++ (Latin-1). The
     standard streams keep the encoding that they have. Nothing is done in UTF-8, where the user
     chose `-X utf8`, or where the process is not one of this program (a script, a test).
 

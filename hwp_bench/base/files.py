@@ -77,7 +77,7 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
 
 
 def _room(path: Path) -> str:
-    """What a person can do about a place that cannot be written."""
+    """Return the remedy for a place that cannot be written."""
     remedy = "Check the free space and the permissions of the folder"
     with contextlib.suppress(HwpError):
         if path.absolute().is_relative_to(cache_root().absolute()):

@@ -371,7 +371,7 @@ def _refuse_none(folder: Path) -> None:
 
 
 def _refuse_unsound(folder: Path, entries: Sequence[Entry]) -> None:
-    """Refuse a folder whose files are no sound entries: its board would be empty."""
+    """Refuse a folder without a sound entry: its board would be empty."""
     from hwp_bench.base.errors import UsageError
 
     if not entries:
