@@ -6,7 +6,7 @@ Each does what the command of its name does.
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -14,12 +14,14 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
+from hwp_bench.base.arguments import of_type, place, whole_number
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.progress import JobsView, notice
 from hwp_bench.base.tables import write_tables
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
-from hwp_bench.evaluation.foresight import check_call, check_suite
+from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
 from hwp_bench.evaluation.outcome import outcome_lines
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
@@ -76,26 +78,34 @@ def evaluate(
     Raises:
         BadMethod: the method directory or a setting is wrong.
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
-        UsageError: there is no such suite.
+        UsageError: an argument is of another type or out of range, or `out` lies in the method
+            or in a capture.
         HwpError: another evaluation is writing to `out`, or `out` cannot be written.
     """
+    method = os.fspath(place(method, "method"))
     suite = captures if isinstance(captures, str) and captures in suite_names() else "captures"
+    given = _folders(captures) if suite == "captures" else []
+    of_type(preset, (str, type(None)), "preset", "a text")
+    of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
+    if whole_number(jobs, "jobs") < 1:
+        raise UsageError(f"is {jobs}", field="jobs", remedy="Use 1 or more.")
     plan = EvaluationSettings(
         suite=suite,
         preset=preset,
         run=RunSettings(dict(settings or {}), seed, Budget(seconds, steps), frames),
     )
-    folder = Path(out) if out is not None else default_folder(os.fspath(method), plan)
-    manifest = read_manifest(find_method(os.fspath(method)))
+    folder = place(out, "out") if out is not None else default_folder(method, plan)
+    manifest = read_manifest(find_method(method))
+    check_results_place(manifest, folder, {"captures": given}, "out")
     check_call(manifest, plan, folder)
     if suite != "captures":
         check_suite(manifest, plan, folder)
     view = JobsView()
     engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
     with engine, view if engine.in_turn else nullcontext():
-        paths = ensure_suite(suite, engine=engine) if suite != "captures" else _folders(captures)
+        paths = ensure_suite(suite, engine=engine) if suite != "captures" else given
         results = evaluate_method(
-            os.fspath(method),
+            method,
             paths,
             folder,
             plan,
@@ -110,8 +120,12 @@ def evaluate(
 
 def _folders(captures: Captures) -> list[Path]:
     """The folders of one capture or several."""
-    several = [captures] if isinstance(captures, str | os.PathLike | Capture) else list(captures)
-    return [item.root if isinstance(item, Capture) else Path(item) for item in several]
+    one = isinstance(captures, str | os.PathLike | Capture)
+    several = [captures] if one else of_type(captures, Iterable, "captures", "a capture or several")
+    return [
+        item.root if isinstance(item, Capture) else place(item, f"captures[{index}]")
+        for index, item in enumerate(several)
+    ]
 
 
 def score(
@@ -131,7 +145,11 @@ def score(
     Raises:
         ShapeMismatch: the three do not describe one image.
         BadInput: a pixel is NaN or out of range, or the mask leaves nothing to score.
+        UsageError: one of them is not an array.
     """
+    given = {"prediction": prediction, "target": target, "mask": mask}
+    for name, image in given.items():
+        of_type(image, np.ndarray, name, "a NumPy array")
     return score_frame(prediction, target, mask, coverage=exact)
 
 
@@ -151,12 +169,19 @@ def compare(
         seed: seed of the resampling.
 
     Raises:
-        UsageError: there is only one method, or the results are of different data.
+        UsageError: there is only one method, the results are of different data, or an argument
+            is of another type or out of range.
         BadInput, BadResult: a results file is missing or wrong.
     """
-    read = [
-        item
-        for result in results
-        for item in ([result] if isinstance(result, Results) else read_all([result]))
-    ]
-    return compare_results(read, metrics, resamples=resamples, seed=seed)
+    names = (
+        [metrics] if isinstance(metrics, str) else of_type(metrics, Sequence, "metrics", "names")
+    )
+    for name in names:
+        of_type(name, str, "metrics", "names")
+    resamples, seed = whole_number(resamples, "resamples"), whole_number(seed, "seed")
+    if seed < 0:
+        raise UsageError(f"is {seed}", field="seed", remedy="Use 0 or more.")
+    read: list[Results] = []
+    for result in results:
+        read += [result] if isinstance(result, Results) else read_all([place(result, "results")])
+    return compare_results(read, names, resamples=resamples, seed=seed)

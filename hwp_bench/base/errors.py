@@ -44,6 +44,17 @@ class HwpError(Exception):
         return f"{head}. {self.remedy}" if self.remedy else head
 
 
+def reason_of(error: OSError) -> str:
+    """Return what the system says of a file or folder that it refuses."""
+    if error.strerror:
+        return error.strerror
+    first = error.args[0] if error.args else ""
+    if isinstance(first, list) and first:
+        # Of `shutil.copytree`: a source, a target and a text for each file.
+        first = first[0][-1] if isinstance(first[0], tuple) else first[0]
+    return str(first)[:300] or type(error).__name__
+
+
 class UsageError(HwpError):
     """The command or function was called in a way that makes no sense."""
 

@@ -12,12 +12,12 @@ import re
 import secrets
 import shutil
 import stat
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
-from hwp_bench.base.errors import BadInput, HwpError, UsageError
+from hwp_bench.base.errors import BadInput, HwpError, UsageError, reason_of
 from hwp_bench.base.text import is_unicode
 
 #: Largest JSON file that is read, in bytes; a result of 10,000 frames stays far below it.
@@ -33,6 +33,10 @@ _DISC = frozenset(
 )
 # Folders of one name that other processes make while one is replaced, before it gives up.
 _MOST_RETIRED = 100
+#: The file that makes a folder a capture, in which nothing else is written.
+_CAPTURE = "capture.json"
+#: Files and folders that an option names.
+Places: TypeAlias = "str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None"
 # The file itself is UTF-8, so that only an escape can stand for half of a surrogate pair.
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
@@ -65,11 +69,20 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
             with contextlib.suppress(OSError):
                 os.unlink(temporary)
         raise HwpError(
-            f"cannot be written ({error.strerror})",
+            f"cannot be written ({reason_of(error)})",
             where=path,
-            remedy="Check the free space and the permissions of the folder.",
+            remedy=_room(path),
         ) from error
     return path
+
+
+def _room(path: Path) -> str:
+    """Return the remedy for a place that cannot be written."""
+    remedy = "Check the free space and the permissions of the folder"
+    with contextlib.suppress(HwpError):
+        if path.absolute().is_relative_to(cache_root().absolute()):
+            remedy += ", or choose another cache folder with HWP_CACHE"
+    return f"{remedy}."
 
 
 @contextlib.contextmanager
@@ -91,7 +104,7 @@ def disc_errors(where: str | os.PathLike[str]) -> Iterator[None]:
         if error.errno not in _DISC:
             raise
         raise HwpError(
-            f"cannot be written ({error.strerror or error})",
+            f"cannot be written ({reason_of(error)})",
             where=where,
             remedy="Make room or check the permissions, and start again with the same arguments: "
             "what is finished stays.",
@@ -114,6 +127,60 @@ def refuse_existing(
     path = Path(path)
     if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
         raise _exists(path, flag)
+
+
+def check_places(
+    outputs: Mapping[str, Places],
+    inputs: Mapping[str, Places],
+    *,
+    replaces: bool = False,
+    makes_captures: bool = False,
+) -> None:
+    """Refuse outputs that would destroy or mix with each other or an input, before work begins.
+
+    Args:
+        outputs: files and folders that a command writes, by the option that names them.
+        inputs: those that it reads, by option or argument.
+        replaces: an output takes the place of what is there, so that it may not hold an input.
+        makes_captures: an output is a capture, and may be where one is.
+
+    Raises:
+        UsageError: an output is named twice, lies in another one, is an input or lies in one, would
+            replace a folder that holds an input, or is not a capture and lies where one is.
+    """
+    made = _resolved(outputs)
+    read = _resolved(inputs)
+    for number, (option, path) in enumerate(made):
+        others = made[:number] + made[number + 1 :]
+        problem = _clash(path, others, "output", "what is made for it would be lost")
+        problem = problem or _clash(path, read, "input", "an input is not changed")
+        if not problem and replaces:
+            held = [name for name, other in read if other.is_relative_to(path)]
+            problem = f"holds the input {held[0]}, and would be replaced" if held else ""
+        if not problem:
+            within = path.parents if makes_captures else (path, *path.parents)
+            capture = next((one for one in within if (one / _CAPTURE).is_file()), None)
+            place = "is a capture" if capture == path else f"lies in the capture {capture}"
+            problem = f"{place}, in which nothing else is written" if capture else ""
+        if problem:
+            raise UsageError(problem, where=path, field=option, remedy="Choose another place.")
+
+
+def _resolved(places: Mapping[str, Places]) -> list[tuple[str, Path]]:
+    found = []
+    for option, value in places.items():
+        several = [value] if isinstance(value, str | os.PathLike) else value or ()
+        found += [(option, Path(path).resolve()) for path in several]
+    return found
+
+
+def _clash(path: Path, others: Sequence[tuple[str, Path]], kind: str, why: str) -> str:
+    for option, other in others:
+        if path == other:
+            return f"is the {kind} {option} too: {why}"
+        if path.is_relative_to(other):
+            return f"lies in the {kind} {option} ({other}): {why}"
+    return ""
 
 
 def _exists(path: Path, flag: str) -> UsageError:
@@ -150,16 +217,16 @@ def atomic_folder(
         temporary = temporary_name(path)
         temporary.mkdir()
     except OSError as error:
-        raise HwpError(f"cannot be made ({error.strerror})", where=path) from error
+        raise HwpError(f"cannot be made ({reason_of(error)})", where=path) from error
     try:
         yield temporary
         _take_name(temporary, path, overwrite, flag)
     except OSError as error:
         shutil.rmtree(temporary, ignore_errors=True)
         raise HwpError(
-            f"cannot be written ({error.strerror})",
+            f"cannot be written ({reason_of(error)})",
             where=path,
-            remedy="Check the free space and the permissions of the folder.",
+            remedy=_room(path),
         ) from error
     except BaseException:
         shutil.rmtree(temporary, ignore_errors=True)
@@ -261,7 +328,7 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
     except FileNotFoundError as error:
         raise BadInput("does not exist", where=path) from error
     except OSError as error:
-        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+        raise BadInput(f"cannot be read ({reason_of(error)})", where=path) from error
     except UnicodeDecodeError as error:
         raise BadInput("is not UTF-8 text", where=path) from error
     except RecursionError as error:
@@ -348,8 +415,17 @@ def inside(root: str | os.PathLike[str], relative: str) -> Path:
 
 
 def cache_root() -> Path:
-    """Return the folder for what can be made again: HWP_CACHE, else the user's cache folder."""
-    if "HWP_CACHE" in os.environ:
-        return Path(os.environ["HWP_CACHE"]).expanduser()
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    """Return the folder for what can be made again: HWP_CACHE, else the user's cache folder.
+
+    Raises:
+        HwpError: the system does not say where the user's folders are.
+    """
+    try:
+        if "HWP_CACHE" in os.environ:
+            return Path(os.environ["HWP_CACHE"]).expanduser()
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+    except RuntimeError as error:
+        raise HwpError(
+            "the user has no home folder", remedy="Name a folder for the cache in HWP_CACHE."
+        ) from error
     return Path(base) / "hwp-bench"

@@ -11,7 +11,7 @@ from typing import BinaryIO
 import numpy as np
 import OpenImageIO as oiio
 
-from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch
+from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch, reason_of
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.text import check_name
 
@@ -124,7 +124,7 @@ def _check_kind(path: Path) -> None:
             if kind == "PNG":
                 _check_parts(stream, path)
     except OSError as error:
-        raise BadImage(f"cannot be read ({error.strerror})", where=path) from error
+        raise BadImage(f"cannot be read ({reason_of(error)})", where=path) from error
 
 
 def _check_parts(stream: BinaryIO, path: Path) -> None:

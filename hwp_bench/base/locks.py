@@ -7,7 +7,7 @@ import os
 from collections.abc import Iterator
 from pathlib import Path
 
-from hwp_bench.base.errors import HwpError
+from hwp_bench.base.errors import HwpError, reason_of
 from hwp_bench.base.progress import notice
 
 #: Name of the lock file inside an output folder.
@@ -38,7 +38,7 @@ def exclusive(folder: str | os.PathLike[str], *, wait: bool = False) -> Iterator
         file.open("a").close()
     except OSError as error:
         raise HwpError(
-            f"cannot be written ({error.strerror})",
+            f"cannot be written ({reason_of(error)})",
             where=folder,
             remedy="Choose another folder, or change its permissions.",
         ) from error

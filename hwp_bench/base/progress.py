@@ -15,6 +15,7 @@ from contextvars import ContextVar
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self, TypeVar
 
+from hwp_bench.base.console import on_terminal, tell
 from hwp_bench.base.text import shown
 
 if TYPE_CHECKING:
@@ -35,8 +36,11 @@ FOUND = 0.1
 
 
 def notice(text: str) -> None:
-    """Print a line for a person on standard error; what could steer a terminal becomes `?`."""
-    print(shown(text), file=sys.stderr, flush=True)
+    """Print a line for a person on standard error; what could steer a terminal becomes `?`.
+
+    Where nobody reads it any more it is dropped, and the work goes on.
+    """
+    tell(shown(text))
 
 
 def clock(seconds: float) -> str:
@@ -79,7 +83,7 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
         with outer(description, total) as update:
             yield update
         return
-    if not sys.stderr.isatty():
+    if not on_terminal(sys.stderr):
         reached = 0
 
         def reach(done: int) -> None:
@@ -125,7 +129,7 @@ class JobsView:
 
     def __init__(self, *, quiet: bool = False) -> None:
         self._quiet = quiet
-        self._bars = new_bars() if sys.stderr.isatty() and not quiet else None
+        self._bars = new_bars() if on_terminal(sys.stderr) and not quiet else None
         self._all: TaskID | None = None
         self._running: dict[int, _Running] = {}
         self._durations: list[float] = []

@@ -9,6 +9,7 @@ from collections.abc import Callable, Iterator
 from contextvars import Token
 from typing import TYPE_CHECKING, Self
 
+from hwp_bench.base.console import on_terminal
 from hwp_bench.base.progress import OUTER, Shows, clock, left_text, new_bars, notice, update_bar
 
 if TYPE_CHECKING:
@@ -23,7 +24,7 @@ class StagesView:
     """
 
     def __init__(self) -> None:
-        self._bars = new_bars() if sys.stderr.isatty() else None
+        self._bars = new_bars() if on_terminal(sys.stderr) else None
         self._all: TaskID | None = None
         self._began = self._stage_began = time.perf_counter()
         self._left: tuple[float, float] = (0.0, 0.0)

@@ -5,11 +5,13 @@ from __future__ import annotations
 import csv
 import io
 import json
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.base.console import encoding_of
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.terminal_tables import WIDTH, table_lines
 
@@ -274,6 +276,8 @@ def to_object(table: Table) -> dict[str, Any]:
 def print_table(table: Table, width: int | None = None) -> None:
     """Print a table on standard output: styled on a terminal, plain text elsewhere.
 
+    Where the encoding of standard output lacks rules and arrows, they are drawn in ASCII.
+
     Args:
         table: the table.
         width: in characters; None takes that of the terminal, `COLUMNS`, or 80.
@@ -283,9 +287,15 @@ def print_table(table: Table, width: int | None = None) -> None:
     from rich.console import Console
     from rich.text import Text
 
+    class Output(Console):
+        def on_broken_pipe(self) -> None:
+            # Of rich's own it would be the end of the program, with status 1.
+            raise
+
     width = width or shutil.get_terminal_size((WIDTH, 24)).columns
-    console = Console(width=width)
-    for line in table_lines(table, width, marks=not console.is_terminal):
+    console = Output(width=width)
+    encoding = encoding_of(sys.stdout)
+    for line in table_lines(table, width, marks=not console.is_terminal, encoding=encoding):
         whole = Text.assemble(*line.pieces)
         whole.rstrip()
         console.print(whole, no_wrap=True, overflow="ignore", crop=False)

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from itertools import groupby
 from typing import Protocol
 
+from hwp_bench.base.console import expressed
+
 #: Columns where no terminal says how wide it is.
 WIDTH = 80
 #: Spaces between two columns.
@@ -18,6 +20,8 @@ _FOLDED = (12, 24)
 _BEST = "*"
 #: Under a table with such a mark.
 _LEGEND = f"{_BEST} the best of the rows on the same data."
+#: What rules are drawn with.
+_RULE = "─"
 
 
 class Column(Protocol):
@@ -79,7 +83,68 @@ class Line:
         return "".join(piece for piece, _ in self.pieces).rstrip()
 
 
-def table_lines(table: Table, width: int, *, marks: bool = False) -> list[Line]:
+@dataclass(frozen=True)
+class _FittedColumn:
+    """A column in characters that an encoding has."""
+
+    heading: str
+    higher_is_better: bool | None
+    group: str
+
+
+@dataclass(frozen=True)
+class _FittedTable:
+    """A table in characters that an encoding has."""
+
+    table: Table
+    encoding: str
+    columns: Sequence[_FittedColumn]
+
+    @property
+    def caption(self) -> str:
+        return self.fit(self.table.caption)
+
+    @property
+    def rows(self) -> Sequence[Sequence[str | float | int | None]]:
+        return self.table.rows
+
+    @property
+    def notes(self) -> Sequence[str]:
+        notes = [self.fit(note) for note in self.table.notes]
+        if any(column.higher_is_better is not None for column in self.columns):
+            up, down = self.fit("↑"), self.fit("↓")
+            notes += [f"{up} higher is better, {down} lower is better."] if up != "↑" else []
+        return notes
+
+    @property
+    def breaks(self) -> Sequence[int]:
+        return self.table.breaks
+
+    def text(self, row: int, column: int) -> str:
+        return self.fit(self.table.text(row, column))
+
+    def rank(self, row: int, column: int) -> int | None:
+        return self.table.rank(row, column)
+
+    def fit(self, text: str) -> str:
+        return expressed(text, self.encoding)
+
+
+def _fitted(table: Table, encoding: str) -> _FittedTable:
+    columns = [
+        _FittedColumn(
+            expressed(column.heading, encoding),
+            column.higher_is_better,
+            expressed(column.group, encoding),
+        )
+        for column in table.columns
+    ]
+    return _FittedTable(table, encoding, columns)
+
+
+def table_lines(
+    table: Table, width: int, *, marks: bool = False, encoding: str = "utf-8"
+) -> list[Line]:
     """Return the lines of a table.
 
     The columns that name a row stand in front of every block of the others. Columns of one group
@@ -89,16 +154,20 @@ def table_lines(table: Table, width: int, *, marks: bool = False) -> list[Line]:
         table: the table.
         width: in characters; a table whose narrowest form is wider is printed wider.
         marks: mark best values with a character.
+        encoding: of what the lines are printed on; what it lacks is said in ASCII.
     """
+    table = _fitted(table, encoding)
     lines = _folded(table.caption, width, "italic")
     keys = _keys(table)
     widths = [_natural(table, index, marks) for index in range(len(table.columns))]
     if _total(widths) > width:
         widths = _narrowed(table, widths, keys, width)
+    rule = table.fit(_RULE)
     for number, block in enumerate(_blocks(table, widths, keys, width)):
         lines += [Line((("", ""),))] if number else []
         columns = [*range(keys), *block]
-        lines += _block_lines(table, columns, _spread(table, columns, widths, width), marks)
+        spread = _spread(table, columns, widths, width)
+        lines += _block_lines(table, columns, spread, marks, rule)
     notes = list(table.notes)
     if marks and any(
         table.rank(row, column) == 0
@@ -205,11 +274,11 @@ def _spread(
 
 
 def _block_lines(
-    table: Table, columns: Sequence[int], widths: Sequence[int], marks: bool
+    table: Table, columns: Sequence[int], widths: Sequence[int], marks: bool, stroke: str
 ) -> list[Line]:
-    """Return heading, rule and rows of one block."""
-    rule = Line((("─" * _total([widths[i] for i in columns]), "dim"),))
-    lines = _group_line(table, columns, widths)
+    """Return heading, rule (of strokes) and rows of one block."""
+    rule = Line(((stroke * _total([widths[i] for i in columns]), "dim"),))
+    lines = _group_line(table, columns, widths, stroke)
     heads = [_wrapped(table.columns[i].heading, widths[i]) for i in columns]
     deepest = max(map(len, heads))
     heads = [[""] * (deepest - len(head)) + head for head in heads]
@@ -291,7 +360,9 @@ def _joined(
     return Line(tuple(pieces))
 
 
-def _group_line(table: Table, columns: Sequence[int], widths: Sequence[int]) -> list[Line]:
+def _group_line(
+    table: Table, columns: Sequence[int], widths: Sequence[int], stroke: str
+) -> list[Line]:
     """Return the line over the heading that names groups of columns, if there are any."""
     if not any(table.columns[i].group for i in columns):
         return []
@@ -307,6 +378,6 @@ def _group_line(table: Table, columns: Sequence[int], widths: Sequence[int]) -> 
             padded = [""] * (deepest - len(texts)) + texts
             text = padded[depth]
             last = named and depth == deepest - 1 and len(text) + 4 <= span
-            parts.append(f" {text} ".center(span, "─") if last else text.center(span))
+            parts.append(f" {text} ".center(span, stroke) if last else text.center(span))
         lines.append(Line((((" " * _GAP).join(parts), "bold"),)))
     return lines

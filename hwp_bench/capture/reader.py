@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hwp_bench.base.arguments import place, whole_number
 from hwp_bench.base.errors import BadCapture, BadInput, UsageError
 from hwp_bench.base.files import read_json, sha256_json
 from hwp_bench.base.images import read_gray, read_rgb
@@ -156,8 +157,7 @@ class Capture:
         Raises:
             UsageError: the capture has no such frame.
         """
-        self._check(frame)
-        return hand_poses(self.hands, frame)
+        return hand_poses(self.hands, self._check(frame))
 
     def camera(self, frame: int) -> Camera:
         """Return the camera of one frame.
@@ -165,8 +165,7 @@ class Capture:
         Raises:
             UsageError: the capture has no such frame.
         """
-        self._check(frame)
-        return self.cameras.camera(frame, self.info.width, self.info.height)
+        return self.cameras.camera(self._check(frame), self.info.width, self.info.height)
 
     def template(self, side: str) -> HandTemplate:
         """Load the hand template of one side, to which the parameters belong.
@@ -204,14 +203,15 @@ class Capture:
         return self.mask(frame), False
 
     def _path(self, kind: str, frame: int) -> Path:
-        self._check(frame)
-        return image_path(self.root, kind, frame)
+        return image_path(self.root, kind, self._check(frame))
 
-    def _check(self, frame: int) -> None:
+    def _check(self, frame: int) -> int:
+        frame = whole_number(frame, "frame")
         if not 0 <= frame < self.info.frame_count:
             raise UsageError(
                 f"there is no frame {frame}, only 0 to {self.info.frame_count - 1}", where=self.root
             )
+        return frame
 
 
 def open_capture(path: str | os.PathLike[str]) -> Capture:
@@ -226,8 +226,9 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
     Raises:
         BadCapture: not a capture folder, or its metadata is wrong; file and field are named.
         BadInput: hand parameters or cameras are damaged, not finite, or of another length.
+        UsageError: the path is none.
     """
-    root = Path(path)
+    root = place(path, "path")
     if not (root / METADATA).is_file():
         raise BadCapture(
             f"is not a capture: it has no {METADATA}",

@@ -198,7 +198,7 @@ def check_id(identifier: str, where: str) -> None:
 def _check_severities(info: CaptureInfo, where: str) -> None:
     for name, values in info.perturbations.items():
         place = f"perturbations.{name}"
-        perturbation(name)
+        perturbation(name, where=where, field="perturbations")
         if values is None:
             continue
         if len(values) != info.frame_count:

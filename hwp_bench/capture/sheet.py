@@ -10,6 +10,7 @@ import numpy as np
 from hwp_bench.base.drawing import fitted, labelled, outlined, sheet
 from hwp_bench.base.evenly import evenly
 from hwp_bench.capture.reader import Capture
+from hwp_bench.taxonomy import perturbation
 
 #: Colour of the projected hand, by side.
 COLOURS = {"right": (255, 160, 0), "left": (0, 170, 255)}
@@ -100,8 +101,7 @@ def _caption(capture: Capture, frame: int) -> str:
     parts = [str(frame)]
     for name, severity in capture.info.severity(frame).items():
         if severity:
-            short = "".join(word[0] for word in name.split("_"))
-            parts.append(f"{short}{severity}")
+            parts.append(f"{perturbation(name).short}{severity}")
     invalid = [side for side, hand in capture.hands.items() if not hand.valid[frame]]
     parts += [f"no {side}" for side in invalid]
     return " ".join(parts)

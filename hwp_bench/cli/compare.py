@@ -50,6 +50,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.analysis.statistics.comparison import compare_results
+    from hwp_bench.base.console import print_document
     from hwp_bench.base.tables import format_table, print_table
     from hwp_bench.report.evaluation_tables import HEADLINE
     from hwp_bench.results import read_all
@@ -72,5 +73,5 @@ def run(args: argparse.Namespace) -> int:
         if args.format == "terminal":
             print_table(table)
         else:
-            print(format_table(table, args.format))
+            print_document(format_table(table, args.format) + "\n")
     return 0

@@ -56,12 +56,13 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.analysis.cost.analysis import CostAnalysis, analyse_cost
     from hwp_bench.analysis.statistics.pairing import group_runs
     from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
     from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table
     from hwp_bench.metrics import metric
     from hwp_bench.report.data_groups import DataGroup, data_groups, data_key
     from hwp_bench.report.figures import write_cost
-    from hwp_bench.report.sources import read_sources
+    from hwp_bench.report.sources import read_sources, source_folders
     from hwp_bench.results import read_all
 
     metric(args.metric)
@@ -75,7 +76,9 @@ def run(args: argparse.Namespace) -> int:
             raise UsageError("names more than one method", field="--reference")
         reference = named[0]
     found: list[tuple[DataGroup, CostAnalysis]] = []
-    groups = data_groups(read_sources(args.results, repeats=False))
+    sources = read_sources(args.results, repeats=False)
+    check_places({"--out": args.out}, {"RESULTS": source_folders(sources)})
+    groups = data_groups(sources)
     for group in groups:
         results = [source.results for source in group.sources]
         # With several groups a reference is only of the one that it shares its data with.

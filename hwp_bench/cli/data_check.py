@@ -54,9 +54,10 @@ def _print(report: CheckReport) -> None:
     else:
         print(f"{title}: {verdict}")
     for finding in report.findings:
-        place = ": ".join(part for part in (finding.where, finding.field) if part)
+        parts = (finding.level, finding.where, finding.field, finding.problem)
         remedy = f" {finding.remedy}" if finding.remedy else ""
-        print(shown(f"{finding.level}: {place}: {finding.problem}.{remedy}").replace("\n", " "))
+        said = ": ".join(part for part in parts if part)
+        print(shown(f"{said}.{remedy}").replace("\n", " "))
 
 
 def _fact(value: object) -> str:

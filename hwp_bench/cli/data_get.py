@@ -38,9 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.files import check_places
     from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.importers.official.download import HuggingFaceHub, download_release
 
+    check_places({"--out": args.out}, {})
     with JobsView() as jobs:
         update = jobs.turn(0, 1, f"downloading to {args.out}")
         made = download_release(

@@ -47,12 +47,14 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.files import check_places
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluation.evaluate import open_captures
     from hwp_bench.publish.inputs import check_place, write_inputs
     from hwp_bench.sim import ensure_suite
 
     # Before a suite is rendered.
+    check_places({"--out": args.out}, {"--capture": args.capture, "--splits": args.splits})
     check_place(args.out, args.name)
     splits = read_splits(args.splits) if args.splits else None
     paths = [Path(path) for path in args.capture] if args.capture else ensure_suite(args.suite)

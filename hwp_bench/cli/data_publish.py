@@ -33,9 +33,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.files import check_places
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.publish import publish
 
+    check_places({"--out": args.out}, {"CAPTURES": args.captures, "--splits": args.splits})
     splits = read_splits(args.splits) if args.splits else None
     made = publish(args.captures, args.out, splits=splits)
     if args.json:

@@ -11,7 +11,7 @@ _EXAMPLES = """examples:
 
 The sheet shows frames evenly over the capture: green the visible-hand mask, orange the right
 and blue the left estimated hand; over each frame its number and the severity of what perturbs
-it (hoi: interaction, cp: complex poses, i: illumination, mb: motion blur).
+it (hoi: interaction, cp: complex poses, il: illumination, mb: motion blur).
 """
 
 
@@ -29,6 +29,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.sheet import contact_sheet
@@ -37,5 +38,6 @@ def run(args: argparse.Namespace) -> int:
         raise UsageError("at least one frame, of 16 to 2048 px, is drawn", field="--count, --edge")
     capture = open_capture(args.capture)
     out = Path(args.out or f"{capture.info.id}-sheet.png")
+    check_places({"--out": out}, {"CAPTURE": args.capture})
     print(write_image(out, contact_sheet(capture, count=args.count, edge=args.edge)))
     return 0

@@ -60,6 +60,7 @@ def run(args: argparse.Namespace) -> int:
     # FFmpeg would print its own messages about a damaged video next to our one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
     from hwp_bench.tracking import TrackerSettings, fetch_models, track_video
 
     if args.fetch:
@@ -69,6 +70,9 @@ def run(args: argparse.Namespace) -> int:
     if args.video is None:
         raise UsageError("VIDEO is missing", remedy="Give a video, or --fetch.")
     out = args.out or args.video.with_suffix(".npz")
+    check_places(
+        {"--out": out, "--sheet": args.sheet}, {"VIDEO": args.video, "--model": args.model}
+    )
     least = args.min_confidence
     tracked = track_video(
         args.video,

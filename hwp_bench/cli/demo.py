@@ -38,7 +38,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.capture import open_capture
     from hwp_bench.cli.evaluate import report_outcome
     from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
-    from hwp_bench.evaluation.foresight import check_call, check_suite
+    from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
     from hwp_bench.evaluation.side_by_side import write_side_by_side
     from hwp_bench.methods import find_method, read_manifest
     from hwp_bench.report.evaluation_tables import all_tables
@@ -49,6 +49,7 @@ def run(args: argparse.Namespace) -> int:
     manifests = [read_manifest(find_method(method)) for method in args.methods]
     names = [manifest.name for manifest in manifests]
     for manifest in manifests:
+        check_results_place(manifest, out, {})
         check_call(manifest, EvaluationSettings("smoke"), out / manifest.name)
         check_suite(manifest, EvaluationSettings("smoke"), out / manifest.name)
     clock = _Clock()

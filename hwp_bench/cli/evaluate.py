@@ -177,10 +177,16 @@ def look_ahead(
     """Report whatever is wrong with a call before a suite is rendered for it.
 
     Raises:
-        HwpError: as `check_call` and `check_suite`.
+        HwpError: as `check_results_place`, `check_call` and `check_suite`.
     """
-    from hwp_bench.evaluation.foresight import check_call, check_suite
+    from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
 
+    inputs = {
+        "--capture": args.capture,
+        "--sealed": getattr(args, "sealed", None),
+        "--splits": args.splits,
+    }
+    check_results_place(manifest, out, inputs)
     check_call(manifest, settings, out, "--set")
     if not args.capture and not getattr(args, "sealed", None):
         local = args.engine == "local"

@@ -31,9 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.convert import convert_capture
 
+    check_places(
+        {"OUT": args.out}, {"CAPTURE": args.capture}, replaces=args.force, makes_captures=True
+    )
     errors = convert_capture(
         open_capture(args.capture), args.out, args.hand_model, overwrite=args.force
     )

@@ -29,9 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.meshes import hand_meshes, write_meshes
 
+    check_places({"FILE": args.out}, {"CAPTURE": args.capture})
     meshes = hand_meshes(open_capture(args.capture), args.frame, truth=args.truth)
     path = write_meshes(meshes, args.out)
     count = sum(len(mesh.vertices) for mesh in meshes.values())

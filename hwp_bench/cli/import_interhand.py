@@ -46,8 +46,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.files import check_places
     from hwp_bench.importers.interhand import InterHandImport, find_sequence, import_interhand
 
+    check_places(
+        {"--out": args.out},
+        {"DIR": args.folder, "--mano": args.mano},
+        replaces=args.force,
+        makes_captures=True,
+    )
     options = InterHandImport(mano=args.mano, size=args.size, fps=args.fps, overwrite=args.force)
     facts = import_interhand(args.folder, find_sequence(args.sequence), args.out, options)
     if args.json:

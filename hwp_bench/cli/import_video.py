@@ -90,8 +90,12 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     # FFmpeg would print its own messages about a damaged video next to our one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    from hwp_bench.base.files import check_places
     from hwp_bench.importers.video import VideoImport, import_video, parse_frame_range
 
+    inputs = {"VIDEO": args.video, "--landmarks": args.landmarks, "--masks": args.masks}
+    check_places({"OUT": args.out}, inputs, replaces=args.force, makes_captures=True)
+    check_places({"--sheet": args.sheet}, {**inputs, "OUT": args.out})
     options = VideoImport(
         side=args.side,
         focal=args.focal,

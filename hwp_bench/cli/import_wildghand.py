@@ -56,10 +56,17 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.files import check_places
     from hwp_bench.base.progress import notice
     from hwp_bench.importers.official import OfficialImport, import_official
     from hwp_bench.importers.official.folders import find_folders
 
+    check_places(
+        {"--out": args.out},
+        {"DIR": args.folder, "--mano": args.mano},
+        replaces=args.force,
+        makes_captures=True,
+    )
     options = OfficialImport(
         mano=args.mano,
         official_compat=args.official_compat,

@@ -85,6 +85,9 @@ makes it `re-run` where the macro mean of PSNR is the same within the tolerance.
 reproduces; 1: it differs (the check says so too); 2: no entry fits.
 """
 
+#: Longest text that an entry holds, characters.
+_LINE = 1000
+
 
 def add_arguments(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
@@ -218,20 +221,24 @@ def _add(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _submit(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.files import check_places
     from hwp_bench.base.progress import notice
     from hwp_bench.leaderboard.soundness import check_source, sound_entries
     from hwp_bench.leaderboard.submit import TEXT, submit
-    from hwp_bench.report.sources import read_sources
+    from hwp_bench.report.sources import read_sources, source_folders
     from hwp_bench.results import results_among
 
+    submission = _submission(args)
     sources = read_sources(args.results)
+    inputs = {"RESULTS": source_folders(sources), "--avatars": args.avatars}
+    check_places({"--out": args.out}, inputs)
     for file in results_among(args.results):
         check_source(file)
     done = submit(
         Path(args.out),
         sources,
         sound_entries(folder),
-        _submission(args),
+        submission,
         Path(args.avatars) if args.avatars else None,
     )
     for entry in done.entries:
@@ -247,6 +254,9 @@ def _submission(args: argparse.Namespace) -> Submission:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.leaderboard.records import Submission
 
+    given = [("--by", args.by), ("--reason", args.reason), ("--revises", args.revises or "")]
+    for option, text in [*given, *(("--link", text) for text in args.link)]:
+        _check_line(option, text)
     links = {}
     for text in args.link:
         kind, equals, address = text.partition("=")
@@ -254,6 +264,19 @@ def _submission(args: argparse.Namespace) -> Submission:
             raise UsageError(f"{text!r} is not KIND=URL", field="--link")
         links[kind] = address
     return Submission(args.by, args.revises, args.reason, links)
+
+
+def _check_line(option: str, text: str) -> None:
+    """Refuse what an entry cannot hold: it would be written, and then not be read."""
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.text import has_odd_characters, shown
+
+    if len(text) > _LINE or "\n" in text or has_odd_characters(text):
+        raise UsageError(
+            f"{shown(text[:60])!r} is not one line of at most {_LINE:,} characters without "
+            "control characters",
+            field=option,
+        )
 
 
 def _check(args: argparse.Namespace, folder: Path) -> int:
@@ -284,6 +307,7 @@ def _show(args: argparse.Namespace, folder: Path) -> int:
 
     _refuse_none(folder)
     entries = sound_entries(folder)
+    _refuse_unsound(folder, entries)
     chosen = [entry for entry in entries if args.suite in (None, entry.results.suite)]
     if args.suite and not chosen:
         raise UsageError(f"no entry is of the suite {args.suite!r}", field="--suite")
@@ -306,6 +330,7 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.soundness import readable_entries
     from hwp_bench.results import read_results, result_files
 
+    _check_line("--by", args.by)
     refuse_installed(folder)
     _refuse_none(folder)
     (file,) = result_files(args.results)
@@ -355,16 +380,21 @@ def _register(args: argparse.Namespace, folder: Path) -> int:
 
 
 def _build(args: argparse.Namespace, folder: Path) -> int:
+    from hwp_bench.base.files import check_places
     from hwp_bench.base.progress import notice
     from hwp_bench.leaderboard.site import build_site
     from hwp_bench.leaderboard.soundness import sound_entries
-    from hwp_bench.report.sources import read_sources
+    from hwp_bench.report.sources import read_sources, source_folders
 
     _refuse_none(folder)
+    sources = read_sources(args.folders)
+    check_places({"--out": args.out}, {"--with": source_folders(sources), "--entries": folder})
+    entries = sound_entries(folder)
+    _refuse_unsound(folder, entries)
     page = build_site(
         Path(args.out),
-        sound_entries(folder),
-        read_sources(args.folders),
+        entries,
+        sources,
         avatar_pages=args.avatar_pages,
     )
     notice(f"site: {page}")
@@ -380,6 +410,20 @@ def _refuse_none(folder: Path) -> None:
         problem = "holds no entry" if folder.is_dir() else "is not a folder"
         raise UsageError(
             problem, where=folder, field="--entries", remedy="Name the folder of the entries."
+        )
+
+
+def _refuse_unsound(folder: Path, entries: Sequence[Entry]) -> None:
+    """Refuse a folder without a sound entry: its board would be empty."""
+    from hwp_bench.base.errors import UsageError
+
+    if not entries:
+        raise UsageError(
+            "holds no sound entry",
+            where=folder,
+            field="--entries",
+            remedy="Name the folder of the entries; `hwp-bench leaderboard check` says what is "
+            "wrong with a file.",
         )
 
 

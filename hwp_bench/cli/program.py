@@ -14,6 +14,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+from hwp_bench.base.console import in_utf8_mode, settle, standard_streams, tell
 from hwp_bench.base.denormals import flushed_process
 from hwp_bench.base.errors import HwpError
 from hwp_bench.base.text import check_name
@@ -33,7 +34,10 @@ class Command:
     commands: dict[str, Command] = field(default_factory=dict)
 
 
-@flushed_process()
+#: Exit status where nobody reads standard output any more, as that of a program which SIGPIPE ends.
+_READER_GONE = 128 + 13
+
+
 def run_program(program: str, tree: Command, arguments: Sequence[str] | None = None) -> int:
     """Run one command of a program.
 
@@ -43,43 +47,53 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
         arguments: the words after the program's name; None takes the process's.
 
     Returns:
-        The exit status: 0 done, 1 failed, 2 wrong command line, 130 stopped by the user.
+        The exit status: 0 done, 1 failed, 2 wrong command line, 130 stopped by the user, 141 when
+        the reader of standard output has gone.
     """
+    if arguments is None:
+        in_utf8_mode(program)
     words = list(sys.argv[1:] if arguments is None else arguments)
     if threading.current_thread() is threading.main_thread():
         # As by Ctrl-C, so that child processes are stopped and temporary files removed.
         signal.signal(signal.SIGTERM, signal.default_int_handler)
+    with standard_streams():
+        return _guarded(program, tree, words)
+
+
+@flushed_process()
+def _guarded(program: str, tree: Command, words: list[str]) -> int:
+    """Run a command; an error is one line, and an exit status."""
     try:
-        for word in words:
-            check_name(word)
-        check_thread_variables(os.environ)
-        share_processors()
-        status = _dispatch(program, tree, words)
+        try:
+            for word in words:
+                check_name(word)
+            check_thread_variables(os.environ)
+            share_processors()
+            status = _dispatch(program, tree, words)
+        except SystemExit:
+            # Help, or a wrong option, which argparse has printed.
+            sys.stdout.flush()
+            raise
         sys.stdout.flush()
         return status
     except HwpError as error:
-        print(f"{program}: error: {_one_line(str(error))}", file=sys.stderr)
-        return error.exit_status
+        return _failed(program, str(error), error.exit_status)
     except KeyboardInterrupt:
-        print(f"{program}: stopped", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # The reader of our output (such as `head`) has gone; the flush at exit must not complain.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 1
+        return _failed(program, "stopped", 130, head="")
     except OSError as error:
+        unwritten = settle(sys.stdout)
+        if isinstance(unwritten, BrokenPipeError):
+            # Whoever read our output (such as `head`) has what they wanted.
+            return _READER_GONE
         # A full disc or a read-only folder: the message names the place.
-        where = f"{error.filename2 or error.filename}: " if error.filename else ""
-        text = _one_line(f"{where}{error.strerror or error}{_remedy(error.errno)}")
-        print(f"{program}: error: {text}", file=sys.stderr)
-        return 1
+        place = error.filename2 or error.filename or ("standard output" if unwritten else "")
+        where = f"{place}: " if place else ""
+        return _failed(program, f"{where}{error.strerror or error}{_remedy(error.errno)}", 1)
     except RuntimeError as error:
         # Python's own words where the system refuses a thread; there is no class for it.
         if "can't start new thread" not in str(error):
             raise
-        text = f"the system starts no more threads{_remedy(errno.EAGAIN)}"
-        print(f"{program}: error: {text}", file=sys.stderr)
-        return 1
+        return _failed(program, f"the system starts no more threads{_remedy(errno.EAGAIN)}", 1)
 
 
 def _remedy(number: int | None) -> str:
@@ -91,6 +105,13 @@ def _remedy(number: int | None) -> str:
     if number in (errno.EMFILE, errno.ENFILE):
         return ". Allow more open files (`ulimit -n`)."
     return ""
+
+
+def _failed(program: str, text: str, status: int, head: str = "error: ") -> int:
+    """Say why a command has failed, after what it has printed; returns the status."""
+    settle(sys.stdout)
+    tell(f"{program}: {head}{_one_line(text)}")
+    return status
 
 
 def _one_line(text: str) -> str:

@@ -54,13 +54,17 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from pathlib import Path
 
+    from hwp_bench.base.files import check_places
     from hwp_bench.base.progress import notice
     from hwp_bench.report.page.mixed import write_reports
-    from hwp_bench.report.sources import read_sources
+    from hwp_bench.report.sources import read_sources, source_folders
 
+    sources = read_sources(args.results, repeats=False)
+    inputs = {"RESULTS": source_folders(sources), "--captures": args.captures}
+    check_places({"--out": args.out}, inputs)
     pages = write_reports(
         Path(args.out),
-        read_sources(args.results, repeats=False),
+        sources,
         args.captures,
         base=args.base,
         title=args.title,

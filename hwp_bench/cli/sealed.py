@@ -104,10 +104,12 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _make(args: argparse.Namespace) -> int:
+    from hwp_bench.base.files import check_places
     from hwp_bench.run.engine.options import engine_for, needs_of
     from hwp_bench.sealed import make_suite
     from hwp_bench.sealed.secret import read_secret
 
+    check_places({"--out": args.out}, {"--secret": args.secret})
     recipe = _recipe(args)
     secret = read_secret(args.secret) if args.secret else None
     with engine_for(args) as engine:
@@ -147,8 +149,10 @@ def _recipe(args: argparse.Namespace) -> Recipe:
 
 
 def _reveal(args: argparse.Namespace) -> int:
+    from hwp_bench.base.files import check_places
     from hwp_bench.sealed import reveal
 
+    check_places({"--out": args.out}, {"SUITE": args.suite})
     reveal(args.suite, args.out)
     print(Path(args.out))
     return 0
@@ -157,8 +161,10 @@ def _reveal(args: argparse.Namespace) -> int:
 def _check(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
+    from hwp_bench.base.files import check_places
     from hwp_bench.sealed import check_revealed
 
+    check_places({"--work": args.work}, {"PUBLIC": args.public, "REVEALED": args.revealed})
     only = () if args.no_render else args.capture
     found = check_revealed(args.public, args.revealed, args.work, only=only, workers=args.workers)
     if args.json:

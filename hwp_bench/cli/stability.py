@@ -46,6 +46,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command; 1 if anything that must hold does not."""
+    from hwp_bench.base.progress import notice
     from hwp_bench.stability import find_cases, run_cases
 
     cases = find_cases(args.group, args.provider)
@@ -54,7 +55,7 @@ def run(args: argparse.Namespace) -> int:
     for outcome in run_cases(cases, args.backend):
         outcomes.append(outcome)
         if not outcome.measured.passed:
-            print(f"failed: {outcome.case.name}: {outcome.measured.text}", file=sys.stderr)
+            notice(f"failed: {outcome.case.name}: {outcome.measured.text}")
     if args.json:
         json.dump([_as_object(outcome) for outcome in outcomes], sys.stdout, indent=1)
         print()

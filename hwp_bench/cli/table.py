@@ -89,6 +89,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.console import print_document
     from hwp_bench.base.tables import format_table, print_table
     from hwp_bench.report.requested_table import TableRequest, make_table
 
@@ -106,5 +107,5 @@ def run(args: argparse.Namespace) -> int:
     if form == "terminal":
         print_table(table)
     else:
-        print(format_table(table, form), end="")
+        print_document(format_table(table, form))
     return 0

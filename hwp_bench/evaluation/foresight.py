@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from hwp_bench.base.errors import BadMethod, HwpError, UsageError
-from hwp_bench.base.files import inside
+from hwp_bench.base.files import Places, check_places, inside
 from hwp_bench.base.locks import exclusive
 from hwp_bench.base.progress import notice
 from hwp_bench.base.records import merged
@@ -20,6 +20,27 @@ from hwp_bench.sim.produce.suites import SuiteItem, is_rendered, suite
 
 #: Most seconds that a method may take to be made while looking ahead.
 REHEARSAL_SECONDS = 600.0
+
+
+def check_results_place(
+    manifest: MethodManifest, out: Path, inputs: Mapping[str, Places], option: str = "--out"
+) -> None:
+    """Refuse results that would lie in the method or in data, or replace data.
+
+    A method could read results in its own folder, and they would change its digest.
+
+    Args:
+        manifest: the method.
+        out: the results folder.
+        inputs: captures and other files that are read, by option.
+        option: what names `out`, for messages.
+
+    Raises:
+        UsageError: the results folder is in the method's folder or in an input, or its folder
+            `captures` holds an input.
+    """
+    check_places({option: out}, {"METHOD_DIR": manifest.root, **inputs})
+    check_places({f"{option}, captures": out / "captures"}, inputs, replaces=True)
 
 
 def check_call(

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, Protocol
 import numpy as np
 from msgspec import Meta
 
+from hwp_bench.base.arguments import of_type, real_number, whole_number
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import read_gray, read_rgb
@@ -124,7 +125,11 @@ class Budget:
     def __post_init__(self) -> None:
         for name, most in (("seconds", MAX_SECONDS), ("steps", MAX_COUNT)):
             value = getattr(self, name)
-            if value is not None and not 0 <= value <= most:
+            if value is None:
+                continue
+            checked = (whole_number if name == "steps" else real_number)(value, name)
+            object.__setattr__(self, name, checked)
+            if not 0 <= value <= most:
                 raise UsageError(f"{brief(value)} is not from 0 to {most:g}", field=name)
 
 
@@ -142,6 +147,9 @@ class RunSettings:
     frames: str = FRAME_CHOICES[0]
 
     def __post_init__(self) -> None:
+        of_type(self.settings, Mapping, "settings", "a table of settings by name")
+        of_type(self.frames, str, "frames", "a text")
+        object.__setattr__(self, "seed", whole_number(self.seed, "seed"))
         # Every file that keeps a seed, and every generator that takes one, can hold these.
         if not 0 <= self.seed <= MAX_SEED:
             raise UsageError(f"{brief(self.seed)} is not from 0 to {MAX_SEED}", field="seed")

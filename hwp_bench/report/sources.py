@@ -85,6 +85,11 @@ def read_sources(
     return list(first.values())
 
 
+def source_folders(sources: Iterable[ResultsSource]) -> list[Path]:
+    """Return where results lie, as inputs that no output may be."""
+    return [source.folder for source in sources if source.folder is not None]
+
+
 def stored_predictions(source: ResultsSource, item: CaptureResult) -> dict[int, Path]:
     """The predictions of the frames that were scored, by frame; empty where none are kept.
 

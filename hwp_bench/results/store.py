@@ -8,6 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.base.arguments import place
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import inside, read_json, sha256_json, write_json
 from hwp_bench.base.progress import notice
@@ -47,7 +48,7 @@ def read_results(path: str | os.PathLike[str]) -> Results:
         BadResult: of another version, a field is missing, unknown, of the wrong type, or a
             number is out of its range, or a text is too long; the field is named.
     """
-    path = Path(path)
+    path = place(path, "path")
     if path.is_dir():
         path = path / "results.json"
     value = without_schema(read_json(path, max_bytes=MAX_BYTES), SCHEMA, where=path)

@@ -17,6 +17,8 @@ class Perturbation:
 
     #: Name in files and on the command line.
     name: str
+    #: Its name over a frame, before the severity.
+    short: str
     #: Column title of the paper's dataset table.
     title: str
     #: Heading of the paper's per-scenario table.
@@ -30,6 +32,7 @@ class Perturbation:
 _ALL = (
     Perturbation(
         name="hand_object_interaction",
+        short="hoi",
         title="Interaction",
         heading="Hand-object Interactions",
         description="An object that the hand holds or touches covers and shades part of it.",
@@ -37,6 +40,7 @@ _ALL = (
     ),
     Perturbation(
         name="complex_poses",
+        short="cp",
         title="Complex Poses",
         heading="Complex Poses",
         description="Fast articulation, self-occlusion and extreme angles; "
@@ -45,6 +49,7 @@ _ALL = (
     ),
     Perturbation(
         name="illumination",
+        short="il",
         title="Illumination Changes",
         heading="Illumination Variations",
         description="Exposure, colour temperature, light direction or cast shadows change.",
@@ -52,6 +57,7 @@ _ALL = (
     ),
     Perturbation(
         name="motion_blur",
+        short="mb",
         title="Motion Blur",
         heading="Motion Blur",
         description="Hand or camera move while the shutter is open.",
@@ -63,8 +69,13 @@ _ALL = (
 PERTURBATIONS: tuple[str, ...] = tuple(item.name for item in _ALL)
 
 
-def perturbation(name: str) -> Perturbation:
+def perturbation(name: str, *, where: str | None = None, field: str | None = None) -> Perturbation:
     """Look a perturbation up by name.
+
+    Args:
+        name: its name.
+        where: the file that names it, for the message.
+        field: the field in it.
 
     Raises:
         BadInput: no perturbation has that name; the message lists the four.
@@ -73,7 +84,10 @@ def perturbation(name: str) -> Perturbation:
         if item.name == name:
             return item
     raise BadInput(
-        f"there is no perturbation {name!r}", remedy=f"Known are: {', '.join(PERTURBATIONS)}."
+        f"there is no perturbation {name!r}",
+        where=where,
+        field=field,
+        remedy=f"Known are: {', '.join(PERTURBATIONS)}.",
     )
 
 

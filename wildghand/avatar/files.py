@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from msgspec import Meta
 
+from hwp_bench.base.arguments import place
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.records import Seed, parse_record
@@ -107,7 +108,7 @@ def load_avatar(
     Raises:
         BadInput: no avatar, damaged, or made with another hand model; the field is named.
     """
-    root = Path(path)
+    root = place(path, "path")
     if not (root / DESCRIPTION).is_file():
         raise BadInput(
             f"is not an avatar: it has no {DESCRIPTION}",

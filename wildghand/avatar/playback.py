@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.files import atomic_folder
+from hwp_bench.base.files import atomic_folder, check_places
 from hwp_bench.base.images import write_image
 from hwp_bench.base.movies import check_encoder, write_movie
 from hwp_bench.base.progress import track
@@ -43,10 +43,11 @@ def render_clip(
 
     Raises:
         UsageError: the capture shows no hand that the avatar has, or belongs to another hand
-            model.
+            model; or the video lies in the folder, or the folder in the capture.
         MissingDependency: a video is asked for, and PyAV is not installed.
         HwpError: the video cannot be written.
     """
+    check_places({"out": out, "video": video}, {"poses": capture.root}, replaces=overwrite)
     sides = shown_sides(avatar, capture)
     if video is not None:
         check_encoder()

@@ -31,11 +31,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
+    from hwp_bench.base.files import check_places
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
     from wildghand.avatar.explain import explain_frames, explanation_sheet
     from wildghand.avatar.files import load_avatar
 
+    check_places({"--out": args.out}, {"AVATAR": args.avatar, "CAPTURE": args.capture})
     capture = open_capture(args.capture)
     found = explain_frames(load_avatar(args.avatar, hand=args.hand_model), capture, args.frames)
     names = {

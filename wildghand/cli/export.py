@@ -50,9 +50,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
     from wildghand.export.formats import ExportSettings, check_target, export
 
     settings = ExportSettings(mesh=args.mesh, scale=args.scale, supersplat=args.supersplat)
+    check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
     check_target(args.out, settings, overwrite=args.overwrite)
     if args.frame is not None and (args.poses is None or args.mesh):
         raise UsageError("needs --poses, and no --mesh", field="--frame")

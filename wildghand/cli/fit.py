@@ -90,11 +90,19 @@ def run(args: argparse.Namespace) -> int:
     """Run the command, in one process or in those that torchrun started."""
     # FFmpeg would print its own messages about a damaged video next to our one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    from hwp_bench.base.files import check_places
     from wildghand.fitting.parallel import run_in_world
     from wildghand.from_video.api import is_video
     from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings
 
+    inputs = {
+        "VIDEO|CAPTURE": args.source,
+        "--landmarks": args.landmarks,
+        "--model": args.model,
+        "--prior": args.prior,
+    }
+    check_places({"--out": args.out}, inputs, replaces=args.overwrite)
     work = _video if is_video(args.source) else _capture
     return run_in_world(
         lambda: choose_device(read_settings(_settings(args)).device),

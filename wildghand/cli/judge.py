@@ -38,9 +38,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.base.files import write_json
+    from hwp_bench.base.files import check_places, write_json
     from hwp_bench.capture import open_capture
 
+    outputs = {"--out": args.out, "--picture": args.picture}
+    check_places(outputs, {"CAPTURE": args.capture})
     capture = open_capture(args.capture)
     assessment, levels = _judge(capture)
     record = _record(capture, assessment, levels)

@@ -45,10 +45,12 @@ def run(args: argparse.Namespace) -> int:
     import dataclasses
     import json
 
+    from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
     from wildghand.page import write_page
     from wildghand.viewer.motion import capture_of
 
+    check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
     place = args.poses or capture_of(args.avatar)
     capture = None if place is None else open_capture(place)
     facts = write_page(

@@ -43,10 +43,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
     from hwp_bench.cli.overrides import overrides
     from wildghand.pretrain.session import pretrain
     from wildghand.prior.files import WEIGHTS
 
+    check_places({"--out": args.out}, {"CAPTURE": args.captures}, replaces=args.overwrite)
     if args.steps is not None and args.steps < 1:
         raise UsageError(f"is {args.steps}", field="--steps", remedy="Use 1 or more.")
     if args.seed < 0:

@@ -39,12 +39,15 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
     from wildghand.avatar.files import load_avatar
     from wildghand.avatar.playback import render_clip
 
     if not 0 <= args.background <= 255:
         raise UsageError(f"is {args.background}", field="--background", remedy="Use 0 to 255.")
+    inputs = {"AVATAR": args.avatar, "--poses": args.poses}
+    check_places({"--out": args.out, "--video": args.video}, inputs, replaces=args.overwrite)
     avatar = load_avatar(args.avatar, hand=args.hand_model)
     capture = open_capture(args.poses)
     frames = _frames(args.frames, capture.info.frame_count)

@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from hwp_bench.base.arguments import of_type, place, real_number, whole_number
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget
@@ -62,7 +63,7 @@ def fit(
 
     Raises:
         UsageError: `out` exists, a capture is too short for a split, or an argument is for videos
-            only.
+            only, of another type or out of range.
         BadMethod: a setting is unknown or out of range.
         BadInput: the capture or the video is wrong, or no training frame can be used.
         MissingDependency: the tracker of hands is not installed.
@@ -70,10 +71,19 @@ def fit(
         HwpError: the video shows no hand, another fit is writing to `out`, or `out` cannot be
             written.
     """
+    if not isinstance(source, Capture):
+        source = place(source, "source")
+    out = None if out is None else place(out, "out")
+    landmarks = None if landmarks is None else place(landmarks, "landmarks")
+    of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
+    of_type(side, (str, type(None)), "side", "a text")
+    seconds = None if seconds is None else real_number(seconds, "seconds")
+    steps = None if steps is None else whole_number(steps, "steps")
+    seed = whole_number(seed, "seed")
     if not isinstance(source, Capture) and is_video(source):
         options = VideoFit(
             side=side or "auto",
-            landmarks=None if landmarks is None else Path(landmarks),
+            landmarks=landmarks,
             quick=quick,
             all_frames=all_frames is not False,
             steps=steps,

@@ -6,7 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
-from hwp_bench.base.errors import HwpError
+from hwp_bench.base.errors import HwpError, reason_of
 from hwp_bench.base.files import canonical_json, sha256_of
 from hwp_bench.capture import open_capture
 from hwp_bench.methods.contract import Budget
@@ -76,7 +76,7 @@ def _place(job: Job) -> None:
             shutil.copyfile(job.fitted / name, partial)
             os.replace(partial, job.folder / name)
     except OSError as error:
-        raise HwpError(f"cannot be written ({error.strerror})", where=job.folder) from error
+        raise HwpError(f"cannot be written ({reason_of(error)})", where=job.folder) from error
 
 
 FIT = Stage(

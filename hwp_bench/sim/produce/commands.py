@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import check_places
 from hwp_bench.sim.scene.reader import known_scenes, load_scene, meant_scenes, scene_path
 from hwp_bench.sim.scene.schema import Scene
 
@@ -60,6 +61,7 @@ def list_scenes(args: argparse.Namespace) -> int:
 
 def print_plan(args: argparse.Namespace) -> int:
     """Print passes and predicted cost."""
+    from hwp_bench.base.console import print_document
     from hwp_bench.base.tables import to_markdown
     from hwp_bench.sim.produce.forecast import forecast, plan_table, share_table
     from hwp_bench.sim.produce.subject_table import distances, subject_table
@@ -76,7 +78,7 @@ def print_plan(args: argparse.Namespace) -> int:
     else:
         tables = [plan_table(reports)] + ([] if args.no_probe else [share_table(reports)])
         tables += [subject_table(off)] if off else []
-        print("\n".join(to_markdown(table) for table in tables), end="")
+        print_document("\n".join(to_markdown(table) for table in tables))
     return 0
 
 
@@ -91,6 +93,7 @@ def render(args: argparse.Namespace) -> int:
     if args.suite is not None:
         if any(change is not None for change in changes) or args.exr:
             raise UsageError("a suite is rendered as it is", field="--suite")
+        check_places({"--out": args.out}, {})
         with engine_for(args) as engine:
             folders = ensure_suite(
                 args.suite,
@@ -105,7 +108,15 @@ def render(args: argparse.Namespace) -> int:
         return 0
     if args.out is None:
         raise UsageError("is missing", field="-o", remedy="Give a folder with -o.")
+    if args.seed is not None and args.seed < 0:
+        raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
     scenes = [_changed(scene, args.severity, args.subject) for scene in _scenes([args.scene])]
+    check_places(
+        {"--out": args.out},
+        {"SCENE": _scene_file(args.scene)},
+        replaces=args.overwrite,
+        makes_captures=len(scenes) == 1,
+    )
     with engine_for(args) as engine:
         folders = _render_scenes(args, scenes, engine)
     for folder in folders:
@@ -142,6 +153,7 @@ def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine
 
 def preview(args: argparse.Namespace) -> int:
     """Write a contact sheet and an animation, or the stage in 3D."""
+    check_places({"--out": args.out}, {})
     scene = _changed(load_scene(args.scene), args.severity, args.subject)
     if args.stage:
         from hwp_bench.sim.produce.stage_view import draw_stage
@@ -157,6 +169,7 @@ def preview(args: argparse.Namespace) -> int:
 
 def gallery(args: argparse.Namespace) -> int:
     """Write the documentation's strips."""
+    check_places({"--out": args.out}, {})
     from hwp_bench.sim.produce.strips import write_gallery
 
     for path in write_gallery(Path(args.out)):
@@ -194,6 +207,11 @@ def calibrate_scenes(args: argparse.Namespace) -> int:
     if args.json:
         print(json.dumps(rows, indent=1))
     return 0
+
+
+def _scene_file(name: str) -> Path | None:
+    """The file that a scene was named by, if any."""
+    return Path(name) if Path(name).is_file() else None
 
 
 def _scenes(names: list[str]) -> list[Scene]:

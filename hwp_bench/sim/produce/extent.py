@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from hwp_bench.base.arguments import whole_number
 from hwp_bench.base.errors import UsageError
 
 #: Smallest and largest number of frames.
@@ -28,5 +29,6 @@ def check_extent(frame_count: int, size: int, workers: int | None = None) -> Non
         ("size", size, *SIZES),
         ("workers", 1 if workers is None else workers, 1, MAX_WORKERS),
     ):
+        value = whole_number(value, name)
         if not low <= value <= high:
             raise UsageError(f"{value} is not in {low}..{high}", field=name)

@@ -13,7 +13,8 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.arguments import place, whole_number
+from hwp_bench.base.errors import HwpError, UsageError, reason_of
 from hwp_bench.base.files import canonical_json, sha256_json
 from hwp_bench.base.locks import exclusive
 from hwp_bench.base.progress import progress
@@ -102,15 +103,18 @@ def render_capture(
         BadInput: the scene file is at fault.
         HwpError: rendering failed, or `out` cannot be written.
     """
-    scene = scene if isinstance(scene, Scene) else load_scene(scene)
+    if not isinstance(scene, Scene):
+        scene = load_scene(os.fspath(place(scene, "scene")))
     if seed is not None:
+        if whole_number(seed, "seed") < 0:
+            raise UsageError(f"is {seed}", field="seed", remedy="Use 0 or more.")
         scene = replace(scene, seed=seed)
     count = scene.frame_count if frame_count is None else frame_count
     edge = DEFAULT_SIZE if size is None else size
     check_extent(count, edge, workers)
     if scene.sensor.h264:
         check_encoder(scene.id)
-    out = Path(out)
+    out = place(out, "out")
     if out.exists() and not overwrite and (out.is_file() or any(out.iterdir())):
         raise UsageError(
             "exists already", where=out, remedy="Choose another place, or --overwrite."
@@ -121,7 +125,7 @@ def render_capture(
         try:
             waiting.mkdir(parents=True, exist_ok=True)
         except OSError as error:
-            raise HwpError(f"cannot be made ({error.strerror})", where=waiting) from error
+            raise HwpError(f"cannot be made ({reason_of(error)})", where=waiting) from error
         try:
             start = time.perf_counter()
             _render_missing(scene, count, edge, waiting, workers, exr)

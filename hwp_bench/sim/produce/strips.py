@@ -29,18 +29,12 @@ from hwp_bench.sim.scene.optics import focus_point, intrinsics, viewmat
 from hwp_bench.sim.scene.reader import load_scene, scene_names
 from hwp_bench.sim.scene.schema import EffectCall, Scene, with_effects, with_severity
 from hwp_bench.sim.subject.hand import scene_hands
-from hwp_bench.taxonomy import MAX_SEVERITY
+from hwp_bench.taxonomy import MAX_SEVERITY, perturbation
 
 #: Frames in a row of the sheet.
 COLUMNS = 8
 #: Duration of a frame of the animation, ms.
 FRAME_MS = 140
-_SHORT = {
-    "hand_object_interaction": "hoi",
-    "complex_poses": "cp",
-    "illumination": "il",
-    "motion_blur": "mb",
-}
 #: Edge of an image in pixels.
 GALLERY_SIZE = 176
 #: Images in the strip of a capture.
@@ -199,7 +193,9 @@ def strip(results: list[SimulatedFrame], columns: int) -> np.ndarray:
 
 def _captioned(result: SimulatedFrame) -> np.ndarray:
     severity = [
-        f"{_SHORT.get(name, name)}{value}" for name, value in result.plan.severity.items() if value
+        f"{perturbation(name).short}{value}"
+        for name, value in result.plan.severity.items()
+        if value
     ]
     return captioned(result.rgb, " ".join([str(result.plan.frame), *severity]))
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
 from collections import Counter
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.arrays import read_npz
-from hwp_bench.base.errors import BadInput
+from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_write, cache_root, sha256_json
 from hwp_bench.sim.geometry.mesh import surface_normals, unit
 from hwp_bench.sim.geometry.raycast import Tracer
@@ -56,7 +57,7 @@ def skin_atlas(subject: Subject) -> SkinAtlas:
 def kept(
     hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], SkinAtlas]
 ) -> SkinAtlas:
-    """Read a painting from the cache, or paint and keep it.
+    """Read a painting from the cache, or paint it and keep it where the cache can be written.
 
     Args:
         hand: on which it lies.
@@ -80,9 +81,12 @@ def kept(
             arrays = read_npz(path)
             return SkinAtlas(*(arrays[name] for name in ("albedo", "height", "roughness")))
         except (BadInput, KeyError):
-            path.unlink(missing_ok=True)
+            with contextlib.suppress(OSError):
+                path.unlink(missing_ok=True)
     atlas = paint()
-    _store(path, atlas)
+    # Where the cache cannot be written, it is painted again next time.
+    with contextlib.suppress(HwpError):
+        _store(path, atlas)
     return atlas
 
 

@@ -33,3 +33,17 @@ def test_the_last_of_a_name_holds() -> None:
 def test_what_is_no_name_is_refused(text: str) -> None:
     with pytest.raises(UsageError, match="is not NAME=VALUE"):
         overrides([text])
+
+
+@pytest.mark.parametrize("value", ["{b=1", "[1, 2", '"word', "'word", "[bold]", ' {b="c}'])
+def test_what_begins_as_toml_is_toml(value: str) -> None:
+    with pytest.raises(UsageError, match="begins as TOML and is none") as error:
+        overrides([f"a={value}"])
+    assert error.value.where == "--set"
+
+
+@pytest.mark.parametrize("texts", [["a=1", "a.b=2"], ["a.b=2", "a=1"], ["a.b.c=1", "a.b=word"]])
+def test_a_name_is_a_value_or_a_table(texts: list[str]) -> None:
+    with pytest.raises(UsageError, match="is a value, and a table in"):
+        overrides(texts)
+    assert overrides(["a={c=1}", "a.b=2"]) == {"a": {"c": 1}, "a.b": 2}

@@ -132,7 +132,7 @@ def test_a_correction_is_a_revision(run: Path, tmp_path: Path, capsys) -> None:
         (["--reason", "because"], 2, "a reason a revision"),
         (["--avatars", "{tmp}/run/captures"], 0, ""),
         (["--avatars", "{tmp}/run"], 1, "holds no avatar of the capture"),
-        (["-o", "{tmp}/run"], 2, "exists already"),
+        (["-o", "{tmp}/run"], 2, "is the input RESULTS too"),
         (["-o", "{tmp}/lib/site-packages/x"], 2, "installed package"),
     ],
 )

@@ -1,0 +1,150 @@
+"""What commands say where a place, a file or an option is wrong. Oracle: the text, the disc."""
+
+from __future__ import annotations
+
+import errno
+import json
+import os
+import pickle
+import shutil
+import warnings
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+from made_results import made_results
+from small_captures import CaptureMaker
+from synthetic_mano import mano_content
+
+from hwp_bench.base.errors import BadHandModel, HwpError, reason_of
+from hwp_bench.base.files import atomic_write, cache_root
+from hwp_bench.cli.main import main
+from hwp_bench.hands.mano import load_mano
+from hwp_bench.results import write_results
+
+
+def test_the_reason_is_said_for_every_kind_of_error(tmp_path: Path) -> None:
+    full = OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+    assert reason_of(full) == "No space left on device"
+    assert reason_of(OSError("of a library")) == "of a library"
+    assert reason_of(OSError()) == "OSError"
+    (tmp_path / "from").mkdir()
+    (tmp_path / "from" / "a.png").write_text("x")
+
+    def refuse(source: str, target: str) -> None:
+        raise full
+
+    with pytest.raises(shutil.Error) as error:
+        shutil.copytree(tmp_path / "from", tmp_path / "to", copy_function=refuse)
+    assert "No space left on device" in reason_of(error.value)
+
+
+def test_a_full_disc_is_named_when_captures_are_published(
+    make_capture: CaptureMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    root = make_capture(frames=20).root
+
+    def refuse(source: object, target: object, **_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
+
+    monkeypatch.setattr("hwp_bench.publish.parts.shutil.copyfile", refuse)
+    assert main(["data", "publish", str(root), "-o", str(tmp_path / "out")]) == 1
+    said = capsys.readouterr().err
+    assert "No space left on device" in said
+    assert "None" not in said
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_cache_that_cannot_be_written_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "file" / "cache"))
+    with pytest.raises(HwpError, match="choose another cache folder with HWP_CACHE"):
+        atomic_write(cache_root() / "x", "")
+    with pytest.raises(HwpError) as error:
+        atomic_write(tmp_path / "file" / "x", "")
+    assert "HWP_CACHE" not in str(error.value)
+
+
+def test_a_subject_is_painted_without_a_cache(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    from hwp_bench.sim.scene.reader import load_scene
+    from hwp_bench.sim.subject.atlas import SkinAtlas, kept
+
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "file" / "cache"))
+    subject = load_scene("capture0").subject
+    blank = SkinAtlas(*(np.zeros((2, 2, 3)), np.zeros((2, 2)), np.zeros((2, 2))))
+    template = SimpleNamespace(digest="of a template")
+    hand: Any = SimpleNamespace(template=template, model=template, betas=np.zeros(10))
+    assert kept(hand, subject, "test", lambda: blank) is blank
+
+
+def test_an_unknown_perturbation_is_named_with_its_file(make_capture: CaptureMaker, capsys) -> None:
+    root = make_capture(frames=12).root
+    value = json.loads((root / "capture.json").read_text("utf-8"))
+    value["perturbations"] = {"fog": None}
+    (root / "capture.json").write_text(json.dumps(value), "utf-8")
+    assert main(["data", "check", str(root)]) == 1
+    said = capsys.readouterr().out
+    assert f"error: {root / 'capture.json'}: perturbations: there is no perturbation 'fog'" in said
+
+
+def test_a_seed_below_zero_is_refused_by_the_simulator(tmp_path: Path, capsys) -> None:
+    out = tmp_path / "out"
+    assert main(["sim", "render", "capture0", "-o", str(out), "--seed", "-1"]) == 2
+    assert "--seed: is -1" in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("option", ["--by", "--reason", "--revises", "--link"])
+@pytest.mark.parametrize("text", ["\x1b[2J", "two\nlines", "\u202egnp", "x" * 1001])
+def test_a_submission_holds_lines_that_can_be_read(
+    option: str, text: str, tmp_path: Path, capsys
+) -> None:
+    write_results(tmp_path / "R" / "results.json", made_results("a", lambda c, f, s: 20.0))
+    out = tmp_path / "out"
+    given = f"code=https://example.org/{text}" if option == "--link" else text
+    words = ["leaderboard", "submit", str(tmp_path / "R"), "-o", str(out), option, given]
+    assert main(words) != 0
+    assert option in capsys.readouterr().err
+    assert not out.exists()
+
+
+@pytest.mark.parametrize("action", [["build", "-o", "site"], ["show"]], ids=["build", "show"])
+def test_a_board_of_no_sound_entry_is_refused(
+    action: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "entries").mkdir()
+    assert main(["leaderboard", *action, "--entries", "entries"]) == 2
+    assert "holds no entry" in capsys.readouterr().err
+    (tmp_path / "entries" / "a.json").write_text("{}")
+    assert main(["leaderboard", *action, "--entries", "entries"]) == 2
+    assert "holds no sound entry" in capsys.readouterr().err
+    assert not (tmp_path / "site").exists()
+
+
+@pytest.mark.parametrize("field", ["v_template", "weights", "kintree_table"])
+def test_complex_numbers_of_a_hand_model_are_refused(field: str, tmp_path: Path) -> None:
+    content = mano_content("right")
+    content["shapedirs"] = content["shapedirs"][:, :, :10]
+    content[field] = np.asarray(content[field]) + 1j
+    (tmp_path / "MANO_RIGHT.pkl").write_bytes(pickle.dumps(content))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        with pytest.raises(BadHandModel, match="complex") as error:
+            load_mano(str(tmp_path), "right")
+    assert error.value.field == field
+
+
+def test_the_sheet_is_explained_with_the_words_on_it() -> None:
+    from hwp_bench.cli.data_show import _EXAMPLES
+    from hwp_bench.taxonomy import PERTURBATIONS, perturbation
+
+    for name in PERTURBATIONS:
+        assert f"{perturbation(name).short}: " in _EXAMPLES

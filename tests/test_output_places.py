@@ -1,0 +1,122 @@
+"""Outputs in outputs, in inputs and in captures. Oracle: what lies on the disc before and after."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+from made_results import made_results
+from small_captures import CaptureMaker
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import check_places
+from hwp_bench.cli.main import main
+from hwp_bench.results import write_results
+from wildghand.cli.main import main as wildghand
+
+#: Commands whose output would mix with another output, an input or a capture; C is a capture, R
+#: and S are results, V a video, L landmarks, M a method, A an avatar, X nothing. Then what is said.
+WRONG = [
+    ("wildghand render A --poses C -o X --video X/x.mp4", "--video: lies in the output --out"),
+    ("wildghand render A --poses C -o X --video X", "is the output --video too"),
+    ("wildghand render A --poses C -o X/x.mp4/y --video X/x.mp4", "lies in the output --video"),
+    ("wildghand render A --poses C -o C/frames --overwrite", "lies in the input --poses"),
+    ("wildghand render A --poses C -o A --overwrite", "is the input AVATAR too"),
+    ("wildghand render A --poses C -o . --overwrite", "holds the input AVATAR"),
+    ("wildghand fit C -o C --overwrite", "is the input VIDEO|CAPTURE too"),
+    ("wildghand fit V -o V", "is the input VIDEO|CAPTURE too"),
+    ("wildghand fit V -o C --overwrite", "is a capture"),
+    ("wildghand fit C -o C/avatar", "lies in the input"),
+    ("wildghand pretrain C -o . --overwrite", "holds the input CAPTURE"),
+    ("wildghand export A -o A/hand.ply", "lies in the input AVATAR"),
+    ("wildghand page A -o C/hand.html", "lies in the capture"),
+    ("wildghand judge C -o X.json --picture X.json", "is the output --picture too"),
+    ("wildghand judge C -o C/judged.json", "lies in the input CAPTURE"),
+    ("wildghand explain A C -o C/capture.json", "lies in the input CAPTURE"),
+    ("sim render all -o C", "is a capture"),
+    ("sim render capture0 -o C/x", "lies in the capture"),
+    ("sim render --suite smoke -o C", "is a capture"),
+    ("sim preview capture0 -o C", "is a capture"),
+    ("report R S -o C", "is a capture"),
+    ("report R S -o C/report", "lies in the capture"),
+    ("report R S -o R", "is the input RESULTS too"),
+    ("cost R S -o S/cost", "lies in the input RESULTS"),
+    ("evaluate M --capture C -o C/runs", "lies in the input --capture"),
+    ("evaluate M --capture C -o M/runs", "lies in the input METHOD_DIR"),
+    ("evaluate M --capture captures/c -o .", "holds the input --capture"),
+    ("ablate wildghand --capture C -o C", "is the input --capture too"),
+    ("budget M --capture C -o M", "is the input METHOD_DIR too"),
+    ("demo --methods M --out M/demo", "lies in the input METHOD_DIR"),
+    ("data show C -o C/frames/000000.png", "lies in the input CAPTURE"),
+    ("data publish C -o C/public", "lies in the input CAPTURES"),
+    ("data inputs --capture C -o C/inputs", "lies in the input --capture"),
+    ("data track V -o V", "is the input VIDEO too"),
+    ("data track V -o X.npz --sheet X.npz", "is the output --sheet too"),
+    ("data import-video V --landmarks L C/x", "lies in the capture"),
+    ("data import-video V --landmarks L X --sheet X/s.png", "lies in the input OUT"),
+    ("data import-video V --landmarks L X --sheet L", "is the input --landmarks too"),
+    ("data import interhand26m D seq -o D", "is the input DIR too"),
+    ("data import wildghand D -o D/made", "lies in the input DIR"),
+    ("hands convert C C --hand-model anny --force", "is the input CAPTURE too"),
+    ("hands convert C . --hand-model anny --force", "holds the input CAPTURE"),
+    ("hands export C C/hand.glb", "lies in the input CAPTURE"),
+    ("leaderboard submit R -o R/submission", "lies in the input RESULTS"),
+    ("leaderboard build -o C", "is a capture"),
+    ("sealed reveal D -o D/public/revealed.json", "lies in the input SUITE"),
+    ("sealed check D revealed --work D/work", "lies in the input PUBLIC"),
+    ("sealed make capture0 -o C", "is a capture"),
+]
+
+
+def listing(folder: Path) -> dict[str, tuple[int, int]]:
+    facts = {path: path.stat() for path in folder.rglob("*") if path.is_file()}
+    return {str(path): (fact.st_size, fact.st_mtime_ns) for path, fact in facts.items()}
+
+
+@pytest.fixture
+def here(make_capture: CaptureMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    make_capture("C", frames=12)
+    make_capture("c", frames=12).root.rename(tmp_path / "moved")
+    (tmp_path / "captures").mkdir()
+    (tmp_path / "moved").rename(tmp_path / "captures" / "c")
+    for name, level in (("R", 25.0), ("S", 20.0)):
+        made = made_results(name.lower(), lambda c, f, s, level=level: level + c)
+        write_results(tmp_path / name / "results.json", made)
+    for name in ("A", "D", "M"):
+        (tmp_path / name).mkdir()
+    (tmp_path / "M" / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "m"\n[entry]\npredictions = "predictions"\n'
+    )
+    (tmp_path / "M" / "predictions").mkdir()
+    for name in ("V", "L", "revealed"):
+        (tmp_path / name).write_text("not read")
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("command", "said"), WRONG)
+def test_no_command_writes_where_something_else_is(
+    command: str, said: str, here: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = listing(here)
+    words = command.split()
+    status = wildghand(words[1:]) if words[0] == "wildghand" else main(words)
+    error = capsys.readouterr().err
+    assert said in error
+    assert "Traceback" not in error
+    assert status == 2
+    assert listing(here) == before
+
+
+def test_places_that_are_fine(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    capture = make_capture("C", frames=12).root
+    free = tmp_path / "free"
+    check_places({"a": free, "b": tmp_path / "free2", "c": None}, {"d": [capture], "e": None})
+    check_places({"a": tmp_path}, {"d": capture})  # a folder of captures may get something more
+    check_places({"a": capture}, {}, makes_captures=True)  # one that is there is replaced, or not
+    with pytest.raises(UsageError, match="is the output b too"):
+        check_places({"a": free, "b": free / ".." / "free"}, {})
+    link = tmp_path / "link"
+    link.symlink_to(capture, target_is_directory=True)
+    with pytest.raises(UsageError, match="lies in the input d"):
+        check_places({"a": link / "x"}, {"d": capture})
