@@ -16,6 +16,7 @@ import numpy as np
 from hwp_bench.base.errors import BadInput, MissingDependency, UsageError
 from hwp_bench.base.files import check_is_file
 from hwp_bench.base.images import MAX_PIXELS, read_gray
+from hwp_bench.base.progress import notice
 from hwp_bench.base.text import bounded, check_name
 from hwp_bench.importers.shared.windows import CropWindows, cut, resample
 from hwp_bench.importers.video.contour import FIELD_SIZE
@@ -83,23 +84,28 @@ class Reading:
     ends_early: bool
     damaged: int
 
+    def counted(self) -> str:
+        """Return the number of frames, with that of the container where it is larger."""
+        return f"{self.frames} of {self.stated}" if self.stated > self.frames else f"{self.frames}"
+
     def warning(self) -> str | None:
         """Say in what the video is not whole; None where it is."""
         said = []
         if self.ends_early:
-            of = f" of {self.stated}" if self.stated > self.frames else ""
-            said.append(f"ends early, after {self.frames}{of} frames: the file is cut off")
+            said.append(f"ends early, after {self.counted()} frames: the file is cut off")
         if self.damaged:
             said.append(f"damaged packets or frames: {self.damaged}")
         return "; ".join(said) or None
 
     def facts(self) -> dict[str, Any]:
-        """Return the numbers, for JSON."""
+        """Return the numbers, and the warning where there is one, for JSON."""
+        said = self.warning()
         return {
             "decoded_frames": self.frames,
             "stated_frames": self.stated or None,
             "ends_early": self.ends_early,
             "damaged": self.damaged,
+            **({} if said is None else {"warning": said}),
         }
 
 
@@ -176,8 +182,11 @@ def read_images(
     selection: FrameRange,
     windows: CropWindows,
     update: Callable[[int], None] | None = None,
+    ended: Callable[[Reading], None] | None = None,
 ) -> ClipImages:
     """Decode the video once and keep the window of every selected frame.
+
+    `ended` is told as by `read_frames`.
 
     Raises:
         BadInput: the video ends early, goes on longer than the landmarks, or is damaged.
@@ -186,7 +195,7 @@ def read_images(
     frames = np.zeros((count, windows.size, windows.size, 3), dtype=np.uint8)
     working = np.zeros((count, edge, edge, 3), dtype=np.uint8)
     done = 0
-    for _, image in read_frames(info, selection):
+    for _, image in read_frames(info, selection, ended):
         if done < count:
             square = cut(image, windows.corners[done], windows.side)
             frames[done] = resample(square, windows.size)
@@ -288,6 +297,13 @@ def read_frames(
                 where=info.path,
                 remedy="Choose other frames with --frames; the file may be truncated.",
             )
+
+
+def warn_of_damage(info: VideoInfo, reading: Reading) -> None:
+    """Say on standard error in what a video is not whole, if it is not."""
+    said = reading.warning()
+    if said is not None:
+        notice(f"warning: {info.path} {said}. What it holds is used.")
 
 
 _AGAIN = "ffmpeg -i VIDEO -c:v libx264 -crf 12 -pix_fmt yuv420p video.mp4"
