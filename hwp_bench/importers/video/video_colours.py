@@ -7,12 +7,15 @@ players assume, and limited range.
 Ordinary video, in the primaries of BT.709 or of BT.601 (which differ little and are taken for
 those of BT.709, as browsers do), is converted by FFmpeg's swscale. Its values are shown as sRGB.
 
-HLG and PQ (ITU-R BT.2100) become light as a display of 1000 cd/m2 shows it. Reference white of HDR,
-203 cd/m2 (ITU-R BT.2408), becomes white. So that what is brighter does not burn out, the curve of
-ITU-R BT.2390 (EETF, from 1000 to 203 cd/m2, on the largest of red, green and blue, which keeps the
-hue) bends above 93 cd/m2. Then the primaries become those of BT.709, colours outside of them are
-clipped, and the rest is encoded as sRGB. Ordinary video in wide primaries (BT.2020, Display P3)
-takes the same way without the curve.
+HLG and PQ (ITU-R BT.2100) become light as a display of 1000 cd/m2 shows it, relative to 203 cd/m2,
+the reference white of HDR (ITU-R BT.2408). So that what is brighter does not burn out, the curve of
+ITU-R BT.2390 (EETF, from 1000 to 203 cd/m2) bends above 88 cd/m2, which is level 176 of 255:
+reference white becomes level 228, the peak 255. It is applied to the largest of red, green and
+blue, which keeps the hue. Then the primaries become those of BT.709, colours outside of them are
+clipped, and the rest is encoded as sRGB. Metadata of single scenes are not used.
+
+Ordinary video in wide primaries (BT.2020, Display P3) takes the same way without the curve, and so
+does the full range of more than 8 bits, which swscale misses by a level.
 """
 
 from __future__ import annotations
@@ -204,7 +207,7 @@ def to_srgb(frame: Any, colours: Colours, size: tuple[int, int]) -> np.ndarray:
         frame.color_range = 2 if colours.full else 1
     width, height = size
     same_size = (frame.width, frame.height) == size
-    if colours.plain:
+    if colours.plain and not (colours.full and colours.bits > 8):
         # Exact rounding moves ordinary video by one level, and would change every capture.
         flags = _bicubic(exact=colours.bits > 8 or not same_size)
         made = frame.reformat(width, height, "rgb24", None, None, flags, None, 2, threads=1)
@@ -301,7 +304,7 @@ def rolled_off(light: np.ndarray) -> np.ndarray:
         light: relative to reference white, 0 or more.
 
     Returns:
-        In [0, 1], the same up to 0.46.
+        In [0, 1], the same up to 0.43.
     """
     peak = pq_signal(np.array(PEAK))
     given = np.minimum(pq_signal(np.asarray(light) * REFERENCE_WHITE) / peak, 1.0)
