@@ -316,10 +316,10 @@ class _Video:
         path: the file, for messages.
         container: PyAV's.
         kind: key of `CONTAINERS`.
-        size: of the file, bytes.
+        half_packet: whether the file ends within a packet of its container.
     """
 
-    def __init__(self, path: Path, container: Any, kind: str, size: int) -> None:
+    def __init__(self, path: Path, container: Any, kind: str, *, half_packet: bool) -> None:
         self._path, self._container = path, container
         self._stream = _choose(container, path)
         context = self._stream.codec_context
@@ -334,8 +334,8 @@ class _Video:
         self.stated: int = _stated_frames(self._stream, self._packets)
         if self.stated <= 0 and self._seconds is not None:
             self.stated = max(0, min(round(self._seconds * self.fps), 2**31 - 1))
-        # A transport stream is a row of packets of one size.
-        self._cut = kind == "MPEG transport stream" and size % 188 != 0 and size % 192 != 0
+        # Half of a packet at the end, of a row of packets of one size.
+        self._cut = half_packet
         self.decoded = self._damaged = self._seen = 0
         self._reached = 0.0
         self._known: dict[tuple[Any, ...], Colours] = {}
@@ -541,17 +541,19 @@ def _check_size(width: int, height: int, path: Path) -> None:
         )
 
 
-def _kind(path: Path, stream: BinaryIO) -> str:
-    """The container by the file's first bytes: FFmpeg does not choose its reader itself.
+def _kind(path: Path, stream: BinaryIO) -> tuple[str, int]:
+    """The container by the file's first bytes, so that FFmpeg does not choose its reader itself.
 
     It also reads playlists, lists of files and descriptions of streams, which make it open other
-    files or addresses of their author's choice.
+    files or addresses of their author's choice. With it the size of its packets, 1 for most.
     """
     head = stream.read(_HEAD)
     stream.seek(0)
     for kind, (_, pattern) in CONTAINERS.items():
         if re.match(pattern, head, re.DOTALL):
-            return kind
+            # Transport streams are rows of packets of 188 bytes, on discs and in cameras of 192.
+            rows = 188 if head[:1] == head[188:189] == b"G" else 192
+            return kind, rows if kind == "MPEG transport stream" else 1
     raise BadInput(
         f"is not a video file of a kind that is read ({', '.join(CONTAINERS)})",
         where=path,
@@ -570,7 +572,7 @@ def _opened(path: Path) -> Iterator[_Video]:
     with contextlib.ExitStack() as stack:
         try:
             stream = stack.enter_context(path.open("rb"))
-            kind = _kind(path, stream)
+            kind, packet = _kind(path, stream)
             container = stack.enter_context(_container(av, stream, kind))
         except OSError as error:
             if not isinstance(error, av.error.FFmpegError):
@@ -578,7 +580,7 @@ def _opened(path: Path) -> Iterator[_Video]:
             raise _unreadable(path, kind) from error
         except (ValueError, av.error.FFmpegError) as error:
             raise _unreadable(path, kind) from error
-        yield _Video(path, container, kind, size)
+        yield _Video(path, container, kind, half_packet=size % packet != 0)
 
 
 def _container(av: ModuleType, stream: BinaryIO, kind: str) -> Any:

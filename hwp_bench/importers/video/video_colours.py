@@ -27,13 +27,14 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
+from hwp_bench.base.colors import eight_bit_srgb, srgb_to_linear
 from hwp_bench.base.errors import BadInput
 
 #: Reference white of HDR (ITU-R BT.2408), and the peak that curves end at, cd/m2.
 REFERENCE_WHITE, PEAK = 203.0, 1000.0
-#: Entries of the tables that stand for curves; between them is interpolated.
-TABLE = 4097
+#: Entries of the tables that stand for curves, of which the nearest is taken: it is less than 0.05
+#: of 255 levels off.
+TABLE = 65537
 
 _UNSPECIFIED, _RESERVED = 2, 3
 _PQ, _HLG = 16, 18
@@ -250,15 +251,15 @@ def _tables(transfer: int, primaries: int) -> tuple[np.ndarray, ...]:
     """The curves and matrix of a conversion, as the kernel takes them.
 
     Returns:
-        Linear light for a signal in [0, 1]; weights of luminance and the exponent of HLG's
-        display, 0 where there is none; factors for a largest component in [0, `top`]; `top`;
-        the matrix of the primaries; sRGB in [0, 255] for the square root of light in [0, 1].
+        Linear light for a signal in [0, 1]; weights of luminance; what HLG's display scales light
+        by, one entry where there is none; factors for a largest component in [0, `top`]; `top`;
+        the matrix of the primaries; sRGB of 8 bits for the square root of light in [0, 1].
     """
     signal = np.linspace(0.0, 1.0, TABLE)
-    exponent, top, factors = 0.0, 1.0, np.ones(TABLE)
+    top, factors, display = 1.0, np.ones(TABLE), np.ones(1)
     if transfer == _HLG:
         # Scene light; with the display's exponent it becomes light of 0 to 1 of the peak.
-        light, exponent = hlg_scene_light(signal) * (PEAK / REFERENCE_WHITE), 0.2
+        light, display = hlg_scene_light(signal) * (PEAK / REFERENCE_WHITE), signal**0.4
     elif transfer == _PQ:
         light = pq_light(signal) / REFERENCE_WHITE
     else:
@@ -268,10 +269,10 @@ def _tables(transfer: int, primaries: int) -> tuple[np.ndarray, ...]:
         largest = np.linspace(0.0, top, TABLE)
         factors[1:] = rolled_off(largest[1:]) / largest[1:]
     luminance = _to_xyz(_WIDE.get(primaries, _BT709))[1]
-    scaled = np.append(luminance, exponent)
     matrix = np.linalg.inv(_to_xyz(_BT709)) @ _to_xyz(_WIDE.get(primaries, _BT709))
-    codes = 255.0 * linear_to_srgb(signal**2)
-    return light, scaled, factors, np.float64(top), matrix, codes
+    codes = eight_bit_srgb(signal**2)
+    small = (one.astype(np.float32) for one in (display, factors))
+    return light.astype(np.float32), luminance, *small, np.float64(top), matrix, codes
 
 
 def hlg_scene_light(signal: np.ndarray) -> np.ndarray:

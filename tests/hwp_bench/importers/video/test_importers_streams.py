@@ -40,10 +40,10 @@ def greys(frames: list[np.ndarray]) -> list[int]:
 
 
 def cut(path: Path, share: float = 0.6) -> Path:
-    """The first part of a file."""
+    """The first part of a file, no whole number of packets of a transport stream."""
     content = path.read_bytes()
     short = path.with_name(f"cut_{path.name}")
-    short.write_bytes(content[: int(share * len(content))])
+    short.write_bytes(content[: int(share * len(content)) // 188 * 188 + 100])
     return short
 
 
