@@ -339,6 +339,7 @@ class _Video:
         self.decoded = self._damaged = self._seen = 0
         self._reached = 0.0
         self._known: dict[tuple[Any, ...], Colours] = {}
+        self._turn: tuple[bool, bool, bool] | None = None
 
     def frames(self, stop: int | None = None) -> Iterator[tuple[int, Any, Colours]]:
         """Decode the video; yields the number of each frame, the frame and its colours."""
@@ -412,15 +413,22 @@ class _Video:
         _check_size(width, height, self._path)
         return width, height
 
+    def _turned(self, frame: Any) -> tuple[bool, bool, bool]:
+        # Of the first frame only: one whose side data are looked at is part of a ring of objects,
+        # and stays in memory until Python looks for garbage.
+        if self._turn is None:
+            self._turn = _turn(frame)
+        return self._turn
+
     def upright_size(self, frame: Any) -> tuple[int, int]:
         """Width and height of a frame as it is shown."""
         width, height = self._shown_size(frame)
-        return (height, width) if _turn(frame)[0] else (width, height)
+        return (height, width) if self._turned(frame)[0] else (width, height)
 
     def picture(self, frame: Any, colours: Colours) -> np.ndarray:
         """A frame as it is shown, (H, W, 3) uint8 sRGB."""
         image = to_srgb(frame, colours, self._shown_size(frame))
-        swapped, up, back = _turn(frame)
+        swapped, up, back = self._turned(frame)
         if swapped:
             image = image.transpose(1, 0, 2)
         image = image[:: -1 if up else 1, :: -1 if back else 1]

@@ -5,6 +5,7 @@ Oracle: frames that were encoded; OpenCV's direction; the arithmetic of ISO 1449
 
 from __future__ import annotations
 
+import gc
 import os
 import socket
 from collections.abc import Callable
@@ -188,6 +189,23 @@ def _fixed(matrix: tuple[int, int, int, int]) -> list[bytes]:
     a, b, c, d = (value << 16 for value in matrix)
     values = (a, b, 0, c, d, 0, 0, 0, 1 << 30)
     return [value.to_bytes(4, "big", signed=True) for value in values]
+
+
+def test_frames_do_not_stay_in_memory(tmp_path: Path) -> None:
+    """Also where Python looks for no garbage: a frame of a phone takes 12 MB and more."""
+    import av
+
+    path = write_pictures(tmp_path / "a.mp4", pictures(COUNT))
+    info = probe(path)
+    gc.collect()
+    gc.disable()
+    try:
+        held = 0
+        for _ in read_frames(info, FrameRange()):
+            held = max(held, sum(isinstance(one, av.VideoFrame) for one in gc.get_objects()))
+    finally:
+        gc.enable()
+    assert 1 <= held <= 4
 
 
 def test_pixels_that_are_not_square(tmp_path: Path) -> None:
