@@ -200,12 +200,12 @@ def test_frames_do_not_stay_in_memory(tmp_path: Path) -> None:
     gc.collect()
     gc.disable()
     try:
-        held = 0
-        for _ in read_frames(info, FrameRange()):
-            held = max(held, sum(isinstance(one, av.VideoFrame) for one in gc.get_objects()))
+        assert sum(1 for _ in read_frames(info, FrameRange())) == COUNT
+        held = sum(type(one) is av.VideoFrame for one in gc.get_objects())
     finally:
         gc.enable()
-    assert 1 <= held <= 4
+    # The first frame, whose marks are read; the library may hold one.
+    assert held <= 2
 
 
 def test_pixels_that_are_not_square(tmp_path: Path) -> None:
