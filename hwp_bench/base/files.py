@@ -231,7 +231,7 @@ def check_is_file(
     remedy: str | None = None,
     error: type[BadInput] = BadInput,
 ) -> None:
-    """Refuse what is no regular file, before something waits for a pipe or reads a device.
+    """Refuse all but a regular file, before something waits for a pipe or reads a device.
 
     Args:
         path: of an input; a link counts as what it leads to.

@@ -460,7 +460,7 @@ def _rate(stream: Any) -> float:
 
 
 def _expected(container: Any, stream: Any, kind: str) -> tuple[int | None, float | None, bool]:
-    """What a file says of its end.
+    """Read what a file says of its end.
 
     Returns:
         Number of the video's packets, None where they are not listed; its seconds, None where they

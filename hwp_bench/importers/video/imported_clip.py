@@ -102,7 +102,7 @@ class ImportedClip:
         """Return the numbers that measure the import, as JSON; of two hands each has its own."""
         seen = self.source.detected
         overlaps = self.masks.overlap[seen]
-        common = {
+        common: dict[str, object] = {
             "frames": len(seen),
             "overlap": round(float(overlaps.mean()), 4),
             "overlap_percentile_5": round(float(np.percentile(overlaps, 5)), 4),

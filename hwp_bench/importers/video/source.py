@@ -112,9 +112,9 @@ def read_source(
     endings: list[Reading] = []
     with progress("reading frames", len(indices)) as update:
         images = read_images(info, options.frames, windows, update, endings.append)
-    for reading in endings:
-        warn_of_damage(info, reading)
     reading = endings[0] if endings else None
+    if reading is not None:
+        warn_of_damage(info, reading)
     found = read_association(landmarks) if len(hands) == 2 else None
     repaired = (0, 0) if found is None else (found.swaps, found.doubles)
     return VideoSource(
