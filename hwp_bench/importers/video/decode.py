@@ -41,6 +41,8 @@ _CHUNK = 1 << 18
 #: A pixel may be at most this many times as wide as high, or as high as wide; what is stated
 #: beyond is a fault of the file.
 _MOST_ASPECT = 4
+# Frames at the end of which one is the last that was recorded: they are stored in another order.
+_TAIL = 4
 # Packets of a stream that say that it is more than a picture, and all that are looked at for it.
 _MOVING, _LOOK = 3, 20_000
 
@@ -337,6 +339,7 @@ class _Video:
         # Half of a packet at the end, of a row of packets of one size.
         self._cut = half_packet
         self.decoded = self._damaged = self._seen = 0
+        self._damaged_at, self._rows = -_TAIL, kind == "MPEG transport stream"
         self._reached = 0.0
         self._known: dict[tuple[Any, ...], Colours] = {}
         self._turn: tuple[bool, bool, bool] | None = None
@@ -354,6 +357,8 @@ class _Video:
                     return
                 self._damaged += bool(frame.is_corrupt) and not packet.is_corrupt
                 self.decoded += 1
+                if frame.is_corrupt:
+                    self._damaged_at = self.decoded
                 yield self.decoded - 1, frame, self._colours(frame)
 
     def _packets_of_file(self) -> Iterator[Any]:
@@ -395,7 +400,8 @@ class _Video:
 
     def reading(self) -> Reading:
         """Say what came of it, after the last frame."""
-        cut = self._cut
+        # Where no length is stated, a damaged frame among the last is the sign of an end.
+        cut = self._cut or (self._rows and self._damaged_at > self.decoded - _TAIL)
         if self._packets is not None:
             cut |= self._seen < self._packets
         elif self._seconds is not None:

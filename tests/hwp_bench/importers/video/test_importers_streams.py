@@ -268,6 +268,16 @@ def test_a_video_that_ends_early_says_so(
     assert count in said
 
 
+def test_a_transport_stream_that_ends_between_packets(tmp_path: Path) -> None:
+    """It states no length; that its last frame is not whole tells."""
+    path = write_pictures(tmp_path / "a.ts", pictures(COUNT), options=ALONE)
+    short = tmp_path / "cut.ts"
+    short.write_bytes(path.read_bytes()[: path.stat().st_size // 2 // 188 * 188])
+    _, frames, reading = read(short)
+    assert reading.ends_early
+    assert (reading.warning() or "").startswith(f"ends early, after {len(frames)} ")
+
+
 @pytest.mark.parametrize("sound", [0.4, 3.0])
 @pytest.mark.parametrize("ending", ["mp4", "mkv"])
 def test_sound_that_is_longer_or_shorter_is_no_damage(
