@@ -46,4 +46,4 @@ _.misplacement_deviation  # the table CUES names it; getattr reads it
 _.hidden_deviation  # the table CUES names it; getattr reads it
 _.found_inf  # torch's fused Adam reads it
 REACH_X  # a row of the rasterizer's records, named for the order of the rows
-_.pts  # the encoder reads the number of a frame
+_.thread_type  # the decoder reads how it may share its work

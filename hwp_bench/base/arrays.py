@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.base.files import atomic_write
+from hwp_bench.base.files import atomic_write, check_is_file
 from hwp_bench.base.text import shown
 
 #: Largest array file that is read, unpacked, in bytes (a zip can unpack to a thousand times).
@@ -30,8 +30,7 @@ def read_npz(
         BadInput: missing, damaged, larger than `max_bytes` when unpacked, or holding objects.
     """
     path = Path(path)
-    if not path.is_file():
-        raise BadInput("does not exist", where=path)
+    check_is_file(path)
     try:
         with zipfile.ZipFile(path) as archive:
             members = archive.infolist()

@@ -291,6 +291,37 @@ def sha256_file(path: str | os.PathLike[str]) -> str:
         return hashlib.file_digest(stream, "sha256").hexdigest()
 
 
+def check_is_file(
+    path: Path,
+    *,
+    field: str | None = None,
+    remedy: str | None = None,
+    error: type[BadInput] = BadInput,
+) -> None:
+    """Refuse all but a regular file, before something waits for a pipe or reads a device.
+
+    Args:
+        path: of an input; a link counts as what it leads to.
+        field, remedy, error: of the refusal.
+
+    Raises:
+        BadInput: (or `error`) there is nothing, a folder, a pipe, a socket or a device.
+    """
+    try:
+        mode = path.stat().st_mode
+    except (FileNotFoundError, NotADirectoryError) as missing:
+        raise error("does not exist", where=path, field=field, remedy=remedy) from missing
+    except (OSError, ValueError) as failure:
+        reason = getattr(failure, "strerror", None) or "its name cannot be used"
+        problem = f"cannot be read ({reason})"
+        raise error(problem, where=path, field=field, remedy=remedy) from failure
+    if not stat.S_ISREG(mode):
+        kinds = ((stat.S_ISDIR, "a folder"), (stat.S_ISFIFO, "a pipe"), (stat.S_ISSOCK, "a socket"))
+        kind = next((name for test, name in kinds if test(mode)), "a device")
+        problem = f"is {kind} where a file is expected"
+        raise error(problem, where=path, field=field, remedy=remedy)
+
+
 def sha256_of(path: Path) -> str:
     """Return the SHA-256 (hex) of a file, read again only when its size or date has changed."""
     facts = path.stat()

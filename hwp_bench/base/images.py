@@ -12,7 +12,7 @@ import numpy as np
 import OpenImageIO as oiio
 
 from hwp_bench.base.errors import BadImage, HwpError, ShapeMismatch, reason_of
-from hwp_bench.base.files import atomic_write
+from hwp_bench.base.files import atomic_write, check_is_file
 from hwp_bench.base.text import check_name
 
 #: Largest image that is decoded, in pixels: a 300 byte PNG can ask for gigabytes.
@@ -111,8 +111,7 @@ def _read(path: Path, size: tuple[int, int] | None) -> np.ndarray:
 
 def _check_kind(path: Path) -> None:
     """Refuse what is not a still PNG, JPEG or BMP, before any decoder sees it."""
-    if not path.is_file():
-        raise BadImage("does not exist", where=path)
+    check_is_file(path, error=BadImage)
     if path.stat().st_size == 0:
         raise BadImage("is empty (0 bytes)", where=path)
     try:

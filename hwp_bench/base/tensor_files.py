@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hwp_bench.base.errors import BadInput
+from hwp_bench.base.files import check_is_file
 
 if TYPE_CHECKING:
     from torch import Tensor
@@ -27,8 +28,7 @@ def read_tensors(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Tens
     import torch
 
     file = Path(path)
-    if not file.is_file():
-        raise BadInput("does not exist", where=file)
+    check_is_file(file)
     if file.stat().st_size > max_bytes:
         raise BadInput(f"is larger than {max_bytes} bytes", where=file)
     try:

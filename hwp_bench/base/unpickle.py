@@ -22,6 +22,7 @@ from typing import Any, cast
 import numpy as np
 
 from hwp_bench.base.errors import BadInput, HwpError, UnsafePickle
+from hwp_bench.base.files import check_is_file
 from hwp_bench.base.text import shown
 
 #: Largest pickle that is read, in bytes; MANO has 4 MB, a released HWP capture some 100 MB.
@@ -102,8 +103,7 @@ def load_pickle(
             memory: by what it shares, by keys of equal hashes, or by its depth.
     """
     path = Path(path)
-    if not path.is_file():
-        raise BadInput("does not exist", where=path)
+    check_is_file(path)
     size = path.stat().st_size
     if size > max_bytes:
         raise BadInput(f"holds {size} bytes, more than the {max_bytes} that are read", where=path)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -57,8 +56,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    # FFmpeg would print its own messages about a damaged video next to our one line.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
     from hwp_bench.tracking import TrackerSettings, fetch_models, track_video
@@ -95,7 +92,8 @@ def run(args: argparse.Namespace) -> int:
 
 def _print(tracked: TrackedVideo, out: Path) -> None:
     facts = tracked.facts()
-    print(f"{out}: {facts['frames']} frames, {facts['frames_per_second']:.1f} frames per second")
+    frames = tracked.reading.counted()
+    print(f"{out}: {frames} frames, {facts['frames_per_second']:.1f} frames per second")
     for hand in facts["hands"]:
         print(
             f"{hand['side']} hand: seen in {hand['frames_seen']} frames, {hand['tracks']} tracks, "

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -88,8 +87,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    # FFmpeg would print its own messages about a damaged video next to our one line.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from hwp_bench.base.files import check_places
     from hwp_bench.importers.video import VideoImport, import_video, parse_frame_range
 

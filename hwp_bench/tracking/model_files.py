@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import IO
 
 from hwp_bench.base.errors import BadInput, HwpError
-from hwp_bench.base.files import atomic_write, cache_root
+from hwp_bench.base.files import atomic_write, cache_root, check_is_file
 
 #: Largest network that is read, bytes.
 MAX_NETWORK = 64 * 1024 * 1024
@@ -211,10 +211,7 @@ def _from_folder(folder: Path, *, pinned: bool) -> HandModels:
     contents = []
     for name in (PALM, HAND):
         path = folder / name
-        if not path.is_file():
-            raise BadInput(
-                "does not exist", where=path, remedy=f"The folder must contain {PALM} and {HAND}."
-            )
+        check_is_file(path, remedy=f"The folder must contain {PALM} and {HAND}.")
         if path.stat().st_size > MAX_NETWORK:
             raise BadInput(f"is larger than {MAX_NETWORK} bytes", where=path)
         content = path.read_bytes()

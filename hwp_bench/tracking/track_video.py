@@ -14,7 +14,13 @@ import numpy as np
 from hwp_bench.base.errors import HwpError, UsageError
 from hwp_bench.base.progress import progress
 from hwp_bench.importers.shared.hand_tracks import HandTracks, write_hand_tracks
-from hwp_bench.importers.video.decode import VideoInfo, probe, read_frames
+from hwp_bench.importers.video.decode import (
+    Reading,
+    VideoInfo,
+    probe,
+    read_frames,
+    warn_of_damage,
+)
 from hwp_bench.importers.video.video_settings import FrameRange
 from hwp_bench.tracking.assemble import Collected
 from hwp_bench.tracking.model_files import load_models
@@ -34,11 +40,13 @@ class TrackedVideo:
         video: the file.
         hands: in every frame.
         seconds: of tracking.
+        reading: what came of reading the video.
     """
 
     video: VideoInfo
     hands: HandTracks
     seconds: float
+    reading: Reading
 
     def facts(self) -> dict[str, Any]:
         """Return the numbers that describe the result, for JSON."""
@@ -46,6 +54,9 @@ class TrackedVideo:
         return {
             "video": os.fspath(self.video.path),
             "frames": frames,
+            "codec": self.video.codec,
+            "colours": self.video.colours,
+            "reading": self.reading.facts(),
             "frames_per_second": frames / max(self.seconds, 1e-9),
             "hands": [self._hand(hand) for hand in range(len(self.hands.score))],
         }
@@ -75,7 +86,7 @@ def track_video(
     """Track the hands of a video and write their landmarks.
 
     Args:
-        video: any file that OpenCV decodes, not mirrored.
+        video: any file that `hwp_bench.importers.video.decode` reads, not mirrored.
         out: `.npz` to write (`hand_tracks` describes it); the importer reads it.
         settings: thresholds; the defaults where None.
         model: file or folder of the networks; None takes the cache, or downloads them once.
@@ -99,9 +110,11 @@ def track_video(
     if networks is None:
         networks = LiteRtNetworks(load_models(model))
     began = time.perf_counter()
+    endings: list[Reading] = []
     with progress("tracking hands", max(info.stated_frames, 1)) as update:
-        frames = (frame for _, frame in read_frames(info, FrameRange()))
+        frames = (frame for _, frame in read_frames(info, FrameRange(), endings.append))
         collected = track_frames(frames, networks, settings, update)
+    warn_of_damage(info, endings[0])
     hands = collected.hands((info.width, info.height), settings.hands)
     if hands is None:
         raise NoHandSeen(
@@ -109,7 +122,7 @@ def track_video(
             where=info.path,
             remedy="The whole hand must be visible. Lower --min-confidence to accept less.",
         )
-    tracked = TrackedVideo(info, hands, time.perf_counter() - began)
+    tracked = TrackedVideo(info, hands, time.perf_counter() - began, endings[0])
     write_hand_tracks(out, hands)
     return tracked
 

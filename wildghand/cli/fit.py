@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -88,8 +87,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command, in one process or in those that torchrun started."""
-    # FFmpeg would print its own messages about a damaged video next to our one line.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
     from hwp_bench.base.files import check_places
     from wildghand.fitting.parallel import run_in_world
     from wildghand.from_video.api import is_video
@@ -138,6 +135,8 @@ def _print(made: MadeAvatar) -> None:
     facts = made.facts()
     hands = " and ".join(facts["hands"])
     print(f"{facts['avatar']}: {hands} hand, {facts['frames']} frames, {facts['steps']} steps")
+    if "warning" in facts["video"]:
+        print(f"video: {facts['video']['warning']}")
     print(f"turntable: {facts['turntable']}")
     print(f"sheet: {facts['sheet']}")
     print(f"page: {facts['page']}")

@@ -18,9 +18,9 @@ from wildghand.from_video.settings import with_quick
 
 
 def is_video(source: str | os.PathLike[str]) -> bool:
-    """Whether a source is a video: a file, or the name of none that has an ending."""
+    """Whether a source is a video: no folder, and something or a name that has an ending."""
     path = Path(source)
-    return path.is_file() or (not path.exists() and bool(path.suffix))
+    return not path.is_dir() and (path.exists() or bool(path.suffix))
 
 
 def fit(

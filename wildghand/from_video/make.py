@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import contextlib
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.locks import exclusive
 from hwp_bench.base.movies import check_encoder
+from hwp_bench.capture import open_capture
 from hwp_bench.importers.video.decode import probe
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
@@ -42,6 +43,13 @@ class MadeAvatar:
     record: JobRecord
     kept: tuple[str, ...]
 
+    def video_facts(self) -> dict[str, Any]:
+        """Return what the import took down of the video; nothing where its capture is gone."""
+        with contextlib.suppress(BadInput):
+            video = open_capture(self.job.capture).info.source.get("video")
+            return dict(video) if isinstance(video, Mapping) else {}
+        return {}
+
     def facts(self) -> dict[str, Any]:
         """Return what a program wants to know of it, for JSON."""
         fit, job = self.avatar.record, self.job
@@ -55,6 +63,7 @@ class MadeAvatar:
             "sheet": str(job.sheet),
             "page": str(job.page),
             "capture": str(job.capture),
+            "video": self.video_facts(),
             "stages": [
                 {
                     "name": name,
@@ -89,7 +98,7 @@ def make_avatar(
     build on them.
 
     Args:
-        video: any file that OpenCV decodes.
+        video: any file that `hwp_bench.importers.video.decode` reads.
         out: folder of the avatar; None: `default_folder`.
         options: choices; the defaults where None.
         overwrite: make everything again; replace an avatar that came from elsewhere.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
@@ -41,9 +42,11 @@ def avatar_sheet(avatar: WildGHandAvatar, capture: Capture, weights: Path) -> np
     masks = {int(path.stem): path for path in sorted(weights.glob("[0-9]*.png"))}
     frames = _spread(sorted(masks) or avatar.record.frames)
     rows: list[list[np.ndarray]] = [[], [], []]
+    video = capture.info.source.get("video")
+    ends_early = isinstance(video, Mapping) and video.get("ends_early") is True
     for frame in frames:
         poses = {s: p for s, p in capture.hand_poses(frame).items() if s in avatar.sides}
-        rows[0].append(_tile(capture.frame(frame), f"frame {frame}"))
+        rows[0].append(_tile(capture.frame(frame), _named(frame, frames, ends_early)))
         drawn = avatar.render(poses, capture.camera(frame))[..., :3]
         rows[1].append(_tile(as_uint8(drawn), "avatar"))
         if frame in masks:
@@ -55,6 +58,10 @@ def avatar_sheet(avatar: WildGHandAvatar, capture: Capture, weights: Path) -> np
     blank = np.full_like(rows[3][0], 250)
     tiles = [tile for row in rows if row for tile in [*row, *[blank] * (COLUMNS - len(row))]]
     return sheet(tiles, COLUMNS)
+
+
+def _named(frame: int, frames: list[int], ends_early: bool) -> str:
+    return f"frame {frame}" + (" (video ends early)" if ends_early and frame == frames[-1] else "")
 
 
 def _spread(frames: list[int]) -> list[int]:

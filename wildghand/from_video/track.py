@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from hwp_bench.base.errors import BadInput
-from hwp_bench.base.files import sha256_of
+from hwp_bench.base.files import check_is_file, sha256_of
 from hwp_bench.importers.video.decode import probe
 from hwp_bench.tracking import TrackerSettings, track_video
 from hwp_bench.tracking.track_video import NoHandSeen
@@ -27,8 +26,7 @@ def frame_count(job: Job) -> int:
 def _facts(job: Job) -> dict[str, str]:
     given, model = job.options.landmarks, job.options.tracker
     if given is not None:
-        if not given.is_file():
-            raise BadInput("does not exist", where=given, field="--landmarks")
+        check_is_file(given, field="--landmarks")
         return {"landmarks": sha256_of(given)}
     return {"video": video_digest(job), "tracker": "shipped" if model is None else str(model)}
 

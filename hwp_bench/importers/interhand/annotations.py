@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.base.files import inside, read_json
+from hwp_bench.base.files import check_is_file, inside, read_json
 from hwp_bench.capture.schema import MAX_FRAMES
 from hwp_bench.importers.interhand.sequences import SPLITS, InterHandSequence
 
@@ -177,8 +177,7 @@ def _list(data: dict[str, Any], name: str, where: Path) -> list[dict[str, Any]]:
 
 def _image(folder: Path, name: str) -> Path:
     path = inside(folder, re.sub(r"^/+", "", name))
-    if not path.is_file():
-        raise BadInput("does not exist", where=path, remedy="Unpack the images of the sequence.")
+    check_is_file(path, remedy="Unpack the images of the sequence.")
     return path
 
 

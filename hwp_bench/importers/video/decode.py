@@ -8,29 +8,43 @@ import re
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from types import ModuleType
+from typing import Any, BinaryIO
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.errors import BadInput, MissingDependency, UsageError
+from hwp_bench.base.files import check_is_file
 from hwp_bench.base.images import MAX_PIXELS, read_gray
+from hwp_bench.base.progress import notice
 from hwp_bench.base.text import bounded, check_name
 from hwp_bench.importers.shared.windows import CropWindows, cut, resample
 from hwp_bench.importers.video.contour import FIELD_SIZE
+from hwp_bench.importers.video.video_colours import Colours, colours_of, to_srgb
 from hwp_bench.importers.video.video_settings import FrameRange
 
-#: Containers that are read, each with how its files begin.
+#: Containers that are read, each with FFmpeg's name of its reader and how its files begin.
 CONTAINERS = {
-    "MP4 or MOV": rb".{4}(ftyp|moov|mdat|wide|free|skip|pnot)",
-    "Matroska or WebM": rb"\x1aE\xdf\xa3",
-    "AVI": rb"RIFF.{4}AVI ",
-    "MPEG transport stream": rb"(?:.{4})?G.{187}(?:.{4})?G",
-    "MPEG": rb"\0\0\x01[\xba\xb3]",
-    "Flash video": rb"FLV\x01",
-    "Ogg": rb"OggS\0",
-    "ASF or WMV": rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11",
+    "MP4 or MOV": ("mov", rb".{4}(ftyp|moov|mdat|wide|free|skip|pnot)"),
+    "Matroska or WebM": ("matroska", rb"\x1aE\xdf\xa3"),
+    "AVI": ("avi", rb"RIFF.{4}AVI "),
+    "MPEG transport stream": ("mpegts", rb"(?:.{4})?G.{187}(?:.{4})?G"),
+    "MPEG": ("mpeg", rb"\0\0\x01\xba"),
+    "MPEG without a container": ("mpegvideo", rb"\0\0\x01\xb3"),
+    "Flash video": ("flv", rb"FLV\x01"),
+    "Ogg": ("ogg", rb"OggS\0"),
+    "ASF or WMV": ("asf", rb"\x30\x26\xb2\x75\x8e\x66\xcf\x11"),
 }
 _HEAD = 512
+# Bytes that FFmpeg asks the file for at once.
+_CHUNK = 1 << 18
+#: A pixel may be at most this many times as wide as high, or as high as wide; what is stated
+#: beyond is a fault of the file.
+_MOST_ASPECT = 4
+# Frames at the end of which one is the last that was recorded: they are stored in another order.
+_TAIL = 4
+# Packets of a stream that say that it is more than a picture, and all that are looked at for it.
+_MOVING, _LOOK = 3, 20_000
 
 
 @dataclass(frozen=True)
@@ -39,10 +53,12 @@ class VideoInfo:
 
     Attributes:
         path: the file.
-        width: pixels, after the rotation that the file asks for.
+        width: pixels, after the rotation and the shape of pixels that the file asks for.
         height: pixels.
         fps: frames per second; 30 where the file does not state it.
         stated_frames: number of frames that the container states, 0 where it states none.
+        codec: FFmpeg's name of what the frames are compressed by.
+        colours: how its samples are read, for a person.
     """
 
     path: Path
@@ -50,36 +66,77 @@ class VideoInfo:
     height: int
     fps: float
     stated_frames: int
+    codec: str = "unknown"
+    colours: str = "unknown"
+
+
+@dataclass(frozen=True)
+class Reading:
+    """What came of reading a video to its end.
+
+    Attributes:
+        frames: number of frames that were decoded.
+        stated: number that the container states, 0 where it states none.
+        ends_early: whether the file ends before the video does.
+        damaged: number of packets and frames that could not be decoded, or not whole.
+    """
+
+    frames: int
+    stated: int
+    ends_early: bool
+    damaged: int
+
+    def counted(self) -> str:
+        """Return the number of frames, with that of the container where it is larger."""
+        return f"{self.frames} of {self.stated}" if self.stated > self.frames else f"{self.frames}"
+
+    def warning(self) -> str | None:
+        """Say in what the video is not whole; None where it is."""
+        said = []
+        if self.ends_early:
+            said.append(f"ends early, after {self.counted()} frames: the file is cut off")
+        if self.damaged:
+            said.append(f"damaged packets or frames: {self.damaged}")
+        return "; ".join(said) or None
+
+    def facts(self) -> dict[str, Any]:
+        """Return the numbers, and the warning where there is one, for JSON."""
+        said = self.warning()
+        return {
+            "decoded_frames": self.frames,
+            "stated_frames": self.stated or None,
+            "ends_early": self.ends_early,
+            "damaged": self.damaged,
+            **({} if said is None else {"warning": said}),
+        }
 
 
 def probe(path: str | os.PathLike[str]) -> VideoInfo:
     """Open a video and decode its first frame.
 
     Raises:
-        BadInput: the file is missing or empty, OpenCV cannot read it, or its frames are too large.
+        BadInput: the file is missing, empty or no video file, holds no video, its codec or its
+            colours cannot be read, or its frames are too large.
     """
     path = Path(path)
-    with _opened(path) as capture:
-        import cv2
-
-        width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
-        height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
-        if width * height > MAX_PIXELS:
+    with _opened(path) as video:
+        _, frame, colours = next(video.frames(), (0, None, None))
+        if frame is None:
             raise BadInput(
-                f"is {width}x{height}, above the limit of {MAX_PIXELS} px per frame", where=path
+                f"contains no frame that can be decoded (codec {video.codec})",
+                where=path,
+                remedy=f"The file is damaged or cut off; if it plays elsewhere: {_AGAIN}",
             )
-        fps = float(capture.get(cv2.CAP_PROP_FPS))
-        stated = capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        found, frame = capture.read()
-        if not found or frame is None:
-            raise BadInput("contains no frame that can be decoded", where=path)
-    return VideoInfo(
-        path=path,
-        width=frame.shape[1],
-        height=frame.shape[0],
-        fps=fps if np.isfinite(fps) and 0 < fps <= 1000 else 30.0,
-        stated_frames=int(stated) if np.isfinite(stated) and 0 < stated < 2**31 else 0,
-    )
+        width, height = video.upright_size(frame)
+        return VideoInfo(
+            path=path,
+            width=width,
+            height=height,
+            fps=video.fps,
+            stated_frames=video.stated,
+            codec=video.codec,
+            colours=str(colours),
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,8 +184,11 @@ def read_images(
     selection: FrameRange,
     windows: CropWindows,
     update: Callable[[int], None] | None = None,
+    ended: Callable[[Reading], None] | None = None,
 ) -> ClipImages:
     """Decode the video once and keep the window of every selected frame.
+
+    `ended` is told as by `read_frames`.
 
     Raises:
         BadInput: the video ends early, goes on longer than the landmarks, or is damaged.
@@ -137,7 +197,7 @@ def read_images(
     frames = np.zeros((count, windows.size, windows.size, 3), dtype=np.uint8)
     working = np.zeros((count, edge, edge, 3), dtype=np.uint8)
     done = 0
-    for _, image in read_frames(info, selection):
+    for _, image in read_frames(info, selection, ended):
         if done < count:
             square = cut(image, windows.corners[done], windows.side)
             frames[done] = resample(square, windows.size)
@@ -200,80 +260,370 @@ def read_masks(
     return masks
 
 
-def read_frames(info: VideoInfo, selection: FrameRange) -> Iterator[tuple[int, np.ndarray]]:
+def read_frames(
+    info: VideoInfo, selection: FrameRange, ended: Callable[[Reading], None] | None = None
+) -> Iterator[tuple[int, np.ndarray]]:
     """Decode the selected frames, one after the other.
 
     Args:
         info: the probed video.
         selection: which frames; those between are decoded and dropped, because seeking is not
             exact in every container.
+        ended: is told what came of it when the video was read to its end, which a selection with
+            a `stop` does not do.
 
     Yields:
-        (index in the video, (H, W, 3) uint8 RGB).
+        (index in the video, (H, W, 3) uint8 sRGB).
 
     Raises:
         BadInput: the size changes between frames, or the video ends before `selection.stop`.
     """
-    import cv2
-
-    index = 0
-    with _opened(info.path) as capture:
-        while selection.stop is None or index < selection.stop:
-            if not capture.grab():
-                break
-            if index >= selection.start and (index - selection.start) % selection.stride == 0:
-                found, frame = capture.retrieve()
-                if not found or frame is None or frame.shape != (info.height, info.width, 3):
-                    raise BadInput(
-                        f"frame {index} cannot be decoded at {info.width}x{info.height}",
-                        where=info.path,
-                        remedy="Re-encode the video, or take other frames with --frames.",
-                    )
-                yield index, cv2.cvtColor(frame, cv2.COLOR_BGR2RGB)
-            index += 1
-    if selection.stop is not None and index < selection.stop:
-        raise BadInput(
-            f"ends after {index} frames, {selection.stop} are selected",
-            where=info.path,
-            remedy="Choose other frames with --frames; the file may be truncated.",
-        )
+    with _opened(info.path) as video:
+        index = 0
+        for index, frame, colours in video.frames(selection.stop):
+            if index < selection.start or (index - selection.start) % selection.stride:
+                continue
+            if video.upright_size(frame) != (info.width, info.height):
+                raise BadInput(
+                    f"frame {index} is not of the size {info.width}x{info.height}",
+                    where=info.path,
+                    remedy="Re-encode the video, or take other frames with --frames.",
+                )
+            yield index, video.picture(frame, colours)
+        if selection.stop is None:
+            if ended is not None:
+                ended(video.reading())
+        elif video.decoded < selection.stop:
+            raise BadInput(
+                f"ends after {video.decoded} frames, {selection.stop} are selected",
+                where=info.path,
+                remedy="Choose other frames with --frames; the file may be truncated.",
+            )
 
 
-def _check_container(path: Path) -> None:
-    """Refuse by its first bytes what is not a video file, before FFmpeg chooses a reader.
+def warn_of_damage(info: VideoInfo, reading: Reading) -> None:
+    """Say on standard error in what a video is not whole, if it is not."""
+    said = reading.warning()
+    if said is not None:
+        notice(f"warning: {info.path} {said}. What it holds is used.")
 
-    FFmpeg also reads playlists, lists of files and descriptions of streams, which make it open
-    other files or addresses of their author's choice.
+
+_AGAIN = "ffmpeg -i VIDEO -c:v libx264 -crf 12 -pix_fmt yuv420p video.mp4"
+
+
+class _Video:
+    """An open file, and the stream of it that is the video.
+
+    Args:
+        path: the file, for messages.
+        container: PyAV's.
+        kind: key of `CONTAINERS`.
+        half_packet: whether the file ends within a packet of its container.
     """
-    try:
-        with path.open("rb") as stream:
-            head = stream.read(_HEAD)
-    except OSError as error:
-        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
-    if not any(re.match(pattern, head, re.DOTALL) for pattern in CONTAINERS.values()):
+
+    def __init__(self, path: Path, container: Any, kind: str, *, half_packet: bool) -> None:
+        self._path, self._container = path, container
+        self._stream = _choose(container, path)
+        context = self._stream.codec_context
+        self.codec: str = _codec_name(self._stream)
+        _check_size(context.width, context.height, path)
+        context.options = {"max_pixels": str(2 * MAX_PIXELS)}
+        self._stream.thread_type = "AUTO"
+        aspect = float(self._stream.sample_aspect_ratio or 1)
+        self._aspect = aspect if 1 / _MOST_ASPECT <= aspect <= _MOST_ASPECT else 1.0
+        self.fps = _rate(self._stream)
+        self._packets, self._seconds, self._own = _expected(container, self._stream, kind)
+        self.stated: int = _stated_frames(self._stream, self._packets)
+        if self.stated <= 0 and self._seconds is not None:
+            self.stated = max(0, min(round(self._seconds * self.fps), 2**31 - 1))
+        # Half of a packet at the end, of a row of packets of one size.
+        self._cut = half_packet
+        self.decoded = self._damaged = self._seen = 0
+        self._damaged_at, self._rows = -_TAIL, kind == "MPEG transport stream"
+        self._reached = 0.0
+        self._known: dict[tuple[Any, ...], Colours] = {}
+        self._turn: tuple[bool, bool, bool] | None = None
+
+    def frames(self, stop: int | None = None) -> Iterator[tuple[int, Any, Colours]]:
+        """Decode the video; yields the number of each frame, the frame and its colours."""
+        for packet in self._packets_of_file():
+            try:
+                frames = packet.decode()
+            except _library().error.FFmpegError:
+                self._damaged += 1
+                continue
+            for frame in frames:
+                if stop is not None and self.decoded >= stop:
+                    return
+                self._damaged += bool(frame.is_corrupt) and not packet.is_corrupt
+                self.decoded += 1
+                if frame.is_corrupt:
+                    self._damaged_at = self.decoded
+                yield self.decoded - 1, frame, self._colours(frame)
+
+    def _packets_of_file(self) -> Iterator[Any]:
+        """Packets of the video; takes note of how far those of all streams reach."""
+        streams, own = self._container.streams, self._stream.index
+        others = () if self._own else (*streams.audio, *streams.video)
+        wanted = [self._stream, *(one for one in others if one.index != own)]
+        packets = iter(self._container.demux(wanted))
+        while True:
+            try:
+                packet = next(packets, None)
+            except _library().error.FFmpegError:
+                self._damaged += 1
+                self._cut = True
+                return
+            if packet is None:
+                return
+            if packet.pts is not None and packet.size:
+                end = float((packet.pts + (packet.duration or 0)) * packet.time_base)
+                self._reached = max(self._reached, end - self._began(packet.stream))
+            if packet.stream.index == own:
+                self._seen += packet.size > 0
+                self._damaged += bool(packet.is_corrupt)
+                yield packet
+
+    def _began(self, stream: Any) -> float:
+        """Second at which the time of a stream begins."""
+        if self._own:
+            return float((stream.start_time or 0) * stream.time_base)
+        return (self._container.start_time or 0) / _library().time_base
+
+    def _colours(self, frame: Any) -> Colours:
+        stated = (frame.colorspace, frame.color_primaries, frame.color_trc, frame.color_range)
+        key = (*stated, frame.format.name, frame.width, frame.height)
+        if key not in self._known:
+            tag = self._stream.codec_context.codec_tag
+            self._known = {key: colours_of(frame, tag, self._path)}
+        return self._known[key]
+
+    def reading(self) -> Reading:
+        """Say what came of it, after the last frame."""
+        # Where no length is stated, a damaged frame among the last is the sign of an end.
+        cut = self._cut or (self._rows and self._damaged_at > self.decoded - _TAIL)
+        if self._packets is not None:
+            cut |= self._seen < self._packets
+        elif self._seconds is not None:
+            # The last frame may be shown for longer than the others.
+            cut |= self._seconds - self._reached > max(2.5 / self.fps, 0.01 * self._seconds)
+        return Reading(self.decoded, self.stated, cut, self._damaged)
+
+    def _shown_size(self, frame: Any) -> tuple[int, int]:
+        """Width and height of a frame with square pixels, before it is turned."""
+        width, height = frame.width, frame.height
+        if self._aspect > 1.0:
+            width = round(width * self._aspect)
+        elif self._aspect < 1.0:
+            height = round(height / self._aspect)
+        _check_size(width, height, self._path)
+        return width, height
+
+    def _turned(self, frame: Any) -> tuple[bool, bool, bool]:
+        # Of the first frame only: one whose side data are looked at is part of a ring of objects,
+        # and stays in memory until Python looks for garbage.
+        if self._turn is None:
+            self._turn = _turn(frame)
+        return self._turn
+
+    def upright_size(self, frame: Any) -> tuple[int, int]:
+        """Width and height of a frame as it is shown."""
+        width, height = self._shown_size(frame)
+        return (height, width) if self._turned(frame)[0] else (width, height)
+
+    def picture(self, frame: Any, colours: Colours) -> np.ndarray:
+        """A frame as it is shown, (H, W, 3) uint8 sRGB."""
+        image = to_srgb(frame, colours, self._shown_size(frame))
+        swapped, up, back = self._turned(frame)
+        if swapped:
+            image = image.transpose(1, 0, 2)
+        image = image[:: -1 if up else 1, :: -1 if back else 1]
+        return np.ascontiguousarray(image)
+
+
+def _turn(frame: Any) -> tuple[bool, bool, bool]:
+    """How a frame is turned for display: rows become columns, then rows and columns reversed.
+
+    The display matrix maps a pixel's column and row to those of the display; the nearest of its
+    eight turns and mirror images is taken.
+    """
+    stated = next((s for s in frame.side_data if s.type.name == "DISPLAYMATRIX"), None)
+    if stated is None:
+        return False, False, False
+    a, b, _, c, d = (int(value) for value in np.frombuffer(stated, dtype=np.int32)[:5])
+    if max(abs(b), abs(c)) > max(abs(a), abs(d)):
+        return True, b < 0, c < 0
+    return False, d < 0, a < 0
+
+
+def _rate(stream: Any) -> float:
+    """Frames per second; 30 where the file states none that can be."""
+    rates = [stream.average_rate, stream.guessed_rate, stream.codec_context.framerate]
+    if stream.time_base is not None and stream.time_base >= 1:
+        # Such a clock counts no frames.
+        rates = rates[2:]
+    return next((float(rate) for rate in rates if rate and 0 < rate <= 1000), 30.0)
+
+
+def _expected(container: Any, stream: Any, kind: str) -> tuple[int | None, float | None, bool]:
+    """Read what a file says of its end.
+
+    Returns:
+        Number of the video's packets, None where they are not listed; its seconds, None where they
+        are not stated; whether these are of the video alone, not of all that the file holds.
+    """
+    if kind == "MP4 or MOV" and stream.frames > 0:
+        # What an edit list leaves out is not among them.
+        return len(stream.index_entries), None, True
+    if kind == "AVI" and stream.frames > 0 and stream.average_rate:
+        return None, stream.frames / float(stream.average_rate), True
+    stated = re.fullmatch(r"(\d+):(\d\d):(\d\d(?:\.\d+)?)", stream.metadata.get("DURATION", ""))
+    if stated:
+        return None, int(stated[1]) * 3600 + int(stated[2]) * 60 + float(stated[3]), True
+    if stream.duration and stream.time_base and kind != "AVI":
+        return None, float(stream.duration * stream.time_base), True
+    if container.duration and container.duration > 0:
+        return None, container.duration / _library().time_base, False
+    return None, None, True
+
+
+def _stated_frames(stream: Any, packets: int | None) -> int:
+    """Number of frames that a file lists; an edit list may leave some out."""
+    if packets is None:
+        return int(stream.frames)
+    return packets - sum(entry.is_discard for entry in stream.index_entries)
+
+
+def _choose(container: Any, path: Path) -> Any:
+    """The stream that is the video: not a cover, not a preview, decodable, marked, the largest."""
+    streams = list(container.streams.video)
+    if not streams:
+        raise BadInput("contains no video", where=path, remedy="It may hold sound only.")
+    flags = _library().stream.Disposition
+    pictures = flags.attached_pic | flags.timed_thumbnails | flags.still_image
+    moving = [stream for stream in streams if not stream.disposition & pictures]
+    if len(moving) > 1:
+        moving = _with_frames(container, moving)
+    if not moving:
+        raise BadInput("contains no video but a cover picture", where=path)
+    readable = [stream for stream in moving if _can_decode(stream)]
+    if not readable:
+        names = ", ".join(_codec_name(stream) for stream in moving)
         raise BadInput(
-            f"is not a video file of a kind that is read ({', '.join(CONTAINERS)})",
+            f"is compressed by a codec that cannot be decoded here ({names})",
             where=path,
-            remedy="Convert it, such as with: ffmpeg -i VIDEO video.mp4",
+            remedy=f"Convert it: {_AGAIN}",
         )
+
+    def rank(stream: Any) -> tuple[bool, bool, int]:
+        area = stream.codec_context.width * stream.codec_context.height
+        marked = bool(stream.disposition & flags.default)
+        return not stream.disposition & flags.dependent, marked, area
+
+    return max(readable, key=rank)
+
+
+def _with_frames(container: Any, streams: list[Any]) -> list[Any]:
+    """Those of some streams that hold more than a picture or two, as the first packets show."""
+    counts = dict.fromkeys((stream.index for stream in streams), 0)
+    with contextlib.suppress(_library().error.FFmpegError):
+        for number, packet in enumerate(container.demux(streams)):
+            counts[packet.stream.index] += packet.size > 0
+            if number > _LOOK or min(counts.values()) >= _MOVING:
+                break
+    container.seek(0)
+    most = min(max(counts.values()), _MOVING)
+    return [stream for stream in streams if counts[stream.index] >= most]
+
+
+def _can_decode(stream: Any) -> bool:
+    return stream.codec_context is not None and stream.codec_context.codec is not None
+
+
+def _codec_name(stream: Any) -> str:
+    context = stream.codec_context
+    if context is None:
+        return "unknown"
+    # The decoder may be named after its library.
+    return {"libdav1d": "av1"}.get(context.name, context.name)
+
+
+def _check_size(width: int, height: int, path: Path) -> None:
+    if width * height > MAX_PIXELS:
+        raise BadInput(
+            f"is {width}x{height}, above the limit of {MAX_PIXELS} px per frame", where=path
+        )
+
+
+def _kind(path: Path, stream: BinaryIO) -> tuple[str, int]:
+    """The container by the file's first bytes, so that FFmpeg does not choose its reader itself.
+
+    It also reads playlists, lists of files and descriptions of streams, which make it open other
+    files or addresses of their author's choice. With it the size of its packets, 1 for most.
+    """
+    head = stream.read(_HEAD)
+    stream.seek(0)
+    for kind, (_, pattern) in CONTAINERS.items():
+        if re.match(pattern, head, re.DOTALL):
+            # Transport streams are rows of packets of 188 bytes, on discs and in cameras of 192.
+            rows = 188 if head[:1] == head[188:189] == b"G" else 192
+            return kind, rows if kind == "MPEG transport stream" else 1
+    raise BadInput(
+        f"is not a video file of a kind that is read ({', '.join(CONTAINERS)})",
+        where=path,
+        remedy="Convert it, such as with: ffmpeg -i VIDEO video.mp4",
+    )
 
 
 @contextlib.contextmanager
-def _opened(path: Path) -> Iterator[Any]:
-    import cv2
-
-    if not path.is_file():
-        raise BadInput("does not exist", where=path, remedy="Give a video file.")
-    if path.stat().st_size == 0:
-        raise BadInput("is empty (0 bytes)", where=path)
-    _check_container(path)
+def _opened(path: Path) -> Iterator[_Video]:
     check_name(path)
-    # FFmpeg would print what the file's headers say, terminal escapes too.
-    os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    capture = cv2.VideoCapture(os.fspath(path), cv2.CAP_FFMPEG)
+    check_is_file(path, remedy="Give a video file.")
+    size = path.stat().st_size
+    if size == 0:
+        raise BadInput("is empty (0 bytes)", where=path)
+    av = _library()
+    with contextlib.ExitStack() as stack:
+        try:
+            stream = stack.enter_context(path.open("rb"))
+            kind, packet = _kind(path, stream)
+            container = stack.enter_context(_container(av, stream, kind))
+        except OSError as error:
+            if not isinstance(error, av.error.FFmpegError):
+                raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+            raise _unreadable(path, kind) from error
+        except (ValueError, av.error.FFmpegError) as error:
+            raise _unreadable(path, kind) from error
+        yield _Video(path, container, kind, half_packet=size % packet != 0)
+
+
+def _container(av: ModuleType, stream: BinaryIO, kind: str) -> Any:
+    """Open a container of an open file: no name is taken for an address."""
+    reader, _ = CONTAINERS[kind]
+    container = av.open(stream, format=reader, buffer_size=_CHUNK)
+    clocks = [one.time_base for one in container.streams.video if one.time_base is not None]
+    if kind == "MP4 or MOV" and clocks and min(clocks) >= 1:
+        # A clock of whole seconds is a fault (a time scale of 0), and by it edits leave frames out.
+        container.close()
+        stream.seek(0)
+        options = {"advanced_editlist": "0"}
+        container = av.open(stream, format=reader, buffer_size=_CHUNK, options=options)
+    return container
+
+
+def _unreadable(path: Path, kind: str) -> BadInput:
+    remedy = f"If it plays elsewhere: {_AGAIN}"
+    if kind == "MP4 or MOV":
+        remedy = f"A file that was cut off has lost its index, which stands at its end. {remedy}"
+    return BadInput(f"is damaged or no video ({kind})", where=path, remedy=remedy)
+
+
+def _library() -> ModuleType:
     try:
-        if not capture.isOpened():
-            raise BadInput("is not a video that can be read", where=path)
-        yield capture
-    finally:
-        capture.release()
+        import av
+    except ImportError as error:
+        raise MissingDependency(
+            "nothing here can decode videos", remedy="Install PyAV: pip install av"
+        ) from error
+    library: ModuleType = av
+    return library

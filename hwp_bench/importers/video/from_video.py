@@ -50,7 +50,7 @@ def import_video(
     """Make a capture of a video of one hand or two.
 
     Args:
-        video: any file that OpenCV decodes.
+        video: any file that `hwp_bench.importers.video.decode` reads.
         landmarks: the tracker's npz, as `read_landmarks` describes it.
         out: the capture folder to make.
         options: choices; the defaults where None.

@@ -102,13 +102,16 @@ class ImportedClip:
         """Return the numbers that measure the import, as JSON; of two hands each has its own."""
         seen = self.source.detected
         overlaps = self.masks.overlap[seen]
-        common = {
+        common: dict[str, object] = {
             "frames": len(seen),
             "overlap": round(float(overlaps.mean()), 4),
             "overlap_percentile_5": round(float(np.percentile(overlaps, 5)), 4),
             "overlap_landmarks_only": round(self.overlap_landmarks_only, 4),
             "focal_px": round(self.focal, 2),
         }
+        warning = self.source.reading and self.source.reading.warning()
+        if warning:
+            common["warning"] = warning
         if len(self.hands) == 1:
             return {**common, **self.first.facts()}
         each = {side: hand.facts() for side, hand in self.hands.items()}
@@ -164,6 +167,9 @@ def capture_info(
                 "width": video.width,
                 "height": video.height,
                 "fps": video.fps,
+                "codec": video.codec,
+                "colours": video.colours,
+                **({} if source.reading is None else source.reading.facts()),
             },
             "landmarks": {
                 "name": source.landmarks_path.name,
@@ -193,7 +199,11 @@ def draw_sheet(clip: ImportedClip) -> np.ndarray:
         offset += hand.projected.vertices.shape[1]
     frames = []
     for frame in sheet_frames(count, SHEET_FRAMES):
-        caption = f"frame {source.indices[frame]}: overlap {clip.masks.overlap[frame]:.2f}"
+        number = f"{source.indices[frame]}"
+        if source.reading is not None and source.reading.ends_early and frame == count - 1:
+            # At the front: long captions are cut.
+            number += f" (video ends early: {source.reading.counted()})"
+        caption = f"frame {number}: overlap {clip.masks.overlap[frame]:.2f}"
         caption += "".join(_said(hand, frame) for hand in hands)
         tracked = [
             hand.projected.in_crop(hand.landmarks.image[frame], frame, size)

@@ -17,11 +17,13 @@ from hwp_bench.importers.shared.landmarks import Landmarks, check_against_video,
 from hwp_bench.importers.shared.windows import CropWindows, follow_hands
 from hwp_bench.importers.video.decode import (
     ClipImages,
+    Reading,
     VideoInfo,
     check_memory,
     probe,
     read_images,
     read_masks,
+    warn_of_damage,
 )
 from hwp_bench.importers.video.fit_clip import Footage
 from hwp_bench.importers.video.side_check import side_scores, warn_of_contradiction
@@ -45,6 +47,7 @@ class VideoSource:
         own_masks: (F, S, S) uint8 or None.
         swaps: how often the tracker had exchanged two hands, over the whole video.
         doubles: number of frames in which it had put both on one hand.
+        reading: what came of reading the video to its end; None where a part was read.
     """
 
     video: VideoInfo
@@ -56,6 +59,7 @@ class VideoSource:
     own_masks: np.ndarray | None
     swaps: int = 0
     doubles: int = 0
+    reading: Reading | None = None
 
     @property
     def landmarks(self) -> Landmarks:
@@ -105,11 +109,17 @@ def read_source(
     windows = follow_hands(list(hands.values()), footage.fps, options.size)
     check_memory(windows)
     own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
+    endings: list[Reading] = []
     with progress("reading frames", len(indices)) as update:
-        images = read_images(info, options.frames, windows, update)
+        images = read_images(info, options.frames, windows, update, endings.append)
+    reading = endings[0] if endings else None
+    if reading is not None:
+        warn_of_damage(info, reading)
     found = read_association(landmarks) if len(hands) == 2 else None
     repaired = (0, 0) if found is None else (found.swaps, found.doubles)
-    return VideoSource(info, Path(landmarks), indices, hands, windows, images, own, *repaired)
+    return VideoSource(
+        info, Path(landmarks), indices, hands, windows, images, own, *repaired, reading
+    )
 
 
 def _read_hands(path: str | os.PathLike[str], options: VideoImport) -> dict[str | None, Landmarks]:

@@ -195,8 +195,8 @@ def test_a_folder_or_a_pipe_is_no_image(tmp_path: Path) -> None:
     import os
 
     os.mkfifo(tmp_path / "pipe.png")
-    for name in ("pipe.png", "."):
-        with pytest.raises(BadImage, match="does not exist"):
+    for name, named in (("pipe.png", "a pipe"), (".", "a folder")):
+        with pytest.raises(BadImage, match=f"is {named} where a file is expected"):
             read_rgb(tmp_path / name)
 
 

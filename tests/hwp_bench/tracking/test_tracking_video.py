@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import re
 import sys
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from encoded_video import write_pictures
 from fake_networks import LAYOUT, RADIUS, SIZE, FakeNetworks, picture
 
 from hwp_bench.base.arrays import write_npz
@@ -98,6 +100,31 @@ def test_the_command(
     assert "none of 3 frames shows a hand" in said
     assert "Traceback" not in said
     assert not empty.with_suffix(".npz").exists()
+
+
+def test_a_video_that_ends_early_is_tracked_and_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of a file: its frames are used, and both numbers stand in the result."""
+    module = sys.modules["hwp_bench.tracking.track_video"]
+    monkeypatch.setattr(module, "load_models", lambda model: None)
+    monkeypatch.setattr(module, "LiteRtNetworks", lambda models: FakeNetworks())
+    discs = [np.ascontiguousarray(picture({"left": (40 + k, 60)})) for k in range(24)]
+    whole = write_pictures(tmp_path / "whole.mkv", discs, "ffv1", pix_fmt="bgr0")
+    cut = tmp_path / "cut.mkv"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    assert main(["data", "track", str(cut)]) == 0
+    said = capsys.readouterr()
+    assert "warning: " in said.err
+    assert re.search(r"cut.mkv ends early, after 1[0-2] of 24 frames: the file is cut", said.err)
+    assert re.search(r"cut.npz: 1[0-2] of 24 frames,", said.out)
+    assert main(["data", "track", str(cut), "--json", "--force"]) == 0
+    facts = json.loads(capsys.readouterr().out)
+    assert facts["reading"]["decoded_frames"] == facts["frames"] < 13
+    assert (facts["reading"]["stated_frames"], facts["reading"]["ends_early"]) == (24, True)
+    assert main(["data", "track", str(whole), "--json"]) == 0
+    said = capsys.readouterr()
+    assert "warning" not in said.err + said.out
 
 
 def test_mistakes_are_one_line(

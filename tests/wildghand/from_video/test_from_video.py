@@ -30,7 +30,7 @@ from hwp_bench.importers.shared.hand_tracks import read_hand_tracks, write_hand_
 from hwp_bench.tracking.model_files import HAND, PALM, models_folder
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.from_video import VideoFit, make_avatar, turntable
+from wildghand.from_video import VideoFit, make_avatar, sheet, turntable
 from wildghand.from_video.capture import import_options, stride
 from wildghand.from_video.job import Job
 from wildghand.from_video.settings import QUICK as QUICK_CHANGES
@@ -244,10 +244,28 @@ def test_the_command(folder: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> N
     assert facts["steps"] == STEPS
     assert [stage["name"] for stage in facts["stages"]] == NAMES
     assert all(stage["kept"] for stage in facts["stages"])
+    assert (facts["video"]["decoded_frames"], facts["video"]["ends_early"]) == (COUNT, False)
+    assert facts["video"]["codec"] == "mjpeg"
     for name in ("avatar", "turntable", "sheet", "capture"):
         assert Path(facts[name]).exists()
     assert main([*words, "-o", str(folder / "my_hand")]) == 0
-    assert "turntable: " in capsys.readouterr().out
+    said = capsys.readouterr().out
+    assert "turntable: " in said
+    assert "video: " not in said
+    # What the import took down is said by later runs too, and stands on the sheet.
+    capture = folder / "my_hand" / "work" / "capture"
+    record = json.loads((capture / "capture.json").read_text())
+    record["source"]["video"] |= {"ends_early": True, "warning": "ends early, after 12 of 24"}
+    (capture / "capture.json").write_text(json.dumps(record))
+    labels: list[str] = []
+    labelled = sheet.labelled
+    monkeypatch.setattr(
+        sheet, "labelled", lambda tile, text: labels.append(text) or labelled(tile, text)
+    )
+    (folder / "my_hand" / "sheet.jpg").unlink()
+    assert main([*words, "-o", str(folder / "my_hand")]) == 0
+    assert "video: ends early, after 12 of 24" in capsys.readouterr().out
+    assert sum("(video ends early)" in label for label in labels) == 1
 
 
 def test_from_python(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -10,7 +10,15 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from synthetic_clip import FOCAL, SyntheticClip, make_clip, write_landmarks, write_video
+from encoded_video import write_pictures
+from synthetic_clip import (
+    FOCAL,
+    SyntheticClip,
+    landmark_import,
+    make_clip,
+    write_landmarks,
+    write_video,
+)
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.images import read_rgb, write_image
@@ -19,6 +27,7 @@ from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import overlap
+from hwp_bench.importers.video.decode import probe, read_frames
 from hwp_bench.importers.video.from_video import import_video
 from hwp_bench.importers.video.imported_clip import IMPORTER_VERSION
 from hwp_bench.importers.video.video_settings import FitSettings, FrameRange, VideoImport
@@ -122,6 +131,31 @@ def test_frames_are_the_video(capture: Capture, clip: SyntheticClip) -> None:
     expected = cv2.resize(square, (128, 128), interpolation=cv2.INTER_AREA)
     # JPEG on noise of 4 levels, averaged.
     assert np.abs(capture.frame(3).astype(float) - expected).mean() < 4
+
+
+def test_a_video_that_ends_early_is_recorded(
+    tmp_path: Path, clip: SyntheticClip, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Half of a file and the landmarks of its frames: imported, with a warning in the record."""
+    images = [clip.picture(frame) for frame in range(FRAMES)]
+    whole = write_pictures(tmp_path / "whole.mkv", images, "ffv1", pix_fmt="bgr0")
+    cut = tmp_path / "cut.mkv"
+    cut.write_bytes(whole.read_bytes()[: whole.stat().st_size // 2])
+    count = len(list(read_frames(probe(cut), FrameRange())))
+    assert FRAMES // 2 - 2 <= count <= FRAMES // 2
+    arrays = {name: getattr(clip.landmarks, name)[:count] for name in ("image", "world", "score")}
+    write_landmarks(tmp_path / "hand.npz", clip.landmarks, **arrays)
+    options = VideoImport(size=64, fit=landmark_import(20, 10), focal=FOCAL)
+    result = import_video(cut, tmp_path / "hand.npz", tmp_path / "capture", options)
+    said = f"ends early, after {count} of {FRAMES} frames: the file is cut off"
+    assert f"warning: {cut} {said}" in capsys.readouterr().err
+    assert result.facts()["warning"] == said
+    source = open_capture(tmp_path / "capture").info.source
+    assert source["fit"]["warning"] == said
+    assert source["video"]["decoded_frames"] == count
+    assert source["video"]["stated_frames"] == FRAMES
+    assert source["video"]["ends_early"] is True
+    assert (source["video"]["codec"], source["video"]["warning"]) == ("ffv1", said)
 
 
 def test_the_command_prints_the_numbers_and_saves_the_sheet(
