@@ -5,13 +5,13 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import HwpError
+from hwp_bench.base.errors import BadCapture, BadHandModel, HwpError, UsageError
 from hwp_bench.base.images import pixel_digest
 from hwp_bench.base.text import bounded, shown
 from hwp_bench.capture.content import image_reader
@@ -221,8 +221,15 @@ def _templates(capture: Capture) -> Iterator[Finding]:
     for side in capture.info.sides:
         try:
             template = capture.template(side)
-        except HwpError:  # not installed here, or another edition: commands that need it say so
-            continue
+        except BadCapture as error:
+            yield _finding(error)
+            return
+        except (BadHandModel, UsageError):
+            continue  # not installed here, as MANO often is: commands that need it say so
+        except HwpError as error:
+            # Nothing of the capture is wrong, but no method here takes it.
+            yield replace(_finding(error), level="warning")
+            return
         for problem in mesh_problems(template):
             yield Finding(
                 "warning",

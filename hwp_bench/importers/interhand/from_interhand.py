@@ -17,7 +17,7 @@ import torch
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import read_rgb
-from hwp_bench.capture import Cameras, CaptureInfo, HandModelId
+from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.capture.convert import with_one_shape
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
 from hwp_bench.hands.fitting import FitTargets, fit_hand
@@ -116,7 +116,7 @@ def import_interhand(
         side: project_hand(template, hands[side], cameras) for side, template in templates.items()
     }
     facts |= {"errors": errors, "crop_px": windows.side, "split": records.split}
-    info = _info(records, sequence, templates, facts, options)
+    info = _info(records, sequence, facts, options)
     shown = set(sheet_frames(count))
     images: dict[int, np.ndarray] = {}
     masks: dict[int, np.ndarray] = {}
@@ -215,21 +215,20 @@ def _shifted(K: np.ndarray, windows: CropWindows, frame: int) -> np.ndarray:
 def _info(
     records: InterHandRecords,
     sequence: InterHandSequence,
-    templates: Mapping[str, HandTemplate],
     facts: Mapping[str, Any],
     options: InterHandImport,
 ) -> CaptureInfo:
-    first = templates[records.sides[0]]
+    shown = "both" if len(records.sides) == 2 else records.sides[0]
     return CaptureInfo(
         id=sequence.id,
-        hands="both" if len(records.sides) == 2 else records.sides[0],
+        hands=shown,
         action=sequence.name,
         device=f"InterHand2.6M camera {sequence.camera}",
         fps=options.fps,
         width=options.size,
         height=options.size,
         frame_count=len(records.frames),
-        hand_model=HandModelId(first.name, first.digest, options.model),
+        hand_model=identify_hand_model(options.model, shown),
         perturbations={},
         source={
             "kind": "InterHand2.6M",

@@ -12,7 +12,7 @@ import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_file
-from hwp_bench.capture import Cameras, CaptureInfo, HandModelId
+from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import load_template
 from hwp_bench.importers.official.crop import CroppedFrame, crop_frames, tracked_joints
@@ -148,17 +148,17 @@ def _info(
     options: OfficialImport,
 ) -> CaptureInfo:
     entry = catalogue().get(folder.id)
-    template = load_template(options.model, sides[0])
+    shown = "both" if len(sides) == 2 else sides[0]
     return CaptureInfo(
         id=folder.id,
-        hands="both" if len(sides) == 2 else sides[0],
+        hands=shown,
         action=entry.action if entry else "unknown",
         device=entry.device if entry else "unknown",
         fps=options.video_fps / (folder.subsample or 1),
         width=options.size,
         height=options.size,
         frame_count=len(records.numbers),
-        hand_model=HandModelId(template.name, template.digest, options.model),
+        hand_model=identify_hand_model(options.model, shown),
         perturbations=dict.fromkeys(entry.perturbations) if entry else {},
         source={
             "kind": "official HWP release",

@@ -10,7 +10,7 @@ import numpy as np
 
 from hwp_bench.base.files import sha256_file
 from hwp_bench.base.images import write_image
-from hwp_bench.capture import Cameras, CaptureInfo, HandModelId
+from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.hands import HandParameters
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.overlay import OverlayFrame, overlay_sheet, sheet_frames
@@ -143,7 +143,6 @@ def capture_info(
     """Return the capture's description."""
     source = clip.source
     video, windows = source.video, source.windows
-    template = clip.first.fitted.model.template
     return CaptureInfo(
         id=options.capture_id(out),
         hands=clip.shown,
@@ -153,7 +152,7 @@ def capture_info(
         width=windows.size,
         height=windows.size,
         frame_count=len(source.indices),
-        hand_model=HandModelId(template.name, template.digest, options.hand_model),
+        hand_model=identify_hand_model(options.hand_model, clip.shown),
         perturbations=dict.fromkeys(options.perturbations),
         source={
             "kind": "video",

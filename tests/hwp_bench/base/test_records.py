@@ -141,9 +141,9 @@ def test_zero_is_not_above_zero_where_denormals_are_flushed(value: float) -> Non
     below = make_dataclass("Below", [("field", Annotated[float, Meta(lt=0.0)])], frozen=True)
     with flushed():
         assert flushes()
-        with pytest.raises(BadResult, match="fps: is .*, expected a finite number above 0 and"):
+        with pytest.raises(BadResult, match=r"fps: is .*, expected a finite number above 0 and"):
             read(fps=value)
-        with pytest.raises(BadResult, match="field: is .*, expected a finite number below 0"):
+        with pytest.raises(BadResult, match=r"field: is .*, expected a finite number below 0"):
             parse_record(below, {"field": -value}, where="file")
         assert read(fps=sys.float_info.min).fps == sys.float_info.min
 
