@@ -21,7 +21,7 @@ from small_captures import (
     results_example,
 )
 
-from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, HandModelId, open_capture
+from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, open_capture
 from hwp_bench.results import Results
 
 #: Skips that nobody allowed fail; and projects for the test of that.
