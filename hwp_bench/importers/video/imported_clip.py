@@ -17,6 +17,7 @@ from hwp_bench.importers.shared.overlay import OverlayFrame, overlay_sheet, shee
 from hwp_bench.importers.shared.writing import write_capture
 from hwp_bench.importers.video.clip_masks import ClipMasks, ProjectedClip
 from hwp_bench.importers.video.fit_clip import FittedClip, ReprojectionError
+from hwp_bench.importers.video.landmark_check import fit_warnings, overlap_warning
 from hwp_bench.importers.video.source import BOTH, VideoSource
 from hwp_bench.importers.video.video_settings import VideoImport
 
@@ -76,12 +77,27 @@ class ImportedClip:
         hands: by side, the hand that is detected most first.
         masks: final masks, of all hands.
         overlap_landmarks_only: mean overlap of mesh and mask before the outline was fitted.
+        doubts: what tells against the landmarks.
     """
 
     source: VideoSource
     hands: Mapping[str, ImportedHand]
     masks: ClipMasks
     overlap_landmarks_only: float
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def overlap(self) -> float:
+        """Mean overlap of mesh and mask in the frames that show a hand."""
+        return float(self.masks.overlap[self.source.detected].mean())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a person should know before the capture is used; empty for a sound clip."""
+        fitted = {side: hand.parameters.valid for side, hand in self.hands.items()}
+        seen = {side: hand.landmarks.detected for side, hand in self.hands.items()}
+        few = fit_warnings(fitted, seen)
+        return (*self.doubts, *few, *overlap_warning(self.overlap))
 
     @property
     def first(self) -> ImportedHand:
@@ -102,13 +118,15 @@ class ImportedClip:
         """Return the numbers that measure the import, as JSON; of two hands each has its own."""
         seen = self.source.detected
         overlaps = self.masks.overlap[seen]
-        common = {
+        common: dict[str, object] = {
             "frames": len(seen),
-            "overlap": round(float(overlaps.mean()), 4),
+            "overlap": round(self.overlap, 4),
             "overlap_percentile_5": round(float(np.percentile(overlaps, 5)), 4),
             "overlap_landmarks_only": round(self.overlap_landmarks_only, 4),
             "focal_px": round(self.focal, 2),
         }
+        if self.warnings:
+            common["warnings"] = list(self.warnings)
         if len(self.hands) == 1:
             return {**common, **self.first.facts()}
         each = {side: hand.facts() for side, hand in self.hands.items()}
