@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput
+from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import is_blank
 from hwp_bench.base.progress import notice, progress
 from hwp_bench.base.text import bounded
@@ -46,6 +46,8 @@ from hwp_bench.importers.video.two_hands import ProjectedHands, project_hands
 from hwp_bench.importers.video.video_settings import VideoImport
 from hwp_bench.taxonomy import perturbation
 
+#: Endings of the names of images that a sheet can be written to.
+SHEET_KINDS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 #: A frame whose landmarks are missed by more than this share of the hand's size is not valid.
 FAILED_FIT = 0.10
 
@@ -118,15 +120,8 @@ def fit_video(
     first_errors = [
         reprojection_error(fitted, hand) for fitted, hand in zip(fits, hands, strict=True)
     ]
-    sides = list(source.hands)
-    refuse_unfitted(
-        {
-            side: followed(e, source.hands[side])
-            for side, e in zip(sides, first_errors, strict=True)
-        },
-        source,
-        doubts,
-    )
+    good = map(followed, first_errors, hands)
+    refuse_unfitted(dict(zip(source.hands, good, strict=True)), source, doubts)
     size = sum(hand_size(hand) for hand in hands) / len(hands)
     scale = source.images.working.shape[1] / source.windows.side
     masking = Masking(source.images, source.detected, size * scale, source.own_masks)
@@ -163,9 +158,8 @@ def fit_video(
             error=error,
             error_landmarks_only=first,
         )
-    refuse_unfitted(
-        {side: hand.parameters.valid for side, hand in imported.items()}, source, doubts
-    )
+    valid = {side: hand.parameters.valid for side, hand in imported.items()}
+    refuse_unfitted(valid, source, doubts)
     return ImportedClip(source, imported, last.masks, overlap_landmarks_only, tuple(doubts))
 
 
@@ -276,3 +270,18 @@ def _check_output(out: Path, options: VideoImport) -> None:
     check_id(options.capture_id(out), os.fspath(out))
     for name in options.perturbations:
         perturbation(name)
+    sheet = options.sheet
+    if sheet is None:
+        return
+    if sheet.suffix.lower() not in SHEET_KINDS:
+        kinds = ", ".join(SHEET_KINDS)
+        raise UsageError(f"must end in one of {kinds}", where=sheet, field="--sheet")
+    if sheet.is_dir() or any(part.is_file() for part in sheet.parents):
+        raise UsageError("cannot be written there", where=sheet, field="--sheet")
+    if out.absolute() in sheet.absolute().parents:
+        raise UsageError(
+            "lies in the capture that is made",
+            where=sheet,
+            field="--sheet",
+            remedy="The capture has its own sheet, extra/overlay.png.",
+        )

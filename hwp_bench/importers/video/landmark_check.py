@@ -136,8 +136,10 @@ def doubts_of_axes(landmarks: Landmarks, which: str = "`image` or `world`") -> l
     """Say how the axes of the image differ from those of space, and in `which` array."""
     image = _centred(landmarks.image[landmarks.detected])
     world = _centred(landmarks.world[landmarks.detected][:, :, :2])
-    scales = [np.sqrt((each**2).sum(axis=(1, 2), keepdims=True)) for each in (image, world)]
-    image, world = (each / np.maximum(s, 1e-12) for each, s in zip((image, world), scales))
+    image, world = (
+        each / np.maximum(np.sqrt((each**2).sum(axis=(1, 2), keepdims=True)), 1e-12)
+        for each in (image, world)
+    )
 
     def alike(axes: Sequence[Sequence[float]]) -> float:
         return float((image * (world @ np.array(axes, float).T)).sum(axis=(1, 2)).mean())

@@ -154,7 +154,7 @@ def annotation(root: Path, kind: str) -> Path:
 
 
 def test_black_images_are_named_and_left_out(
-    release: tuple[Path, dict], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    release: tuple[Path, dict], mano: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """https://github.com/facebookresearch/InterHand2.6M/issues/125"""
     root = copied(release[0], tmp_path)
@@ -162,7 +162,7 @@ def test_black_images_are_named_and_left_out(
     black = np.random.default_rng(0).integers(0, 4, (HEIGHT, WIDTH, 3)).astype(np.uint8)
     for frame in FRAMES[2], FRAMES[11]:
         cv2.imwrite(str(images / f"image{frame}.jpg"), black)
-    facts = import_interhand(root, SEQUENCE, tmp_path / "c", InterHandImport(size=64))
+    facts = import_interhand(root, SEQUENCE, tmp_path / "c", InterHandImport(mano=mano, size=64))
     kept = [frame for frame in FRAMES if frame not in (FRAMES[2], FRAMES[11])]
     assert facts["black_frames"] == [FRAMES[2], FRAMES[11]]
     assert "2 of 12 frames are black, or of one colour, and are left out: 13, 40." in (
@@ -199,7 +199,7 @@ def test_a_hand_that_is_never_annotated_is_left_out_on_request(
     assert capture.hands["right"].valid.all()
     assert check_capture(capture.root).ok
     # With MANO the file is needed, and it is named.
-    with pytest.raises(BadInput, match="MANO_NeuralAnnot.json: does not exist"):
+    with pytest.raises(BadInput, match=r"MANO_NeuralAnnot.json: does not exist"):
         import_interhand(root, SEQUENCE, tmp_path / "m", InterHandImport(mano=tmp_path))
 
 

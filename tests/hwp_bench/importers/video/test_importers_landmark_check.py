@@ -122,7 +122,7 @@ def test_tracks_of_another_size_are_refused(source: VideoSource, tmp_path: Path)
         refuse_other_units(replace(source, landmarks_path=path))
 
 
-@pytest.mark.parametrize("name", ["exchanged", "MANO", "world mirrored"])
+@pytest.mark.parametrize("name", ["exchanged", "MANO"])
 def test_nothing_fitted_is_an_error_with_its_reason(
     source: VideoSource,
     tmp_path: Path,
