@@ -114,7 +114,7 @@ def _without_denormals(meta: Any) -> Any:
     `msgspec` takes "above 0" for "at least the smallest float". That is a denormal, which is equal
     to 0 where they are flushed, so that 0 would pass.
     """
-    changed = {}
+    changed: dict[str, Any] = {}
     if isinstance(meta.gt, float) and meta.gt == 0.0:
         changed |= {"gt": None, "ge": _LEAST}
     if isinstance(meta.lt, float) and meta.lt == 0.0:

@@ -157,7 +157,7 @@ def _free_view(capture: Capture) -> tuple[Finding, ...]:
 
 
 def _import(capture: Capture) -> Iterator[Finding]:
-    """What the importer of a video has warned of, as its record keeps it."""
+    """Warnings of the importer of a video, as its record keeps them."""
     record = capture.info.source.get("fit")
     warnings = record.get("warnings") if isinstance(record, dict) else None
     for warning in warnings[:MOST_WARNINGS] if isinstance(warnings, list) else ():

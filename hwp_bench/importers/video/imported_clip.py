@@ -93,7 +93,7 @@ class ImportedClip:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """What a person should know before the capture is used; empty for a sound clip."""
+        """Things to know before the capture is used; empty for a sound clip."""
         fitted = {side: hand.parameters.valid for side, hand in self.hands.items()}
         seen = {side: hand.landmarks.detected for side, hand in self.hands.items()}
         few = fit_warnings(fitted, seen)

@@ -4,7 +4,7 @@ Landmarks of another convention are numbers like all others: a fit to them runs 
 follows no frame. Three things tell beforehand. The joints of a hand are near each other along its
 fingers, in one order only. Its landmarks in the image look like its landmarks in space, seen from
 the front. And skin has other colours than what is around it, so that landmarks that lie on a hand
-separate the colours on them from those around them better than any that lie beside it.
+separate the colours on them from those around them better than any that lie elsewhere.
 """
 
 from __future__ import annotations
@@ -232,7 +232,7 @@ def _separation(pictures: Sequence[np.ndarray], points: np.ndarray) -> float:
         points: (F, 21, 2) px.
 
     Returns:
-        Mean probability over the frames that a colour on the hand lies on its side of one beside
+        Mean probability over the frames that a colour on the hand lies on its side of one around
         it: 0.5 by chance, 1 where all do.
     """
     found = []
