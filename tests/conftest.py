@@ -12,9 +12,16 @@ from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
-from small_captures import CaptureMaker, cameras, hand_parameters, hand_picture, results_example
+from small_captures import (
+    CaptureMaker,
+    cameras,
+    free_hand,
+    hand_parameters,
+    hand_picture,
+    results_example,
+)
 
-from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, HandModelId, open_capture
+from hwp_bench.capture import Capture, CaptureInfo, CaptureWriter, open_capture
 from hwp_bench.results import Results
 
 #: Skips that nobody allowed fail; and projects for the test of that.
@@ -78,7 +85,7 @@ def make_capture(tmp_path: Path) -> CaptureMaker:
             width=size,
             height=size,
             frame_count=frames,
-            hand_model=HandModelId("anny-1", "0" * 64),
+            hand_model=free_hand(hands),
             perturbations=perturbations,
             source={"kind": "test"},
             licence="CC0",

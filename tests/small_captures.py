@@ -1,19 +1,23 @@
-"""Small captures and results for tests; they need no simulator and no hand model."""
+"""Small captures and results for tests; they need no simulator."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable
 
 import numpy as np
 
-from hwp_bench.capture import (
-    Cameras,
-    Capture,
-)
+from hwp_bench.capture import Cameras, Capture, HandModelId, identify_hand_model
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.results import CaptureResult, CurvePoint, FrameResult, MethodId, Results
 
 CaptureMaker = Callable[..., Capture]
+
+
+@functools.cache
+def free_hand(hands: str) -> HandModelId:
+    """What a capture of the free hand says of its model."""
+    return identify_hand_model("anny", hands)
 
 
 def hand_parameters(frames: int, seed: int = 0) -> HandParameters:

@@ -53,7 +53,7 @@ WRONG = [
     ("data track V -o V", "is the input VIDEO too"),
     ("data track V -o X.npz --sheet X.npz", "is the output --sheet too"),
     ("data import-video V --landmarks L C/x", "lies in the capture"),
-    ("data import-video V --landmarks L X --sheet X/s.png", "lies in the input OUT"),
+    ("data import-video V --landmarks L X --sheet X/s.png", "lies in the output OUT"),
     ("data import-video V --landmarks L X --sheet L", "is the input --landmarks too"),
     ("data import interhand26m D seq -o D", "is the input DIR too"),
     ("data import wildghand D -o D/made", "lies in the input DIR"),

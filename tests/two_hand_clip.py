@@ -45,7 +45,7 @@ def make_two_hands(frames: int, *, nearest: float = 0.035) -> TwoHandClip:
 
 
 def write_two_hands(
-    folder: Path, clip: TwoHandClip, swaps: tuple[int, ...], gap: range
+    folder: Path, clip: TwoHandClip, swaps: tuple[int, ...], gap: range, lost: str = "left"
 ) -> tuple[Path, Path]:
     """Write the video, and the landmarks of a tracker.
 
@@ -53,7 +53,8 @@ def write_two_hands(
         folder: of both files.
         clip: the hands.
         swaps: frames from which on the tracker has exchanged the hands.
-        gap: frames in which it does not see the left hand, which is behind.
+        gap: frames in which it does not see one of the hands.
+        lost: that hand; the left one is behind.
     """
     random = np.random.default_rng(7)
     frames = len(clip.right.landmarks.score)
@@ -66,8 +67,9 @@ def write_two_hands(
     score, right = np.ones((2, frames)), np.stack([np.full(frames, 0.9), np.full(frames, 0.1)])
     # Votes err in single frames.
     right[:, :: max(frames // 4, 1)] = 0.5
-    score[1, list(gap)], right[1, list(gap)] = 0.0, 0.5
-    image[1, list(gap)] = world[1, list(gap)] = 0.0
+    hand = list(clip.hands).index(lost)
+    score[hand, list(gap)], right[hand, list(gap)] = 0.0, 0.5
+    image[hand, list(gap)] = world[hand, list(gap)] = 0.0
     track = np.where(score > 0, 0, -1)
     for first in swaps:
         for array in (image, world, score, right, track):

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError, reason_of
-from hwp_bench.base.text import is_unicode
+from hwp_bench.base.text import is_unicode, shown
 
 #: Largest JSON file that is read, in bytes; a result of 10,000 frames stays far below it.
 MAX_JSON_BYTES = 256 * 1024 * 1024
@@ -37,6 +37,8 @@ _MOST_RETIRED = 100
 _CAPTURE = "capture.json"
 #: Files and folders that an option names.
 Places: TypeAlias = "str | os.PathLike[str] | Sequence[str | os.PathLike[str]] | None"
+# Longest piece of a name that a message repeats.
+_SHOWN = 100
 # The file itself is UTF-8, so that only an escape can stand for half of a surrogate pair.
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
@@ -347,14 +349,18 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
 
     Raises:
         BadInput: the file is missing, not a regular file, larger than `max_bytes`, not UTF-8, not
-            JSON, nested too deeply, or holds a number that is infinite or absurdly large, or text
-            that is not Unicode.
+            JSON, nested too deeply, or names a key twice in one object, or holds a number that is
+            infinite or absurdly large, or text that is not Unicode.
     """
     path = Path(path)
     try:
         text = _read_bounded(path, max_bytes).decode()
         value = json.loads(
-            text, parse_constant=_refuse_constant, parse_float=_finite, parse_int=_bounded_int
+            text,
+            parse_constant=_refuse_constant,
+            parse_float=_finite,
+            parse_int=_bounded_int,
+            object_pairs_hook=_table,
         )
     except FileNotFoundError as error:
         raise BadInput("does not exist", where=path) from error
@@ -364,6 +370,12 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
         raise BadInput("is not UTF-8 text", where=path) from error
     except RecursionError as error:
         raise BadInput("is nested too deeply", where=path) from error
+    except _RepeatedKey as error:
+        raise BadInput(
+            f"names {shown(error.args[0])[:_SHOWN]!r} twice in one object",
+            where=path,
+            remedy="Readers of JSON disagree on which value counts; keep one of them.",
+        ) from error
     except ValueError as error:
         raise BadInput(f"is not valid JSON ({error})", where=path) from error
     if _deeper_than(value, MAX_JSON_DEPTH):
@@ -403,6 +415,21 @@ def _deeper_than(value: Any, limit: int) -> bool:
         if not level:
             return False
     return True
+
+
+class _RepeatedKey(ValueError):
+    """An object names a key twice; the argument is the key."""
+
+
+def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        seen: set[str] = set()
+        for name, _ in pairs:
+            if name in seen:
+                raise _RepeatedKey(name)
+            seen.add(name)
+    return table
 
 
 def _refuse_constant(name: str) -> float:

@@ -23,6 +23,8 @@ _ENDS = {".png": b"IEND\xaeB`\x82"}
 _JPEG_QUALITY = 98
 #: zlib level of written PNG files: within 10 % of the smallest at a third of the time.
 PNG_LEVEL = 3
+#: An image whose channels all stay within this many levels shows nothing.
+BLANK_RANGE = 8
 #: First bytes by format. OpenImageIO reads dozens of others, among them film and raw formats,
 #: whatever a file is called; an untrusted file must not choose such a decoder.
 MAGIC = {
@@ -36,6 +38,11 @@ _MOST_CHUNKS = 1000
 _MOST_COMPRESSED = 128 * 1024
 #: The parts that hold such.
 _COMPRESSED = (b"zTXt", b"iTXt", b"iCCP")
+
+
+def is_blank(pixels: np.ndarray) -> bool:
+    """Whether an image (H, W, 3) uint8 is of one colour, such as black, but for a codec's noise."""
+    return int(np.ptp(pixels.reshape(-1, pixels.shape[-1]), axis=0).max()) <= BLANK_RANGE
 
 
 def read_rgb(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:

@@ -29,6 +29,8 @@ _SHOWN = 100
 _REPR = reprlib.Repr()
 _REPR.maxstring = _REPR.maxother = _REPR.maxlong = _SHOWN - 20
 _LARGEST = sys.float_info.max
+# The least float above 0 that is also above it where denormals are flushed, as in our processes.
+_LEAST = sys.float_info.min
 _PLAIN_TEXT = Meta(pattern=rf"\A[^{ODD_CHARACTERS}]*\Z")
 
 
@@ -85,6 +87,7 @@ def _strict(hint: Any, metadata: Mapping[str, Any], rules: Rules) -> Any:
     elif dataclasses.is_dataclass(hint):
         strict = strict_twin(typing.cast("type", hint), rules)
     elif hint in (int, float):
+        metas = tuple(_without_denormals(meta) for meta in metas)
         metas = (*metas, *_bounds(hint, metas, metadata.get("range", (rules.low, rules.high))))
         strict = hint
     elif hint is str:
@@ -103,6 +106,23 @@ def _strict(hint: Any, metadata: Mapping[str, Any], rules: Rules) -> Any:
     else:
         strict = hint
     return Annotated[(strict, *metas)] if metas else strict
+
+
+def _without_denormals(meta: Any) -> Any:
+    """The same bounds where denormals are flushed to zero.
+
+    `msgspec` takes "above 0" for "at least the smallest float". That is a denormal, which is equal
+    to 0 where they are flushed, so that 0 would pass.
+    """
+    changed: dict[str, Any] = {}
+    if isinstance(meta.gt, float) and meta.gt == 0.0:
+        changed |= {"gt": None, "ge": _LEAST}
+    if isinstance(meta.lt, float) and meta.lt == 0.0:
+        changed |= {"lt": None, "le": -_LEAST}
+    if not changed:
+        return meta
+    names = ("gt", "ge", "lt", "le", "description")
+    return Meta(**{name: getattr(meta, name) for name in names} | changed)
 
 
 def _bounds(kind: type, metas: tuple[Any, ...], limits: tuple[float, float]) -> Iterator[Meta]:
@@ -208,6 +228,10 @@ def _expected(kind: Any, metas: tuple[Any, ...]) -> str:
         return f"{words[origin or kind]} of {size} {'characters' if kind is str else 'entries'}"
     sides = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
     limits = {name: value for name, value in rules.items() if abs(value) < _LARGEST}
+    if limits.get("ge") == _LEAST:
+        limits = {"gt": 0.0} | {name: limits[name] for name in limits if name != "ge"}
+    if limits.get("le") == -_LEAST:
+        limits = {name: limits[name] for name in limits if name != "le"} | {"lt": 0.0}
     if {"ge", "le"} == limits.keys():
         return f"{words[kind]} from {limits['ge']:g} to {limits['le']:g}"
     bounds = " and ".join(f"{sides[name]} {value:g}" for name, value in limits.items())

@@ -5,24 +5,35 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import HwpError
-from hwp_bench.base.images import pixel_digest
+from hwp_bench.base.errors import BadCapture, BadHandModel, HwpError, UsageError
+from hwp_bench.base.images import is_blank, pixel_digest
 from hwp_bench.base.text import bounded, shown
 from hwp_bench.capture.content import image_reader
 from hwp_bench.capture.reader import Capture, open_capture
-from hwp_bench.capture.schema import IMAGE_FOLDERS, SIMULATED, CaptureInfo, image_path
+from hwp_bench.capture.schema import (
+    HANDS,
+    IMAGE_FOLDERS,
+    METADATA,
+    SIMULATED,
+    CaptureInfo,
+    image_path,
+)
 from hwp_bench.capture.tracks import arrays_digest, hand_arrays
 from hwp_bench.capture.writer import combine
 from hwp_bench.hands.template import HandTemplate
 
 #: A visible hand smaller than this share of the frame is reported.
 SMALL_HAND = 0.002
+#: A hand that is valid in a smaller share of the frames than this is reported.
+FEW_VALID = 0.5
+#: Most warnings of an import that are repeated, and most characters of each.
+MOST_WARNINGS, MAX_TEXT = 20, 1000
 #: Faces of a hand template that are smaller than this are reported, in square metres.
 SMALL_FACE = 1e-12
 
@@ -70,6 +81,8 @@ def check_capture(path: str | os.PathLike[str]) -> CheckReport:
     except HwpError as error:
         return CheckReport(os.fspath(path), {}, (_finding(error),))
     findings = [
+        *_import(capture),
+        *_valid(capture),
         *_images(capture),
         *_geometry(capture),
         *_templates(capture),
@@ -143,6 +156,33 @@ def _free_view(capture: Capture) -> tuple[Finding, ...]:
     return () if clip is None else check_capture(clip.root).findings
 
 
+def _import(capture: Capture) -> Iterator[Finding]:
+    """Warnings of the importer of a video, as its record keeps them."""
+    record = capture.info.source.get("fit")
+    warnings = record.get("warnings") if isinstance(record, dict) else None
+    for warning in warnings[:MOST_WARNINGS] if isinstance(warnings, list) else ():
+        yield Finding(
+            "warning",
+            os.fspath(capture.root / METADATA),
+            "source.fit.warnings",
+            shown(str(warning))[:MAX_TEXT],
+            "Look at extra/overlay.png; correct the landmarks and import again.",
+        )
+
+
+def _valid(capture: Capture) -> Iterator[Finding]:
+    """Hands whose parameters are valid in few frames, or in none."""
+    where = os.fspath(capture.root / HANDS)
+    counts = {side: int(hand.valid.sum()) for side, hand in capture.hands.items()}
+    for side, count in counts.items():
+        said = f"the {side} hand is valid in {count} of {len(capture)} frames"
+        if not any(counts.values()):
+            yield Finding("error", where, f"{side}_valid", said, "There is nothing to be fitted.")
+        elif count < FEW_VALID * len(capture):
+            remedy = "Only they are fitted; look whether they follow the hand."
+            yield Finding("warning", where, f"{side}_valid", said, remedy)
+
+
 def _images(capture: Capture) -> Iterator[Finding]:
     for kind in IMAGE_FOLDERS:
         folder = capture.root / IMAGE_FOLDERS[kind]
@@ -167,6 +207,14 @@ def _one_kind(capture: Capture, kind: str, folder: Path) -> Iterator[Finding]:
                 None,
                 f"covers {100 * (pixels > 127).mean():.2f} % of the frame",
                 "A frame without a visible hand teaches a method nothing.",
+            )
+        if kind == "frames" and is_blank(pixels):
+            finding = Finding(
+                "warning",
+                os.fspath(image_path(capture.root, kind, frame)),
+                None,
+                f"is of one colour (mean level {pixels.mean():.0f})",
+                "It shows no hand; leave such frames out of the capture.",
             )
         return pixel_digest(pixels), finding
 
@@ -221,8 +269,15 @@ def _templates(capture: Capture) -> Iterator[Finding]:
     for side in capture.info.sides:
         try:
             template = capture.template(side)
-        except HwpError:  # not installed here, or another edition: commands that need it say so
-            continue
+        except BadCapture as error:
+            yield _finding(error)
+            return
+        except (BadHandModel, UsageError):
+            continue  # not installed here, as MANO often is: commands that need it say so
+        except HwpError as error:
+            # Nothing of the capture is wrong, but no method here takes it.
+            yield replace(_finding(error), level="warning")
+            return
         for problem in mesh_problems(template):
             yield Finding(
                 "warning",

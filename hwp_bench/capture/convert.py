@@ -9,8 +9,7 @@ import numpy as np
 import torch
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
-from hwp_bench.capture.reader import Capture
-from hwp_bench.capture.schema import HandModelId
+from hwp_bench.capture.reader import Capture, identify_hand_model
 from hwp_bench.capture.writer import rewrite_capture
 from hwp_bench.hands.fitting import FitTargets, FittedHand, FittingSettings, fit_hand
 from hwp_bench.hands.parameters import HandParameters
@@ -155,11 +154,10 @@ def convert_capture(
     for side, hand in capture.hands.items():
         target = load_template(source, side)
         made[side], errors[side] = convert_hand(hand, capture.template(side), target, settings)
-    first = load_template(source, info.sides[0])
     note = {side: vars(error) for side, error in errors.items()}
     changed = replace(
         info,
-        hand_model=HandModelId(first.name, first.digest, source),
+        hand_model=identify_hand_model(source, info.hands),
         source={**info.source, "converted": {"from": info.hand_model.name, "error": note}},
     )
     rewrite_capture(capture, out, changed, made, overwrite=overwrite)

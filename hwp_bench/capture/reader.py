@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hwp_bench.base.arguments import place, whole_number
-from hwp_bench.base.errors import BadCapture, BadInput, UsageError
+from hwp_bench.base.errors import BadCapture, BadInput, HwpError, UsageError
 from hwp_bench.base.files import read_json, sha256_json
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.capture.schema import (
@@ -20,6 +20,7 @@ from hwp_bench.capture.schema import (
     HANDS,
     IMAGE_FOLDERS,
     METADATA,
+    SIDES,
     TRUE_HANDS,
     TRUE_TEMPLATE,
     CaptureInfo,
@@ -36,6 +37,9 @@ if TYPE_CHECKING:
 
 # Facts that a free-view clip shares with its capture.
 _SHARED = ("hands", "width", "height")
+
+
+_CONVERT = "Use the model that it was made with, or convert it: hwp-bench hands convert."
 
 
 class Capture:
@@ -245,6 +249,20 @@ def open_capture(path: str | os.PathLike[str]) -> Capture:
     )
 
 
+def identify_hand_model(source: str, hands: str) -> HandModelId:
+    """Say which hand model the parameters of a capture belong to, as its reader compares it.
+
+    Args:
+        source: the model, as `load_template` takes it.
+        hands: the hands that the capture has: `right`, `left` or `both`.
+
+    Raises:
+        UsageError, BadHandModel: it cannot be loaded.
+    """
+    first = load_template(source, SIDES[hands][0])
+    return HandModelId(first.name, first.digest, source)
+
+
 def load_matching_template(
     model: HandModelId, sides: Sequence[str], side: str, *, where: str | os.PathLike[str]
 ) -> HandTemplate:
@@ -258,24 +276,42 @@ def load_matching_template(
         where: the capture or avatar, for the message.
 
     Raises:
+        BadCapture: the digest is that of another hand than the first.
         BadInput: the model that is installed here is another one: by name or by content.
         UsageError, BadHandModel: it cannot be loaded.
     """
     first = load_template(model.source, sides[0])
-    problem = None
     if first.name != model.name:
-        problem = f"belongs to hand model {model.name}, not {first.name}"
-    elif first.digest != model.digest:
-        problem = (
-            f"belongs to another edition of hand model {model.name} "
-            f"({model.digest[:12]}) than the one here ({first.digest[:12]})"
-        )
-    if problem is not None:
         raise BadInput(
-            problem,
+            f"belongs to hand model {model.name}, and {model.source!r} is {first.name} here",
             where=where,
-            field="hand_model",
-            remedy=f"Use the model that it was made with, or convert it: hwp-bench hands convert "
-            f"(what is loaded here comes from {model.source!r}).",
+            field="hand_model.name",
+            remedy=_CONVERT,
+        )
+    if first.digest != model.digest:
+        other = "left" if sides[0] == "right" else "right"
+        if model.digest == _digest(model.source, other):
+            raise BadCapture(
+                f"is the digest of the {other} hand of {model.name}; the capture's first hand is "
+                f"the {sides[0]} one",
+                where=where,
+                field="hand_model.digest",
+                remedy=f"Import it again; or, where it has the right hands, write {first.digest} "
+                "there.",
+            )
+        raise BadInput(
+            f"belongs to another edition of hand model {model.name} ({model.digest[:12]}) than "
+            f"{model.source!r} here ({first.digest[:12]})",
+            where=where,
+            field="hand_model.digest",
+            remedy=_CONVERT,
         )
     return first if side == sides[0] else load_template(model.source, side)
+
+
+def _digest(source: str, side: str) -> str | None:
+    """Digest of one hand of a model; None where it cannot be loaded."""
+    try:
+        return load_template(source, side).digest
+    except HwpError:
+        return None

@@ -46,6 +46,8 @@ IMAGE_FOLDERS = {
 MAX_FRAMES = 100_000
 #: Largest edge of a frame, in pixels.
 MAX_EDGE = 8192
+#: Rate of a capture's frames: from one in 1,000 seconds to the fastest cameras.
+FrameRate = Annotated[float, Meta(ge=1e-3, le=1e6)]
 #: The hands that a capture may hold, and the sides that it then has parameters for.
 SIDES: Mapping[str, tuple[str, ...]] = {
     "right": ("right",),
@@ -83,7 +85,7 @@ class CaptureInfo:
     #: Device that recorded it.
     device: Text
     #: Frames per second.
-    fps: Annotated[float, Meta(gt=0.0, lt=1e6)]
+    fps: FrameRate
     #: Width of every frame, in pixels.
     width: _Edge
     #: Height of every frame, in pixels.

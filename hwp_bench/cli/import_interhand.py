@@ -40,6 +40,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         default=5.0,
         help="frame rate of the annotated frames, 5 or 30 (default: 5)",
     )
+    parser.add_argument(
+        "--side",
+        choices=("auto", "right", "left", "both"),
+        default="auto",
+        help="which hands (default: auto, those that the sequence is said to show)",
+    )
     parser.add_argument("--force", action="store_true", help="replace an existing capture")
     parser.add_argument("--json", action="store_true", help="print the facts as JSON")
 
@@ -55,7 +61,9 @@ def run(args: argparse.Namespace) -> int:
         replaces=args.force,
         makes_captures=True,
     )
-    options = InterHandImport(mano=args.mano, size=args.size, fps=args.fps, overwrite=args.force)
+    options = InterHandImport(
+        mano=args.mano, size=args.size, fps=args.fps, side=args.side, overwrite=args.force
+    )
     facts = import_interhand(args.folder, find_sequence(args.sequence), args.out, options)
     if args.json:
         print(json.dumps({"out": str(args.out), **facts}, indent=1))

@@ -91,8 +91,8 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.importers.video import VideoImport, import_video, parse_frame_range
 
     inputs = {"VIDEO": args.video, "--landmarks": args.landmarks, "--masks": args.masks}
-    check_places({"OUT": args.out}, inputs, replaces=args.force, makes_captures=True)
-    check_places({"--sheet": args.sheet}, {**inputs, "OUT": args.out})
+    outputs = {"OUT": args.out, "--sheet": args.sheet}
+    check_places(outputs, inputs, replaces=args.force, makes_captures=True)
     options = VideoImport(
         side=args.side,
         focal=args.focal,

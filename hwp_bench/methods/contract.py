@@ -17,13 +17,14 @@ from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.evenly import evenly
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.record_types import brief
-from hwp_bench.base.records import MAX_COUNT, MAX_SECONDS, MAX_SEED, Line
+from hwp_bench.base.records import MAX_COUNT, MAX_SECONDS, MAX_SEED, Line, Seed
 from hwp_bench.capture.schema import (
     CAMERAS,
     FREE_VIEW,
     HANDS,
     MAX_FRAMES,
     SIDES,
+    FrameRate,
     HandModelId,
     image_path,
 )
@@ -185,7 +186,7 @@ class RequestRecord:
     #: Frame height, px.
     height: _Pixels
     #: Frames per second.
-    fps: Annotated[float, Meta(gt=0.0)]
+    fps: FrameRate
     #: The hand model that the parameters belong to.
     hand_model: HandModelId
     #: The split; `Split.from_json` checks it.
@@ -193,7 +194,7 @@ class RequestRecord:
     #: Settings of the method.
     settings: dict[str, Any]
     #: Seed of everything random.
-    seed: int
+    seed: Seed
     #: When to stop fitting.
     budget: Budget
     #: Which training frames are given.

@@ -14,6 +14,7 @@ from msgspec import Meta
 
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
+from hwp_bench.base.records import Count, Seconds
 from hwp_bench.capture.schema import MAX_FRAMES, HandModelId
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import Camera, HandPose
@@ -46,11 +47,11 @@ class FitRecord:
     #: Weight of each in the fit.
     frame_weights: Annotated[list[float], _PER_FRAME] = field(default_factory=list)
     #: Optimizer steps.
-    steps: int = 0
+    steps: Count = 0
     #: Steps behind the state that validation frames chose; None: behind the last one.
-    chosen_steps: int | None = None
+    chosen_steps: Count | None = None
     #: Seconds of fitting.
-    seconds: float = 0.0
+    seconds: Seconds = 0.0
     #: The avatar's origin, such as a capture's id.
     source: dict[str, Any] = field(default_factory=dict)
 

@@ -52,7 +52,7 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "--model", type=Path, metavar="FILE", help="the tracker's networks, as `data track` takes"
     )
     parser.add_argument(
-        "--hand-model", default="anny", metavar="MODEL", help="for a video: anny or mano:PATH"
+        "--hand-model", metavar="MODEL", help="for a video: anny (default) or mano:PATH"
     )
     parser.add_argument("--steps", type=int, help="optimizer steps")
     parser.add_argument("--seconds", type=float, help="most seconds of optimizing")
@@ -112,7 +112,7 @@ def _video(args: argparse.Namespace, world: World) -> int:
 
     options = VideoFit(
         side=args.side or "auto",
-        hand_model=args.hand_model,
+        hand_model=args.hand_model or "anny",
         landmarks=args.landmarks,
         tracker=args.model,
         quick=args.quick,
@@ -150,9 +150,11 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     from wildghand.fitting.session import fit_capture
     from wildghand.from_video.settings import with_quick
 
-    for option in ("side", "landmarks", "model"):
-        if getattr(args, option) is not None:
-            raise UsageError("is for videos", where=args.source, field=f"--{option}")
+    for option in ("side", "landmarks", "model", "hand-model"):
+        if getattr(args, option.replace("-", "_")) is not None:
+            raise UsageError(
+                "is for videos; a capture says it itself", where=args.source, field=f"--{option}"
+            )
     if args.out is None:
         raise UsageError("is missing", field="--out", remedy="Name the avatar folder to make.")
     if args.steps is not None and args.steps < 1:

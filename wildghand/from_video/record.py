@@ -8,7 +8,7 @@ from typing import Literal
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import read_json, write_json
-from hwp_bench.base.records import parse_record
+from hwp_bench.base.records import Seconds, parse_record
 
 #: Largest record that is read, bytes.
 _MAX_BYTES = 1 << 20
@@ -23,9 +23,9 @@ class StageRecord:
     #: Whether it ended; False for one that was begun.
     done: bool = False
     #: Seconds that it took.
-    seconds: float = 0.0
+    seconds: Seconds = 0.0
     #: Seconds of processor time that it took, on all cores together.
-    cpu_seconds: float = 0.0
+    cpu_seconds: Seconds = 0.0
 
 
 @dataclass(frozen=True)

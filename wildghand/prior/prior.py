@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import BadInput
+from hwp_bench.base.records import Count, Seed
 from wildghand.network import PredictionNetwork
 from wildghand.network.weight_shapes import MAPS
 
@@ -31,9 +32,9 @@ class PriorRecord:
     #: All settings of that fit.
     settings: dict[str, Any]
     #: Its seed.
-    seed: int
+    seed: Seed
     #: Its optimizer steps.
-    steps: int
+    steps: Count
     #: SHA-256 of the file of weights, hex.
     weights: str
 

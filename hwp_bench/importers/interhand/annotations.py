@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +21,8 @@ MAX_BYTES = 3 * 1024 * 1024 * 1024
 #: The data set's joints of one hand in the order of our 21 landmarks (wrist, then each finger
 #: from its base to its tip): it lists thumb to little finger from tip to base, the wrist last.
 LANDMARK_ROWS = (20, 3, 2, 1, 0, 7, 6, 5, 4, 11, 10, 9, 8, 15, 14, 13, 12, 19, 18, 17, 16)
+#: The file of MANO parameters, which comes apart from the others.
+MANO = "MANO_NeuralAnnot"
 #: First joint of each hand.
 FIRST_JOINT = {"right": 0, "left": 21}
 
@@ -68,16 +70,41 @@ class InterHandRecords:
     joints: Mapping[str, np.ndarray]
     mano: Mapping[str, ManoAnnotation]
 
+    def select(self, kept: np.ndarray) -> InterHandRecords:
+        """The annotations of some frames, (F,) bool."""
+        mano = {
+            side: ManoAnnotation(
+                hand.pose[kept], hand.shape[kept], hand.transl[kept], hand.valid[kept]
+            )
+            for side, hand in self.mano.items()
+        }
+        return replace(
+            self,
+            frames=self.frames[kept],
+            images=tuple(image for image, one in zip(self.images, kept, strict=True) if one),
+            joints={side: joints[kept] for side, joints in self.joints.items()},
+            mano=mano,
+        )
 
-def read_annotations(root: str | os.PathLike[str], sequence: InterHandSequence) -> InterHandRecords:
+
+def read_annotations(
+    root: str | os.PathLike[str],
+    sequence: InterHandSequence,
+    side: str = "auto",
+    *,
+    mano: bool = True,
+) -> InterHandRecords:
     """Read the annotations of one camera of one sequence.
 
     Args:
         root: the folder with `images/` and `annotations/`.
         sequence: which one.
+        side: `right`, `left` or `both`; `auto`: the hands that the sequence is said to show.
+        mano: whether MANO parameters are needed. If not, they are read where they are.
 
     Raises:
-        BadInput: a file or field is missing or damaged, or no frame of the sequence is listed.
+        BadInput: a file or field is missing or damaged, or no frame of the sequence is listed or
+            shows that hand.
     """
     base = Path(root)
     split, data = _data(base, sequence)
@@ -87,7 +114,14 @@ def read_annotations(root: str | os.PathLike[str], sequence: InterHandSequence) 
     frames = np.array([row["frame_idx"] for row in rows])
     types = {row["hand_type"] for row in rows}
     shown = {"right", "left"} if "interacting" in types else types & {"right", "left"}
-    sides = tuple(side for side in ("right", "left") if side in shown)
+    wanted = ("right", "left") if side in ("auto", "both") else (side,)
+    if side != "auto" and not shown >= set(wanted):
+        raise BadInput(
+            f"shows the {' and the '.join(sorted(shown)) or 'no'} hand only",
+            where=folder / f"Capture{sequence.capture}" / sequence.name,
+            field="--side",
+        )
+    sides = tuple(side for side in wanted if side in shown)
     sizes = {(row["width"], row["height"]) for row in rows}
     if len(sizes) != 1 or not sides:
         raise BadInput(
@@ -104,7 +138,7 @@ def read_annotations(root: str | os.PathLike[str], sequence: InterHandSequence) 
         K=K,
         viewmat=viewmat,
         joints=_joints(base, split, sequence, keys, sides),
-        mano=_mano(base, split, sequence, keys, sides),
+        mano=_mano(base, split, sequence, keys, sides, needed=mano),
     )
 
 
@@ -233,9 +267,23 @@ def _joints(
 
 
 def _mano(
-    base: Path, split: str, sequence: InterHandSequence, keys: list[str], sides: tuple[str, ...]
+    base: Path,
+    split: str,
+    sequence: InterHandSequence,
+    keys: list[str],
+    sides: tuple[str, ...],
+    *,
+    needed: bool,
 ) -> dict[str, ManoAnnotation]:
-    path, capture = _of_capture(base, split, "MANO_NeuralAnnot", sequence)
+    if not needed and not _annotation(base, split, MANO).exists():
+        nothing = {side: np.zeros((len(keys), 16, 3)) for side in sides}
+        return {
+            side: ManoAnnotation(
+                pose, np.zeros((len(keys), 10)), pose[:, 0], np.zeros(len(keys), dtype=bool)
+            )
+            for side, pose in nothing.items()
+        }
+    path, capture = _of_capture(base, split, MANO, sequence)
     made = {}
     for side in sides:
         pose, shape, transl = (np.zeros((len(keys), n)) for n in (48, 10, 3))

@@ -16,8 +16,10 @@ import numpy as np
 import torch
 
 from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.images import read_rgb
-from hwp_bench.capture import Cameras, CaptureInfo, HandModelId
+from hwp_bench.base.images import is_blank, read_rgb
+from hwp_bench.base.progress import notice
+from hwp_bench.base.text import bounded
+from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.capture.convert import with_one_shape
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
 from hwp_bench.hands.fitting import FitTargets, fit_hand
@@ -38,6 +40,10 @@ from hwp_bench.importers.shared.overlay import (
 from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hands, resample
 from hwp_bench.importers.shared.writing import refuse_existing, write_capture
 
+#: The hands that can be asked for.
+CHOICES = ("auto", "right", "left", "both")
+#: Fewest frames of a capture.
+FEWEST = 3
 #: Terms of the data set.
 LICENCE = "CC BY-NC 4.0 (InterHand2.6M)"
 
@@ -56,10 +62,15 @@ class InterHandImport:
     size: int = 256
     #: Frames per second of the annotated frames; the data set comes at 5 and at 30.
     fps: float = 5.0
+    #: The hands that are imported: `right`, `left`, `both`, or `auto`: those that the data set
+    #: says the sequence shows.
+    side: str = "auto"
     #: Replace an existing capture.
     overwrite: bool = False
 
     def __post_init__(self) -> None:
+        if self.side not in CHOICES:
+            raise UsageError(f"must be one of {', '.join(CHOICES)}", field="--side")
         if not 32 <= self.size <= 2048:
             raise UsageError("must be 32 to 2048 px", field="--size")
         if not 0 < self.fps < 1000:
@@ -95,9 +106,12 @@ def import_interhand(
     """
     options = options or InterHandImport()
     refuse_existing(out, overwrite=options.overwrite)
-    records = read_annotations(root, sequence)
+    records = read_annotations(root, sequence, options.side, mano=options.mano is not None)
+    records, black = _without_black_frames(records, root)
     templates = {side: load_template(options.model, side) for side in records.sides}
     hands, facts = {}, {"frames": len(records.frames), "hands": list(records.sides)}
+    if black:
+        facts["black_frames"] = black
     errors: dict[str, Any] = {}
     for side, template in templates.items():
         if options.mano is not None:
@@ -116,7 +130,7 @@ def import_interhand(
         side: project_hand(template, hands[side], cameras) for side, template in templates.items()
     }
     facts |= {"errors": errors, "crop_px": windows.side, "split": records.split}
-    info = _info(records, sequence, templates, facts, options)
+    info = _info(records, sequence, facts, options)
     shown = set(sheet_frames(count))
     images: dict[int, np.ndarray] = {}
     masks: dict[int, np.ndarray] = {}
@@ -134,12 +148,42 @@ def import_interhand(
     return facts
 
 
+def _without_black_frames(
+    records: InterHandRecords, root: str | os.PathLike[str]
+) -> tuple[InterHandRecords, list[int]]:
+    """Leave out frames whose image is black, as the data set has some (its issue 125)."""
+    height, width = records.size[::-1]
+    kept = np.array([not is_blank(read_rgb(path, (height, width))) for path in records.images])
+    black = [int(frame) for frame in records.frames[~kept]]
+    if kept.sum() < FEWEST:
+        raise BadInput(
+            f"{len(black)} of {len(kept)} images of the sequence are black, or of one colour",
+            where=root,
+            remedy="Get the images again, or another camera of the sequence.",
+        )
+    if black:
+        notice(
+            f"warning: {len(black)} of {len(kept)} frames are black, or of one colour, and are "
+            f"left out: {bounded(black)}."
+        )
+    return records.select(kept), black
+
+
+def _no_annotation(what: str, side: str, root: str | os.PathLike[str]) -> BadInput:
+    other = "left" if side == "right" else "right"
+    return BadInput(
+        f"the {side} hand has no {what} in any frame",
+        where=root,
+        remedy=f"Import the other hand alone: --side {other}.",
+    )
+
+
 def _mano_hand(
     mano: ManoAnnotation, template: HandTemplate, side: str, root: str | os.PathLike[str]
 ) -> tuple[HandParameters, np.ndarray]:
     """MANO as annotated: relative to the mean pose, each hand with its own model."""
     if not mano.valid.any():
-        raise BadInput(f"the {side} hand has no MANO parameters in any frame", where=root)
+        raise _no_annotation("MANO parameters", side, root)
     pose = mano.pose.copy()
     pose[:, 1:] += template.mean_pose.reshape(15, 3)
     return with_one_shape(template, pose, mano.shape, mano.transl, mano.valid)
@@ -152,7 +196,7 @@ def _free_hand(
     # A hand is placed by its wrist and knuckles; without them it cannot be placed.
     valid = np.isfinite(joints[:, [0, 5, 9, 17]]).all(axis=(1, 2))
     if not valid.any():
-        raise BadInput(f"the {side} hand has no joints in any frame", where=root)
+        raise _no_annotation("joints", side, root)
     mano = records.mano[side]
     pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
     zeros = np.zeros((len(pose), 3))
@@ -215,21 +259,20 @@ def _shifted(K: np.ndarray, windows: CropWindows, frame: int) -> np.ndarray:
 def _info(
     records: InterHandRecords,
     sequence: InterHandSequence,
-    templates: Mapping[str, HandTemplate],
     facts: Mapping[str, Any],
     options: InterHandImport,
 ) -> CaptureInfo:
-    first = templates[records.sides[0]]
+    shown = "both" if len(records.sides) == 2 else records.sides[0]
     return CaptureInfo(
         id=sequence.id,
-        hands="both" if len(records.sides) == 2 else records.sides[0],
+        hands=shown,
         action=sequence.name,
         device=f"InterHand2.6M camera {sequence.camera}",
         fps=options.fps,
         width=options.size,
         height=options.size,
         frame_count=len(records.frames),
-        hand_model=HandModelId(first.name, first.digest, options.model),
+        hand_model=identify_hand_model(options.model, shown),
         perturbations={},
         source={
             "kind": "InterHand2.6M",

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +12,9 @@ import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_file
-from hwp_bench.capture import Cameras, CaptureInfo, HandModelId
+from hwp_bench.base.images import is_blank
+from hwp_bench.base.text import bounded
+from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import load_template
 from hwp_bench.importers.official.crop import CroppedFrame, crop_frames, tracked_joints
@@ -112,6 +114,11 @@ def import_official(
         compat=options.official_compat,
         where=os.fspath(folder.path),
     )
+    blank = np.array([is_blank(crop.image) for crop in crops])
+    if blank.any():
+        numbers = records.numbers[blank].tolist()
+        warnings.append(f"frames of one colour, as black ones, are not valid: {bounded(numbers)}")
+        hands = {side: _without(made, blank) for side, made in hands.items()}
     cameras = Cameras(np.stack([c.K for c in crops]), np.tile(np.eye(4), (len(crops), 1, 1)))
     clips = {
         side: project_hand(load_template(options.model, side), made.hand, cameras)
@@ -140,6 +147,11 @@ def import_official(
     return facts
 
 
+def _without(made: ImportedHand, frames: np.ndarray) -> ImportedHand:
+    """The same hand, not valid in some frames, (F,) bool."""
+    return replace(made, hand=replace(made.hand, valid=made.hand.valid & ~frames))
+
+
 def _info(
     folder: OfficialFolder,
     records: OfficialRecords,
@@ -148,17 +160,17 @@ def _info(
     options: OfficialImport,
 ) -> CaptureInfo:
     entry = catalogue().get(folder.id)
-    template = load_template(options.model, sides[0])
+    shown = "both" if len(sides) == 2 else sides[0]
     return CaptureInfo(
         id=folder.id,
-        hands="both" if len(sides) == 2 else sides[0],
+        hands=shown,
         action=entry.action if entry else "unknown",
         device=entry.device if entry else "unknown",
         fps=options.video_fps / (folder.subsample or 1),
         width=options.size,
         height=options.size,
         frame_count=len(records.numbers),
-        hand_model=HandModelId(template.name, template.digest, options.model),
+        hand_model=identify_hand_model(options.model, shown),
         perturbations=dict.fromkeys(entry.perturbations) if entry else {},
         source={
             "kind": "official HWP release",

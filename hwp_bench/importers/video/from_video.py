@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.progress import progress
+from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.images import is_blank
+from hwp_bench.base.progress import notice, progress
+from hwp_bench.base.text import bounded
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import load_template
 from hwp_bench.importers.shared.landmarks import Landmarks
@@ -20,6 +23,7 @@ from hwp_bench.importers.video.contour import FIELD_SIZE, ContourEnergy
 from hwp_bench.importers.video.fit_clip import (
     FittedClip,
     Footage,
+    ReprojectionError,
     fit_landmarks,
     fit_outline,
     fit_picture,
@@ -29,6 +33,11 @@ from hwp_bench.importers.video.fit_clip import (
 from hwp_bench.importers.video.fit_terms import hand_size
 from hwp_bench.importers.video.hand_pictures import HandPictures
 from hwp_bench.importers.video.imported_clip import ImportedClip, ImportedHand, store_clip
+from hwp_bench.importers.video.landmark_check import (
+    landmark_doubts,
+    refuse_other_units,
+    refuse_unfitted,
+)
 from hwp_bench.importers.video.picture_energy import PictureEnergy
 from hwp_bench.importers.video.segmentation import NARROW, WIDE, MaskSettings
 from hwp_bench.importers.video.source import VideoSource, read_source
@@ -37,6 +46,8 @@ from hwp_bench.importers.video.two_hands import ProjectedHands, project_hands
 from hwp_bench.importers.video.video_settings import VideoImport
 from hwp_bench.taxonomy import perturbation
 
+#: Endings of the names of images that a sheet can be written to.
+SHEET_KINDS = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 #: A frame whose landmarks are missed by more than this share of the hand's size is not valid.
 FAILED_FIT = 0.10
 
@@ -64,12 +75,40 @@ def import_video(
     """
     options = options or VideoImport()
     _check_output(Path(out), options)
-    clip = fit_video(read_source(video, landmarks, options), options)
+    source = without_blank_frames(read_source(video, landmarks, options))
+    refuse_other_units(source)
+    doubts = landmark_doubts(source)
+    for doubt in doubts:
+        notice(f"warning: {os.fspath(landmarks)}: it seems that {doubt}.")
+    clip = fit_video(source, options, doubts)
+    for warning in clip.warnings[len(doubts) :]:
+        notice(f"warning: {warning}. Look at the sheet.")
     store_clip(clip, out, options)
     return clip
 
 
-def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
+def without_blank_frames(source: VideoSource) -> VideoSource:
+    """The same clip; no hand counts as detected in a frame of one colour, such as a black one."""
+    blank = np.array([is_blank(frame) for frame in source.images.frames])
+    hands = {
+        side: replace(hand, detected=hand.detected & ~blank) for side, hand in source.hands.items()
+    }
+    wrong = np.flatnonzero(source.detected & blank)
+    if not len(wrong):
+        return source
+    numbers = [int(source.indices[frame]) for frame in wrong]
+    notice(f"warning: no hand is taken from frames of one colour: {bounded(numbers)}.")
+    for side, hand in hands.items():
+        if not hand.detected.any():
+            raise BadInput(
+                f"the {side} hand is detected in frames of one colour only", where=source.video.path
+            )
+    return replace(source, hands=hands)
+
+
+def fit_video(
+    source: VideoSource, options: VideoImport, doubts: Sequence[str] = ()
+) -> ImportedClip:
     """Fit the hands and cut the masks in turns.
 
     Landmarks, masks, outline, masks, outline and texture, masks, whole pictures, masks. Two hands
@@ -81,6 +120,8 @@ def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
     first_errors = [
         reprojection_error(fitted, hand) for fitted, hand in zip(fits, hands, strict=True)
     ]
+    good = map(followed, first_errors, hands)
+    refuse_unfitted(dict(zip(source.hands, good, strict=True)), source, doubts)
     size = sum(hand_size(hand) for hand in hands) / len(hands)
     scale = source.images.working.shape[1] / source.windows.side
     masking = Masking(source.images, source.detected, size * scale, source.own_masks)
@@ -109,16 +150,23 @@ def fit_video(source: VideoSource, options: VideoImport) -> ImportedClip:
         source.hands.items(), fits, last.clips, first_errors, strict=True
     ):
         error = reprojection_error(fitted, landmarks)
-        missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * hand_size(landmarks)
         imported[side] = ImportedHand(
             landmarks=landmarks,
-            parameters=fitted.model.parameters(landmarks.detected & ~missed),
+            parameters=fitted.model.parameters(followed(error, landmarks)),
             fitted=fitted,
             projected=projected,
             error=error,
             error_landmarks_only=first,
         )
-    return ImportedClip(source, imported, last.masks, overlap_landmarks_only)
+    valid = {side: hand.parameters.valid for side, hand in imported.items()}
+    refuse_unfitted(valid, source, doubts)
+    return ImportedClip(source, imported, last.masks, overlap_landmarks_only, tuple(doubts))
+
+
+def followed(error: ReprojectionError, landmarks: Landmarks) -> np.ndarray:
+    """(F,) bool, the frames in which a fit follows the landmarks."""
+    missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * hand_size(landmarks)
+    return np.asarray(landmarks.detected & ~missed)
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,3 +270,11 @@ def _check_output(out: Path, options: VideoImport) -> None:
     check_id(options.capture_id(out), os.fspath(out))
     for name in options.perturbations:
         perturbation(name)
+    sheet = options.sheet
+    if sheet is None:
+        return
+    if sheet.suffix.lower() not in SHEET_KINDS:
+        kinds = ", ".join(SHEET_KINDS)
+        raise UsageError(f"must end in one of {kinds}", where=sheet, field="--sheet")
+    if sheet.is_dir() or any(part.is_file() for part in sheet.parents):
+        raise UsageError("cannot be written there", where=sheet, field="--sheet")

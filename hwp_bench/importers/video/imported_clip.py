@@ -10,13 +10,14 @@ import numpy as np
 
 from hwp_bench.base.files import sha256_file
 from hwp_bench.base.images import write_image
-from hwp_bench.capture import Cameras, CaptureInfo, HandModelId
+from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.hands import HandParameters
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.overlay import OverlayFrame, overlay_sheet, sheet_frames
 from hwp_bench.importers.shared.writing import write_capture
 from hwp_bench.importers.video.clip_masks import ClipMasks, ProjectedClip
 from hwp_bench.importers.video.fit_clip import FittedClip, ReprojectionError
+from hwp_bench.importers.video.landmark_check import fit_warnings, overlap_warning
 from hwp_bench.importers.video.source import BOTH, VideoSource
 from hwp_bench.importers.video.video_settings import VideoImport
 
@@ -76,12 +77,27 @@ class ImportedClip:
         hands: by side, the hand that is detected most first.
         masks: final masks, of all hands.
         overlap_landmarks_only: mean overlap of mesh and mask before the outline was fitted.
+        doubts: what tells against the landmarks.
     """
 
     source: VideoSource
     hands: Mapping[str, ImportedHand]
     masks: ClipMasks
     overlap_landmarks_only: float
+    doubts: tuple[str, ...] = ()
+
+    @property
+    def overlap(self) -> float:
+        """Mean overlap of mesh and mask in the frames that show a hand."""
+        return float(self.masks.overlap[self.source.detected].mean())
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """Things to know before the capture is used; empty for a sound clip."""
+        fitted = {side: hand.parameters.valid for side, hand in self.hands.items()}
+        seen = {side: hand.landmarks.detected for side, hand in self.hands.items()}
+        few = fit_warnings(fitted, seen)
+        return (*self.doubts, *few, *overlap_warning(self.overlap))
 
     @property
     def first(self) -> ImportedHand:
@@ -104,14 +120,16 @@ class ImportedClip:
         overlaps = self.masks.overlap[seen]
         common: dict[str, object] = {
             "frames": len(seen),
-            "overlap": round(float(overlaps.mean()), 4),
+            "overlap": round(self.overlap, 4),
             "overlap_percentile_5": round(float(np.percentile(overlaps, 5)), 4),
             "overlap_landmarks_only": round(self.overlap_landmarks_only, 4),
             "focal_px": round(self.focal, 2),
         }
-        warning = self.source.reading and self.source.reading.warning()
-        if warning:
-            common["warning"] = warning
+        reading = self.source.reading and self.source.reading.warning()
+        warnings = [f"the video {reading}"] if reading else []
+        warnings += self.warnings
+        if warnings:
+            common["warnings"] = warnings
         if len(self.hands) == 1:
             return {**common, **self.first.facts()}
         each = {side: hand.facts() for side, hand in self.hands.items()}
@@ -146,7 +164,6 @@ def capture_info(
     """Return the capture's description."""
     source = clip.source
     video, windows = source.video, source.windows
-    template = clip.first.fitted.model.template
     return CaptureInfo(
         id=options.capture_id(out),
         hands=clip.shown,
@@ -156,7 +173,7 @@ def capture_info(
         width=windows.size,
         height=windows.size,
         frame_count=len(source.indices),
-        hand_model=HandModelId(template.name, template.digest, options.hand_model),
+        hand_model=identify_hand_model(options.hand_model, clip.shown),
         perturbations=dict.fromkeys(options.perturbations),
         source={
             "kind": "video",

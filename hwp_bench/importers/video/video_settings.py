@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.records import MAX_TEXT
+from hwp_bench.base.text import has_odd_characters
 
 
 @dataclass(frozen=True)
@@ -162,11 +165,19 @@ class VideoImport:
             ("--focal", self.focal is None or 1 <= self.focal <= 1e6, "must be 1 to 1e6 px"),
             ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
             ("--min-score", 0 <= self.min_score <= 1, "must be in [0, 1]"),
-            ("--licence", bool(self.licence), "must not be empty"),
+            *self._text_rules(),
         )
         for option, good, problem in rules:
             if not good:
                 raise UsageError(problem, field=option)
+
+    def _text_rules(self) -> Iterator[tuple[str, bool, str]]:
+        """The same bounds as in `capture.json`, which is written after all the work."""
+        texts = {name: getattr(self, name) for name in ("action", "device", "licence")}
+        for name, text in {**texts, "hand-model": self.hand_model}.items():
+            long = f"must have 1 to {MAX_TEXT:,} characters"
+            yield f"--{name}", 1 <= len(text) <= MAX_TEXT, long
+            yield f"--{name}", not has_odd_characters(text), "holds a control character"
 
     def capture_id(self, out: str | os.PathLike[str]) -> str:
         """Return the id of the capture that is written to `out`."""

@@ -176,6 +176,10 @@ unpack(pack(root / "made"), root / "sent")
         ('{"a": 9223372036854775809}', "is too large a number"),
         ('"' + "x" * 300 + '"', "more than the 200 bytes"),
         (b"\xff\xfe{", "is not UTF-8"),
+        ('{"fps": 30, "id": "a", "fps": 5}', "names 'fps' twice in one object. .* keep one"),
+        ('[{"a": {"b": 1, "b": 1}}]', "names 'b' twice"),
+        ('{"a": 1, "\\u0061": 1}', "names 'a' twice"),
+        ('{"\x7f": 1, "\x7f": 1}', r"names '\?' twice"),
     ],
 )
 def test_damaged_json_is_named(tmp_path: Path, text: str | bytes, problem: str) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import sys
 from dataclasses import asdict, dataclass, field, make_dataclass
 from typing import Annotated, Any, ClassVar, Literal
 
@@ -12,6 +13,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from msgspec import Meta
 
+from hwp_bench.base.denormals import flushed, flushes
 from hwp_bench.base.errors import BadInput, BadMethod, BadResult, UsageError
 from hwp_bench.base.records import (
     Line,
@@ -131,6 +133,19 @@ def test_faults_are_named(values: dict[str, Any], message: str) -> None:
     assert message in str(caught.value)
     assert "\x1b" not in str(caught.value)
     assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize("value", [0, 0.0, -0.0, 5e-324, 1e-310])
+def test_zero_is_not_above_zero_where_denormals_are_flushed(value: float) -> None:
+    # As in every process of ours. Least that passes: the smallest normal number.
+    below = make_dataclass("Below", [("field", Annotated[float, Meta(lt=0.0)])], frozen=True)
+    with flushed():
+        assert flushes()
+        with pytest.raises(BadResult, match=r"fps: is .*, expected a finite number above 0 and"):
+            read(fps=value)
+        with pytest.raises(BadResult, match=r"field: is .*, expected a finite number below 0"):
+            parse_record(below, {"field": -value}, where="file")
+        assert read(fps=sys.float_info.min).fps == sys.float_info.min
 
 
 def test_the_caller_chooses_path_error_and_strictness() -> None:

@@ -135,7 +135,10 @@ def _edit(root: Path, **changes: object) -> None:
     [
         ({"schema": "hwp-capture/9"}, "schema: is 'hwp-capture/9'"),
         ({"fps": "DELETE"}, "fps: is missing"),
-        ({"fps": -1}, "fps: is -1, expected a finite number above 0"),
+        ({"fps": -1}, "fps: is -1, expected a finite number from 0.001 to 1e+06"),
+        ({"fps": 0}, "fps: is 0, expected a finite number from 0.001"),
+        ({"fps": 1e-300}, "fps: is 1e-300, expected a finite number from 0.001"),
+        ({"fps": 1e7}, "fps: is 10000000.0, expected a finite number from 0.001"),
         ({"width": 1.5}, "width: is 1.5, expected an integer from 1 to 8192"),
         ({"frame_count": True}, "frame_count"),
         ({"frame_count": 10**9}, "frame_count"),

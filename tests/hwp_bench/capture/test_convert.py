@@ -113,7 +113,10 @@ def test_the_command_rewrites_a_capture(
     assert made.true_hands is None
     np.testing.assert_array_equal(made.frame(3), plain.frame(3))
     assert main(["hands", "convert", source, out, "--hand-model", "anny"]) == 2
-    assert main(["hands", "convert", str(plain.root), str(tmp_path / "x"), "--hand", "anny"]) == 1
+    old = replace(plain.info, hand_model=HandModelId(free_right.name, "0" * 64))
+    rewrite_capture(plain, tmp_path / "old", old, {"right": bent(10)})
+    words = ["hands", "convert", str(tmp_path / "old"), str(tmp_path / "x"), "--hand", "anny"]
+    assert main(words) == 1
     assert "another edition of hand model anny-1" in capsys.readouterr().err
 
 

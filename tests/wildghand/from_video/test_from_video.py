@@ -297,6 +297,7 @@ def test_from_python(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         (["hand.avi", "--set", "gausians=3"], 1, "gaussians"),
         (["hand.avi", "--landmarks", "absent.npz"], 1, "absent.npz"),
         (["taken", "--side", "left", "-o", "x"], 2, "--side: is for videos"),
+        (["taken", "--hand-model", "mano:/etc", "-o", "x"], 2, "--hand-model: is for videos"),
         (["taken"], 2, "--out: is missing"),
     ],
 )

@@ -6,10 +6,11 @@ import json
 import shutil
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import torch
-from interhand_release import FRAMES, project, write_interhand
+from interhand_release import FRAMES, HEIGHT, WIDTH, project, write_interhand
 from synthetic_mano import write_mirrored_mano
 
 from hwp_bench.base.errors import BadInput, UsageError
@@ -141,6 +142,73 @@ def test_damaged_annotations_are_named(
     with pytest.raises(BadInput, match=message):
         import_interhand(root, SEQUENCE, tmp_path / "c", InterHandImport(mano=mano))
     assert not (tmp_path / "c").exists()
+
+
+def copied(root: Path, tmp_path: Path) -> Path:
+    shutil.copytree(root, tmp_path / "copy")
+    return tmp_path / "copy"
+
+
+def annotation(root: Path, kind: str) -> Path:
+    return root / "annotations" / "test" / f"InterHand2.6M_test_{kind}.json"
+
+
+def test_black_images_are_named_and_left_out(
+    release: tuple[Path, dict], mano: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """https://github.com/facebookresearch/InterHand2.6M/issues/125"""
+    root = copied(release[0], tmp_path)
+    images = root / "images" / "test" / "Capture21" / "0390_dh_touchROM" / "cam400015"
+    black = np.random.default_rng(0).integers(0, 4, (HEIGHT, WIDTH, 3)).astype(np.uint8)
+    for frame in FRAMES[2], FRAMES[11]:
+        cv2.imwrite(str(images / f"image{frame}.jpg"), black)
+    facts = import_interhand(root, SEQUENCE, tmp_path / "c", InterHandImport(mano=mano, size=64))
+    kept = [frame for frame in FRAMES if frame not in (FRAMES[2], FRAMES[11])]
+    assert facts["black_frames"] == [FRAMES[2], FRAMES[11]]
+    assert "2 of 12 frames are black, or of one colour, and are left out: 13, 40." in (
+        capsys.readouterr().err
+    )
+    capture = open_capture(tmp_path / "c")
+    assert capture.info.source["frames"] == kept
+    assert capture.info.source["import"]["black_frames"] == [FRAMES[2], FRAMES[11]]
+    # The frame in which the left hand is missing is one earlier.
+    np.testing.assert_array_equal(capture.hands["left"].valid, np.arange(10) != 3)
+    for frame in FRAMES[:10]:
+        cv2.imwrite(str(images / f"image{frame}.jpg"), black)
+    with pytest.raises(BadInput, match="11 of 12 images of the sequence are black"):
+        import_interhand(root, SEQUENCE, tmp_path / "d")
+
+
+def test_a_hand_that_is_never_annotated_is_left_out_on_request(
+    release: tuple[Path, dict], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """https://github.com/facebookresearch/InterHand2.6M/issues/33, without the MANO file."""
+    root = copied(release[0], tmp_path)
+    annotation(root, "MANO_NeuralAnnot").unlink()
+    joints = json.loads(annotation(root, "joint_3d").read_text())
+    for frame in joints["21"].values():
+        frame["joint_valid"][21:] = [[0]] * 21
+    annotation(root, "joint_3d").write_text(json.dumps(joints))
+    words = ["data", "import", "interhand26m", str(root), "touchrom-15", "--size", "64"]
+    assert main([*words, "-o", str(tmp_path / "both")]) == 1
+    said = capsys.readouterr().err
+    assert "the left hand has no joints in any frame. Import the other hand alone: --side r" in said
+    assert main([*words, "-o", str(tmp_path / "right"), "--side", "right"]) == 0
+    capture = open_capture(tmp_path / "right")
+    assert capture.info.hands == "right"
+    assert capture.hands["right"].valid.all()
+    assert check_capture(capture.root).ok
+    # With MANO the file is needed, and it is named.
+    with pytest.raises(BadInput, match=r"MANO_NeuralAnnot.json: does not exist"):
+        import_interhand(root, SEQUENCE, tmp_path / "m", InterHandImport(mano=tmp_path))
+
+
+def test_a_hand_that_the_sequence_does_not_show_is_refused(mano: Path, tmp_path: Path) -> None:
+    write_interhand(tmp_path, {"left": load_template(f"mano:{mano}", "left")})
+    with pytest.raises(BadInput, match="--side: shows the left hand only"):
+        import_interhand(tmp_path, SEQUENCE, tmp_path / "c", InterHandImport(side="both"))
+    with pytest.raises(UsageError, match="--side: must be one of auto, right, left, both"):
+        InterHandImport(side="up")
 
 
 def test_an_absent_sequence_is_named(release: tuple[Path, dict], tmp_path: Path) -> None:

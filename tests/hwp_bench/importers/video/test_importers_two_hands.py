@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 import torch
-from synthetic_clip import FOCAL, FPS, HEIGHT, WIDTH, make_clip, write_landmarks
+from small_captures import CaptureMaker
+from synthetic_clip import FOCAL, FPS, HEIGHT, WIDTH, landmark_import, make_clip, write_landmarks
 from two_hand_clip import TwoHandClip, make_two_hands, write_two_hands
 
-from hwp_bench.base.errors import BadInput
-from hwp_bench.capture import open_capture
+from hwp_bench.base.errors import BadCapture, BadInput
+from hwp_bench.capture import identify_hand_model, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
 from hwp_bench.hands import pose_hand
@@ -21,6 +23,7 @@ from hwp_bench.importers.shared.landmarks import read_landmarks
 from hwp_bench.importers.video import FitSettings, ImportedClip, VideoImport, import_video
 from hwp_bench.importers.video.fit_clip import Footage, fit_landmarks, share_camera
 from hwp_bench.importers.video.source import read_source
+from hwp_bench.results import read_results
 
 FRAMES, SWAPS, GAP = 16, (4, 9, 13), range(7, 9)
 QUICK = FitSettings(
@@ -136,6 +139,56 @@ def test_two_hands_get_one_focal_length(clip: TwoHandClip) -> None:
             moved = fit.model.pixels(fit.model.posed().landmarks[:, 0]) - wrist
         # The tracker's offset of the wrist is not on the ray of its joint.
         assert moved.abs().max() < 0.1
+
+
+@pytest.mark.slow
+def test_whichever_hand_is_seen_most_a_method_takes_the_capture(tmp_path: Path) -> None:
+    """From video to scored table, one hand or two, of which the left or the right is seen most."""
+    frames, options = 10, VideoImport(size=32, fit=landmark_import(24, 2), focal=FOCAL)
+    made = []
+    for most, other in (("left", "right"), ("right", "left")):
+        folder = tmp_path / most
+        folder.mkdir()
+        clip = make_two_hands(frames, nearest=0.08)
+        write_two_hands(folder, clip, (), range(4, 8), lost=other)
+        for side in ("auto", most):
+            out = folder / side
+            chosen = replace(options, side=side, id=f"{most}-{side}")
+            imported = import_video(folder / "hands.avi", folder / "hands.npz", out, chosen)
+            assert next(iter(imported.hands)) == most
+            assert open_capture(out).info.hands == ("both" if side == "auto" else most)
+            report = check_capture(out)
+            assert report.ok, report.findings
+            assert not [one for one in report.findings if one.field == "hand_model.digest"]
+            made.append(str(out))
+    words = ["evaluate", "baselines/plain", "--capture", *made, "--steps", "2"]
+    assert main([*words, "-o", str(tmp_path / "results"), "--isolation", "none"]) == 0
+    results = read_results(tmp_path / "results")
+    assert [capture.failure for capture in results.captures] == [None] * 4
+    assert all(capture.frames for capture in results.captures)
+    assert main(["table", str(tmp_path / "results")]) == 0
+
+
+@pytest.mark.parametrize(
+    ("hands", "other"), [("both", "left"), ("right", "left"), ("left", "right")]
+)
+def test_a_digest_of_the_other_hand_is_named(
+    make_capture: CaptureMaker, capsys: pytest.CaptureFixture[str], hands: str, other: str
+) -> None:
+    capture = make_capture(hands=hands, frames=10)
+    file = capture.root / "capture.json"
+    digests = [identify_hand_model("anny", one).digest for one in (hands, other)]
+    file.write_text(file.read_text().replace(*digests))
+    assert main(["data", "check", str(capture.root)]) == 1
+    said = capsys.readouterr().out
+    assert "NOT SOUND" in said
+    assert f"hand_model.digest: is the digest of the {other} hand of anny-1" in said
+    first = "right" if hands == "both" else hands
+    with pytest.raises(
+        BadCapture, match=f"capture's first hand is the {first} one.* write"
+    ) as caught:
+        open_capture(capture.root).template(first)
+    assert digests[0] in str(caught.value)
 
 
 def test_one_of_two_hands_can_be_chosen(folder: Path) -> None:

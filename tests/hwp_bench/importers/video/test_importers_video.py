@@ -28,8 +28,9 @@ from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import overlap
 from hwp_bench.importers.video.decode import probe, read_frames
-from hwp_bench.importers.video.from_video import import_video
+from hwp_bench.importers.video.from_video import import_video, without_blank_frames
 from hwp_bench.importers.video.imported_clip import IMPORTER_VERSION
+from hwp_bench.importers.video.source import read_source
 from hwp_bench.importers.video.video_settings import FitSettings, FrameRange, VideoImport
 
 FRAMES = 16
@@ -149,9 +150,9 @@ def test_a_video_that_ends_early_is_recorded(
     result = import_video(cut, tmp_path / "hand.npz", tmp_path / "capture", options)
     said = f"ends early, after {count} of {FRAMES} frames: the file is cut off"
     assert f"warning: {cut} {said}" in capsys.readouterr().err
-    assert result.facts()["warning"] == said
+    assert result.facts()["warnings"][0] == f"the video {said}"
     source = open_capture(tmp_path / "capture").info.source
-    assert source["fit"]["warning"] == said
+    assert source["fit"]["warnings"][0] == f"the video {said}"
     assert source["video"]["decoded_frames"] == count
     assert source["video"]["stated_frames"] == FRAMES
     assert source["video"]["ends_early"] is True
@@ -230,6 +231,50 @@ def test_bad_input_is_one_clear_error_and_leaves_nothing(
             folder / "hand.avi", landmarks, tmp_path / "out", replace(VideoImport(), **changes)
         )
     assert set(tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["--licence", "\x1b[2J"], "--licence: holds a control character"),
+        (["--licence", ""], "--licence: must have 1 to 10,000 characters"),
+        (["--action", "a\x07"], "--action: holds a control character"),
+        (["--device", "\u202eb"], "--device: holds a control character"),
+        (["--device", "x" * 10_001], "--device: must have 1 to 10,000 characters"),
+        (["--hand-model", "mano:\x1b"], "--hand-model: holds a control character"),
+        (["--id", "a\x1bb"], "id: 'a\\x1bb' is not a capture id"),
+        (["--perturbations", "\x1b"], "there is no perturbation"),
+        (["--sheet", "sheet.xyz"], "--sheet: must end in one of .png"),
+        (["--sheet", "."], "--sheet: must end in one of .png"),
+        (["--sheet", "out/sheet.png"], "--sheet: lies in the output OUT"),
+        (["--sheet", "hand.npz/sheet.png"], "--sheet: cannot be written there"),
+    ],
+)
+def test_arguments_are_checked_before_any_work(
+    folder: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    words: list[str],
+    message: str,
+) -> None:
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr("hwp_bench.importers.video.from_video.read_source", None)
+    given = ["data", "import-video", "hand.avi", "out", "--landmarks", "hand.npz"]
+    assert main([*given, *words]) in (1, 2)
+    said = capsys.readouterr().err
+    assert message in said
+    assert "\x1b" not in said
+    assert not (folder / "out").exists()
+
+
+def test_black_frames_show_no_hand(
+    folder: Path, clip: SyntheticClip, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pictures = [clip.picture(frame) * (frame not in (3, 9)) for frame in range(FRAMES)]
+    video = write_video(tmp_path / "hand.avi", pictures)
+    source = without_blank_frames(read_source(video, folder / "hand.npz", VideoImport()))
+    assert "no hand is taken from frames of one colour: 3, 9." in capsys.readouterr().err
+    np.testing.assert_array_equal(np.flatnonzero(~source.detected), [3, 5, 9])
 
 
 def test_a_mask_of_another_size_is_named(folder: Path, tmp_path: Path) -> None:
