@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from msgspec import Meta
 
+from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture.schema import MAX_FRAMES, HandModelId
@@ -75,6 +76,22 @@ class PosedGaussians:
 
     def __repr__(self) -> str:
         return f"PosedGaussians({len(self)} Gaussians)"
+
+    def require_finite(self) -> None:
+        """Refuse Gaussians with a number that is NaN or infinite, before they are written.
+
+        Raises:
+            BadInput: there is one; the field is named.
+        """
+        for item in fields(self):
+            bad = int((~np.isfinite(getattr(self, item.name))).sum())
+            if bad:
+                raise BadInput(
+                    f"hold {bad:,} numbers that are NaN or infinite",
+                    field=item.name,
+                    remedy="The avatar is damaged, or a pose or scale is out of range; nothing is "
+                    "written.",
+                )
 
 
 class WildGHandAvatar(HandAvatar):
@@ -243,20 +260,31 @@ class WildGHandAvatar(HandAvatar):
 
     @denormals_flushed()
     @torch.no_grad()
-    def pose(self, hands: Mapping[str, HandPose], *, closed: bool = False) -> PosedGaussians:
+    def pose(
+        self,
+        hands: Mapping[str, HandPose],
+        *,
+        closed: bool = False,
+        viewmat: np.ndarray | None = None,
+    ) -> PosedGaussians:
         """Pose the Gaussians of the given hands, one hand after the other.
 
         Args:
             hands: by side.
             closed: after them, the walls that close the open ends of the wrists in `render`.
+            viewmat: (4, 4) world to camera, m: colours are those that `render` draws for this
+                camera. None: those that the network gives, also where no frame has shown them.
 
         Raises:
             UsageError: no hand, or one that was not fitted.
         """
         refine, posed = self.settings.heads.refinement, self.posed(hands)
         dark = self.model.cast(posed)
+        viewmats = None if viewmat is None else self._tensor(viewmat)[None]
         found = {
-            side: self.model.gaussians(side, *given, refine=refine, dark=dark.get(side))
+            side: self.model.gaussians(
+                side, *given, refine=refine, viewmats=viewmats, dark=dark.get(side)
+            )
             for side, given in posed.items()
         }
         parts = [made for made, _ in found.values()] + (self.model.walls(found) if closed else [])
