@@ -27,6 +27,10 @@ from wildghand.model.settings import WildGHandSettings
 from wildghand.splat.threads import denormals_flushed
 
 _Frame = Annotated[int, Meta(ge=0, lt=MAX_FRAMES)]
+# A little more than what is possible, since numbers are rounded.
+_Omega = Annotated[float, Meta(ge=-1.001, le=1.001)]
+_Share = Annotated[float, Meta(ge=-0.001, le=1.001)]
+_Weight = Annotated[float, Meta(ge=0.0, le=1e6)]
 # A capture has no more frames, so that a fit has none.
 _PER_FRAME = Meta(max_length=MAX_FRAMES)
 
@@ -41,11 +45,11 @@ class FitRecord:
     #: Frames of the capture that were fitted.
     frames: Annotated[list[_Frame], _PER_FRAME] = field(default_factory=list)
     #: Temporal weight of each of them by side; empty without DPD.
-    temporal: dict[str, Annotated[list[float], _PER_FRAME]] = field(default_factory=dict)
+    temporal: dict[str, Annotated[list[_Omega], _PER_FRAME]] = field(default_factory=dict)
     #: Probability that each is clean, as the pre-pass judged; empty without it.
-    clean: Annotated[list[float], _PER_FRAME] = field(default_factory=list)
+    clean: Annotated[list[_Share], _PER_FRAME] = field(default_factory=list)
     #: Weight of each in the fit.
-    frame_weights: Annotated[list[float], _PER_FRAME] = field(default_factory=list)
+    frame_weights: Annotated[list[_Weight], _PER_FRAME] = field(default_factory=list)
     #: Optimizer steps.
     steps: int = 0
     #: Steps behind the state that validation frames chose; None: behind the last one.

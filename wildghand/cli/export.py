@@ -49,6 +49,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         "(default: 3; 0: one colour each, and a third of the size)",
     )
     parser.add_argument(
+        "--texture",
+        type=int,
+        default=1024,
+        metavar="TEXELS",
+        help="edge of a mesh's texture (default: 1024)",
+    )
+    parser.add_argument(
         "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
     )
     parser.add_argument("--overwrite", action="store_true", help="replace what exists")
@@ -61,7 +68,11 @@ def run(args: argparse.Namespace) -> int:
     from wildghand.export.formats import ExportSettings, check_target, export
 
     settings = ExportSettings(
-        mesh=args.mesh, scale=args.scale, supersplat=args.supersplat, harmonics=args.harmonics
+        mesh=args.mesh,
+        scale=args.scale,
+        supersplat=args.supersplat,
+        harmonics=args.harmonics,
+        texture=args.texture,
     )
     check_target(args.out, settings, overwrite=args.overwrite)
     if args.frame is not None and (args.poses is None or args.mesh):

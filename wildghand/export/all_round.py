@@ -30,7 +30,7 @@ TURNS = (
 MAX_DEGREE = 3
 # What the front counts more than another side: a file opens there. Cosine to the viewer from which
 # a side counts, and what holds harmonics of degree 1 and more near zero.
-_FRONT, _RIM, _RIDGE = 30.0, -0.2, 1e-3
+_FRONT, _RIM, _RIDGE = 30.0, -0.2, 8e-5
 # Without harmonics the front's colour is taken up to the rim: cosines of the change.
 _AWAY, _TOWARDS = -0.2, 0.1
 # Gaussians that are solved for at once.

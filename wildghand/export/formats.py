@@ -21,13 +21,14 @@ from wildghand.export.placing import (
     SUPERSPLAT_SCALE,
     for_supersplat,
     laid_to_rest,
+    require_scale,
     scaled,
 )
 from wildghand.export.ply import ply_bytes
 from wildghand.export.skinned_glb import SkinnedHand, require_skinning, skinned_glb_bytes
 from wildghand.export.splat_glb import splat_glb_bytes
 from wildghand.export.spz import spz_bytes
-from wildghand.export.texture import baked
+from wildghand.export.texture import SIZE, baked
 
 #: Content by extension.
 FORMATS = {
@@ -52,6 +53,8 @@ class ExportSettings:
     #: Degree of the spherical harmonics by which the colours of Gaussians change with the side they
     #: are seen from, 0 to 3.
     harmonics: int = MAX_DEGREE
+    #: Edge of a mesh's texture, texels, 64 to 4096.
+    texture: int = SIZE
 
 
 def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> None:
@@ -77,8 +80,11 @@ def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> No
         raise UsageError("is for .ply", where=path, field="--supersplat")
     if settings.supersplat and settings.scale != 1.0:
         raise UsageError("sets the scale itself", where=path, field="--supersplat")
+    require_scale(settings.scale)
     if not 0 <= settings.harmonics <= MAX_DEGREE:
         raise UsageError(f"is {settings.harmonics}", field="--harmonics", remedy="Use 0 to 3.")
+    if not 64 <= settings.texture <= 4096:
+        raise UsageError(f"is {settings.texture}", field="--texture", remedy="Use 64 to 4096.")
     if path.exists() and not overwrite:
         raise UsageError("exists", where=path, remedy="Give --overwrite to replace it.")
 
@@ -114,7 +120,7 @@ def export(
     settings = settings or ExportSettings()
     check_target(path, settings, overwrite=overwrite)
     if settings.mesh:
-        data, counts = _mesh_bytes(avatar, capture)
+        data, counts = _mesh_bytes(avatar, capture, settings.texture)
     else:
         data, counts = _splat_bytes(avatar, path.suffix.lower(), settings, capture, frame or 0)
     atomic_write(path, data, overwrite=overwrite, flag="--overwrite")
@@ -152,7 +158,9 @@ def _splat_bytes(
     return splat_glb_bytes(placed, _GENERATOR, colors), counts
 
 
-def _mesh_bytes(avatar: WildGHandAvatar, capture: Capture | None) -> tuple[bytes, dict[str, int]]:
+def _mesh_bytes(
+    avatar: WildGHandAvatar, capture: Capture | None, size: int
+) -> tuple[bytes, dict[str, int]]:
     """The file of a skinned mesh, and counts of what is in it."""
     sides = avatar.sides if capture is None else shown_sides(avatar, capture)
     rest = {side: pose for side, pose in avatar.rest_poses().items() if side in sides}
@@ -161,7 +169,7 @@ def _mesh_bytes(avatar: WildGHandAvatar, capture: Capture | None) -> tuple[bytes
     for side, pose in rest.items():
         template = avatar.model.rigs[side].template
         require_skinning(template)
-        texture = baked(avatar, side, layouts[side])
+        texture = baked(avatar, side, layouts[side], size)
         skinned[side] = SkinnedHand(
             template, layouts[side], np.asarray(pose.betas), np.asarray(pose.transl), texture
         )

@@ -34,8 +34,7 @@ def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
         UsageError: the factor is not a number above 0.
         BadInput: with this factor the numbers of the file are not finite.
     """
-    if not (np.isfinite(factor) and factor > 0.0):
-        raise UsageError(f"is {factor}", field="scale", remedy="Use a number above 0.")
+    require_scale(factor)
     with np.errstate(over="ignore"):
         made = replace(
             splats,
@@ -44,6 +43,16 @@ def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
         )
     made.require_finite()
     return made
+
+
+def require_scale(factor: float) -> None:
+    """Refuse a scale that is none.
+
+    Raises:
+        UsageError: the factor is not a number above 0.
+    """
+    if not (np.isfinite(factor) and factor > 0.0):
+        raise UsageError(f"is {factor}", field="--scale", remedy="Use a number above 0.")
 
 
 def laid_to_rest(

@@ -18,8 +18,8 @@ from wildghand.export.all_round import TURNS, middle, turned, view_turn
 
 #: Texels along an edge.
 SIZE = 1024
-# Edge of the pictures, px, and how much of it the hand's ball fills.
-_PICTURE, _FILLED = 1024, 0.95
+# How much of the pictures, which are as large as the texture, the hand's ball fills.
+_FILLED = 0.95
 # Power of the cosine between skin and viewer that a picture counts by, its least value, and how
 # much more the front counts.
 _POWER, _LEAST, _FRONT = 4.0, 0.15, 4.0
@@ -64,7 +64,7 @@ def baked(
     front = avatar.studio.posed()[side]
     centre = middle(avatar.pose({side: front}))
     vertices, _ = _posed(avatar, front)
-    camera = _camera(vertices, centre)
+    camera = _camera(vertices, centre, size)
     total, weight = np.zeros((len(rows), 3)), np.zeros(len(rows))
     for turn, tilt in TURNS:
         hand = turned(avatar, {side: front}, view_turn(camera.viewmat, turn, tilt), centre)[side]
@@ -121,14 +121,14 @@ def _posed(avatar: WildGHandAvatar, hand: HandPose) -> tuple[np.ndarray, np.ndar
     return vertices[0].double().cpu().numpy(), normals[0].double().cpu().numpy()
 
 
-def _camera(vertices: np.ndarray, centre: np.ndarray) -> Camera:
-    """The studio's camera, with the ball around a hand in its picture."""
+def _camera(vertices: np.ndarray, centre: np.ndarray, size: int) -> Camera:
+    """The studio's camera, with the ball around a hand in its square picture."""
     radius = float(np.linalg.norm(vertices - centre, axis=1).max())
-    half = 0.5 * _PICTURE
+    half = 0.5 * size
     focal = _FILLED * half * np.sqrt(max(centre[2] ** 2 - radius**2, 1e-6)) / radius
     x, y = half - focal * centre[:2] / centre[2]
     K = np.array([[focal, 0.0, x], [0.0, focal, y], [0.0, 0.0, 1.0]])
-    return Camera(K, np.eye(4), _PICTURE, _PICTURE)
+    return Camera(K, np.eye(4), size, size)
 
 
 def _shares(places: np.ndarray, normals: np.ndarray) -> np.ndarray:
