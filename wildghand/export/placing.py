@@ -31,8 +31,7 @@ def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
         factor: units of the file in a metre, above 0.
 
     Raises:
-        UsageError: the factor is not a number above 0.
-        BadInput: with this factor the numbers of the file are not finite.
+        UsageError: the factor is not a number above 0, or numbers become infinite by it.
     """
     require_scale(factor)
     with np.errstate(over="ignore"):
@@ -41,7 +40,12 @@ def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
             means=(splats.means.astype(np.float64) * factor).astype(np.float32),
             scales=(splats.scales.astype(np.float64) * factor).astype(np.float32),
         )
-    made.require_finite()
+    if not (np.isfinite(made.means).all() and np.isfinite(made.scales).all()):
+        raise UsageError(
+            f"is {factor:g}, by which numbers become infinite",
+            field="--scale",
+            remedy="Use a smaller one.",
+        )
     return made
 
 
