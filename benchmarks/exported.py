@@ -67,8 +67,8 @@ def main() -> None:
             found = [_psnr(image[box], shown[box][..., :3]) for image in drawn.values()]
             print(f"{turn:5d} {tilt:5d} " + " ".join(f"{each:10.1f}" for each in found), flush=True)
             if args.pictures:
-                beside = np.concatenate([shown[..., :3], *drawn.values()], axis=1)
-                write_image(args.pictures / f"{turn:03d}_{tilt:02d}.png", as_uint8(beside))
+                pair = np.concatenate([shown[..., :3], *drawn.values()], axis=1)
+                write_image(args.pictures / f"{turn:03d}_{tilt:02d}.png", as_uint8(pair))
 
 
 def _from_rest(avatar: WildGHandAvatar, hand: HandPose) -> Place:
