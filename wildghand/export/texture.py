@@ -168,7 +168,8 @@ def _sampled(rgba: np.ndarray, pixel: np.ndarray) -> np.ndarray:
     padded = np.zeros((-(-len(pixel) // width) * width, 2), dtype=np.float32)
     padded[: len(pixel)] = pixel
     table = padded.reshape(-1, width, 2)
-    read = cv2.remap(rgba, table, None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
+    across, down = (np.ascontiguousarray(table[..., axis]) for axis in range(2))
+    read = cv2.remap(rgba, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
     return np.asarray(read.reshape(-1, 4)[: len(pixel)])
 
 
