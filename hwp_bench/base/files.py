@@ -43,17 +43,23 @@ _SHOWN = 100
 _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 
 
-def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
+def atomic_write(
+    path: str | os.PathLike[str], data: bytes | str, *, overwrite: bool = True, flag: str = ""
+) -> Path:
     """Write a file so that a reader sees the old content or the new one, never a part.
 
     Args:
         path: the file; its folder is made.
         data: bytes, or text that is stored as UTF-8.
+        overwrite: replace what is there; without it a file is refused also where another process
+            made it a moment ago.
+        flag: the option by which a person asks for that, for the message; empty where none is.
 
     Returns:
         The path.
 
     Raises:
+        UsageError: `path` exists and may not be replaced.
         HwpError: the place cannot be written (no space, no permission).
     """
     path = Path(path)
@@ -65,11 +71,13 @@ def atomic_write(path: str | os.PathLike[str], data: bytes | str) -> Path:
         # Not by tempfile, whose files are private: a result has the mode that the umask gives.
         with open(temporary, "xb") as stream:
             stream.write(raw)
-        os.replace(temporary, path)
+        _name_file(temporary, path, overwrite)
     except OSError as error:
         if temporary is not None:
             with contextlib.suppress(OSError):
                 os.unlink(temporary)
+        if isinstance(error, FileExistsError) and not overwrite:
+            raise _exists(path, flag) from error
         raise HwpError(
             f"cannot be written ({reason_of(error)})",
             where=path,
@@ -85,6 +93,32 @@ def _room(path: Path) -> str:
         if path.absolute().is_relative_to(cache_root().absolute()):
             remedy += ", or choose another cache folder with HWP_CACHE"
     return f"{remedy}."
+
+
+def _name_file(temporary: Path, path: Path, overwrite: bool) -> None:
+    """Give a written file its name; the system decides in one step whether the name is free.
+
+    Raises:
+        FileExistsError: something is there that may not be replaced.
+        OSError: the file cannot be named for another reason.
+    """
+    if not overwrite:
+        try:
+            os.link(temporary, path)
+        except FileExistsError:
+            raise
+        except OSError:
+            # A file system without links: the name is taken first, and filled in the next step.
+            os.close(os.open(path, os.O_CREAT | os.O_EXCL | os.O_WRONLY))
+        else:
+            os.unlink(temporary)
+            return
+    try:
+        os.replace(temporary, path)
+    except OSError:
+        if not overwrite:
+            os.unlink(path)
+        raise
 
 
 @contextlib.contextmanager

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from msgspec import Meta
 
+from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.records import Count, Seconds
@@ -27,6 +28,10 @@ from wildghand.model.settings import WildGHandSettings
 from wildghand.splat.threads import denormals_flushed
 
 _Frame = Annotated[int, Meta(ge=0, lt=MAX_FRAMES)]
+# A little more than what is possible, since numbers are rounded.
+_Omega = Annotated[float, Meta(ge=-1.001, le=1.001)]
+_Share = Annotated[float, Meta(ge=-0.001, le=1.001)]
+_Weight = Annotated[float, Meta(ge=0.0, le=1e6)]
 # A capture has no more frames, so that a fit has none.
 _PER_FRAME = Meta(max_length=MAX_FRAMES)
 
@@ -41,11 +46,11 @@ class FitRecord:
     #: Frames of the capture that were fitted.
     frames: Annotated[list[_Frame], _PER_FRAME] = field(default_factory=list)
     #: Temporal weight of each of them by side; empty without DPD.
-    temporal: dict[str, Annotated[list[float], _PER_FRAME]] = field(default_factory=dict)
+    temporal: dict[str, Annotated[list[_Omega], _PER_FRAME]] = field(default_factory=dict)
     #: Probability that each is clean, as the pre-pass judged; empty without it.
-    clean: Annotated[list[float], _PER_FRAME] = field(default_factory=list)
+    clean: Annotated[list[_Share], _PER_FRAME] = field(default_factory=list)
     #: Weight of each in the fit.
-    frame_weights: Annotated[list[float], _PER_FRAME] = field(default_factory=list)
+    frame_weights: Annotated[list[_Weight], _PER_FRAME] = field(default_factory=list)
     #: Optimizer steps.
     steps: Count = 0
     #: Steps behind the state that validation frames chose; None: behind the last one.
@@ -76,6 +81,22 @@ class PosedGaussians:
 
     def __repr__(self) -> str:
         return f"PosedGaussians({len(self)} Gaussians)"
+
+    def require_finite(self) -> None:
+        """Refuse Gaussians with a number that is NaN or infinite, before they are written.
+
+        Raises:
+            BadInput: there is one; the field is named.
+        """
+        for item in fields(self):
+            bad = int((~np.isfinite(getattr(self, item.name))).sum())
+            if bad:
+                raise BadInput(
+                    f"hold {bad:,} numbers that are NaN or infinite",
+                    field=item.name,
+                    remedy="The avatar is damaged, or a pose or scale is out of range; nothing is "
+                    "written.",
+                )
 
 
 class WildGHandAvatar(HandAvatar):
@@ -244,20 +265,31 @@ class WildGHandAvatar(HandAvatar):
 
     @denormals_flushed()
     @torch.no_grad()
-    def pose(self, hands: Mapping[str, HandPose], *, closed: bool = False) -> PosedGaussians:
+    def pose(
+        self,
+        hands: Mapping[str, HandPose],
+        *,
+        closed: bool = False,
+        viewmat: np.ndarray | None = None,
+    ) -> PosedGaussians:
         """Pose the Gaussians of the given hands, one hand after the other.
 
         Args:
             hands: by side.
             closed: after them, the walls that close the open ends of the wrists in `render`.
+            viewmat: (4, 4) world to camera, m: colours are those that `render` draws for this
+                camera. None: those that the network gives, also where no frame has shown them.
 
         Raises:
             UsageError: no hand, or one that was not fitted.
         """
         refine, posed = self.settings.heads.refinement, self.posed(hands)
         dark = self.model.cast(posed)
+        viewmats = None if viewmat is None else self._tensor(viewmat)[None]
         found = {
-            side: self.model.gaussians(side, *given, refine=refine, dark=dark.get(side))
+            side: self.model.gaussians(
+                side, *given, refine=refine, viewmats=viewmats, dark=dark.get(side)
+            )
             for side, given in posed.items()
         }
         parts = [made for made, _ in found.values()] + (self.model.walls(found) if closed else [])

@@ -24,7 +24,7 @@ from hwp_bench.base.records import Seed, parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
-from wildghand.avatar.tensors import read_tensors
+from wildghand.avatar.tensors import MAX_TENSORS, read_tensors
 from wildghand.avatar.weight_masks import read_weight_masks, write_weight_masks
 from wildghand.evidence import ColorChanges, Evidence, rename_former
 from wildghand.light import KnownLight
@@ -44,6 +44,8 @@ MODEL = "model.safetensors"
 WEIGHTS = "weights"
 #: Largest description that is read, bytes: that of a fit of 100,000 frames has 10 million.
 MAX_DESCRIPTION_BYTES = 32 << 20
+#: Largest shape parameter that is read, standard deviations; people lie within 5.
+MAX_BETA = 100.0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -58,6 +60,10 @@ class _Description:
     betas: dict[str, list[float]]
     settings: dict[str, Any]
     fit: FitRecord
+    #: Names of the tensors of `model.safetensors`; None in avatars that do not say.
+    tensors: (
+        Annotated[list[Annotated[str, Meta(max_length=200)]], Meta(max_length=MAX_TENSORS)] | None
+    ) = None
 
 
 def save_avatar(
@@ -70,6 +76,7 @@ def save_avatar(
     """
     from safetensors.torch import save
 
+    tensors = avatar.model.state_dict()
     description = _Description(
         schema=SCHEMA,
         hand_model=avatar.hand_model,
@@ -79,9 +86,9 @@ def save_avatar(
         betas={side: [float(b) for b in betas] for side, betas in avatar.betas.items()},
         settings=dataclasses.asdict(avatar.settings),
         fit=avatar.record,
+        tensors=sorted(tensors),
     )
     with atomic_folder(path, overwrite=overwrite, flag="--overwrite") as folder:
-        tensors = avatar.model.state_dict()
         # Not `save_file`, which makes a file that only its owner may read.
         data = save({name: value.detach().cpu().contiguous() for name, value in tensors.items()})
         (folder / MODEL).write_bytes(data)
@@ -132,7 +139,7 @@ def load_avatar(
     mean_color, frame_count = torch.tensor(value.mean_color), max(1, len(value.fit.frames))
     device = torch.device(device)
     file = root / MODEL
-    tensors = rename_former(read_tensors(file, settings, value.sides, frame_count))
+    tensors = rename_former(read_tensors(file, settings, value.sides, frame_count, value.tensors))
     try:
         subject = SubjectShape.from_tensors(tensors, next(iter(templates.values())), str(file))
         model = make_model(
@@ -175,8 +182,13 @@ def _check_description(value: _Description) -> None:
     if len(value.mean_color) != 3 or not all(0.0 <= part <= 1.0 for part in value.mean_color):
         raise BadInput("must be three numbers in [0, 1]", field="mean_color")
     for side in value.sides:
-        if len(value.betas.get(side, ())) != 10:
-            raise BadInput("must be ten numbers for each hand", field="betas")
+        betas = value.betas.get(side, [])
+        if len(betas) != 10 or not all(abs(each) <= MAX_BETA for each in betas):
+            raise BadInput(
+                f"must be ten numbers from -{MAX_BETA:g} to {MAX_BETA:g} for each hand",
+                field=f"betas.{side}",
+                remedy="The avatar is damaged: take another copy, or fit it again.",
+            )
 
 
 def _templates(

@@ -17,11 +17,19 @@ MAX_MODEL_BYTES = 4 << 30
 #: Most tensors of a model.
 MAX_TENSORS = 10_000
 
+#: Largest number of a tensor that is read; those of fits lie far below.
+LARGEST = 1e6
+
+_ANOTHER_COPY = "The avatar is damaged: take another copy, or fit it again."
 _FLOATS = ("F16", "BF16", "F32", "F64")
 
 
 def read_tensors(
-    file: Path, settings: WildGHandSettings, sides: Sequence[str], frame_count: int
+    file: Path,
+    settings: WildGHandSettings,
+    sides: Sequence[str],
+    frame_count: int,
+    declared: Sequence[str] | None = None,
 ) -> dict[str, torch.Tensor]:
     """Read the tensors of an avatar.
 
@@ -30,10 +38,12 @@ def read_tensors(
         settings: those that the avatar's description states.
         sides: its hands.
         frame_count: its training frames.
+        declared: names of all tensors; None: the description does not say.
 
     Raises:
-        BadInput: the file is missing, too large or damaged, or a tensor is of integers, not finite,
-            or has another shape than the description says; the tensor is named.
+        BadInput: the file is missing, too large or damaged, or a tensor is missing, not declared,
+            of integers, not finite, out of range, or has another shape than the description says;
+            the tensor is named.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -48,8 +58,17 @@ def read_tensors(
             for name in names:
                 part = stored.get_slice(name)
                 _check_part(name, part.get_shape(), str(part.get_dtype()), expected, file)
-            for name in sorted(expected.keys() - set(names)):
-                raise BadInput("is missing", where=file, field=name)
+            for name in sorted((expected.keys() | set(declared or ())) - set(names)):
+                raise BadInput(
+                    "is missing", where=file, field=shown(name)[:100], remedy=_ANOTHER_COPY
+                )
+            for name in sorted(set(names) - set(names if declared is None else declared)):
+                raise BadInput(
+                    "is not among the tensors that its description names",
+                    where=file,
+                    field=shown(name)[:100],
+                    remedy=_ANOTHER_COPY,
+                )
             tensors = {name: stored.get_tensor(name) for name in names}
     except (SafetensorError, RuntimeError, OSError, ValueError, AssertionError) as error:
         problem = (str(error).splitlines() or [type(error).__name__])[0][:300]
@@ -57,6 +76,13 @@ def read_tensors(
     for name, tensor in tensors.items():
         if not bool(torch.isfinite(tensor).all()):
             raise BadInput("holds NaN or infinity", where=file, field=shown(name)[:100])
+        if tensor.numel() and float(tensor.abs().max()) > LARGEST:
+            raise BadInput(
+                f"holds a number beyond {LARGEST:g}",
+                where=file,
+                field=shown(name)[:100],
+                remedy=_ANOTHER_COPY,
+            )
     return tensors
 
 

@@ -38,7 +38,22 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--supersplat",
         action="store_true",
-        help="as SuperSplat shows it well: y down, ten units in a metre (.ply)",
+        help="for SuperSplat: opens upright, palm to the viewer, ten units in a metre (.ply)",
+    )
+    parser.add_argument(
+        "--harmonics",
+        type=int,
+        default=3,
+        metavar="DEGREE",
+        help="how finely colours of Gaussians change with the side they are seen from, 0 to 3 "
+        "(default: 3; 0: one colour each, and a third of the size)",
+    )
+    parser.add_argument(
+        "--texture",
+        type=int,
+        default=1024,
+        metavar="TEXELS",
+        help="edge of a mesh's texture (default: 1024)",
     )
     parser.add_argument(
         "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
@@ -53,7 +68,13 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from wildghand.export.formats import ExportSettings, check_target, export
 
-    settings = ExportSettings(mesh=args.mesh, scale=args.scale, supersplat=args.supersplat)
+    settings = ExportSettings(
+        mesh=args.mesh,
+        scale=args.scale,
+        supersplat=args.supersplat,
+        harmonics=args.harmonics,
+        texture=args.texture,
+    )
     check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
     check_target(args.out, settings, overwrite=args.overwrite)
     if args.frame is not None and (args.poses is None or args.mesh):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,18 +11,24 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture
-from hwp_bench.hands import anchor_uv, load_template
-from hwp_bench.hands.anchors import SurfaceAnchors
-from hwp_bench.methods.contract import HandPose
-from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar
+from hwp_bench.hands import load_template
+from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.playback import shown_sides
+from wildghand.export.all_round import MAX_DEGREE, harmonics, seen, standing
 from wildghand.export.motion import capture_motion, closing_motion
-from wildghand.export.placing import SUPERSPLAT_SCALE, half_turned, scaled
+from wildghand.export.placing import (
+    HALF_TURN,
+    SUPERSPLAT_SCALE,
+    for_supersplat,
+    laid_to_rest,
+    require_scale,
+    scaled,
+)
 from wildghand.export.ply import ply_bytes
-from wildghand.export.skinned_glb import SkinnedHand, skinned_glb_bytes
+from wildghand.export.skinned_glb import SkinnedHand, require_skinning, skinned_glb_bytes
 from wildghand.export.splat_glb import splat_glb_bytes
 from wildghand.export.spz import spz_bytes
-from wildghand.export.texture import baked
+from wildghand.export.texture import SIZE, baked
 
 #: Content by extension.
 FORMATS = {
@@ -43,8 +48,13 @@ class ExportSettings:
     mesh: bool = False
     #: Units of the file in a metre; of Gaussians.
     scale: float = 1.0
-    #: The axes and ten times the size that SuperSplat shows well; .ply only.
+    #: Upright, the palm to SuperSplat's first view, and ten times the size; .ply only.
     supersplat: bool = False
+    #: Degree of the spherical harmonics by which the colours of Gaussians change with the side they
+    #: are seen from, 0 to 3.
+    harmonics: int = MAX_DEGREE
+    #: Edge of a mesh's texture, texels, 64 to 4096.
+    texture: int = SIZE
 
 
 def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> None:
@@ -70,6 +80,11 @@ def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> No
         raise UsageError("is for .ply", where=path, field="--supersplat")
     if settings.supersplat and settings.scale != 1.0:
         raise UsageError("sets the scale itself", where=path, field="--supersplat")
+    require_scale(settings.scale)
+    if not 0 <= settings.harmonics <= MAX_DEGREE:
+        raise UsageError(f"is {settings.harmonics}", field="--harmonics", remedy="Use 0 to 3.")
+    if not 64 <= settings.texture <= 4096:
+        raise UsageError(f"is {settings.texture}", field="--texture", remedy="Use 64 to 4096.")
     if path.exists() and not overwrite:
         raise UsageError("exists", where=path, remedy="Give --overwrite to replace it.")
 
@@ -99,67 +114,68 @@ def export(
 
     Raises:
         UsageError: `check_target` refuses it; the capture shows none of the avatar's hands, or
-            belongs to another hand model.
+            belongs to another hand model; `path` was made by somebody else meanwhile.
+        BadInput: the avatar gives numbers that are not finite.
     """
     settings = settings or ExportSettings()
     check_target(path, settings, overwrite=overwrite)
-    hands = avatar.rest_poses()
-    if capture is not None:
-        shown = capture.hand_poses(frame or 0)
-        hands = {side: shown[side] for side in shown_sides(avatar, capture)}
     if settings.mesh:
-        return _write_mesh(avatar, path, hands, capture)
-    splats = avatar.pose(hands, closed=True)
-    posed = _splat_bytes(splats, path.suffix.lower(), settings, capture is not None)
-    atomic_write(path, posed[0])
-    return {"gaussians": posed[1]}
+        data, counts = _mesh_bytes(avatar, capture, settings.texture)
+    else:
+        data, counts = _splat_bytes(avatar, path.suffix.lower(), settings, capture, frame or 0)
+    atomic_write(path, data, overwrite=overwrite, flag="--overwrite")
+    return counts
 
 
 def _splat_bytes(
-    splats: PosedGaussians, suffix: str, settings: ExportSettings, down: bool
-) -> tuple[bytes, int]:
-    """The file of Gaussians, and their number.
-
-    Args:
-        down: whether y points down, as in captures, and not up, as at rest.
-    """
-    count = len(splats)
+    avatar: WildGHandAvatar,
+    suffix: str,
+    settings: ExportSettings,
+    capture: Capture | None,
+    frame: int,
+) -> tuple[bytes, dict[str, int]]:
+    """The file of Gaussians, and their number."""
+    place = standing(avatar, capture, frame)
+    given, down = seen(avatar, place), capture is not None
+    scale = SUPERSPLAT_SCALE if settings.supersplat else settings.scale
+    if settings.supersplat:
+        given = for_supersplat(avatar, given, place.hands)
+        axes = "y is down; upright, the palm to SuperSplat's first view"
+    elif not down:
+        given = laid_to_rest(avatar, given, place.hands)
+        axes = "y is up (out of the back of the hand)"
+    else:
+        axes = "y is down, z is front"
+    if suffix != ".ply" and down:
+        given = given.moved(HALF_TURN, np.zeros(3))
+    placed, colors = scaled(given.splats, scale), harmonics(given, settings.harmonics)
+    counts = {"gaussians": len(placed)}
     if suffix == ".ply":
-        scale = SUPERSPLAT_SCALE if settings.supersplat else settings.scale
-        placed = scaled(splats, scale)
-        if settings.supersplat and not down:
-            placed, down = half_turned(placed), True
-        comments = (
-            f"{_GENERATOR}",
-            f"{scale:g} units are a metre",
-            "y is down, z is front" if down else "y is up (out of the back of the hand)",
-        )
-        return ply_bytes(placed, comments), count
-    placed = scaled(half_turned(splats) if down else splats, settings.scale)
+        comments = (_GENERATOR, f"{scale:g} units are a metre", axes)
+        return ply_bytes(placed, comments, colors), counts
     if suffix == ".spz":
-        return spz_bytes(placed), count
-    return splat_glb_bytes(placed, _GENERATOR), count
+        return spz_bytes(placed, colors), counts
+    return splat_glb_bytes(placed, _GENERATOR, colors), counts
 
 
-def _write_mesh(
-    avatar: WildGHandAvatar, path: Path, hands: Mapping[str, HandPose], capture: Capture | None
-) -> dict[str, int]:
-    rest = {side: pose for side, pose in avatar.rest_poses().items() if side in hands}
+def _mesh_bytes(
+    avatar: WildGHandAvatar, capture: Capture | None, size: int
+) -> tuple[bytes, dict[str, int]]:
+    """The file of a skinned mesh, and counts of what is in it."""
+    sides = avatar.sides if capture is None else shown_sides(avatar, capture)
+    rest = {side: pose for side, pose in avatar.rest_poses().items() if side in sides}
     layouts = {side: load_template(avatar.hand_model.source, side) for side in rest}
     skinned = {}
     for side, pose in rest.items():
-        rig = avatar.model.rigs[side]
-        anchors = SurfaceAnchors(
-            np.asarray(rig.anchors.face_index), np.asarray(rig.anchors.barycentric)
-        )
-        splats = avatar.pose({side: pose})
-        texture = baked(anchor_uv(layouts[side], anchors), splats.colors, splats.opacities)
+        template = avatar.model.rigs[side].template
+        require_skinning(template)
+        texture = baked(avatar, side, layouts[side], size)
         skinned[side] = SkinnedHand(
-            rig.template, layouts[side], np.asarray(pose.betas), np.asarray(pose.transl), texture
+            template, layouts[side], np.asarray(pose.betas), np.asarray(pose.transl), texture
         )
     if capture is None:
         motion = closing_motion(layouts, rest)
     else:
         motion = capture_motion(avatar, capture, tuple(rest))
-    atomic_write(path, skinned_glb_bytes(skinned, motion, _GENERATOR))
-    return {"hands": len(skinned), "keys": len(motion.times)}
+    counts = {"hands": len(skinned), "keys": len(motion.times)}
+    return skinned_glb_bytes(skinned, motion, _GENERATOR), counts

@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.errors import BadInput
+
 _TYPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
 #: What a buffer view is for: vertex attributes, indices of corners, or neither.
@@ -37,7 +39,16 @@ class GlbBuilder:
                 given by rows and kept by columns.
             target: one of this module's.
             bounds: write the least and the largest value, which positions and times need.
+
+        Raises:
+            BadInput: a number is NaN or infinite.
         """
+        if not np.isfinite(values).all():
+            raise BadInput(
+                "holds NaN or infinity, which glTF does not know",
+                field=f"array {len(self.content['accessors'])}",
+                remedy="The avatar or the motion is damaged; nothing is written.",
+            )
         kind = _TYPES[values.shape[1:]]
         flat = values.transpose(0, 2, 1) if kind == "MAT4" else values
         accessor: dict[str, Any] = {

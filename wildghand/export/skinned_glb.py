@@ -12,8 +12,10 @@ import numpy as np
 from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import HandTemplate, TemplateTensors
 from hwp_bench.hands.skeleton import JOINT_NAMES, PARENTS
+from hwp_bench.hands.topology import boundary_loop
 from wildghand.export.glb import ATTRIBUTES, INDICES, GlbBuilder
 from wildghand.export.motion import Motion
+from wildghand.export.texture import SkinTexture
 
 #: Colours are shown as they are: light is in them already.
 UNLIT = "KHR_materials_unlit"
@@ -35,8 +37,7 @@ class SkinnedHand:
     betas: np.ndarray
     #: (3,) m, where it lies at rest.
     transl: np.ndarray
-    #: (S, S, 3) uint8 sRGB.
-    texture: np.ndarray
+    texture: SkinTexture
 
 
 def skinned_glb_bytes(hands: Mapping[str, SkinnedHand], motion: Motion, generator: str) -> bytes:
@@ -65,18 +66,27 @@ def skinned_glb_bytes(hands: Mapping[str, SkinnedHand], motion: Motion, generato
     times = made.array(motion.times.astype(np.float32), bounds=True)
     centre = np.concatenate(list(motion.transls.values())).mean(axis=0)
     for side, hand in hands.items():
-        if hand.template.pose_basis is not None:
-            raise UsageError(
-                "changes its shape with the pose, which a skinned mesh cannot",
-                field="hand_model",
-                remedy="Export Gaussians (.ply, .spz), or fit with the free hand.",
-            )
+        require_skinning(hand.template)
         joints = _joints(hand)
         first = _add_nodes(made, side, joints, hand.transl)
         _add_mesh(made, side, hand, joints, first)
         _add_motion(made, clip, times, motion, side, joints, first, centre)
     content["animations"] = [clip]
     return made.to_bytes()
+
+
+def require_skinning(template: TemplateTensors) -> None:
+    """Refuse a hand model that changes its shape with the pose beyond skinning.
+
+    Raises:
+        UsageError: it does.
+    """
+    if template.pose_basis is not None:
+        raise UsageError(
+            "changes its shape with the pose, which a skinned mesh cannot",
+            field="hand_model",
+            remedy="Export Gaussians (.ply, .spz), or fit with the free hand.",
+        )
 
 
 def _joints(hand: SkinnedHand) -> np.ndarray:
@@ -111,18 +121,24 @@ def _add_mesh(
     pairs = np.stack((layout.faces.ravel(), layout.face_uv.ravel()), axis=1)
     kept, corners = np.unique(pairs, axis=0, return_inverse=True)
     vertex, texel = kept.T
-    uv = layout.uv[texel].astype(np.float32)
+    places, uv, weights = rest[vertex], layout.uv[texel], template.weights.numpy()[vertex]
+    border = boundary_loop(layout.faces)
+    if len(border):
+        cap = wrist_cap(rest[border], template.weights.numpy()[border], hand.texture)
+        corners = np.concatenate([corners.reshape(-1, 3), cap.faces + len(places)])
+        places = np.concatenate([places, cap.places])
+        uv, weights = np.concatenate([uv, cap.uv]), np.concatenate([weights, cap.weights])
     # glTF counts v from the top.
-    uv[:, 1] = 1.0 - uv[:, 1]
-    numbers, shares = strongest(template.weights.numpy()[vertex])
+    uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
+    numbers, shares = strongest(weights)
     attributes = {
-        "POSITION": made.array(rest[vertex].astype(np.float32), ATTRIBUTES, bounds=True),
-        "TEXCOORD_0": made.array(uv, ATTRIBUTES),
+        "POSITION": made.array(places.astype(np.float32), ATTRIBUTES, bounds=True),
+        "TEXCOORD_0": made.array(uv.astype(np.float32), ATTRIBUTES),
         "JOINTS_0": made.array(numbers, ATTRIBUTES),
         "WEIGHTS_0": made.array(shares, ATTRIBUTES),
     }
     faces = made.array(corners.reshape(-1).astype(np.uint32), INDICES)
-    _, png = cv2.imencode(".png", hand.texture[..., ::-1])
+    _, png = cv2.imencode(".png", hand.texture.image[..., ::-1])
     place = len(content["meshes"])
     content["textures"].append({"source": made.image(png.tobytes()), "sampler": 0})
     content["materials"].append(
@@ -150,6 +166,42 @@ def _add_mesh(
     )
     content["scenes"][0]["nodes"].append(len(content["nodes"]))
     content["nodes"].append({"name": f"{side}_hand", "mesh": place, "skin": place})
+
+
+@dataclass(frozen=True, eq=False)
+class WristCap:
+    """What closes the open end of a wrist: a fan around its middle."""
+
+    #: (L + 1, 3) m, the border's vertices and their middle.
+    places: np.ndarray
+    #: (L + 1, 2) texture coordinates, origin at the bottom left.
+    uv: np.ndarray
+    #: (L + 1, 16) rows sum to 1.
+    weights: np.ndarray
+    #: (L, 3) counter-clockwise seen from outside.
+    faces: np.ndarray
+
+
+def wrist_cap(border: np.ndarray, weights: np.ndarray, texture: SkinTexture) -> WristCap:
+    """Close the open end of a wrist.
+
+    Args:
+        border: (L, 3) m, vertices around it in the direction of the faces' own edges.
+        weights: (L, 16) skinning weights.
+        texture: it has a place for the cap.
+    """
+    count = len(border)
+    around = 2.0 * np.pi * np.arange(count) / count
+    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
+    uv = np.concatenate([texture.radius * circle, np.zeros((1, 2))]) + texture.cap
+    own, following = np.arange(count), (np.arange(count) + 1) % count
+    return WristCap(
+        places=np.concatenate([border, border.mean(axis=0, keepdims=True)]),
+        uv=uv,
+        weights=np.concatenate([weights, weights.mean(axis=0, keepdims=True)]),
+        # Against the edges of the skin, so that the surface has one outside.
+        faces=np.stack([following, own, np.full(count, count)], axis=1),
+    )
 
 
 def _add_motion(

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from wildghand.avatar.avatar import PosedGaussians
+from wildghand.export.all_round import SH_CONSTANT
 from wildghand.export.glb import ATTRIBUTES, GlbBuilder
-from wildghand.export.ply import SH_CONSTANT
 
 #: Name of the extension.
 EXTENSION = "KHR_gaussian_splatting"
 
 
-def splat_glb_bytes(splats: PosedGaussians, generator: str) -> bytes:
+def splat_glb_bytes(
+    splats: PosedGaussians, generator: str, harmonics: np.ndarray | None = None
+) -> bytes:
     """Return N Gaussians as one primitive of points.
 
     Programs that do not know the extension show coloured points.
@@ -20,6 +24,8 @@ def splat_glb_bytes(splats: PosedGaussians, generator: str) -> bytes:
     Args:
         splats: in glTF's axes: y up, z back.
         generator: the program that writes it.
+        harmonics: (N, K, 3) of their colours (`wildghand.export.all_round`); None: the colours of
+            the Gaussians in every direction.
 
     Source: Khronos, KHR_gaussian_splatting, release candidate of 2026: the kernel `ellipse`,
     display-referred sRGB, quaternions (x, y, z, w), scales and opacities as they are.
@@ -31,8 +37,12 @@ def splat_glb_bytes(splats: PosedGaussians, generator: str) -> bytes:
         "SCALE": splats.scales,
         "ROTATION": quats / np.linalg.norm(quats, axis=1, keepdims=True),
         "OPACITY": splats.opacities,
-        "SH_DEGREE_0_COEF_0": (splats.colors - 0.5) / SH_CONSTANT,
     }
+    if harmonics is None:
+        harmonics = ((splats.colors - 0.5) / SH_CONSTANT)[:, None]
+    for number in range(harmonics.shape[1]):
+        degree = math.isqrt(number)
+        own[f"SH_DEGREE_{degree}_COEF_{number - degree**2}"] = harmonics[:, number]
     attributes = {
         "POSITION": made.array(splats.means.astype(np.float32), ATTRIBUTES, bounds=True),
         "COLOR_0": made.array(colors.astype(np.float32), ATTRIBUTES),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import gzip
+import math
 import struct
 
 import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from wildghand.avatar.avatar import PosedGaussians
-from wildghand.export.ply import SH_CONSTANT
+from wildghand.export.all_round import SH_CONSTANT
 
 #: "NGSP", read as a little-endian number, and the version of the format.
 MAGIC, VERSION = 0x5053474E, 3
@@ -21,18 +22,20 @@ _LOG_SCALES = (-10.0, 16.0)
 _SMALLEST_THREE = 511.0
 
 
-def spz_bytes(splats: PosedGaussians) -> bytes:
+def spz_bytes(splats: PosedGaussians, harmonics: np.ndarray | None = None) -> bytes:
     """Return N Gaussians as SPZ.
 
     Args:
         splats: in the axes of the format: x right, y up, z back; within 64 units of the origin.
+        harmonics: (N, K, 3) of their colours (`wildghand.export.all_round`); None: the colours of
+            the Gaussians in every direction. Those of degree 1 and more are cut to [-1, 1].
 
     Raises:
         UsageError: a coordinate is beyond the format's reach.
 
     Source: the public description of the format by Niantic (nianticlabs/spz, version 3): gzip of
-    16 bytes of header and, one array after the other, positions, opacities, colours, scales and
-    rotations. The same Gaussians give the same bytes.
+    16 bytes of header and, one array after the other, positions, opacities, colours, scales,
+    rotations and harmonics. The same Gaussians give the same bytes.
     """
     fixed = np.rint(splats.means.astype(np.float64) * 2**FRACTIONAL_BITS)
     if len(fixed) and np.abs(fixed).max() >= 2**23:
@@ -43,12 +46,15 @@ def spz_bytes(splats: PosedGaussians) -> bytes:
         )
     places = fixed.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[..., :3]
     opacities = _byte(255.0 * splats.opacities)
-    harmonics = (splats.colors - 0.5) / SH_CONSTANT
-    colors = _byte(harmonics * (COLOR_SCALE * 255.0) + 127.5)
+    if harmonics is None:
+        harmonics = ((splats.colors - 0.5) / SH_CONSTANT)[:, None]
+    degree = math.isqrt(harmonics.shape[1]) - 1
+    colors = _byte(harmonics[:, 0] * (COLOR_SCALE * 255.0) + 127.5)
+    others = _byte(harmonics[:, 1:] * 128.0 + 128.0)
     low, steps = _LOG_SCALES
     scales = _byte((np.log(np.maximum(splats.scales, 1e-12)) - low) * steps)
-    header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(splats), 0, FRACTIONAL_BITS, 0, 0)
-    arrays = (places, opacities, colors, scales, packed_rotations(splats.quats))
+    header = struct.pack("<IIIBBBB", MAGIC, VERSION, len(splats), degree, FRACTIONAL_BITS, 0, 0)
+    arrays = (places, opacities, colors, scales, packed_rotations(splats.quats), others)
     body = header + b"".join(np.ascontiguousarray(array).tobytes() for array in arrays)
     return gzip.compress(body, mtime=0)
 

@@ -163,11 +163,17 @@ def bake_hand(
 def gaussians_of(
     avatar: WildGHandAvatar, side: str, pose: np.ndarray, transl: np.ndarray
 ) -> PosedGaussians:
-    """The Gaussians of one hand and its wall as the avatar poses them, with its own shape."""
+    """The Gaussians of one hand and its wall as the avatar poses them, with its own shape.
+
+    Raises:
+        BadInput: numbers of them are not finite.
+    """
     from hwp_bench.methods.contract import HandPose
 
     hand = HandPose(side, pose, avatar.betas[side], transl)
-    return avatar.pose({side: hand}, closed=True)
+    made = avatar.pose({side: hand}, closed=True)
+    made.require_finite()
+    return made
 
 
 def _rotations(vectors: np.ndarray) -> np.ndarray:

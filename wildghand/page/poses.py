@@ -18,8 +18,6 @@ from wildghand.avatar import WildGHandAvatar
 from wildghand.avatar.playback import shown_sides
 from wildghand.page.settings import PageSettings
 
-# The camera before a hand at rest: it looks at the palm, fingers upwards.
-_REST_VIEW = np.array([[0.0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0.5], [0, 0, 0, 1]])
 # Each fourth frame at most is kept out of what is baked, this many at most.
 _HELD_OUT = 8
 
@@ -53,9 +51,10 @@ def sample_poses(
     """
     random = np.random.default_rng(settings.seed)
     if capture is None:
-        start = avatar.rest_poses()
+        # In the studio, where the light is as frames have shown it.
+        start = avatar.studio.posed()
         clip = {side: start[side].pose[None] for side in avatar.sides}
-        frames, held_out, viewmat, fps = [], [], _REST_VIEW, 30.0
+        frames, held_out, viewmat, fps = [], [], np.eye(4), 30.0
         motion = {side: np.zeros((0, 51)) for side in avatar.sides}
     else:
         _check(avatar, capture)

@@ -95,7 +95,7 @@ def write_page(
     }
     weights = {} if capture is None else mean_weights(avatar, capture, avatar.weight_masks)
     html = _html(avatar, hands, samples, measured, settings, biases, weights)
-    atomic_write(out, html)
+    atomic_write(out, html, overwrite=overwrite, flag="--overwrite")
     return PageFacts(
         bytes=len(html.encode()),
         gaussians=sum(len(baked) for baked in hands.values()),

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import json
+import os
 import subprocess
 import sys
 import threading
@@ -240,3 +242,42 @@ def test_halves_of_surrogate_pairs_are_refused(tmp_path: Path, text: str) -> Non
         read_json(file)
     file.write_text('"\\ud83d\\ude00"')
     assert read_json(file) == "\U0001f600"
+
+
+def test_one_of_many_that_write_a_new_file_at_once_has_it(tmp_path: Path) -> None:
+    """Threads that start together: one is told that it has written, and its content is there."""
+    target, barrier = tmp_path / "file", threading.Barrier(8)
+    refusals: list[str] = []
+
+    def write(number: int) -> bool:
+        barrier.wait()
+        try:
+            atomic_write(target, str(number), overwrite=False, flag="--overwrite")
+        except UsageError as error:
+            refusals.append(str(error))
+            return False
+        return True
+
+    with ThreadPoolExecutor(8) as pool:
+        wrote = list(pool.map(write, range(8)))
+    assert sum(wrote) == 1
+    assert len(refusals) == 7
+    assert all("exists already" in said and "--overwrite" in said for said in refusals)
+    assert target.read_text() == str(wrote.index(True))
+    assert list(tmp_path.iterdir()) == [target]
+
+
+def test_a_new_file_is_exclusive_where_there_are_no_links(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def link(*_: object) -> None:
+        raise PermissionError(errno.EPERM, "no links here")
+
+    monkeypatch.setattr(os, "link", link)
+    target = atomic_write(tmp_path / "file", "first", overwrite=False)
+    with pytest.raises(UsageError, match="exists already"):
+        atomic_write(target, "second", overwrite=False)
+    assert target.read_text() == "first"
+    atomic_write(target, "third")
+    assert target.read_text() == "third"
+    assert list(tmp_path.iterdir()) == [target]

@@ -51,6 +51,14 @@ def _describe(avatar: Path, change: Change) -> None:
         (lambda v: v["fit"].update(frames=[10**18]), r"fit.frames\[0\]"),
         (lambda v: v["fit"].update(clean=[0.5] * 200_000), "fit.clean"),
         (lambda v: v["fit"].update(temporal={"right": [0.5] * 200_000}), "fit.temporal"),
+        (lambda v: v["fit"].update(temporal={"right": [1e300]}), "fit.temporal"),
+        (lambda v: v["fit"].update(frame_weights=[1e300]), "fit.frame_weights"),
+        (lambda v: v["fit"].update(clean=[-1e300]), "fit.clean"),
+        (
+            lambda v: v["betas"].update(right=[1e308] * 10),
+            r"betas.right: must be ten numbers from -100 to 100.*another copy",
+        ),
+        (lambda v: v["betas"].update(right=[0.0] * 9 + [-101.0]), "betas.right"),
         (
             lambda v: v["settings"]["network"].update(
                 identity_resolution=4096, identity_channels=1024
@@ -109,3 +117,27 @@ def test_others_may_read_an_avatar(avatar: Path) -> None:
     plain.write_text("")
     for name in (DESCRIPTION, MODEL):
         assert (avatar / name).stat().st_mode == plain.stat().st_mode
+
+
+def test_a_tensor_that_the_description_names_is_required(avatar: Path) -> None:
+    """Also of those that an avatar need not have, such as changes of colours. Those of the network
+    are required anyway."""
+    whole = load_file(avatar / MODEL)
+    named = json.loads((avatar / DESCRIPTION).read_text())["tensors"]
+    assert named == sorted(whole)
+    for name in [each for each in named if not each.startswith("network.")]:
+        save_file({key: value for key, value in whole.items() if key != name}, avatar / MODEL)
+        with pytest.raises(BadInput, match=f"{name}: is missing.*another copy"):
+            load_avatar(avatar)
+    save_file({**whole, "more": torch.zeros(1)}, avatar / MODEL)
+    with pytest.raises(BadInput, match="more: is not among the tensors"):
+        load_avatar(avatar)
+
+
+def test_numbers_out_of_range_are_refused(avatar: Path) -> None:
+    """Finite ones, too: multiplied they would not be."""
+    whole = load_file(avatar / MODEL)
+    name = "network.attribute_head.attributes.bias"
+    save_file({**whole, name: torch.full_like(whole[name], 1e30)}, avatar / MODEL)
+    with pytest.raises(BadInput, match=rf"{name}: holds a number beyond 1e\+06.*another copy"):
+        load_avatar(avatar)

@@ -26,6 +26,7 @@ from wildghand.avatar import WildGHandAvatar, save_avatar
 from wildghand.cli.main import main
 from wildghand.page import bake_hand, write_page
 from wildghand.page.bake import joint_motions
+from wildghand.page.measure import draw_baked
 from wildghand.page.poses import sample_poses
 from wildghand.page.settings import PageSettings
 
@@ -198,6 +199,17 @@ def test_what_was_baked_from_one_pose_is_that_pose(fitted) -> None:
     truth = avatar.pose({"right": hand}, closed=True)
     np.testing.assert_allclose(means, truth.means, atol=1e-5)
     np.testing.assert_allclose(colors, truth.colors, atol=1e-5)
+
+
+def test_without_a_capture_a_page_opens_as_the_studio_shows_the_hand(fitted) -> None:
+    avatar, _ = fitted
+    samples = sample_poses(avatar, None, SMALL)
+    baked = bake_hand(avatar, "right", samples.baked["right"], geometry_rank=6, color_rank=12)
+    camera = avatar.studio.camera(64, 64)
+    truth = avatar.render(avatar.studio.posed(), camera)
+    found = draw_baked({"right": baked}, samples.start, camera)
+    assert psnr(found, truth[..., :3], truth[..., 3]) >= LEAST
+    np.testing.assert_array_equal(samples.viewmat, camera.viewmat)
 
 
 def test_the_wall_of_the_wrist_follows_the_hand(fitted) -> None:

@@ -245,9 +245,9 @@ def test_bad_input_is_one_clear_error_and_leaves_nothing(
         (["--id", "a\x1bb"], "id: 'a\\x1bb' is not a capture id"),
         (["--perturbations", "\x1b"], "there is no perturbation"),
         (["--sheet", "sheet.xyz"], "--sheet: must end in one of .png"),
-        (["--sheet", "."], "--sheet: must end in one of .png"),
+        (["--sheet", "."], "OUT: lies in the output --sheet"),
         (["--sheet", "out/sheet.png"], "--sheet: lies in the output OUT"),
-        (["--sheet", "hand.npz/sheet.png"], "--sheet: cannot be written there"),
+        (["--sheet", "hand.npz/sheet.png"], "--sheet: lies in the input --landmarks"),
     ],
 )
 def test_arguments_are_checked_before_any_work(
