@@ -90,7 +90,13 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     # FFmpeg would print its own messages about a damaged video next to our one line.
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
-    from hwp_bench.importers.video import VideoImport, import_video, parse_frame_range
+    from hwp_bench.base.progress import notice
+    from hwp_bench.importers.video import (
+        VideoImport,
+        finished_import,
+        import_video,
+        parse_frame_range,
+    )
 
     options = VideoImport(
         side=args.side,
@@ -108,6 +114,11 @@ def run(args: argparse.Namespace) -> int:
         sheet=args.sheet,
         overwrite=args.force,
     )
+    finished = finished_import(args.video, args.landmarks, args.out, options)
+    if finished is not None:
+        notice(f"{args.out} is complete: the same call has made it; --force imports again")
+        print(json.dumps(finished, indent=1) if args.json else f"capture: {args.out}")
+        return 0
     clip = import_video(args.video, args.landmarks, args.out, options)
     if args.json:
         print(json.dumps(clip.facts(), indent=1))
