@@ -17,7 +17,6 @@ from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
 from hwp_bench.base.arguments import of_type, place, whole_number
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.progress import JobsView, notice
-from hwp_bench.base.tables import write_tables
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder
 from hwp_bench.evaluation.evaluate import evaluate as evaluate_method
@@ -26,8 +25,7 @@ from hwp_bench.evaluation.outcome import outcome_lines
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.metrics.score import score_frame
-from hwp_bench.report.evaluation_tables import HEADLINE, all_tables
-from hwp_bench.report.free_view_table import free_view_tables
+from hwp_bench.report.evaluation_tables import HEADLINE
 from hwp_bench.results import Results, read_all
 from hwp_bench.run.engine import Engine, LocalEngine
 from hwp_bench.run.engine.parallel import ParallelEngine
@@ -51,17 +49,19 @@ def evaluate(
     steps: int | None = None,
     frames: str = "perturbed",
     jobs: int = 1,
+    overwrite: bool = False,
 ) -> Results:
     """Run a method on captures and score it, as `hwp-bench evaluate` does.
 
     An evaluation that is started again with the same arguments takes finished captures as they
-    are.
+    are. Before the first capture the method is made once with its settings.
 
     Args:
         method: method directory, or the name of one that ships: `plain`, `wildghand`.
         captures: a suite (`smoke`, `mini`, `full`, `wild-dev`, `wild-test`; rendered on first
             use), a capture or its folder, or a list of these.
-        out: results folder; `runs/METHOD-SUITE` if None, with the oracle's name behind it.
+        out: results folder; `runs/METHOD-SUITE` if None, with the oracle's name, the budget and
+            a seed other than 0 behind it.
         preset: preset of the method; the suite's, else `default`, if None.
         settings: settings that override the preset, such as `{"dpd.enabled": False}`.
         seed: seed of everything random.
@@ -70,16 +70,18 @@ def evaluate(
         frames: training frames that the method is given: `perturbed`, or an oracle's (`clean`,
             `unperturbed-only`).
         jobs: captures that are evaluated at once, each in a process of its own.
+        overwrite: replace results of another evaluation in `out`, once the new ones are whole.
 
     Returns:
         The results, which `out/results.json` then holds; tables are written to `out/tables`.
         Progress is shown on standard error.
 
     Raises:
-        BadMethod: the method directory or a setting is wrong.
+        BadMethod: the method directory or the name of a setting is wrong.
+        MethodFailed: the method cannot be made: an import fails, or a setting's value is wrong.
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
-        UsageError: an argument is of another type or out of range, or `out` lies in the method
-            or in a capture.
+        UsageError: an argument is of another type or out of range, there is no such suite, or `out`
+            lies in the method or in a capture, or holds results of another evaluation.
         HwpError: another evaluation is writing to `out`, or `out` cannot be written.
     """
     method = os.fspath(place(method, "method"))
@@ -97,9 +99,8 @@ def evaluate(
     folder = place(out, "out") if out is not None else default_folder(method, plan)
     manifest = read_manifest(find_method(method))
     check_results_place(manifest, folder, {"captures": given}, "out")
-    check_call(manifest, plan, folder)
-    if suite != "captures":
-        check_suite(manifest, plan, folder)
+    check_call(manifest, plan, folder, overwrite=overwrite)
+    rehearsed = suite != "captures" and check_suite(manifest, plan, folder)
     view = JobsView()
     engine: Engine = LocalEngine() if jobs == 1 else ParallelEngine(jobs, view)
     with engine, view if engine.in_turn else nullcontext():
@@ -111,8 +112,9 @@ def evaluate(
             plan,
             on_capture=view.turn if engine.in_turn else None,
             engine=engine,
+            overwrite=overwrite,
+            rehearse=not rehearsed,
         )
-    write_tables(folder / "tables", {**all_tables([results]), **free_view_tables([results])})
     for line in outcome_lines(folder, results):
         notice(line)
     return results

@@ -12,7 +12,6 @@ their cases are needed.
 
 from __future__ import annotations
 
-import difflib
 import importlib
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -20,6 +19,7 @@ from dataclasses import dataclass
 from importlib import metadata
 
 from hwp_bench.base.errors import HwpError, MissingDependency, UsageError
+from hwp_bench.base.text import did_you_mean
 
 #: Entry-point group of functions that return cases.
 ENTRY_POINTS = "hwp_bench.stability"
@@ -92,12 +92,11 @@ def find_cases(groups: Sequence[str] = (), providers: Sequence[str] = ()) -> lis
     known = list(dict.fromkeys(case.group for case in cases))
     for group in groups:
         if group not in known:
-            near = difflib.get_close_matches(group, known, n=1)
-            hint = f"Did you mean {near[0]!r}? " if near else ""
+            hint = did_you_mean(group, known)
             raise UsageError(
                 f"there is no group {group!r}",
                 field="--group",
-                remedy=f"{hint}There are {', '.join(known)}",
+                remedy=f"{hint} There are {', '.join(known)}".strip(),
             )
     return [case for case in cases if not groups or case.group in groups]
 

@@ -11,7 +11,7 @@ request, output = map(pathlib.Path, sys.argv[1:])
 value = json.loads((request / "request.json").read_text())
 settings, split, seed = value["settings"], value["split"], value["seed"]
 try:
-    with open(pathlib.Path(__file__).parent / "fits.log", "a") as stream:
+    with open(pathlib.Path(__file__).parent.parent / "fits.log", "a") as stream:
         stream.write(f"{value['id']} {seed} {settings['tone']} {settings['edge']} "
                      f"{settings['mask']}\\n")
 except OSError:
@@ -63,7 +63,7 @@ def write_toy_method(folder: Path) -> Path:
 
     `tone` makes every pixel 30 levels better and a fit 1.5 times as long, `edge` 10 levels and
     1.2 times; `hard-mask` makes it 5 levels worse. A full fit takes 3.6 s on its own clock.
-    Every fit without a sandbox is a line of `fits.log` in the folder.
+    Every fit without a sandbox is a line of `fits.log` next to the folder.
     """
     folder.mkdir()
     (folder / "run.py").write_text(_SCRIPT)

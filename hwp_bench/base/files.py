@@ -364,7 +364,7 @@ def sha256_of(path: Path) -> str:
     return _sha256(path, facts.st_size, facts.st_mtime_ns)
 
 
-@lru_cache(maxsize=4096)
+@lru_cache(maxsize=1 << 17)
 def _sha256(path: Path, size: int, modified: int) -> str:
     return sha256_file(path)
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import collections.abc
 import dataclasses
-import difflib
 import math
 import reprlib
 import sys
@@ -22,7 +21,7 @@ from typing import Annotated, Any, Literal, Union
 import msgspec
 from msgspec import UNSET, Meta
 
-from hwp_bench.base.text import ODD_CHARACTERS, has_odd_characters, is_unicode, shown
+from hwp_bench.base.text import ODD_CHARACTERS, has_odd_characters, is_unicode, nearest, shown
 
 # Longest piece of a name or value that a message repeats.
 _SHOWN = 100
@@ -240,7 +239,7 @@ def _expected(kind: Any, metas: tuple[Any, ...]) -> str:
 
 def _remedy(name: str, path: str, kind: type[msgspec.Struct]) -> str:
     known = [n for n in kind.__struct_fields__ if n not in kind.__removed__]  # type: ignore[attr-defined]
-    close = difflib.get_close_matches(name, known, n=1)
+    close = nearest(name, known)
     return f"Did you mean {join(path, close[0])!r}?" if close else f"Known: {', '.join(known)}."
 
 

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import difflib
 import os
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
 from hwp_bench.base.errors import UsageError
 
@@ -19,6 +20,24 @@ def bounded(items: Sequence[object], most: int = 12) -> str:
     """Return items separated by commas, at most some of them, and how many more there are."""
     text = ", ".join(str(item) for item in items[:most])
     return text if len(items) <= most else f"{text} and {len(items) - most} more"
+
+
+def nearest(wrong: str, known: Iterable[str], *, most: int = 1, cutoff: float = 0.6) -> list[str]:
+    """Return the known names that are most like a wrong one, the closest first; often none.
+
+    Args:
+        wrong: what was given.
+        known: the names that there are.
+        most: how many are returned at most.
+        cutoff: how alike they must be, from 0 to 1.
+    """
+    return difflib.get_close_matches(wrong[:200], list(known), n=most, cutoff=cutoff)
+
+
+def did_you_mean(wrong: str, known: Iterable[str], *, cutoff: float = 0.6) -> str:
+    """Return `Did you mean 'NAME'?` of the nearest known name; empty where none is near."""
+    near = nearest(wrong, known, cutoff=cutoff)
+    return f"Did you mean {near[0]!r}?" if near else ""
 
 
 def has_odd_characters(text: str) -> bool:

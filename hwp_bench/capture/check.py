@@ -21,6 +21,7 @@ from hwp_bench.capture.schema import (
     IMAGE_FOLDERS,
     METADATA,
     SIMULATED,
+    TRUE_HANDS,
     CaptureInfo,
     image_path,
 )
@@ -87,6 +88,7 @@ def check_capture(path: str | os.PathLike[str]) -> CheckReport:
         *_geometry(capture),
         *_templates(capture),
         *_numbers(capture),
+        *_missing_truth(capture),
         *_free_view(capture),
     ]
     findings.sort(key=lambda finding: finding.level)
@@ -310,6 +312,25 @@ def mesh_problems(template: HandTemplate) -> list[str]:
     elif mesh.volume < 0:
         problems.append("is turned inside out")
     return problems
+
+
+def _missing_truth(capture: Capture) -> Iterator[Finding]:
+    """Truth that the digests list and the folder lacks, as a copy without it does."""
+    listed = capture.info.digests or {}
+    places = {kind: capture.root / folder for kind, folder in IMAGE_FOLDERS.items()}
+    places["true_hands"] = capture.root / TRUE_HANDS
+    for kind, place in places.items():
+        if kind in ("frames", "masks") or kind not in listed or place.exists():
+            continue
+        scored = "Scores are taken over the estimated masks, and the digest says so; results do "
+        scored += "not compare with those of the whole capture."
+        yield Finding(
+            "warning",
+            os.fspath(capture.root / METADATA),
+            f"digests.{kind}",
+            f"lists {place.relative_to(capture.root)}, which is not there",
+            scored if kind == "true_masks" else "What needs this truth is refused.",
+        )
 
 
 def _numbers(capture: Capture) -> Iterator[Finding]:

@@ -84,8 +84,11 @@ class Capture:
 
     @property
     def digest(self) -> str:
-        """SHA-256 (hex) of the metadata and of the digests of every part."""
-        return sha256_json(self.info.to_json())
+        """SHA-256 (hex) of the metadata and of the digests of every part.
+
+        A copy that lacks its exact masks has another one: it is scored on the estimated masks.
+        """
+        return digest_at(self.root, self.info)
 
     @property
     def has_clean(self) -> bool:
@@ -96,6 +99,11 @@ class Capture:
     def has_true_masks(self) -> bool:
         """Whether the exact visible-hand coverage is known."""
         return (self.root / IMAGE_FOLDERS["true_masks"]).is_dir()
+
+    @property
+    def lacks_masks(self) -> bool:
+        """Whether the exact masks that belong to the capture are not there."""
+        return "true_masks" in (self.info.digests or {}) and not self.has_true_masks
 
     @cached_property
     def true_hands(self) -> dict[str, HandParameters] | None:
@@ -216,6 +224,18 @@ class Capture:
                 f"there is no frame {frame}, only 0 to {self.info.frame_count - 1}", where=self.root
             )
         return frame
+
+
+def digest_at(root: Path, info: CaptureInfo) -> str:
+    """Return the digest of the capture in a folder, as `Capture.digest`.
+
+    Args:
+        root: the folder; it need not be sound.
+        info: its description.
+    """
+    whole = info.to_json()
+    lacking = "true_masks" in whole["digests"] and not (root / IMAGE_FOLDERS["true_masks"]).is_dir()
+    return sha256_json({"capture": whole, "masks": "estimated"} if lacking else whole)
 
 
 def open_capture(path: str | os.PathLike[str]) -> Capture:

@@ -31,8 +31,9 @@ Which variants are run:
   other flags     the full method; each of the named components out of it (alternatives: put in);
                   and, of two components or more, all of them out
 
-Started again with the same arguments, it takes finished jobs as they are. Exit status 1: the
-method failed on a capture or left out frames.
+Started again with the same arguments, it takes finished jobs as they are; results of other settings
+are refused, or replaced at the end with --overwrite. Exit status 1: the method failed on a capture
+or left out frames.
 """
 #: Flags of the reference method's switches.
 _FLAGS = {
@@ -106,7 +107,7 @@ def run(args: argparse.Namespace) -> int:
     design = make_design(manifest, args.thrown or [], args.only)
     out = Path(args.out or f"runs/ablation-{manifest.name}-{settings.suite}")
     splits = read_splits(args.splits) if args.splits else None
-    look_ahead(args, manifest, settings, out, splits)
+    rehearse = look_ahead(args, manifest, settings, out, splits)
     names = ", ".join(variant.name for variant in design.variants)
     notice(f"{len(design.variants)} variants: {names}")
     with engine_for(args) as engine:
@@ -123,6 +124,8 @@ def run(args: argparse.Namespace) -> int:
                 on_job=view.turn if view else None,
                 engine=engine,
                 needs=needs_of(args),
+                overwrite=args.overwrite,
+                rehearse=rehearse,
             )
     return _report(ablation, out, print_json=args.json)
 
@@ -152,7 +155,7 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
     if print_json:
         json.dump(record, sys.stdout, indent=1, allow_nan=False)
         print()
-    else:
+    elif any(result.drawn for result in ablation.results):
         for name in ("ablation", "effects", "component_cost", "seconds"):
             if name in tables:
                 print_table(tables[name])

@@ -62,7 +62,7 @@ def run(args: argparse.Namespace) -> int:
     check_truths(truths, settings)
     out = Path(args.out or f"runs/budget-{manifest.name}-{settings.suite}")
     splits = read_splits(args.splits) if args.splits else None
-    look_ahead(args, manifest, settings, out, splits)
+    rehearse = look_ahead(args, manifest, settings, out, splits)
     with engine_for(args) as engine:
         captures = chosen_captures(args, engine)
         with JobsView() if engine.in_turn else nullcontext() as view:
@@ -81,6 +81,8 @@ def run(args: argparse.Namespace) -> int:
                 on_run=on_run,
                 engine=engine,
                 needs=needs_of(args),
+                overwrite=args.overwrite,
+                rehearse=rehearse,
             )
     return _report(runs, out, print_json=args.json)
 
@@ -104,7 +106,7 @@ def _report(runs: BudgetRuns, out: Path, *, print_json: bool) -> int:
     if print_json:
         json.dump(budget.to_json(), sys.stdout, indent=1, allow_nan=False)
         print()
-    else:
+    elif any(result.drawn for result in evaluations):
         print_table(tables["budget"])
         print(next_work(budget))
     notice(f"record: {record}; tables: {out / 'tables'}; picture: {picture}")

@@ -29,6 +29,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="METHOD",
         help="methods to run: directories or shipped names (default plain wildghand)",
     )
+    parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace results of other versions of the methods in the folder",
+    )
 
 
 def run(args: argparse.Namespace) -> int:
@@ -49,9 +54,10 @@ def run(args: argparse.Namespace) -> int:
     manifests = [read_manifest(find_method(method)) for method in args.methods]
     names = [manifest.name for manifest in manifests]
     for manifest in manifests:
+        folder, settings = out / manifest.name, EvaluationSettings("smoke")
         check_results_place(manifest, out, {})
-        check_call(manifest, EvaluationSettings("smoke"), out / manifest.name)
-        check_suite(manifest, EvaluationSettings("smoke"), out / manifest.name)
+        check_call(manifest, settings, folder, overwrite=args.overwrite)
+        check_suite(manifest, settings, folder)
     clock = _Clock()
     captures = ensure_suite("smoke")
     clock.lap("simulated captures (rendered once, then cached)")
@@ -59,7 +65,12 @@ def run(args: argparse.Namespace) -> int:
     for method, name in zip(args.methods, names, strict=True):
         with JobsView() as jobs:
             results = evaluate(
-                method, captures, out / name, EvaluationSettings("smoke"), on_capture=jobs.turn
+                method,
+                captures,
+                out / name,
+                EvaluationSettings("smoke"),
+                on_capture=jobs.turn,
+                overwrite=args.overwrite,
             )
         clock.lap(f"{results.method.title}: fit, render, score, pictures")
         sources.append(ResultsSource(results, out / name))

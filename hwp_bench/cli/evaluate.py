@@ -32,7 +32,9 @@ _EXAMPLES = """examples:
   hwp-bench evaluate my_method --suite mini --jobs 4                 # four captures at once
   hwp-bench evaluate my_method --suite full --engine ray://10.0.0.1:6379 --job-gpus 1
 
-An evaluation that is started again with the same arguments keeps finished captures.
+An evaluation that is started again with the same arguments keeps finished captures. A folder with
+results of other arguments is refused, and what differs is said; with --overwrite they are
+replaced once all new ones are there.
 Exit status 0: every frame was scored; 1: the method failed on a capture or left out frames
 (they get the protocol's penalty); 2: the command line is wrong.
 """
@@ -50,7 +52,12 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="DIR",
         help="sealed part of a publication, instead of captures; checked against its commitment",
     )
-    parser.add_argument("-o", "--out", help="results folder (default runs/METHOD-SUITE)")
+    parser.add_argument(
+        "-o",
+        "--out",
+        help="results folder (default runs/METHOD-SUITE; "
+        "oracle, budget and a seed other than 0 are added to the name)",
+    )
     parser.add_argument("--seed", type=int, default=0, help="seed of everything random")
     parser.add_argument("--json", action="store_true", help="print the result file")
 
@@ -116,6 +123,11 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         metavar="PATH",
         help="further files and folders that an isolated method may read, such as weights",
     )
+    parser.add_argument(
+        "--overwrite",
+        action="store_true",
+        help="replace results of another evaluation in the folder, once the new ones are whole",
+    )
     add_engine_arguments(parser)
 
 
@@ -124,7 +136,7 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import asdict, replace
 
     from hwp_bench.base.progress import JobsView
-    from hwp_bench.base.tables import print_table, write_tables
+    from hwp_bench.base.tables import print_table
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluation.evaluate import default_folder, evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
@@ -141,7 +153,7 @@ def run(args: argparse.Namespace) -> int:
     splits = read_splits(args.splits) if args.splits else None
     if sealed is not None:
         splits = sealed.splits
-    look_ahead(args, manifest, settings, out, splits)
+    rehearse = look_ahead(args, manifest, settings, out, splits)
     with engine_for(args) as engine:
         captures = chosen_captures(args, engine) if sealed is None else list(sealed.captures)
         with JobsView() if engine.in_turn else nullcontext() as jobs:
@@ -154,14 +166,15 @@ def run(args: argparse.Namespace) -> int:
                 on_capture=jobs.turn if jobs else None,
                 engine=engine,
                 needs=needs_of(args),
+                overwrite=args.overwrite,
+                rehearse=rehearse,
             )
-    novel = free_view_tables([results])
-    tables = {**all_tables([results]), **novel}
-    write_tables(out / "tables", tables)
     if args.json:
         json.dump(asdict(results), sys.stdout, indent=1)
         print()
-    else:
+    elif results.drawn:
+        novel = free_view_tables([results])
+        tables = {**all_tables([results]), **novel}
         for name in ("overall", "captures", *novel):
             print_table(tables[name])
     return report_outcome(out, results)
@@ -173,8 +186,11 @@ def look_ahead(
     settings: EvaluationSettings,
     out: Path,
     splits: Mapping[str, Split] | None,
-) -> None:
+) -> bool:
     """Report whatever is wrong with a call before a suite is rendered for it.
+
+    Returns:
+        Whether the method is still to be made once before the first capture.
 
     Raises:
         HwpError: as `check_results_place`, `check_call` and `check_suite`.
@@ -187,10 +203,11 @@ def look_ahead(
         "--splits": args.splits,
     }
     check_results_place(manifest, out, inputs)
-    check_call(manifest, settings, out, "--set")
-    if not args.capture and not getattr(args, "sealed", None):
-        local = args.engine == "local"
-        check_suite(manifest, settings, out, splits, rehearse=local)
+    check_call(manifest, settings, out, "--set", overwrite=args.overwrite)
+    local = args.engine == "local"
+    if args.capture or getattr(args, "sealed", None):
+        return local
+    return local and not check_suite(manifest, settings, out, splits, rehearse=local)
 
 
 def _sealed_part(args: argparse.Namespace) -> SealedPart | None:

@@ -88,7 +88,13 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.files import check_places
-    from hwp_bench.importers.video import VideoImport, import_video, parse_frame_range
+    from hwp_bench.base.progress import notice
+    from hwp_bench.importers.video import (
+        VideoImport,
+        finished_import,
+        import_video,
+        parse_frame_range,
+    )
 
     inputs = {"VIDEO": args.video, "--landmarks": args.landmarks, "--masks": args.masks}
     outputs = {"OUT": args.out, "--sheet": args.sheet}
@@ -109,6 +115,11 @@ def run(args: argparse.Namespace) -> int:
         sheet=args.sheet,
         overwrite=args.force,
     )
+    finished = finished_import(args.video, args.landmarks, args.out, options)
+    if finished is not None:
+        notice(f"{args.out} is complete: the same call has made it; --force imports again")
+        print(json.dumps(finished, indent=1) if args.json else f"capture: {args.out}")
+        return 0
     clip = import_video(args.video, args.landmarks, args.out, options)
     if args.json:
         print(json.dumps(clip.facts(), indent=1))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import difflib
 import errno
 import importlib
 import os
@@ -17,7 +16,7 @@ from typing import Any
 from hwp_bench.base.console import in_utf8_mode, settle, standard_streams, tell
 from hwp_bench.base.denormals import flushed_process
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.text import check_name
+from hwp_bench.base.text import check_name, nearest
 from hwp_bench.base.threads import check_thread_variables, share_processors
 from hwp_bench.base.version import __version__
 
@@ -129,7 +128,7 @@ def _dispatch(program: str, group: Command, words: list[str]) -> int:
         parser.error("name a command")
     name, rest = words[0], words[1:]
     if name not in group.commands:
-        near = difflib.get_close_matches(name, group.commands, n=1)
+        near = nearest(name, group.commands)
         hint = f"; did you mean {near[0]!r}?" if near else ""
         parser.error(f"there is no command {name!r}{hint}")
     command = group.commands[name]

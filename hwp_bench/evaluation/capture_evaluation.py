@@ -13,7 +13,7 @@ from hwp_bench.base.files import disc_errors, read_json, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import MAX_TEXT, parse_record
 from hwp_bench.base.scratch import scratch_folder
-from hwp_bench.base.text import one_line, shown
+from hwp_bench.base.text import bounded, one_line, shown
 from hwp_bench.base.trees import remove_tree
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.content import refuse_changed
@@ -31,10 +31,16 @@ from hwp_bench.evaluation.scoring import (
     read_targets,
     score_predictions,
 )
-from hwp_bench.methods.contents import exposed_digest
+from hwp_bench.methods.contents import (
+    digest_of,
+    exposed_digest,
+    left_out_folders,
+    method_files,
+)
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, read_manifest
 from hwp_bench.methods.request import write_request
+from hwp_bench.methods.setting_files import ships
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
@@ -68,6 +74,14 @@ class CaptureEvaluation:
     confinement: Confinement = field(default_factory=Confinement)
     #: LPIPS by backbone, where the weights are there.
     networks: Mapping[str, Network] = field(default_factory=dict)
+    #: Digests of the method's files when the evaluation was planned; None takes them as they are.
+    method_files: Mapping[str, str] | None = None
+
+    @property
+    def method_digest(self) -> str:
+        """Digest (hex) of the method."""
+        planned = self.method_files
+        return self.manifest.digest if planned is None else digest_of(planned)
 
     @property
     def exposed(self) -> str | None:
@@ -80,7 +94,7 @@ class CaptureEvaluation:
         """Digest (hex) of everything that decides the scores."""
         clip = self.capture.free_view
         return evaluation_key(
-            method=(self.manifest.name, self.manifest.digest),
+            method=(self.manifest.name, self.method_digest),
             capture=self.capture.digest,
             split=self.split.digest,
             settings=self.run.settings,
@@ -110,6 +124,7 @@ def evaluate_capture(
 
     Raises:
         BadCapture, BadImage: the capture itself is damaged, or was changed after it was written.
+        BadMethod: files of the method changed while it ran.
         HwpError: `folder` cannot be written to.
     """
     stored = stored_result(evaluation, folder)
@@ -131,6 +146,7 @@ def _evaluate(
     folder.mkdir(parents=True)
     output = folder / "run"
     record, failure = _run(evaluation, output, on_progress)
+    _refuse_edited(evaluation)
     started = time.perf_counter()
     frames = [target.frame for target in targets]
     source = record.predictions if record else output / "none"
@@ -173,6 +189,27 @@ def _evaluate(
     result = replace(result, job_seconds=time.perf_counter() - began)
     write_json(folder / RESULT, asdict(result))
     return result
+
+
+def _refuse_edited(evaluation: CaptureEvaluation) -> None:
+    """Refuse to score a run of a method whose files are not those that it began with.
+
+    Raises:
+        BadMethod: files were changed, added or removed since the evaluation was planned.
+    """
+    planned = evaluation.method_files
+    if planned is None:
+        return
+    found = method_files(evaluation.manifest.root)
+    changed = sorted(name for name in {*planned, *found} if planned.get(name) != found.get(name))
+    if changed:
+        raise BadMethod(
+            f"files changed while it ran, so that nobody could say what was scored: "
+            f"{shown(bounded(changed, 5))}",
+            where=evaluation.manifest.root,
+            remedy="Leave them alone meanwhile, and let the method write to its output folder "
+            "alone. Started again, what is finished stays.",
+        )
 
 
 def _refuse_changed(evaluation: CaptureEvaluation) -> None:
@@ -279,13 +316,16 @@ def _lasting(error: HwpError, output: Path) -> str:
 
 
 def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
-    """Hide the capture and the results next to the run, which hold images of test frames."""
+    """Hide what holds test frames, the capture and results next to the run, and undigested code."""
     asked = evaluation.confinement
     hands = hand_model_files(evaluation.capture.info.hand_model.source)
+    root = evaluation.manifest.root.resolve()
+    # What is in no digest must decide no score. Shipped methods keep their compiled modules.
+    odd = [] if ships(root) else left_out_folders(root)
     return replace(
         asked,
         exposed=(*asked.exposed, *hands),
-        hidden=(*asked.hidden, evaluation.capture.root, output.parent.parent),
+        hidden=(*asked.hidden, *odd, evaluation.capture.root, output.parent.parent),
     )
 
 
@@ -370,14 +410,16 @@ class EvaluateElsewhere:
                 remedy="Put them on every node, or on none.",
             )
         method = inputs["method"] if self.shipped is None else PACKAGES / self.shipped
+        manifest = read_manifest(method)
         evaluation = CaptureEvaluation(
-            read_manifest(method),
+            manifest,
             open_capture(inputs["capture"]),
             self.split,
             self.run,
             self.time_limit,
             self.confinement,
             {name: known[name] for name in self.networks},
+            method_files(manifest.root),
         )
         if evaluation.key != self.key:
             raise HwpError(

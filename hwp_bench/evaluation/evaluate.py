@@ -9,6 +9,7 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadCapture, BadMethod
 from hwp_bench.base.locks import exclusive
+from hwp_bench.base.progress import notice
 from hwp_bench.base.records import check_json_values, merged, parse_record
 from hwp_bench.base.text import one_line
 from hwp_bench.base.version import __version__
@@ -17,20 +18,27 @@ from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation.capture_evaluation import (
     CaptureEvaluation,
     evaluation_job,
-    read_result,
 )
+from hwp_bench.evaluation.results_folder import (
+    finish_together,
+    open_results_folder,
+    say_kept,
+)
+from hwp_bench.methods.contents import digest_of, method_files, refuse_links_out
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
 from hwp_bench.methods.setting_files import find_setting_files
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
-from hwp_bench.results import CaptureResult, MethodId, Results, write_results
+from hwp_bench.results import CaptureResult, MethodId, Results
 from hwp_bench.results.environment import environment
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
-from hwp_bench.run.runner import DEFAULT_TIME_LIMIT
+from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, rehearse_method
 from hwp_bench.run.sandbox.confinement import Confinement
 
+#: Most seconds that a method may take to be made before the first capture.
+REHEARSAL_SECONDS = 600.0
 #: Called when a capture's work begins, with (index, count, capture id); returns a function that is
 #: then called with (done, total) steps.
 OnCapture = Callable[[int, int, str], Callable[[int, int], None] | None]
@@ -53,10 +61,17 @@ class EvaluationSettings:
 
 
 def default_folder(method: str, settings: EvaluationSettings) -> Path:
-    """Return the results folder of an evaluation that names none; an oracle has its own."""
-    frames = settings.run.frames
-    oracle = "" if frames == FRAME_CHOICES[0] else f"-{frames}"
-    return Path("runs") / f"{Path(method).name}-{settings.suite}{oracle}"
+    """Return the results folder of an evaluation that names none.
+
+    Oracles, budgets and seeds other than 0 have folders of their own.
+    """
+    run = settings.run
+    parts = [Path(method).name or Path(method).resolve().name, settings.suite]
+    parts += [] if run.frames == FRAME_CHOICES[0] else [run.frames]
+    parts += [] if run.budget.seconds is None else [f"{run.budget.seconds:g}s"]
+    parts += [] if run.budget.steps is None else [f"{run.budget.steps}steps"]
+    parts += [] if run.seed == 0 else [f"seed{run.seed}"]
+    return Path("runs") / "-".join(parts)
 
 
 def evaluate(
@@ -69,12 +84,15 @@ def evaluate(
     on_capture: OnCapture | None = None,
     engine: Engine | None = None,
     needs: Needs | None = None,
+    overwrite: bool = False,
+    rehearse: bool = False,
 ) -> Results:
     """Evaluate a method.
 
     Every capture is opened and checked before the method runs on the first one. A capture's
     result is on disk before the next begins, and an evaluation that is started again takes
-    finished captures as they are.
+    finished captures as they are, and says so. Results of another evaluation that `out` holds are
+    refused, or stay until all new ones are whole.
 
     Args:
         method: method directory, or the name of one that ships with the toolkit.
@@ -85,28 +103,69 @@ def evaluate(
         on_capture: hook for showing progress, where captures are evaluated in turn.
         engine: where captures are evaluated; one after another in this process if None.
         needs: the share of a machine that one capture takes.
+        overwrite: results of another evaluation in `out` may be replaced.
+        rehearse: make the method once before the first capture, where any is to be run; not to be
+            asked for where it runs on other machines.
 
     Returns:
-        The results, which `out/results.json` then holds.
+        The results, which `out/results.json` then holds, with tables in `out/tables`.
 
     Raises:
-        BadMethod: the method directory is wrong.
+        UsageError: `out` holds results of another evaluation.
+        BadMethod: the method directory is wrong, or its files change meanwhile.
+        MethodFailed: the method cannot be made.
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
         HwpError: another evaluation is writing to `out`, or it cannot be written.
     """
     manifest = read_manifest(find_method(method))
     settings = with_setting_files(manifest, settings)
     plan = make_plan(manifest, open_captures(captures, splits), settings)
-    folders = [out / "captures" / item.capture.info.id for item in plan.evaluations]
-    jobs = [
-        evaluation_job(evaluation, folder, folder.name, needs or Needs())
-        for evaluation, folder in zip(plan.evaluations, folders, strict=True)
-    ]
     with exclusive(out):
-        (engine or LocalEngine()).run(jobs, lambda index: None, on_capture)
-        results = plan.results([read_result(folder) for folder in folders])
-        write_results(out / "results.json", results)
+        return _evaluate(
+            plan, out, engine, needs, on_capture, overwrite=overwrite, rehearse=rehearse
+        )
+
+
+def _evaluate(
+    plan: Plan,
+    out: Path,
+    engine: Engine | None,
+    needs: Needs | None,
+    on_capture: OnCapture | None,
+    *,
+    overwrite: bool,
+    rehearse: bool,
+) -> Results:
+    """Run what is missing of a plan, with the lock of its folder."""
+    for evaluation in plan.evaluations:
+        if evaluation.capture.lacks_masks:
+            name = evaluation.capture.info.id
+            notice(f"{name}: its true masks are not there: scored on its estimated masks")
+    folder = open_results_folder(out, plan.results([]), plan.evaluations, overwrite=overwrite)
+    say_kept([folder])
+    missing, found = folder.missing, dict(folder.kept)
+    if rehearse and missing:
+        plan.rehearse()
+    jobs = []
+    for place in missing:
+        evaluation = hiding(plan.evaluations[place], out)
+        text = evaluation.capture.info.id
+        jobs.append(evaluation_job(evaluation, folder.unfinished(place), text, needs or Needs()))
+
+    def on_done(index: int) -> None:
+        found[missing[index]] = folder.finish(missing[index])
+
+    (engine or LocalEngine()).run(jobs, on_done, on_capture)
+    results = plan.results([found[place] for place in range(len(plan.evaluations))])
+    finish_together([(folder, results)], tables=True)
     return results
+
+
+def hiding(evaluation: CaptureEvaluation, out: Path) -> CaptureEvaluation:
+    """Return an evaluation whose method does not see a results folder, with its test frames."""
+    confinement = evaluation.confinement
+    hidden = (*confinement.hidden, out.absolute())
+    return replace(evaluation, confinement=replace(confinement, hidden=hidden))
 
 
 def with_setting_files(
@@ -142,6 +201,21 @@ class Plan:
     evaluations: tuple[CaptureEvaluation, ...]
     #: When the plan was made, ISO 8601, UTC.
     started: str
+    #: Digest of the method when the plan was made.
+    digest: str
+    #: Seconds after which a method is stopped, and how it is confined.
+    time_limit: float
+    confinement: Confinement
+
+    def rehearse(self) -> None:
+        """Make the method once with its settings: what fails there would fail on every capture.
+
+        Raises:
+            MethodFailed: it cannot be made; its last lines have been printed.
+            BadMethod: there is no such program.
+        """
+        limit = min(self.time_limit, REHEARSAL_SECONDS)
+        rehearse_method(self.manifest, self.run, time_limit=limit, confinement=self.confinement)
 
     def results(self, finished: Sequence[CaptureResult]) -> Results:
         """Return the record of the captures that are finished."""
@@ -150,7 +224,7 @@ class Plan:
             method=MethodId(
                 manifest.name,
                 one_line(manifest.title),
-                manifest.digest,
+                self.digest,
                 self.preset,
                 dict(run.settings),
             ),
@@ -182,7 +256,8 @@ def make_plan(
 
     Raises:
         BadMethod: there is no such preset, or an override is not a plain value or not a setting
-            of the method, or the result could not be read again.
+            of the method, or the result could not be read again, or the method has a link to what
+            is in no digest.
     """
     preset = manifest.preset(settings.preset, settings.suite)
     check_json_values(
@@ -191,15 +266,27 @@ def make_plan(
     manifest.check_setting_names(settings.run.settings)
     chosen = merged(manifest.presets.get(preset, {}), settings.run.settings)
     run = replace(settings.run, settings=chosen)
+    refuse_links_out(manifest.root, settings.confinement.exposed)
+    files = method_files(manifest.root)
     known = load_available() if networks is None else networks
     evaluations = tuple(
         CaptureEvaluation(
-            manifest, capture, split, run, settings.time_limit, settings.confinement, known
+            manifest, capture, split, run, settings.time_limit, settings.confinement, known, files
         )
         for capture, split in captures
     )
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    plan = Plan(manifest, settings.suite, preset, run, evaluations, started)
+    plan = Plan(
+        manifest,
+        settings.suite,
+        preset,
+        run,
+        evaluations,
+        started,
+        digest_of(files),
+        settings.time_limit,
+        settings.confinement,
+    )
     # Before anything runs: what is to be written will have to be read.
     head = asdict(plan.results([]))
     parse_record(Results, head, where=manifest.name, error=BadMethod)

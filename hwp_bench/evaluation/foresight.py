@@ -9,17 +9,13 @@ from hwp_bench.base.errors import BadMethod, HwpError, UsageError
 from hwp_bench.base.files import Places, check_places, inside
 from hwp_bench.base.locks import exclusive
 from hwp_bench.base.progress import notice
-from hwp_bench.base.records import merged
 from hwp_bench.capture.splits import Split, split_for
-from hwp_bench.evaluation.evaluate import EvaluationSettings, with_setting_files
+from hwp_bench.evaluation.evaluate import EvaluationSettings, make_plan, with_setting_files
+from hwp_bench.evaluation.results_folder import refuse_other
 from hwp_bench.methods.contract import FRAME_CHOICES
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.methods.setting_files import check_settings
-from hwp_bench.run.runner import rehearse_method
 from hwp_bench.sim.produce.suites import SuiteItem, is_rendered, suite
-
-#: Most seconds that a method may take to be made while looking ahead.
-REHEARSAL_SECONDS = 600.0
 
 
 def check_results_place(
@@ -44,7 +40,12 @@ def check_results_place(
 
 
 def check_call(
-    manifest: MethodManifest, settings: EvaluationSettings, out: Path, field: str = "settings"
+    manifest: MethodManifest,
+    settings: EvaluationSettings,
+    out: Path,
+    field: str = "settings",
+    *,
+    overwrite: bool = False,
 ) -> None:
     """Refuse a call that cannot work, as far as it can be told from the call alone.
 
@@ -53,10 +54,12 @@ def check_call(
         settings: settings, preset, training frames, exposed files.
         out: the results folder.
         field: where the settings come from, for messages.
+        overwrite: results of another evaluation in `out` may be replaced.
 
     Raises:
         BadMethod: a setting or the preset has no such name.
-        UsageError: a file that is named is not there, or there is no such choice of frames.
+        UsageError: a file that is named is not there, there is no such choice of frames, or `out`
+            holds results of another evaluation.
         HwpError: the results folder is a file or lies in one.
     """
     check_settings(manifest, settings.run.settings, field)
@@ -74,6 +77,9 @@ def check_call(
             where=above,
             remedy="Choose another folder with --out.",
         )
+    if not overwrite:
+        plan = make_plan(manifest, (), with_setting_files(manifest, settings), {})
+        refuse_other(out, plan.results([]))
 
 
 def check_suite(
@@ -83,7 +89,7 @@ def check_suite(
     splits: Mapping[str, Split] | None = None,
     *,
     rehearse: bool = True,
-) -> None:
+) -> bool:
     """Refuse what would fail on a suite, before it is rendered.
 
     Args:
@@ -93,6 +99,9 @@ def check_suite(
         splits: splits by capture id; None applies the 80/10/10 rule.
         rehearse: make the method once with its settings where captures must be rendered first;
             not to be asked for where it runs on other machines.
+
+    Returns:
+        Whether the method was made once.
 
     Raises:
         BadSplit: a capture of the suite has no split, or one of another length.
@@ -106,15 +115,12 @@ def check_suite(
     if manifest.kind == "predictions":
         _check_predictions(manifest, items)
     if is_rendered(settings.suite):
-        return
+        return False
     with exclusive(out):
         pass
     if rehearse:
-        ready = with_setting_files(manifest, settings)
-        preset = manifest.presets.get(manifest.preset(settings.preset, settings.suite), {})
-        chosen = type(ready.run)(merged(preset, ready.run.settings), ready.run.seed)
-        limit = min(ready.time_limit, REHEARSAL_SECONDS)
-        rehearse_method(manifest, chosen, time_limit=limit, confinement=ready.confinement)
+        make_plan(manifest, (), with_setting_files(manifest, settings), {}).rehearse()
+    return rehearse
 
 
 def _check_predictions(manifest: MethodManifest, items: Sequence[SuiteItem]) -> None:

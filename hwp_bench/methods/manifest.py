@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 import itertools
 import os
 from collections.abc import Mapping
@@ -23,6 +22,7 @@ from hwp_bench.base.records import (
     parse_record,
     without_schema,
 )
+from hwp_bench.base.text import nearest
 from hwp_bench.base.toml_text import parse_toml
 from hwp_bench.methods.contents import method_digest
 from hwp_bench.taxonomy import SIZED_LIKE
@@ -164,7 +164,7 @@ class MethodManifest:
         for name, _ in flattened(values):
             if name in known:
                 continue
-            close = difflib.get_close_matches(name, sorted(known), n=3, cutoff=0.75)
+            close = nearest(name, sorted(known), most=3, cutoff=0.75)
             if not close:
                 notice(f"{field}: {name}: {self.name} does not list its settings; not checked")
                 continue
@@ -179,8 +179,8 @@ class MethodManifest:
     def _nearest_settings(self, wrong: str) -> str:
         """Say which setting was probably meant, or which there are in its place."""
         last = {name.rpartition(".")[2]: name for name in self.settings}
-        close = difflib.get_close_matches(wrong, self.settings, n=1, cutoff=0.75)
-        close = close or [last[word] for word in difflib.get_close_matches(wrong, last, n=1)]
+        close = nearest(wrong, self.settings, cutoff=0.75)
+        close = close or [last[word] for word in nearest(wrong, last)]
         if close:
             return f"Did you mean {close[0]!r}?"
         table = wrong.rpartition(".")[0]
@@ -214,7 +214,7 @@ class MethodManifest:
 
     @property
     def digest(self) -> str:
-        """SHA-256 (hex) of the method's own code, settings and weights: what was run."""
+        """SHA-256 (hex) of every file of the method: what was run."""
         return method_digest(self.root)
 
 

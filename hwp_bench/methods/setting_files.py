@@ -74,7 +74,7 @@ def check_settings(
     manifest.check_setting_names(values, field)
     manifest.doubt_setting_names(values, field)
     resolved, files = find_setting_files(manifest, values)
-    if files and manifest.check_files and _ships(manifest.root):
+    if files and manifest.check_files and ships(manifest.root):
         module, _, function = manifest.check_files.partition(":")
         getattr(importlib.import_module(module), function)(resolved)
 
@@ -95,6 +95,7 @@ def _absolute(kinds: tuple[str, ...], name: str, value: str, found: list[Path]) 
     return f"{kind}:{path}"
 
 
-def _ships(root: Path) -> bool:
+def ships(root: Path) -> bool:
+    """Return whether a method directory is one that ships with the toolkit."""
     places = (PACKAGES / "wildghand", data_folder("baselines"))
     return any(root.resolve().is_relative_to(place.resolve()) for place in places)

@@ -6,11 +6,11 @@ that a number can be traced to the settings that made it.
 
 from __future__ import annotations
 
-import difflib
 from dataclasses import asdict, dataclass
 from typing import Any, Literal
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.text import did_you_mean
 
 #: Score of identical images, in dB; keeps means finite.
 PSNR_CAP = 100.0
@@ -103,6 +103,5 @@ def protocol(name: str) -> Protocol:
         if candidate.name == name:
             return candidate
     names = [candidate.name for candidate in PROTOCOLS]
-    near = difflib.get_close_matches(name, names, n=1)
-    hint = f"Did you mean {near[0]}?" if near else f"There are: {', '.join(names)}."
+    hint = did_you_mean(name, names) or f"There are: {', '.join(names)}."
     raise UsageError(f"no protocol is called {name!r}", field="protocol", remedy=hint)

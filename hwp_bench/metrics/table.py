@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Iterable
 from dataclasses import dataclass
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.text import did_you_mean
 from hwp_bench.metrics.protocol import HWP_V1, PAPER_WILDGHAND, PROTOCOLS, PSNR_CAP, Protocol
 
 
@@ -103,8 +103,7 @@ def metric(name: str) -> Metric:
     for candidate in METRICS:
         if candidate.name == name:
             return candidate
-    near = difflib.get_close_matches(name, [candidate.name for candidate in METRICS], n=1)
-    hint = f"Did you mean {near[0]}?" if near else None
+    hint = did_you_mean(name, [candidate.name for candidate in METRICS]) or None
     raise UsageError(f"no metric is called {name!r}", field="metric", remedy=hint)
 
 

@@ -16,7 +16,7 @@ HEADING = "Data"
 
 @dataclass(frozen=True)
 class DataGroup:
-    """Results on the same captures, splits and test frames, in the same protocols."""
+    """Results on the same captures, splits, test frames and masks, in the same protocols."""
 
     #: `A`, `B`, ... in the order of the results; empty where there is one group only.
     label: str
@@ -45,14 +45,14 @@ def data_groups(sources: Sequence[ResultsSource], *, oracles: bool = False) -> l
 
 
 def data_key(results: Results, *, oracles: bool = False) -> str:
-    """Return a digest of the data of a result: captures, splits, test frames, protocols.
+    """Return a digest of the data of a result: captures, splits, test frames, masks, protocols.
 
     Args:
         results: the result.
         oracles: leave out which training frames the method was given.
     """
     captures = sorted(
-        (c.id, c.digest, c.split_digest, [frame.frame for frame in c.frames])
+        (c.id, c.digest, c.split_digest, [frame.frame for frame in c.frames], c.exact_masks)
         for c in results.captures
     )
     return sha256_json([captures, results.protocols, None if oracles else results.frames])
@@ -72,6 +72,10 @@ def _text(results: Results) -> str:
         f"{results.suite}, {count} capture{'' if count == 1 else 's'}, {frames} test frames",
         f"protocol {headline or 'not said'} ({protocol})",
     ]
+    estimated = sum(not capture.exact_masks for capture in results.captures)
+    if estimated:
+        all_ = "" if estimated == count else f" in {estimated} captures"
+        parts.append(f"scored on estimated masks{all_}")
     if results.frames != "perturbed":
         parts.append(f"{results.frames} training frames")
     return "; ".join(parts)

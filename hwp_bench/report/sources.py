@@ -17,9 +17,11 @@ from hwp_bench.base.files import cache_root, inside, read_json, sha256_json
 from hwp_bench.base.progress import notice
 from hwp_bench.base.records import parse_record
 from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.reader import digest_at
 from hwp_bench.capture.schema import CaptureInfo, frame_name
-from hwp_bench.results import CaptureResult, Results, read_results, results_among
+from hwp_bench.results import CaptureResult, Results, results_among
 from hwp_bench.results.bounds import MAX_FRAMES
+from hwp_bench.results.store import read_unchanged
 
 #: Largest file of temporal weights that is read, bytes.
 MAX_WEIGHT_BYTES = 16 * 1024 * 1024
@@ -70,9 +72,9 @@ def read_sources(
             it is left out and said, for what shows each of them once.
 
     Raises:
-        BadInput, BadResult: one is missing or damaged.
+        BadInput, BadResult: one is missing or damaged, or was changed by hand.
     """
-    sources = [ResultsSource(read_results(file), file.parent) for file in results_among(paths)]
+    sources = [ResultsSource(read_unchanged(file), file.parent) for file in results_among(paths)]
     if repeats:
         return sources
     first: dict[str, ResultsSource] = {}
@@ -203,7 +205,7 @@ def _located(
             info = CaptureInfo.from_json(read_json(path), where=os.fspath(path))
         except HwpError:
             continue
-        digest = sha256_json(info.to_json())
+        digest = digest_at(place, info)
         if digest in digests:
             found[digest] = (info, place)
     return found

@@ -205,6 +205,11 @@ class Results:
         return f"Results({', '.join(parts)})"
 
     @property
+    def drawn(self) -> bool:
+        """Whether any frame could be scored; where none was, every score is a penalty."""
+        return any(item.failed_frames < len(item.frames) for item in self.captures)
+
+    @property
     def scores(self) -> Scores:
         """Mean of each metric over the perturbations; over the captures where there is none."""
         if not self.captures:

@@ -8,7 +8,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.arguments import place
+from hwp_bench.base.arguments import place as checked_place
 from hwp_bench.base.errors import BadResult
 from hwp_bench.base.files import inside, read_json, sha256_json, write_json
 from hwp_bench.base.progress import notice
@@ -48,13 +48,8 @@ def read_results(path: str | os.PathLike[str]) -> Results:
         BadResult: of another version, a field is missing, unknown, of the wrong type, or a
             number is out of its range, or a text is too long; the field is named.
     """
-    path = place(path, "path")
-    if path.is_dir():
-        path = path / "results.json"
-    value = without_schema(read_json(path, max_bytes=MAX_BYTES), SCHEMA, where=path)
     # Whether the content was changed by hand is for `verify` and the leaderboard to say.
-    value.pop("digest", None)
-    return parse_record(Results, value, where=path)
+    return _read(checked_place(path, "path"))[0]
 
 
 def read_unchanged(path: str | os.PathLike[str]) -> Results:
@@ -64,10 +59,8 @@ def read_unchanged(path: str | os.PathLike[str]) -> Results:
         BadInput, BadResult: as `read_results`, or the content is not of the digest that the file
             states.
     """
-    path = Path(path)
-    path = path / "results.json" if path.is_dir() else path
-    results = read_results(path)
-    stated, found = content_digest(read_json(path, max_bytes=MAX_BYTES))
+    results, content = _read(Path(path))
+    stated, found = content_digest(content)
     if stated not in (None, found):
         raise BadResult(
             "is not the digest of the content: the result was changed by hand",
@@ -76,6 +69,15 @@ def read_unchanged(path: str | os.PathLike[str]) -> Results:
             remedy="Evaluate again; `hwp-bench verify` shows what differs.",
         )
     return results
+
+
+def _read(path: Path) -> tuple[Results, Mapping[str, Any]]:
+    """Return the results, and the file as JSON."""
+    path = path / "results.json" if path.is_dir() else path
+    content = read_json(path, max_bytes=MAX_BYTES)
+    value = without_schema(content, SCHEMA, where=path)
+    value.pop("digest", None)
+    return parse_record(Results, value, where=path), content
 
 
 def result_files(path: str | os.PathLike[str]) -> list[Path]:
@@ -128,6 +130,6 @@ def read_all(paths: Iterable[str | os.PathLike[str]]) -> list[Results]:
     """Read every evaluation that some paths stand for, in order.
 
     Raises:
-        BadInput, BadResult: one is missing or damaged.
+        BadInput, BadResult: one is missing or damaged, or was changed by hand.
     """
-    return [read_results(file) for file in results_among(paths)]
+    return [read_unchanged(file) for file in results_among(paths)]

@@ -14,8 +14,9 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadInput, BadMethod, MethodFailed
 from hwp_bench.base.files import inside, read_json, write_json
+from hwp_bench.base.progress import notice
 from hwp_bench.base.scratch import scratch_folder
-from hwp_bench.base.text import shown
+from hwp_bench.base.text import one_line, shown
 from hwp_bench.base.trees import remove_tree
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
@@ -48,6 +49,9 @@ from hwp_bench.run.space import SpaceWatch
 
 #: Seconds a method may take on one capture unless told otherwise.
 DEFAULT_TIME_LIMIT = 3600.0
+
+#: Lines of a method's output that are repeated when it cannot be made.
+LAST = 8
 
 _REMEDIES = {
     "time": "Raise --time-limit, or give the method a --budget.",
@@ -177,16 +181,12 @@ def rehearse_method(
         confinement: how it is confined; None takes the defaults.
 
     Raises:
-        MethodFailed: it cannot be made; the message has the reason.
+        MethodFailed: it cannot be made; the message has the reason, and the last lines that it
+            printed go to standard error.
         BadMethod: there is no such program.
     """
     if manifest.kind == "command":
-        program = manifest.entry[0]
-        bare = "{" not in program and os.sep not in program
-        if bare and shutil.which(program) is None:
-            raise BadMethod(
-                f"there is no program {program!r}", where=manifest.root, field="entry.command"
-            )
+        _look_for_program(manifest)
     if manifest.kind != "python":
         return
     confinement = confinement or Confinement()
@@ -198,11 +198,50 @@ def rehearse_method(
         write_json(request / REHEARSAL, asked)
         outcome, _ = _run(manifest, request, output, confinement, limits, None, ("--rehearse",))
         if outcome.status != 0:
+            lines = _last_lines(output / LOG)
+            # One line is the reason itself.
+            for line in lines if len(lines) > 1 else ():
+                notice(f"{manifest.name}: {line}")
             broken = outcome.stopped and f"stopped by the limit of {outcome.stopped}"
             raise MethodFailed(
                 f"{manifest.name} cannot be made: {broken or _reason(output, outcome.status)}",
-                remedy="It fails before it sees a capture, so that nothing was rendered.",
+                remedy="It fails before it sees a capture, so that nothing was rendered or run.",
             )
+
+
+def _look_for_program(manifest: MethodManifest) -> None:
+    """Refuse a command whose program is not there, or may not be run.
+
+    Raises:
+        BadMethod: it is so.
+    """
+    word = str(manifest.entry[0])
+    program = word.replace("{method}", str(manifest.root.resolve()))
+    if "{" in program or (os.sep in program and not os.path.isabs(program)):
+        return
+    problem = ""
+    if shutil.which(program) is None:
+        problem = f"there is no program {word!r}"
+        if os.path.isfile(program):
+            problem = f"the program {word!r} is not executable"
+    if problem:
+        raise BadMethod(
+            problem,
+            where=manifest.root,
+            field="entry.command",
+            remedy="Install it, or correct the command; chmod +x makes a script executable.",
+        )
+
+
+def _last_lines(log: Path) -> list[str]:
+    """Return the last lines that a method printed, such as the end of its traceback."""
+    try:
+        with open(log, "rb") as stream:
+            stream.seek(max(0, log.stat().st_size - 8192))
+            text = stream.read(8192).decode(errors="replace")
+    except OSError:
+        return []
+    return [one_line(line.rstrip(), 500) for line in text.splitlines() if line.strip()][-LAST:]
 
 
 def _run(
@@ -289,6 +328,9 @@ def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
 def _reason(output: Path, status: int | None) -> str:
     with contextlib.suppress(BadInput, KeyError, TypeError):
         return shown(str(read_json(output / FAILURE, max_bytes=100_000)["problem"])[:2000])
+    last = _last_lines(output / LOG)[-1:]
+    if status is not None and status > 0 and last:
+        return f"exit status {status}; it printed last: {last[0]}"
     if status is not None and status < 0:
         with contextlib.suppress(ValueError):
             return f"killed by {signal.Signals(-status).name}"

@@ -23,6 +23,7 @@ from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.images import write_image
 from hwp_bench.base.progress import notice
+from hwp_bench.base.text import shown
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.hands.parameters import Camera, HandPose
 from hwp_bench.methods.contract import Avatar, Budget, MethodFactory, TrainingCapture
@@ -67,18 +68,24 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"error: {error}", file=sys.stderr)
         _leave_reason(args.output, str(error))
         return 1
-    except Exception as error:
-        traceback.print_exc()
-        problem = f"{type(error).__name__}: {error}"[:500]
-        _leave_reason(args.output, problem)
+    except SystemExit as error:
+        if isinstance(error.code, int | None):
+            raise
+        print(f"error: {error.code}", file=sys.stderr)
+        _leave_reason(args.output, str(error.code))
         return 1
+    except BaseException as error:
+        traceback.print_exc()
+        _leave_reason(args.output, f"{type(error).__name__}: {error}")
+        return 130 if isinstance(error, KeyboardInterrupt) else 1
     return 0
 
 
 def _leave_reason(output: Path, problem: str) -> None:
     """Leave the reason of a failure for the runner; a full disc takes it from nobody else."""
     with contextlib.suppress(HwpError, ValueError):
-        write_json(output / FAILURE, {"problem": problem})
+        # A message may hold what no file of Unicode can.
+        write_json(output / FAILURE, {"problem": shown(problem[:2000])})
 
 
 def load_entry(method: Path, entry: str) -> MethodFactory:
@@ -180,7 +187,8 @@ def drawn(avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: s
     A fourth channel is dropped: the data set owns the mask.
 
     Raises:
-        MethodFailed: the result has another shape or is not finite; it says the `name`.
+        MethodFailed: the result has another shape, holds other than real numbers, or is not
+            finite; it says the `name`.
     """
     image = np.asarray(avatar.render(hands, camera))
     size = (camera.height, camera.width)
@@ -188,6 +196,8 @@ def drawn(avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: s
         raise MethodFailed(
             f"render returned shape {image.shape}, not {(*size, 3)} or {(*size, 4)}", field=name
         )
+    if image.dtype.kind not in "fiub":
+        raise MethodFailed(f"render returned {image.dtype}, not real numbers", field=name)
     if not np.isfinite(image).all():
         raise MethodFailed("render returned NaN or infinity", field=name)
     from hwp_bench.base.images import as_uint8

@@ -3,6 +3,7 @@
 avatar.json           what it is, of which hand model, how it was fitted
 model.safetensors     every tensor of the model
 weights/000012.png    weight mask of a training frame, to look at
+call.json             digest of the call that made it, where one call made it of a capture
 """
 
 from __future__ import annotations
@@ -42,6 +43,7 @@ VERSION_1 = "wildghand-avatar/1"
 DESCRIPTION = "avatar.json"
 MODEL = "model.safetensors"
 WEIGHTS = "weights"
+CALL = "call.json"
 #: Largest description that is read, bytes: that of a fit of 100,000 frames has 10 million.
 MAX_DESCRIPTION_BYTES = 32 << 20
 #: Largest shape parameter that is read, standard deviations; people lie within 5.
@@ -67,9 +69,19 @@ class _Description:
 
 
 def save_avatar(
-    avatar: WildGHandAvatar, path: str | os.PathLike[str], *, overwrite: bool = False
+    avatar: WildGHandAvatar,
+    path: str | os.PathLike[str],
+    *,
+    overwrite: bool = False,
+    call: str | None = None,
 ) -> Path:
     """Write an avatar folder, whole or not at all.
+
+    Args:
+        avatar: the avatar.
+        path: the folder to make.
+        overwrite: replace an existing folder.
+        call: digest of the call that makes it, by which a second one knows that it is complete.
 
     Raises:
         UsageError: something is there and may not be replaced.
@@ -94,8 +106,20 @@ def save_avatar(
         (folder / MODEL).write_bytes(data)
         write_json(folder / DESCRIPTION, dataclasses.asdict(description))
         write_weight_masks(avatar, folder / WEIGHTS)
+        if call is not None:
+            write_json(folder / CALL, {"call": call})
     avatar.folder = Path(path)
     return avatar.folder
+
+
+def made_by_call(path: Path, call: str) -> bool:
+    """Whether a folder is the avatar that a call has made, by the digest of the call."""
+    if not (path / DESCRIPTION).is_file() or not (path / CALL).is_file():
+        return False
+    try:
+        return read_json(path / CALL, max_bytes=1000) == {"call": call}
+    except BadInput:
+        return False
 
 
 def load_avatar(

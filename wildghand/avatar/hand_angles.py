@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping
 
 import numpy as np
@@ -10,6 +9,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.text import did_you_mean
 from hwp_bench.hands import (
     HandTemplate,
     anatomical_limits,
@@ -135,8 +135,7 @@ class HandAngles:
         angles = np.zeros((len(JOINT_NAMES), 3))
         for name, degrees in given.items():
             if name not in ANGLE_NAMES:
-                near = difflib.get_close_matches(name, ANGLE_NAMES, n=1)
-                hint = f"Did you mean {near[0]!r}?" if near else "Use a name as 'index1 flexion'."
+                hint = did_you_mean(name, ANGLE_NAMES) or "Use a name as 'index1 flexion'."
                 raise UsageError(f"there is no angle {name[:40]!r}", field="pose", remedy=hint)
             place = divmod(ANGLE_NAMES.index(name), len(ANGLES))
             low, high = self.lower[place], self.upper[place]

@@ -20,7 +20,7 @@ from hwp_bench.capture.splits import Split, contiguous_split
 from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.avatar.files import save_avatar
+from wildghand.avatar.files import CALL, load_avatar, made_by_call, save_avatar
 from wildghand.fitting.affordable import affordable
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Watch, Watchers, optimize
@@ -92,7 +92,8 @@ def fit_capture(
     """Fit an avatar to a capture, and write it if a folder is named.
 
     With `out` the state is saved next to it every 20 seconds. The same call goes on with it after
-    a stop; with a budget in steps the result is that of a fit that was never stopped.
+    a stop, and takes the avatar as it is where it was finished; with a budget in steps the result
+    is that of a fit that was never stopped.
 
     Args:
         source: the capture folder.
@@ -107,8 +108,8 @@ def fit_capture(
 
     Raises:
         BadMethod: a setting is unknown or out of range.
-        UsageError: `out` exists, the processes cannot share a batch evenly, or there are several
-            and no `out`.
+        UsageError: `out` exists and is not of the same call, the processes cannot share a batch
+            evenly, or there are several and no `out`.
         BadInput: no training frame can be used, or the saved state is of another fit.
         DidNotConverge: the fit diverged at once.
         HwpError: another fit is writing to `out`, or `out` cannot be written to (steps up to the
@@ -128,21 +129,34 @@ def fit_capture(
             _ = avatar.weight_masks  # Made while the frames are there.
             return avatar
     out = Path(out)
-    if out.exists() and not overwrite:
-        raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
+    if out.exists() and not overwrite and not (out / CALL).is_file():
+        raise _exists(out)
     capture = open_capture(source)
     split = every_frame(capture) if all_frames else _split(capture)
     work = unfinished(out)
+    limits = [run.budget.seconds, run.budget.steps]
+    call = sha256_json([capture.digest, split.digest, dict(run.settings), seed, limits])
+    if out.exists() and not overwrite:
+        if not made_by_call(out, call):
+            raise _exists(out)
+        # A process may be killed after its avatar was whole.
+        if world.is_main:
+            notice(f"{out} is complete: the same call has made it; --overwrite fits again")
+        return load_avatar(out)
     with disc_errors(work), exclusive(work) if world.is_main else contextlib.nullcontext():
         if world.is_main:
             write_request(work / "request", capture, split, run)
         world.wait_for_main()
         avatar = _fit_in(work, capture, run, chosen, world, watch)
         if world.is_main:
-            save_avatar(avatar, out, overwrite=overwrite)
+            save_avatar(avatar, out, overwrite=overwrite, call=call)
             shutil.rmtree(work, ignore_errors=True)
         world.wait_for_main()
     return avatar
+
+
+def _exists(out: Path) -> UsageError:
+    return UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
 
 
 def _fit_in(

@@ -7,7 +7,6 @@ changed. What it returns says plainly what runs: no setting overrules another on
 from __future__ import annotations
 
 import dataclasses
-import difflib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -15,6 +14,7 @@ from typing import Any
 
 from hwp_bench.base.errors import BadMethod
 from hwp_bench.base.records import flattened, merged
+from hwp_bench.base.text import nearest
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.evidence import EvidenceSettings
@@ -344,11 +344,11 @@ def _check_names(changes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
             continue
         table, _, word = name.rpartition(".")
         fields = [other for other in names if other.rpartition(".")[0] == table]
-        close = difflib.get_close_matches(name, [*names, *tables, "mode"], n=1, cutoff=0.75)
+        close = nearest(name, [*names, *tables, "mode"], cutoff=0.75)
         if not close and not (table and fields):
             # The name may be that of a field without its table.
             lasts = {other.rpartition(".")[2]: other for other in names}
-            close = [lasts[last] for last in difflib.get_close_matches(word, lasts, n=1)]
+            close = [lasts[last] for last in nearest(word, lasts)]
         everything = ["mode", *known] if not table else fields or [*known]
         raise BadMethod(
             "is not a setting of this method",

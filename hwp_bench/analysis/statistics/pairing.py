@@ -120,8 +120,8 @@ def refuse_unlike(runs: Sequence[MethodRuns]) -> None:
     """Refuse results whose difference would not be that of the methods.
 
     Raises:
-        UsageError: protocols, captures, capture or split digests, or the choice of training
-            frames differ; the message says which.
+        UsageError: protocols, captures, capture or split digests, the masks that are scored, or the
+            choice of training frames differ; the message says which.
     """
     everything = [(run.label, result) for run in runs for result in run.seeds.values()]
     label, reference = everything[0]
@@ -160,7 +160,9 @@ def _same_captures(between: str, reference: Results, other: Results) -> None:
         )
     for identifier, capture in ours.items():
         twin = theirs[identifier]
-        if capture.digest != twin.digest:
+        if capture.exact_masks != twin.exact_masks:
+            problem, field = "different masks (exact and estimated)", "exact_masks"
+        elif capture.digest != twin.digest:
             problem, field = "different data", "digest"
         elif capture.split_digest != twin.split_digest:
             problem, field = "different splits", "split_digest"

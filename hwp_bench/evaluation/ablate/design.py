@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import combinations, product
 from typing import Any
 
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.text import did_you_mean
 from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
 
 #: Components that are crossed when nothing is asked for and the method names none.
@@ -119,13 +119,12 @@ def make_design(
 def _switch(manifest: MethodManifest, name: str) -> Switch:
     if name in manifest.switches:
         return manifest.switches[name]
-    near = difflib.get_close_matches(name, manifest.switches, n=1)
     known = ", ".join(manifest.switches) or "none"
     raise UsageError(
         f"{manifest.name} has no switch {name!r}",
         where=manifest.root / MANIFEST,
         field="switches",
-        remedy=f"Did you mean {near[0]!r}?" if near else f"It declares: {known}.",
+        remedy=did_you_mean(name, manifest.switches) or f"It declares: {known}.",
     )
 
 

@@ -10,13 +10,20 @@ from hwp_bench.analysis.statistics.pairing import MethodRuns
 from hwp_bench.base.locks import exclusive
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.ablate.design import Design, Variant
-from hwp_bench.evaluation.capture_evaluation import evaluation_job, read_result
+from hwp_bench.evaluation.capture_evaluation import evaluation_job
 from hwp_bench.evaluation.evaluate import (
     EvaluationSettings,
     Plan,
+    hiding,
     make_plan,
     open_captures,
     with_setting_files,
+)
+from hwp_bench.evaluation.results_folder import (
+    RESULTS,
+    finish_together,
+    open_results_folder,
+    say_kept,
 )
 from hwp_bench.methods.manifest import MethodManifest
 from hwp_bench.metrics.lpips_weights import load_available
@@ -60,8 +67,12 @@ def run_ablation(
     on_job: OnJob | None = None,
     engine: Engine | None = None,
     needs: Needs | None = None,
+    overwrite: bool = False,
+    rehearse: bool = False,
 ) -> AblationRuns:
-    """Run an ablation; what is on disk from an earlier start is taken as it is.
+    """Run an ablation; what is on disk from an earlier start is taken as it is, and said.
+
+    Results of other settings are refused, or stay until all new ones are whole.
 
     The jobs go seed by seed and capture by capture, all variants of a capture after each other:
     the variants are then timed under the same load, and whenever the run is stopped, all have
@@ -78,8 +89,13 @@ def run_ablation(
         on_job: hook for showing progress, where jobs run in turn.
         engine: where jobs run; one after another in this process if None.
         needs: what one job takes of a machine.
+        overwrite: results of another ablation in `out` may be replaced.
+        rehearse: make each variant of the method once before the first job, where any of its
+            jobs is to be run; not to be asked for where they run on other machines.
 
     Raises:
+        UsageError: `out` holds results of another ablation.
+        MethodFailed: a variant cannot be made.
         BadMethod: there is no such preset.
         BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
         HwpError: another run is writing to `out`, or nobody can.
@@ -103,26 +119,46 @@ def run_ablation(
         for number in range(len(opened))
         for variant in _rotated(design.variants, number + seed)
     ]
-    # By capture, so that a result file lists captures in one order whichever ended first.
-    finished: dict[tuple[str, int], dict[int, CaptureResult]] = {key: {} for key in plans}
-    jobs = []
-    for seed, number, variant in order:
-        evaluation = plans[variant.name, seed].evaluations[number]
-        name = evaluation.capture.info.id
-        folder = out / result_folder(variant.name, seed) / "captures" / name
-        text = f"{name}, {variant.name}, seed {seed}"
-        jobs.append(evaluation_job(evaluation, folder, text, needs or Needs()))
-
-    def on_done(index: int) -> None:
-        seed, number, variant = order[index]
-        done = finished[variant.name, seed]
-        done[number] = read_result(jobs[index].output)
-        results = plans[variant.name, seed].results([done[key] for key in sorted(done)])
-        write_results(out / result_folder(variant.name, seed) / "results.json", results)
-
     with exclusive(out):
+        folders = {
+            key: open_results_folder(
+                out / result_folder(*key), plan.results([]), plan.evaluations, overwrite=overwrite
+            )
+            for key, plan in plans.items()
+        }
+        say_kept(list(folders.values()))
+        # By capture, so that a result file lists captures in one order whichever ended first.
+        finished = {key: dict(folder.kept) for key, folder in folders.items()}
+        missing = [
+            (seed, number, variant)
+            for seed, number, variant in order
+            if number not in folders[variant.name, seed].kept
+        ]
+        if rehearse:
+            for name in dict.fromkeys(variant.name for _, _, variant in missing):
+                plans[name, seeds[0]].rehearse()
+        jobs = []
+        for seed, number, variant in missing:
+            evaluation = hiding(plans[variant.name, seed].evaluations[number], out)
+            folder = folders[variant.name, seed].unfinished(number)
+            text = f"{evaluation.capture.info.id}, {variant.name}, seed {seed}"
+            jobs.append(evaluation_job(evaluation, folder, text, needs or Needs()))
+
+        def on_done(index: int) -> None:
+            seed, number, variant = missing[index]
+            key = variant.name, seed
+            finished[key][number] = folders[key].finish(number)
+            if not folders[key].replaces:
+                write_results(folders[key].root / RESULTS, _results(plans[key], finished[key]))
+
         (engine or LocalEngine()).run(jobs, on_done, on_job)
+        whole = [(folders[key], _results(plans[key], finished[key])) for key in plans]
+        finish_together(whole, tables=False)
     return AblationRuns(design, _runs(design, plans, finished, seeds))
+
+
+def _results(plan: Plan, finished: Mapping[int, CaptureResult]) -> Results:
+    return plan.results([result for _, result in sorted(finished.items())])
 
 
 def _of_variant(settings: EvaluationSettings, variant: Variant, seed: int) -> EvaluationSettings:
@@ -149,9 +185,7 @@ def _runs(
         variant.name: MethodRuns(
             plans[variant.name, seeds[0]].manifest.title,
             {
-                seed: plans[variant.name, seed].results(
-                    [result for _, result in sorted(finished[variant.name, seed].items())]
-                )
+                seed: _results(plans[variant.name, seed], finished[variant.name, seed])
                 for seed in seeds
             },
         )

@@ -43,6 +43,8 @@ def run_budget(
     on_run: Callable[[int, int, str], OnCapture | None] | None = None,
     engine: Engine | None = None,
     needs: Needs | None = None,
+    overwrite: bool = False,
+    rehearse: bool = False,
 ) -> BudgetRuns:
     """Evaluate a method as it is, with each truth in place of an estimate, and with all of them.
 
@@ -59,6 +61,8 @@ def run_budget(
             the hook for its captures.
         engine: where captures are evaluated; one after another in this process if None.
         needs: the share of a machine that one capture takes.
+        overwrite: results of other settings in `out` may be replaced, evaluation by evaluation.
+        rehearse: make the method once before the first capture.
 
     Raises:
         UsageError: a truth has no such name, or the settings ask for other frames.
@@ -83,6 +87,8 @@ def run_budget(
             on_capture=on_run(index, len(variants), name) if on_run else None,
             engine=engine,
             needs=needs,
+            overwrite=overwrite,
+            rehearse=rehearse and index == 0,
         )
     return BudgetRuns(opened, results, folders)
 

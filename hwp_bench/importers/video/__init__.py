@@ -1,6 +1,6 @@
 """A video of one hand or two and the tracked landmarks: frames, fit, masks, capture."""
 
-from hwp_bench.importers.video.from_video import import_video
+from hwp_bench.importers.video.from_video import finished_import, import_video
 from hwp_bench.importers.video.imported_clip import ImportedClip
 from hwp_bench.importers.video.video_settings import (
     FitSettings,
@@ -14,6 +14,7 @@ __all__ = [
     "FrameRange",
     "ImportedClip",
     "VideoImport",
+    "finished_import",
     "import_video",
     "parse_frame_range",
 ]

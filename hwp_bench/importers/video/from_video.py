@@ -4,20 +4,22 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.files import atomic_write, read_json, sha256_file, sha256_json
 from hwp_bench.base.images import is_blank
 from hwp_bench.base.progress import notice, progress
 from hwp_bench.base.text import bounded
-from hwp_bench.capture.schema import check_id
+from hwp_bench.capture.schema import EXTRA, METADATA, check_id
 from hwp_bench.hands import load_template
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.writing import refuse_existing
+from hwp_bench.importers.shared.writing import REPORT_NAME, SHEET_NAME, refuse_existing
 from hwp_bench.importers.video.clip_masks import ClipMasks, Masking, ProjectedClip, project_clip
 from hwp_bench.importers.video.contour import FIELD_SIZE, ContourEnergy
 from hwp_bench.importers.video.fit_clip import (
@@ -75,6 +77,7 @@ def import_video(
     """
     options = options or VideoImport()
     _check_output(Path(out), options)
+    call = _call(video, landmarks, out, options)
     source = without_blank_frames(read_source(video, landmarks, options))
     refuse_other_units(source)
     doubts = landmark_doubts(source)
@@ -83,8 +86,56 @@ def import_video(
     clip = fit_video(source, options, doubts)
     for warning in clip.warnings[len(doubts) :]:
         notice(f"warning: {warning}. Look at the sheet.")
-    store_clip(clip, out, options)
+    store_clip(clip, out, options, call)
     return clip
+
+
+def finished_import(
+    video: str | os.PathLike[str],
+    landmarks: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    options: VideoImport,
+) -> dict[str, Any] | None:
+    """Return the numbers of an import that the same call has finished; None where it has not.
+
+    A process may be killed after its capture was whole, and before its sheet was written, which is
+    made up for. Code and hand model do not count.
+
+    Args:
+        video, landmarks, out, options: as `import_video`.
+
+    Raises:
+        BadInput: one of the files cannot be read.
+    """
+    report = Path(out) / EXTRA / REPORT_NAME
+    if options.overwrite or not report.is_file() or not (Path(out) / METADATA).is_file():
+        return None
+    try:
+        facts = read_json(report)
+    except BadInput:
+        return None
+    if not isinstance(facts, dict) or "call" not in facts:
+        return None
+    if facts.pop("call") != _call(video, landmarks, out, options):
+        return None
+    if options.sheet is not None and not options.sheet.exists():
+        atomic_write(options.sheet, (Path(out) / EXTRA / SHEET_NAME).read_bytes())
+    return facts
+
+
+def _call(
+    video: str | os.PathLike[str],
+    landmarks: str | os.PathLike[str],
+    out: str | os.PathLike[str],
+    options: VideoImport,
+) -> str:
+    """The digest of everything that a person gives an import; empty where a file is not there."""
+    chosen = asdict(replace(options, overwrite=False, sheet=None, id=options.capture_id(out)))
+    masks = sorted(options.masks.glob("*")) if options.masks is not None else []
+    files = [Path(video), Path(landmarks), *masks]
+    digests = [sha256_file(path) if path.is_file() else "" for path in files]
+    chosen["masks"] = None if options.masks is None else [path.name for path in masks]
+    return sha256_json([chosen, digests])
 
 
 def without_blank_frames(source: VideoSource) -> VideoSource:

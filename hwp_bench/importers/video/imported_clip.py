@@ -137,8 +137,17 @@ class ImportedClip:
         return {**common, **repaired, "hands": each}
 
 
-def store_clip(clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport) -> None:
-    """Write the capture, whole or not at all, and the separate sheet where one is asked for."""
+def store_clip(
+    clip: ImportedClip, out: str | os.PathLike[str], options: VideoImport, call: str | None = None
+) -> None:
+    """Write the capture, whole or not at all, and the separate sheet where one is asked for.
+
+    Args:
+        clip: the clip.
+        out: the capture folder to make.
+        options: choices.
+        call: digest of the call that makes it, by which a second one knows that it is complete.
+    """
     source = clip.source
     frames = len(source.indices)
     Ks = source.windows.intrinsics(clip.focal, source.video.width, source.video.height)
@@ -151,7 +160,7 @@ def store_clip(clip: ImportedClip, out: str | os.PathLike[str], options: VideoIm
         cameras,
         zip(source.images.frames, clip.masks.coverage, strict=True),
         lambda: drawn,
-        clip.facts(),
+        {**clip.facts(), **({} if call is None else {"call": call})},
         overwrite=options.overwrite,
     )
     if options.sheet is not None:

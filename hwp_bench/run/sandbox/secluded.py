@@ -7,13 +7,12 @@ would render the test frames again. Runs and captures below a method's own folde
 from __future__ import annotations
 
 import os
-import re
 from collections.abc import Iterable
 from glob import escape, glob
 from pathlib import Path
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.locks import LOCK
+from hwp_bench.methods.contents import is_foreign
 
 #: Parts of `hwp_bench` that a method may import: all that methods which ship are built from. Any
 #: other stays out of sight; those render, seal, score or rank test frames.
@@ -22,11 +21,6 @@ SHOWN_ROOMS = frozenset(
     | {"report", "results", "run", "taxonomy", "tracking"}
 )
 
-#: Files that say that a folder is a capture or a result of the toolkit, by their first words.
-_MARKED_FILES = ("capture.json", "results.json")
-_MARK, _HEAD_BYTES = b'"hwp-', 256
-#: How `base.files.temporary_name` calls what a killed run leaves half written.
-_TEMPORARY = re.compile(r"\..+\.[0-9a-f]{12}(\.old)?")
 #: Most folders of a method that are looked into.
 MAX_FOLDERS = 20_000
 
@@ -64,8 +58,8 @@ def _parts(package: str) -> list[str]:
 def foreign_folders(method: Path) -> list[str]:
     """Return the folders below a method's that do not belong to it: captures and outputs of runs.
 
-    A capture and a results file are known by what they begin with, an output that is not finished
-    by its lock file or its temporary name. Links are not followed; inside walls they lead nowhere.
+    `is_foreign` knows them, as the digest of a method does. Links are not followed; inside walls
+    they lead nowhere.
 
     Raises:
         UsageError: there are more than `MAX_FOLDERS` folders.
@@ -79,22 +73,7 @@ def foreign_folders(method: Path) -> list[str]:
                 remedy="Keep the method in a folder of its own.",
             )
         own = folder == os.fspath(method)
-        if not own and _is_foreign(folder, files):
+        if not own and is_foreign(folder, files):
             found.append(folder)
             folders.clear()
     return found
-
-
-def _is_foreign(folder: str, files: list[str]) -> bool:
-    if _TEMPORARY.fullmatch(os.path.basename(folder)) or LOCK in files:
-        return True
-    return any(name in files and _marked(os.path.join(folder, name)) for name in _MARKED_FILES)
-
-
-def _marked(path: str) -> bool:
-    try:
-        with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as stream:
-            return _MARK in stream.read(_HEAD_BYTES)
-    except OSError:
-        # What cannot be read cannot be told apart from a capture.
-        return True

@@ -140,7 +140,7 @@ def test_a_full_disc_is_one_message_and_the_next_start_finishes(
         assert main(words) == 1
     said = capsys.readouterr().err.strip().splitlines()[-1]
     assert said.startswith("hwp-bench: error: ")
-    assert f"{out}/captures/tiny: cannot be written (No space left on device)" in said
+    assert f"{out}/captures/.unfinished/tiny: cannot be written (No space left on device)" in said
     assert said.endswith("what is finished stays.")
     assert not (out / "results.json").exists()
     assert main(words) == 0

@@ -135,7 +135,7 @@ def test_evaluate_prints_the_table_and_says_where_things_are(
     assert main(["table", str(out), "--format", "md"]) == 0
     assert "100.00" in capsys.readouterr().out
     (entry / "predictions" / "tiny" / "000019.png").unlink()
-    assert main(words) == 1
+    assert main([*words, "--overwrite"]) == 1
     assert "1 of 2 frames: 000019.png: does not exist" in capsys.readouterr().err
 
 

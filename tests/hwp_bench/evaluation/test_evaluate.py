@@ -10,17 +10,17 @@ import numpy as np
 import pytest
 from small_captures import CaptureMaker
 
-from hwp_bench.base.errors import BadCapture, BadImage, BadSplit
+from hwp_bench.base.errors import BadCapture, BadImage, BadSplit, UsageError
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.evaluation.evaluate import EvaluationSettings, default_folder, evaluate
-from hwp_bench.methods.contract import RunSettings
+from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric, penalty
 from hwp_bench.results import Results, read_results
 from hwp_bench.run.sandbox.confinement import Confinement
 
-# Some methods here note their fits in their own folder, which a sandbox forbids.
+# Some methods here note their fits next to their folder, which a sandbox forbids.
 SETTINGS = EvaluationSettings(confinement=Confinement("none"))
 
 
@@ -168,7 +168,7 @@ def test_a_capture_without_predictions_fails_by_name_and_the_rest_is_scored(
 
 
 def counting_method(folder: Path, body: str = "") -> Path:
-    """A method that paints gray and notes each fit in a file of its own folder."""
+    """A method that paints gray and notes each fit in a file next to its folder."""
     folder.mkdir()
     (folder / "counting_method.py").write_text(
         f"""
@@ -179,7 +179,8 @@ class Method:
     def __init__(self, settings, seed): self.level = settings.get("level", 0.5)
     def fit(self, training, budget, report):
         {body or "pass"}
-        with open({str(folder / "fits.log")!r}, "a") as stream: stream.write(training.id + " ")
+        with open({str(folder.parent / "fits.log")!r}, "a") as stream:
+            stream.write(training.id + " ")
         return self
     def render(self, hands, camera):
         return np.full((camera.height, camera.width, 4), self.level)
@@ -196,7 +197,7 @@ def test_a_second_start_takes_what_is_finished_and_redoes_what_changed(
     captures, tmp_path: Path
 ) -> None:
     method, out = counting_method(tmp_path / "method"), tmp_path / "out"
-    fits = method / "fits.log"
+    fits = method.parent / "fits.log"
     first = run(method, captures[:1], out)
     second = run(method, captures, out)
     assert fits.read_text() == "single pair "
@@ -204,7 +205,9 @@ def test_a_second_start_takes_what_is_finished_and_redoes_what_changed(
     assert first.captures[0].steps == 4
     assert first.captures[0].curve[-1].scores["psnr"] > 0
     changed = replace(SETTINGS, run=RunSettings({"level": 0.25}))
-    third = evaluate(str(method), [captures[0].root], out, changed)
+    with pytest.raises(UsageError, match=r"setting level 0\.5, now 0\.25.*--overwrite"):
+        evaluate(str(method), [captures[0].root], out, changed)
+    third = evaluate(str(method), [captures[0].root], out, changed, overwrite=True)
     assert fits.read_text() == "single pair single "
     assert scores(third) != scores(first)
 
@@ -220,7 +223,7 @@ def test_a_crash_on_one_capture_loses_nothing_and_is_tried_again(captures, tmp_p
     assert "/run/" not in results.captures[0].failure
     assert "log.txt next to result.json" in results.captures[0].failure
     run(method, captures, out)
-    assert (method / "fits.log").read_text() == "pair "
+    assert (method.parent / "fits.log").read_text() == "pair "
 
 
 def test_faults_of_the_capture_are_errors_before_the_method_runs(
@@ -240,7 +243,7 @@ def test_faults_of_the_capture_are_errors_before_the_method_runs(
     (single.root / "frames" / "000018.png").write_bytes(b"")
     with pytest.raises(BadImage, match=r"000018\.png: is empty"):
         run(method, [single], tmp_path / "out")
-    assert not (method / "fits.log").exists()
+    assert not (method.parent / "fits.log").exists()
 
 
 @pytest.mark.parametrize(
@@ -256,3 +259,9 @@ def test_an_oracle_has_a_results_folder_of_its_own(
 ) -> None:
     settings = EvaluationSettings(suite=suite, run=RunSettings(frames=frames))
     assert default_folder(method, settings) == Path(expected)
+
+
+def test_budgets_and_seeds_have_results_folders_of_their_own() -> None:
+    run = RunSettings({}, 1, Budget(16.0, 300))
+    folder = default_folder("plain", EvaluationSettings("mini", run=run))
+    assert folder == Path("runs/plain-mini-16s-300steps-seed1")

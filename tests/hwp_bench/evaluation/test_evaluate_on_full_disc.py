@@ -21,7 +21,7 @@ _METHOD = """
 import json, os, pathlib, sys, time
 import cv2, numpy as np
 request, output = map(pathlib.Path, sys.argv[1:])
-here = pathlib.Path(__file__).parent
+here = pathlib.Path(__file__).parent.parent
 value = json.loads((request / "request.json").read_text())
 filler, marker = pathlib.Path("FILLER"), here / f"ran-{value['id']}"
 full = not marker.exists() and value["id"] == "second"
@@ -68,7 +68,7 @@ for start in range(2):
         failures = {one["id"]: one["failure"] for one in json.loads(file.read_text())["captures"]}
     told.append({"status": status, "said": errors.getvalue(), "failures": failures})
     (disc / "filler").unlink(missing_ok=True)
-runs = {path.name: len(path.read_text()) for path in method.glob("ran-*")}
+runs = {path.name: len(path.read_text()) for path in method.parent.glob("ran-*")}
 print(json.dumps({"starts": told, "runs": runs}))
 """
 _MOUNT = 'mount -t tmpfs -o size=16m none "$1" && exec "$2" -c "$3" "$1" "$4" "$5" "$6"'
@@ -127,7 +127,7 @@ def test_a_disc_that_stays_full_ends_in_one_message_and_what_is_finished_stays(
     errors = [line for line in full["said"].splitlines() if "error" in line]
     assert len(errors) == 1
     assert "Traceback" not in full["said"]
-    assert "out/captures/second" in errors[0]
+    assert "out/captures/.unfinished/second" in errors[0]
     assert "No space left" in errors[0]
     assert "free space" in errors[0] or "Make room" in errors[0]
     assert full["failures"] is None

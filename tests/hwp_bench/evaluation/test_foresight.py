@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import pytest
+from small_captures import CaptureMaker
 
 from hwp_bench.cli.main import main
 
@@ -91,6 +92,48 @@ def test_a_method_that_cannot_start_renders_nothing(
     assert problem in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", ["evaluate", "ablate", "budget"])
+def test_a_method_that_cannot_be_made_is_said_once_before_the_first_capture(
+    command: str, make_capture: CaptureMaker, tmp_path: Path, capsys
+) -> None:
+    _method(tmp_path / "mine")
+    with open(tmp_path / "mine" / "method.toml", "a") as stream:
+        stream.write("[switches.a]\nsettings_off = {level = 0.1}\n")
+    captures = [make_capture(name).root for name in ("first", "second")]
+    words = [command, "mine", "--set", "level=bright", "--out", "out", "--capture"]
+    assert main([*words, *map(str, captures)]) == 1
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert shown.err.count("mine cannot be made: ValueError: could not convert") == 1
+    # The end of the traceback, with the line at fault.
+    assert 'self.level = float(settings["level"])' in shown.err
+    assert not list((tmp_path / "out").rglob("result*.json"))
+
+
+def test_nothing_drawn_is_no_table(make_capture: CaptureMaker, tmp_path: Path, capsys) -> None:
+    _method(tmp_path / "mine", code=METHOD + "    def fit(self, *_): raise OSError('no luck')\n")
+    words = ["mine", "--out", "out", "--capture", str(make_capture("first").root)]
+    assert main(["evaluate", *words]) == 1
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert "failed: first: 2 of 2 frames: mine failed on first: OSError: no luck" in shown.err
+    assert (tmp_path / "out" / "results.json").is_file()
+
+
+def test_a_program_that_may_not_be_run_is_said_before_the_first_capture(
+    make_capture: CaptureMaker, tmp_path: Path, capsys
+) -> None:
+    mine = _method(
+        tmp_path / "mine", 'command = ["{{method}}/run.sh"]'.replace("{{", "{").replace("}}", "}")
+    )
+    words = ["evaluate", "mine", "--capture", str(make_capture("first").root)]
+    assert main(words) == 1
+    assert "there is no program '{method}/run.sh'" in capsys.readouterr().err
+    (mine / "run.sh").write_text("#!/bin/sh\n")
+    assert main(words) == 1
+    assert "'{method}/run.sh' is not executable" in capsys.readouterr().err
+
+
 def test_a_submission_that_is_not_filled_renders_nothing(tmp_path: Path, capsys) -> None:
     mine = _method(tmp_path / "mine", 'predictions = "predictions"', "")
     for name in ("capture0", "capture4"):
@@ -140,12 +183,14 @@ def test_a_wrong_truth_renders_nothing(tmp_path: Path, capsys) -> None:
     assert "'posse' is not an estimate" in capsys.readouterr().err
 
 
-def test_python_looks_ahead_too(tmp_path: Path) -> None:
+def test_python_looks_ahead_too(make_capture: CaptureMaker, tmp_path: Path) -> None:
     import hwp_bench
-    from hwp_bench.base.errors import BadMethod, UsageError
+    from hwp_bench.base.errors import BadMethod, MethodFailed, UsageError
 
     _method(tmp_path / "mine")
     with pytest.raises(BadMethod, match="Did you mean 'level'"):
         hwp_bench.evaluate("mine", "smoke", settings={"levl": 1})
     with pytest.raises(UsageError, match="is not one of perturbed"):
         hwp_bench.evaluate("mine", "smoke", frames="cleen")
+    with pytest.raises(MethodFailed, match="mine cannot be made: ValueError"):
+        hwp_bench.evaluate("mine", make_capture("first"), settings={"level": "bright"})

@@ -66,9 +66,9 @@ def test_settings_that_give_the_protocols_their_names():
 
 
 def test_unknown_names_are_answered_with_the_nearest():
-    with pytest.raises(UsageError, match="Did you mean ssim_full"):
+    with pytest.raises(UsageError, match="Did you mean 'ssim_full'"):
         metric("ssim_ful")
-    with pytest.raises(UsageError, match="Did you mean hwp-v1"):
+    with pytest.raises(UsageError, match="Did you mean 'hwp-v1'"):
         protocol("hwp_v1")
     assert protocol("paper-wildghand") is PAPER_WILDGHAND
     assert metric("psnr").unit == "dB"

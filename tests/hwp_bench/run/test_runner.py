@@ -130,6 +130,11 @@ for frame in range(*split["test"]):
         ("Avatar.render = lambda *a: np.zeros((5, 5, 4))", r"shape \(5, 5, 4\)"),
         ("return Avatar(np.nan)", "NaN or infinity"),
         ("import sys; sys.exit(0)", "ended before"),
+        ("import sys; sys.exit('a reason')", "a reason"),
+        ("raise type('Own', (BaseException,), {})('a reason')", "Own: a reason"),
+        ("raise ValueError('a reason \\ud800')", r"ValueError: a reason \?"),
+        ("Avatar.render = lambda *a: np.zeros((32, 32, 3), complex)", "complex128, not real"),
+        ("Avatar.render = lambda *a: np.zeros((32, 32, 3), object)", "object, not real"),
     ],
 )
 def test_crashes_are_named(request_folder: Path, tmp_path: Path, body: str, problem: str) -> None:

@@ -91,17 +91,17 @@ def test_the_factorial_end_to_end(captures, tmp_path: Path, capsys) -> None:
         "Toy", "Toy without Tone", "Toy without Edge", "Toy without Tone, Edge",
     }  # fmt: skip
     # Started again it runs nothing; with a seed more it runs what is new.
-    fits = (method / "fits.log").read_text().count("\n")
+    fits = (method.parent / "fits.log").read_text().count("\n")
     assert fits == 16
     assert main(words(method, captures, out, "--seeds", "2")) == 0
-    assert (method / "fits.log").read_text().count("\n") == fits
+    assert (method.parent / "fits.log").read_text().count("\n") == fits
     assert (
         json.loads((out / "ablation.json").read_text())["score_effects"]
         == (record["score_effects"])
     )
     capsys.readouterr()
     assert main(words(method, captures, out, "--without", "edge", "--json")) == 0
-    assert (method / "fits.log").read_text().count("\n") == fits + 2 * 2
+    assert (method.parent / "fits.log").read_text().count("\n") == fits + 2 * 2
     value = json.loads(capsys.readouterr().out)
     assert [variant["name"] for variant in value["variants"]] == ["no-edge", "full"]
 
@@ -116,7 +116,7 @@ def test_a_failing_variant_is_named_and_penalised(captures, tmp_path: Path, caps
     assert [row["Failed frames"] for row in record["tables"]["ablation"]["rows"]] == [2, 2]
     # The time of the capture that both got through is still told.
     assert {row["captures"] for row in record["cost_effects"]} == {1}
-    log = (method / "fits.log").read_text().splitlines()
+    log = (method.parent / "fits.log").read_text().splitlines()
     assert log[:2] == ["single 0 True True False", "single 0 True True True"]
     assert log[2:] == ["pair 0 True True True", "pair 0 True True False"]
 

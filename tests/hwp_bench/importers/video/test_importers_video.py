@@ -177,8 +177,12 @@ def test_the_command_prints_the_numbers_and_saves_the_sheet(
     assert (info.id, info.frame_count, info.fps) == ("by_command", 5, 15.0)
     assert info.source["frames"] == [6, 8, 10, 12, 14]
     assert info.perturbations == {"motion_blur": None}
-    # Again: refused without --force, done with it.
-    assert main(words) == 2
+    # Again: it is complete, as after a kill in the last moment. Another call needs --force.
+    sheet.unlink()
+    assert main(words) == 0
+    assert "is complete: the same call has made it" in capsys.readouterr().err
+    assert read_rgb(sheet).shape[0] > 96
+    assert main([*words, "--min-score", "0.4"]) == 2
     assert "exists already" in capsys.readouterr().err
     assert main([*words, "--force", "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["frames"] == 5

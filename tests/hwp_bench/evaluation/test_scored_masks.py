@@ -1,0 +1,126 @@
+"""A copy of a capture without its truth is scored on other masks, and is other data.
+
+Oracles: a whole capture and a copy of it, predictions that are the same pixels, and the words of
+the commands.
+"""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+from small_captures import CaptureMaker
+
+from hwp_bench.base.files import sha256_json
+from hwp_bench.base.images import write_image
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.capture.check import check_capture
+from hwp_bench.cli.main import main
+from hwp_bench.evaluation.verify import verify_results
+from hwp_bench.report.sources import find_captures
+from hwp_bench.results import Results, read_results
+
+
+@pytest.fixture
+def whole(make_capture: CaptureMaker) -> Capture:
+    return make_capture("clip", frames=20, size=48, truth=True)
+
+
+@pytest.fixture
+def stripped(whole: Capture, tmp_path: Path) -> Capture:
+    folder = shutil.copytree(whole.root, tmp_path / "copy")
+    shutil.rmtree(folder / "truth")
+    return open_capture(folder)
+
+
+def submission(folder: Path, name: str, capture: Capture) -> Path:
+    for frame in (18, 19):
+        pixels = capture.frame(frame) // 2
+        write_image(folder / "predictions" / "clip" / f"{frame:06d}.png", pixels)
+    (folder / "method.toml").write_text(
+        f'schema = "hwp-method/1"\nname = "{name}"\n[entry]\npredictions = "predictions"\n'
+    )
+    return folder
+
+
+@pytest.fixture
+def both(whole: Capture, stripped: Capture, tmp_path: Path) -> list[Results]:
+    for name, capture in (("one", whole), ("two", stripped)):
+        folder = submission(tmp_path / name, name, whole)
+        words = ["evaluate", str(folder), "-o", str(tmp_path / f"out-{name}")]
+        assert main([*words, "--capture", str(capture.root)]) == 0
+    return [read_results(tmp_path / f"out-{name}") for name in ("one", "two")]
+
+
+def test_the_digest_says_which_masks_are_scored(whole: Capture, stripped: Capture) -> None:
+    # That of a whole capture is that of its description, as it always was.
+    assert whole.digest == sha256_json(json.loads((whole.root / "capture.json").read_text()))
+    assert stripped.digest != whole.digest
+    assert not whole.lacks_masks
+    assert stripped.lacks_masks
+    # Other truth decides no score.
+    shutil.rmtree(whole.root / "truth" / "clean")
+    (whole.root / "truth" / "hands.npz").unlink()
+    assert open_capture(whole.root).digest == whole.digest
+
+
+def test_a_capture_that_never_had_exact_masks_is_whole(make_capture: CaptureMaker) -> None:
+    capture = make_capture("video", frames=20, size=48)
+    assert capture.digest == sha256_json(capture.info.to_json())
+    assert not check_capture(capture.root).findings
+
+
+def test_a_check_names_truth_that_is_listed_and_not_there(stripped: Capture, capsys) -> None:
+    assert main(["data", "check", str(stripped.root)]) == 0
+    shown = capsys.readouterr().out
+    for part in ("true_masks", "clean", "clean_masks", "true_hands"):
+        assert f"digests.{part}: lists truth/" in shown
+    assert "Scores are taken over the estimated masks" in shown
+
+
+def test_results_on_other_masks_are_kept_apart(
+    both: list[Results], whole: Capture, stripped: Capture, tmp_path: Path, capsys
+) -> None:
+    first, second = (results.captures[0] for results in both)
+    assert (first.exact_masks, second.exact_masks) == (True, False)
+    assert first.digest == whole.digest
+    assert second.digest == stripped.digest
+    assert first.key != second.key
+    folders = [str(tmp_path / "out-one"), str(tmp_path / "out-two")]
+    capsys.readouterr()
+    assert main(["table", *folders]) == 0
+    shown = capsys.readouterr().out
+    assert "only rows of the same data are ranked together" in shown
+    assert "scored on estimated masks" in " ".join(shown.split())
+    assert main(["compare", *folders]) == 2
+    assert "evaluated on different masks (exact and estimated)" in capsys.readouterr().err
+    assert not verify_results(tmp_path / "out-two", [stripped.root]).discrepancies
+    found = verify_results(tmp_path / "out-two", [whole.root]).discrepancies
+    assert [item.what for item in found] == ["capture"]
+    assert set(find_captures(both, [stripped.root, whole.root])) == {first.digest, second.digest}
+
+
+def test_an_evaluation_without_the_truth_says_so_and_does_not_replace_the_other(
+    both: list[Results], whole: Capture, stripped: Capture, tmp_path: Path, capsys
+) -> None:
+    words = ["evaluate", str(tmp_path / "one"), "-o", str(tmp_path / "out-one"), "--capture"]
+    capsys.readouterr()
+    assert main([*words, str(stripped.root)]) == 2
+    said = capsys.readouterr().err
+    assert "clip: its true masks are not there: scored on its estimated masks" in said
+    assert "clip: data: it has changed, other masks are scored" in said
+
+
+def test_a_result_that_was_changed_by_hand_is_in_no_table(
+    both: list[Results], tmp_path: Path, capsys
+) -> None:
+    file = tmp_path / "out-one" / "results.json"
+    value = json.loads(file.read_text())
+    value["captures"][0]["frames"][0]["scores"]["psnr"] += 10
+    file.write_text(json.dumps(value))
+    commands = (["table"], ["report", "-o", str(tmp_path / "page")], ["cost"])
+    for words in (*commands, ["compare", str(tmp_path / "out-two")]):
+        assert main([*words, str(file.parent)]) == 1
+        assert "the result was changed by hand" in capsys.readouterr().err
