@@ -25,6 +25,7 @@ SCRATCH_BYTES, SCRATCH_SHARE = 1 << 30, 0.25
 SCRATCH = ("/tmp", "/var/tmp", "/dev/shm")
 
 _CONTROL = Path("/sys/fs/cgroup")
+_PREFIX, _NEW_SECONDS = "hwp-bench-", 600.0
 _MEMORY_FILE, _SHARED_MAPPING = "/memfd:", b"/dev/zero (deleted)"
 
 
@@ -33,14 +34,12 @@ def default_limit() -> int:
     import psutil
 
     free = psutil.virtual_memory().available
-    for most, used in (("memory.max", "memory.current"), *_OLD_NAMES):
-        with contextlib.suppress(OSError, ValueError):
-            room = int((_CONTROL / most).read_text()) - int((_CONTROL / used).read_text())
-            free = min(free, max(0, room))
+    with contextlib.suppress(OSError, ValueError):
+        most, used = (
+            int((_CONTROL / name).read_text()) for name in ("memory.max", "memory.current")
+        )
+        free = min(free, max(0, most - used))
     return int(DEFAULT_SHARE * free)
-
-
-_OLD_NAMES = (("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),)
 
 
 def scratch_bytes(limit: int) -> int:
@@ -167,29 +166,11 @@ def _memory_files(processes: Iterable[int]) -> int:
 
 
 @dataclass(frozen=True)
-class _Names:
-    """Files of a control group; the two editions of the kernel's interface differ."""
-
-    #: Most memory, bytes.
-    limit: str
-    #: Most memory and swap (the first edition) or swap alone (the second).
-    swap: str
-    #: Holds a line `oom_kill COUNT`.
-    events: str
-
-
-_SECOND = _Names("memory.max", "memory.swap.max", "memory.events")
-_FIRST = _Names("memory.limit_in_bytes", "memory.memsw.limit_in_bytes", "memory.oom_control")
-
-
-@dataclass(frozen=True)
 class ControlGroup:
     """A group of processes whose memory the kernel limits; it also counts what no process holds."""
 
     #: Its folder.
     folder: Path
-    #: Its files.
-    names: _Names
 
     def take(self, process: int) -> None:
         """Put a process into it, and with it all that it starts."""
@@ -198,7 +179,7 @@ class ControlGroup:
     def kills(self) -> int:
         """Return how many of its processes the kernel has ended, because they took too much."""
         with contextlib.suppress(OSError, ValueError):
-            for line in (self.folder / self.names.events).read_text().splitlines():
+            for line in (self.folder / "memory.events").read_text().splitlines():
                 name, _, count = line.partition(" ")
                 if name == "oom_kill":
                     return int(count)
@@ -223,6 +204,8 @@ def control_group(
 ) -> ControlGroup | None:
     """Make a control group for one run; None where this user or system has none.
 
+    Only the second edition of control groups is used (cgroup v2).
+
     Args:
         limit: most memory of its processes, bytes.
         mounted: where control groups are mounted.
@@ -232,38 +215,44 @@ def control_group(
         own = ""
         with contextlib.suppress(OSError), open("/proc/self/cgroup") as table:
             own = table.read()
-    for above, names in _above(mounted, own):
-        folder = above / f"hwp-bench-{secrets.token_hex(6)}"
-        group = ControlGroup(folder, names)
+    for above in _above(mounted, own):
+        _remove_old(above)
+        group = ControlGroup(above / f"{_PREFIX}{secrets.token_hex(6)}")
         try:
-            folder.mkdir()
-            (folder / names.limit).write_text(str(limit))
+            group.folder.mkdir()
+            (group.folder / "memory.max").write_text(str(limit))
         except OSError:
             group.remove()
             continue
-        with contextlib.suppress(OSError):
-            (folder / names.swap).write_text(str(limit if names is _FIRST else 0))
-        with contextlib.suppress(OSError):
-            (folder / "memory.oom.group").write_text("1")
+        for name, value in (("memory.swap.max", "0"), ("memory.oom.group", "1")):
+            with contextlib.suppress(OSError):
+                (group.folder / name).write_text(value)
         return group
     return None
 
 
-def _above(mounted: Path, own: str) -> Iterable[tuple[Path, _Names]]:
+def _remove_old(above: Path) -> None:
+    """Remove groups that killed runs have left; one with processes in it stays."""
+    for folder in above.glob(f"{_PREFIX}*"):
+        with contextlib.suppress(OSError):
+            # A new one is empty until its first process comes.
+            if time.time() - folder.stat().st_mtime > _NEW_SECONDS:
+                folder.rmdir()
+
+
+def _above(mounted: Path, own: str) -> Iterable[Path]:
     """Folders in which a group of its own may be possible, best first.
 
-    In the second edition a group that holds processes has no limited groups in it, so that a new
-    one stands next to this process's own.
+    A group that holds processes has no limited groups in it, so that a new one stands next to this
+    process's own.
     """
     for line in own.splitlines():
-        _, controllers, place = line.split(":", 2)
-        if controllers == "":
-            here = mounted / place.strip("/")
+        if line.startswith("0::/"):
+            here = mounted / line[4:]
             for folder in (here, here.parent):
-                if folder.is_relative_to(mounted) and _limits_memory(folder):
-                    yield folder, _SECOND
-        elif "memory" in controllers.split(","):
-            yield mounted / "memory" / place.strip("/"), _FIRST
+                inside = folder.is_relative_to(mounted) and ".." not in folder.parts
+                if inside and _limits_memory(folder):
+                    yield folder
 
 
 def _limits_memory(folder: Path) -> bool:
