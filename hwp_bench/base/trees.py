@@ -18,8 +18,15 @@ DEEPEST = 32
 
 
 def remove_tree(folder: str | os.PathLike[str]) -> None:
-    """Remove a folder and everything in it; what is not there, or cannot be removed, is left."""
+    """Remove a folder and everything in it; what is not there, or cannot be removed, is left.
+
+    Of a link only the link is removed.
+    """
     if not os.path.lexists(folder):
+        return
+    if os.path.islink(folder):
+        with contextlib.suppress(OSError):
+            os.unlink(folder)
         return
     with contextlib.suppress(OSError):
         open_up(Path(folder))

@@ -135,9 +135,10 @@ def run_method(
     space = SpaceWatch(folders[1])
     outcome, isolation = _run(manifest, *folders, confinement, limits, on_progress, space=space)
     wall = time.perf_counter() - started
+    # First the links: a method may have put one in the place of these folders.
+    remove_odd_files(output)
     for name in (CACHE, HOME):
         remove_tree(output / name)
-    remove_odd_files(output)
     shortage = space.finish(outcome.log_problem)
     reason = f"; {shortage}" if shortage else ""
     log = output / LOG

@@ -25,6 +25,7 @@ SCRATCH_BYTES, SCRATCH_SHARE = 1 << 30, 0.25
 SCRATCH = ("/tmp", "/var/tmp", "/dev/shm")
 
 _CONTROL = Path("/sys/fs/cgroup")
+_FIRST_TO_END = "1000"
 _PREFIX, _NEW_SECONDS = "hwp-bench-", 600.0
 _MEMORY_FILE, _SHARED_MAPPING = "/memfd:", b"/dev/zero (deleted)"
 
@@ -63,6 +64,18 @@ def kernel_kills() -> int:
             if name == "oom_kill":
                 return int(count)
     return 0
+
+
+def offer_to_kernel(processes: Iterable[int]) -> None:
+    """Have the kernel end these processes first, and not others, when memory runs out.
+
+    They may take it back, so that it is said again whenever they are looked at.
+    """
+    for process in processes:
+        with contextlib.suppress(OSError), open(f"/proc/{process}/oom_score_adj", "r+") as stream:
+            if stream.read().strip() != _FIRST_TO_END:
+                stream.seek(0)
+                stream.write(_FIRST_TO_END)
 
 
 @dataclass

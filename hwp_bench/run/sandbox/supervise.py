@@ -229,6 +229,7 @@ class _Watch:
                 return "time"
             if now >= due:
                 family = _processes_of(self._process.pid)
+                memory.offer_to_kernel(family)
                 used = self._measure.used(family, self._limits.memory)
                 broken = self._broken(family, used)
                 if broken is not None:

@@ -55,6 +55,27 @@ def test_a_run_finds_nothing_of_another(
     assert sorted(path.name for path in (tmp_path / "output").iterdir()) == ["log.txt"]
 
 
+@pytest.mark.parametrize("mode", MODES)
+def test_links_in_the_place_of_a_cache_lead_nowhere(attack, tmp_path: Path, mode: str) -> None:
+    """Caches are removed after a run: what a link leads to must stay as it was."""
+    mine = folder_of(tmp_path / "mine")
+    (mine / "notes").write_text("mine")
+    (mine / "link").symlink_to("notes")
+    mine.chmod(0o755)
+    script = f"""
+import shutil
+for name in ("cache", "home"):
+    place = os.path.join(sys.argv[2], name)
+    shutil.rmtree(place, ignore_errors=True)
+    os.symlink({str(mine)!r}, place)
+print("{{}}")
+"""
+    attack(script, mode)
+    assert sorted(path.name for path in mine.iterdir()) == ["link", "notes"]
+    assert stat.S_IMODE(mine.stat().st_mode) == 0o755
+    assert not (tmp_path / "output" / "cache").is_symlink()
+
+
 CALL = """
 import numpy as np
 from hwp_bench.metrics.ssim_kernel import similarity

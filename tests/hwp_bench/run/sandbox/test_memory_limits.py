@@ -46,7 +46,11 @@ for folder in ("/tmp", "/var/tmp", "/dev/shm"):
     "nested tmpfs": """
 import ctypes
 libc = ctypes.CDLL(None, use_errno=True)
-if libc.unshare(0x10020000) == -1 or libc.mount(b"t", b"/tmp", b"tmpfs", 0, b"size=1g") == -1:
+user = os.getuid()
+if libc.unshare(0x10020000) == -1:
+    raise SystemExit("refused")
+open("/proc/self/uid_map", "w").write(f"{user} {user} 1")
+if libc.mount(b"t", b"/tmp", b"tmpfs", 0, b"size=1g") == -1:
     raise SystemExit("refused")
 with open("/tmp/filled", "wb") as stream:
     for _ in range(400):
