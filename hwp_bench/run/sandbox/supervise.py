@@ -156,8 +156,10 @@ def run_confined(
 
 def _unseen(word: str) -> str:
     """What may be wrong with a program that cannot be started inside the walls."""
-    real = os.path.realpath(word)
-    leads = f" It leads to {shown(real)}." if os.path.isabs(word) and real != word else ""
+    leads = ""
+    with contextlib.suppress(OSError):  # links of the process table are closed to most
+        real = os.path.realpath(word)
+        leads = f" It leads to {shown(real)}." if os.path.isabs(word) and real != word else ""
     return (
         "A method sees the programs of the system, the toolkit's Python and its own folder, but "
         f"not what links in that folder lead to.{leads} If you trust it and it needs another "

@@ -46,10 +46,12 @@ for folder in ("/tmp", "/var/tmp", "/dev/shm"):
     "nested tmpfs": """
 import ctypes
 libc = ctypes.CDLL(None, use_errno=True)
-user = os.getuid()
+user, group = os.getuid(), os.getgid()
 if libc.unshare(0x10020000) == -1:
     raise SystemExit("refused")
-open("/proc/self/uid_map", "w").write(f"{user} {user} 1")
+for name, text in (("uid_map", f"{user} {user} 1"), ("setgroups", "deny"),
+                   ("gid_map", f"{group} {group} 1")):
+    open(f"/proc/self/{name}", "w").write(text)
 if libc.mount(b"t", b"/tmp", b"tmpfs", 0, b"size=1g") == -1:
     raise SystemExit("refused")
 with open("/tmp/filled", "wb") as stream:
