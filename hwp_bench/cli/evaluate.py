@@ -99,7 +99,7 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         "--memory-limit",
         type=float,
         metavar="GB",
-        help="kill the method when it takes more memory (default: nine tenths of the machine's)",
+        help="kill the method when it takes more memory (default: nine tenths of what is free)",
     )
     parser.add_argument(
         "--isolation",
@@ -114,7 +114,8 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="PATH",
-        help="further files and folders that an isolated method may read, such as weights",
+        help="further files and folders that an isolated method may read, such as weights or the "
+        "environment of another Python",
     )
     add_engine_arguments(parser)
 

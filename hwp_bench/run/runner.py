@@ -35,7 +35,6 @@ from hwp_bench.run.sandbox.confinement import (
     CACHE,
     HOME,
     Confinement,
-    cache_state,
     has_accelerators,
     plain_environment,
     sandbox_environment,
@@ -75,9 +74,6 @@ class RunRecord:
     #: How the process was isolated: `namespaces`, or `processes` with the reason;
     #: None for submitted predictions.
     isolation: str | None = None
-    #: How the method's cache was when it began (`confinement.cache_state`); None for submitted
-    #: predictions.
-    cache: str | None = None
     #: Folder of the predicted frames of the free-view clip; None where a submission or command
     #: has none.
     free_view: Path | None = None
@@ -174,7 +170,6 @@ def run_method(
         facts,
         wall,
         isolation,
-        cache_state(manifest.root),
         clip if offered else None,
         shortage,
     )

@@ -110,11 +110,6 @@ class Confinement:
         return default_limit() if self.memory_limit is None else self.memory_limit
 
 
-#: What `cache_state` says of the cache that a run begins with.
-EMPTY_CACHE = "empty"
-EMPTY_CACHE_AND_KERNELS = "empty, compiles into the kernels of the toolkit"
-
-
 def plain_environment(method: Path, output: Path) -> dict[str, str]:
     """Return the environment of a method that runs without a sandbox.
 
@@ -170,11 +165,6 @@ def sandbox_environment(
         scratch=scratch_bytes(confinement.memory_bytes),
     )
     return environment, places
-
-
-def cache_state(method: Path) -> str:
-    """Return how the cache is that a run of a method begins with, as results record it."""
-    return EMPTY_CACHE_AND_KERNELS if _ships(method) else EMPTY_CACHE
 
 
 def has_accelerators() -> bool:

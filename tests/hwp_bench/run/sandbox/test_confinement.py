@@ -12,7 +12,6 @@ from hwp_bench.base.machine_code import KEPT
 from hwp_bench.base.packages import data_folder
 from hwp_bench.run.sandbox.confinement import (
     Confinement,
-    cache_state,
     sandbox_environment,
     visible_places,
 )
@@ -114,4 +113,3 @@ def test_only_methods_that_ship_compile_for_others(
         kinds = {path: kind for kind, path, _ in places}
         assert kinds[kernels] == ("write" if ships else "read")
         assert kinds[str(tmp_path / "toolkit")] == "hidden"
-        assert ("compiles" in cache_state(method)) == ships
