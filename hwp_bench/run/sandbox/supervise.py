@@ -129,12 +129,9 @@ def run_confined(
         finally:
             _end(process)
             drain.join(timeout=5)
-<<<<<<< HEAD
             if not drain.is_alive():  # what it reads from must not be taken from it
                 process.stdout.close()
-=======
             starved = watch.finish()
->>>>>>> b01ad77 (Methods get nothing that a method brought or left)
         text = report.read()
     lost = log_problems[0] if log_problems else None
     if stopped is not None:
