@@ -34,6 +34,9 @@ MAX_BYTES, MAX_CACHE_BYTES = 64 * 2**20, 256 * 2**20
 #: Environment variable: a second folder, which is only read. Methods in a sandbox get the
 #: toolkit's here, because they may not write where others read.
 SHARED = "HWP_KERNELS"
+#: Environment variable: the folder where machine code is kept in place of the cache's. Methods that
+#: ship with the toolkit get the toolkit's here, whatever cache they have otherwise.
+KEPT = "HWP_KEPT_KERNELS"
 
 _SUFFIX = ".code"
 #: Settings of numba that change machine code.
@@ -42,7 +45,7 @@ _SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO
 
 def code_folder() -> Path:
     """Return the folder where machine code is kept."""
-    return cache_root() / "kernels"
+    return Path(os.environ.get(KEPT) or cache_root() / "kernels")
 
 
 class MachineCode:

@@ -18,8 +18,15 @@ DEEPEST = 32
 
 
 def remove_tree(folder: str | os.PathLike[str]) -> None:
-    """Remove a folder and everything in it; what is not there, or cannot be removed, is left."""
+    """Remove a folder and everything in it; what is not there, or cannot be removed, is left.
+
+    Of a link only the link is removed.
+    """
     if not os.path.lexists(folder):
+        return
+    if os.path.islink(folder):
+        with contextlib.suppress(OSError):
+            os.unlink(folder)
         return
     with contextlib.suppress(OSError):
         open_up(Path(folder))
@@ -30,6 +37,7 @@ def open_up(folder: Path) -> None:
     """Make everything in a folder readable for its owner, and leave only plain files and folders.
 
     Links, pipes, sockets and devices are removed, and so is whatever lies deeper than `DEEPEST`.
+    Files lose what gives rights to whoever runs them: set-user-id, set-group-id, capabilities.
     To be called when no process that writes there is left.
 
     Args:
@@ -53,8 +61,18 @@ def open_up(folder: Path) -> None:
                     _remove_deep(entry.path)
                 elif not stat.S_ISREG(mode):
                     os.unlink(entry.path)
-                elif not mode & stat.S_IRUSR:
-                    os.chmod(entry.path, 0o600)
+                else:
+                    _take_rights(entry.path, stat.S_IMODE(mode))
+
+
+def _take_rights(path: str, mode: int) -> None:
+    """Make a file readable for its owner, and no program that runs with another's rights."""
+    plain = mode & 0o777 if mode & stat.S_IRUSR else 0o600
+    if plain != mode:
+        os.chmod(path, plain)
+    if mode & 0o111 and hasattr(os, "removexattr"):
+        with contextlib.suppress(OSError):
+            os.removexattr(path, "security.capability", follow_symlinks=False)
 
 
 def _remove_deep(folder: str) -> None:

@@ -106,7 +106,7 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         "--memory-limit",
         type=float,
         metavar="GB",
-        help="kill the method when it takes more memory (default: nine tenths of the machine's)",
+        help="kill the method when it takes more memory (default: nine tenths of what is free)",
     )
     parser.add_argument(
         "--isolation",
@@ -121,7 +121,8 @@ def add_evaluation_arguments(parser: argparse.ArgumentParser) -> None:
         action="extend",
         default=[],
         metavar="PATH",
-        help="further files and folders that an isolated method may read, such as weights",
+        help="further files and folders that an isolated method may read, such as weights or the "
+        "environment of another Python",
     )
     parser.add_argument(
         "--overwrite",

@@ -278,6 +278,12 @@ def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
     mine = environment()
     if results.environment.get("code") != mine["code"]:
         notes.append("Made with other code of the toolkit than this.")
+    ran = any(capture.isolation is not None for capture in results.captures)
+    if ran and results.environment.get("caches") != mine["caches"]:
+        notes.append(
+            "It does not say that each run began with new caches: code that another method left "
+            "may have run in it. Only a new run can tell."
+        )
     recorded = results.environment.get("packages")
     theirs = recorded if isinstance(recorded, dict) else {}
     ours = mine["packages"]

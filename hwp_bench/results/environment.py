@@ -9,6 +9,7 @@ from typing import Any
 
 from hwp_bench.base import packages
 from hwp_bench.base.files import files_digest
+from hwp_bench.results.walls import NEW_CACHES
 
 #: Packages whose version can move a number.
 PACKAGES = (
@@ -30,7 +31,7 @@ def environment() -> dict[str, Any]:
     """Return the versions, the processor and the system; no host name and no path.
 
     `code` is the digest of the toolkit's own modules, which a version number alone does not tell
-    while it is being developed.
+    while it is being developed. `caches` says what caches the methods began with.
     """
     versions = {}
     for package in PACKAGES:
@@ -47,6 +48,7 @@ def environment() -> dict[str, Any]:
         else os.cpu_count(),
         "packages": versions,
         "code": code_digest(),
+        "caches": NEW_CACHES,
     }
 
 

@@ -10,6 +10,8 @@ from hwp_bench.results.schema import Results
 
 #: What `CaptureResult.isolation` says of a run inside the walls.
 WALLED = "namespaces"
+#: What `Results.environment` says under `caches`: a run finds nothing that a method wrote before.
+NEW_CACHES = "new for each run"
 
 
 def without_walls(results: Results) -> dict[str, list[str]]:

@@ -33,7 +33,10 @@ from hwp_bench.run.output import (
     read_facts,
 )
 from hwp_bench.run.sandbox.confinement import (
+    CACHE,
+    HOME,
     Confinement,
+    has_accelerators,
     plain_environment,
     sandbox_environment,
 )
@@ -57,6 +60,8 @@ _REMEDIES = {
     "time": "Raise --time-limit, or give the method a --budget.",
     "memory": "Raise --memory-limit, or make the method smaller.",
     "processes": "Make the method start fewer.",
+    "machine": "End other programs, run fewer jobs at once, or make the method smaller; "
+    "--memory-limit stops it earlier.",
 }
 
 
@@ -130,20 +135,27 @@ def run_method(
     space = SpaceWatch(folders[1])
     outcome, isolation = _run(manifest, *folders, confinement, limits, on_progress, space=space)
     wall = time.perf_counter() - started
+    # First the links: a method may have put one in the place of these folders.
     remove_odd_files(output)
+    for name in (CACHE, HOME):
+        remove_tree(output / name)
     shortage = space.finish(outcome.log_problem)
     reason = f"; {shortage}" if shortage else ""
     log = output / LOG
     if outcome.stopped is not None:
+        broken = _broken(outcome.stopped, f"on {capture_id}", limits)
         raise MethodFailed(
-            f"{manifest.name} {_broken(outcome.stopped, capture_id, limits)}{reason}",
+            f"{manifest.name} {broken}{reason}",
             where=log,
             remedy=_REMEDIES[outcome.stopped],
         )
     if outcome.status != 0:
+        if outcome.starved:
+            reason = f"; the kernel ended processes for want of memory meanwhile{reason}"
         raise MethodFailed(
             f"{manifest.name} failed on {capture_id}: {_reason(output, outcome.status)}{reason}",
             where=log,
+            remedy=_REMEDIES["machine"] if outcome.starved else None,
         )
     if manifest.kind == "python" and not (output / RUN).is_file():
         raise MethodFailed(
@@ -158,7 +170,12 @@ def run_method(
     clip = output / FREE_VIEW
     offered = manifest.kind == "python" or clip.is_dir()
     return RunRecord(
-        output / PREDICTIONS, facts, wall, isolation, clip if offered else None, shortage
+        output / PREDICTIONS,
+        facts,
+        wall,
+        isolation,
+        clip if offered else None,
+        shortage,
     )
 
 
@@ -202,7 +219,7 @@ def rehearse_method(
             # One line is the reason itself.
             for line in lines if len(lines) > 1 else ():
                 notice(f"{manifest.name}: {line}")
-            broken = outcome.stopped and f"stopped by the limit of {outcome.stopped}"
+            broken = outcome.stopped and _broken(outcome.stopped, "while it was made", limits)
             raise MethodFailed(
                 f"{manifest.name} cannot be made: {broken or _reason(output, outcome.status)}",
                 remedy="It fails before it sees a capture, so that nothing was rendered or run.",
@@ -265,10 +282,9 @@ def _run(
             _show_progress(output / PROGRESS, on_progress)
 
     if confinement.mode != "none":
-        environment, places = sandbox_environment(
-            manifest.root, command, request, output, confinement
-        )
-        walled = Program(command, output, environment, places, output / LOG)
+        environment, places = sandbox_environment(manifest.root, request, output, confinement)
+        memory_files = has_accelerators()
+        walled = Program(command, output, environment, places, output / LOG, memory_files)
         outcome = run_confined(walled, limits, poll)
         if outcome.refused is None:
             return outcome, WALLED
@@ -282,7 +298,8 @@ def _run(
         isolation = f"processes ({outcome.refused})"
     else:
         isolation = "processes"
-    plain = Program(command, output, plain_environment(), None, output / LOG)
+    environment = plain_environment(manifest.root, output)
+    plain = Program(command, output, environment, None, output / LOG)
     outcome = run_confined(plain, limits, poll)
     if outcome.refused is not None:
         raise MethodFailed(f"could not be started ({outcome.refused})", where=manifest.name)
@@ -308,11 +325,12 @@ def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]
     return words
 
 
-def _broken(limit: str, capture_id: str, limits: Limits) -> str:
+def _broken(limit: str, when: str, limits: Limits) -> str:
     return {
-        "time": f"ran out of time on {capture_id} after {limits.seconds:g} s",
-        "memory": f"took more than {limits.memory / 1e9:.3g} GB of memory on {capture_id}",
-        "processes": f"ran more than {MAX_PROCESSES} processes at once on {capture_id}",
+        "time": f"ran out of time {when} after {limits.seconds:g} s",
+        "memory": f"took more than {limits.memory / 1e9:.3g} GB of memory {when}",
+        "processes": f"ran more than {MAX_PROCESSES} processes at once {when}",
+        "machine": f"was stopped {when} because the machine's memory ran out",
     }[limit]
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import hashlib
+import contextlib
 import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -13,16 +13,14 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.packages import PACKAGES, data_folder
 from hwp_bench.base.threads import OPENCV_WAITING, OPENMP_WAITING, TORCH_COUNTS
-from hwp_bench.run.sandbox.pythons import checkout, environment_of, of_packages, python_places
+from hwp_bench.run.sandbox.memory import SCRATCH, SCRATCH_BYTES, default_limit, scratch_bytes
+from hwp_bench.run.sandbox.pythons import checkout, of_packages, python_places
 from hwp_bench.run.sandbox.root import Place
 from hwp_bench.run.sandbox.secluded import foreign_folders, secluded_rooms
 
 #: `auto` takes namespaces where the system allows them and says so where it does not; `required`
 #: refuses to run without; `none` leaves the program its user's files and network.
 MODES = ("auto", "required", "none")
-#: Share of the machine's memory that a program may take unless told otherwise.
-DEFAULT_MEMORY_SHARE = 0.9
-
 #: Environment variables that a method's process inherits in any case.
 INHERITED = (
     "CUDA_VISIBLE_DEVICES",
@@ -42,8 +40,6 @@ INHERITED = (
 #: Variables that name folders, which exist only where it runs without a sandbox.
 INHERITED_FOLDERS = (
     "HOME",
-    "HWP_CACHE",
-    "NUMBA_CACHE_DIR",
     "TMPDIR",
     "TORCH_HOME",
     "XDG_CACHE_HOME",
@@ -67,9 +63,16 @@ _ETC = (
 )
 # Of /sys what tells processors, memory and accelerators; not firmware, nor the kernel's tracing.
 _SYS = ("bus", "class", "dev", "devices", "fs/cgroup", "kernel/mm", "module")
-_DEVICES = ("null", "zero", "full", "random", "urandom", "nvidia*", "dri", "kfd")
-_SCRATCH = ("/tmp", "/var/tmp", "/dev/shm")
+_DEVICES = ("null", "zero", "full", "random", "urandom")
+_ACCELERATORS = ("nvidia*", "dri", "kfd")
+# What the walls give in part must not be opened whole by a word on the command line.
+_NEVER_EXPOSED = ("/", "/dev", "/dev/shm")
+_NEVER_FROM = ("/proc", "/sys")
 _MOST_LINKS = 40
+#: Folders inside the output of a run: its cache, and its home inside the walls.
+CACHE, HOME = "cache", "home"
+#: As `hwp_bench.base.machine_code.KEPT`, which needs numba.
+KEPT_KERNELS = "HWP_KEPT_KERNELS"
 
 
 @dataclass(frozen=True)
@@ -78,7 +81,8 @@ class Confinement:
 
     #: One of `MODES`.
     mode: str = "auto"
-    #: Most memory of all its processes together, bytes; None: nine tenths of the machine's.
+    #: Most memory of all its processes together, bytes; None: nine tenths of what is free when it
+    #: starts.
     memory_limit: int | None = None
     #: Files and folders that it may read besides the system, Python, the toolkit, its own folder
     #: and its request, such as weights.
@@ -91,42 +95,48 @@ class Confinement:
             raise UsageError(f"{self.mode!r} is not one of {', '.join(MODES)}", field="isolation")
         if self.memory_limit is not None and self.memory_limit <= 0:
             raise UsageError(f"{self.memory_limit} is not above 0", field="memory limit")
+        for path in self.exposed:
+            if _opens_the_machine(path):
+                raise UsageError(
+                    "would open the whole machine to a method",
+                    where=path,
+                    field="--expose",
+                    remedy="Name the files or folders that it needs, one by one.",
+                )
 
     @property
     def memory_bytes(self) -> int:
-        """The limit in force, bytes."""
-        if self.memory_limit is not None:
-            return self.memory_limit
-        import psutil
-
-        return int(DEFAULT_MEMORY_SHARE * psutil.virtual_memory().total)
+        """The limit in force for a program that starts now, bytes."""
+        return default_limit() if self.memory_limit is None else self.memory_limit
 
 
-def plain_environment() -> dict[str, str]:
-    """Return the environment of a method that runs without a sandbox."""
-    return _taken((*INHERITED, *INHERITED_FOLDERS))
-
-
-def sandbox_environment(
-    method: Path,
-    command: Sequence[str],
-    request: Path,
-    output: Path,
-    confinement: Confinement,
-) -> tuple[dict[str, str], list[Place]]:
-    """Return the environment of a method in a sandbox, and what it sees of the file system.
-
-    It may write to its output folder, and to a cache that it shares only with other runs of the
-    same method: compiled code must survive a run, and must never reach another program. It may
-    read the machine code that the toolkit itself has compiled. It does not see the simulator, nor
-    captures and runs that lie below its own folder (`secluded`), unless `exposed` names them.
+def plain_environment(method: Path, output: Path) -> dict[str, str]:
+    """Return the environment of a method that runs without a sandbox.
 
     Args:
         method: its directory.
-        command: its words; the first is the program.
+        output: its work folder.
+    """
+    return {**_taken((*INHERITED, *INHERITED_FOLDERS)), **_cache_environment(method, output)}
+
+
+def sandbox_environment(
+    method: Path, request: Path, output: Path, confinement: Confinement
+) -> tuple[dict[str, str], list[Place]]:
+    """Return the environment of a method in a sandbox, and what it sees of the file system.
+
+    It may write to its output folder, which holds a cache and a home that are empty when it begins
+    and removed when it has ended: nothing that a method wrote reaches another run. It may read the
+    machine code that the toolkit has compiled. It does not see the simulator, nor captures and
+    runs that lie below its own folder (`secluded`), unless `exposed` names them.
+
+    Nothing that a method brings decides what is shown: not its command, nor links in its folder.
+
+    Args:
+        method: its directory.
         request: the folder that it is given.
         output: its work folder.
-        confinement: what else is shown or hidden.
+        confinement: what else is shown or hidden, and how much memory it may take.
 
     Raises:
         UsageError: a path that is to be exposed does not exist.
@@ -134,29 +144,32 @@ def sandbox_environment(
     for path in confinement.exposed:
         if not path.exists():
             raise UsageError("does not exist", where=path, field="--expose")
-    home = output / "home"
-    home.mkdir()
-    cache = _own_cache(method, output)
-    kernels = cache_root().absolute() / "kernels"
+    home = output / HOME
+    home.mkdir(exist_ok=True)
     environment = {
         **_taken(INHERITED),
         "HOME": str(home.resolve()),
-        "HWP_CACHE": str(cache),
-        "NUMBA_CACHE_DIR": str(cache / "numba"),
-        "HWP_KERNELS": str(kernels),
+        **_cache_environment(method, output),
     }
     weights = _torch_home()
     if weights.is_dir():
         environment["TORCH_HOME"] = str(weights)
     shown = {os.path.realpath(path) for path in confinement.exposed}
     foreign = [path for path in foreign_folders(method.resolve()) if path not in shown]
+    kernels = _kernels()
+    writable = [output, kernels] if KEPT_KERNELS in environment else [output]
     places = visible_places(
         read=[method, request, weights, kernels, *_libraries(), *confinement.exposed],
-        write=[output, cache],
+        write=writable,
         hidden=[*map(Path, foreign), *_unless(shown, cache_root()), *confinement.hidden],
-        program=command[0],
+        scratch=scratch_bytes(confinement.memory_bytes),
     )
     return environment, places
+
+
+def has_accelerators() -> bool:
+    """Whether the machine has devices whose drivers run in the method's process."""
+    return any(glob(f"/dev/{name}") for name in _ACCELERATORS)
 
 
 def hand_model_files(source: str) -> list[Path]:
@@ -174,6 +187,17 @@ def hand_model_files(source: str) -> list[Path]:
     names = (path.name, "MANO_RIGHT.pkl", "MANO_LEFT.pkl")
     files = [folder / name for folder in folders for name in names if name.endswith(".pkl")]
     return [file for file in files if file.is_file()]
+
+
+def _opens_the_machine(path: Path) -> bool:
+    absolute = os.path.abspath(path)
+    # Links of the process table cannot be followed for everybody; they are refused before.
+    real = os.path.realpath(absolute) if not _of_the_kernel(absolute) else absolute
+    return real in _NEVER_EXPOSED or _of_the_kernel(real)
+
+
+def _of_the_kernel(path: str) -> bool:
+    return any(Path(path).is_relative_to(top) for top in _NEVER_FROM)
 
 
 def _taken(names: Sequence[str]) -> dict[str, str]:
@@ -197,26 +221,33 @@ def _torch_home() -> Path:
     return Path(os.environ.get("TORCH_HOME") or f"{cache}/torch").expanduser()
 
 
-def _own_cache(method: Path, output: Path) -> Path:
-    name = hashlib.sha256(os.fsencode(_identity(method.resolve()))).hexdigest()[:16]
-    cache = cache_root().absolute() / "methods" / name
-    try:
-        cache.mkdir(parents=True, exist_ok=True)
-    except OSError:
-        cache = output.resolve() / "cache"
-        cache.mkdir()
-    return cache.resolve()
+def _cache_environment(method: Path, output: Path) -> dict[str, str]:
+    """Variables of the caches: a new one for this run, and the machine code of the toolkit.
 
-
-def _identity(method: Path) -> str:
-    """Return what makes a method the same program as another time: its place, as a rule.
-
-    A method that ships has its name: its machine code is then found after another installation.
+    A method that ships is the toolkit's own code and compiles for all; another one only reads.
     """
-    for folder in (data_folder("baselines"), PACKAGES / "wildghand"):
-        if method.is_relative_to(folder):
-            return f"{folder.name}/{method.relative_to(folder)}"
-    return os.fspath(method)
+    cache = output.resolve() / CACHE
+    cache.mkdir(mode=0o700, exist_ok=True)
+    environment = {
+        "HWP_CACHE": str(cache),
+        "NUMBA_CACHE_DIR": str(cache / "numba"),
+        "HWP_KERNELS": str(_kernels()),
+    }
+    if _ships(method):
+        with contextlib.suppress(OSError):
+            _kernels().mkdir(mode=0o700, parents=True, exist_ok=True)
+            environment[KEPT_KERNELS] = str(_kernels())
+    return environment
+
+
+def _kernels() -> Path:
+    return cache_root().absolute() / "kernels"
+
+
+def _ships(method: Path) -> bool:
+    """Whether a method is a part of this installation of the toolkit."""
+    real = method.resolve()
+    return any(map(real.is_relative_to, (data_folder("baselines"), PACKAGES / "wildghand")))
 
 
 def visible_places(
@@ -224,7 +255,7 @@ def visible_places(
     read: Iterable[Path],
     write: Iterable[Path],
     hidden: Iterable[Path] = (),
-    program: str | None = None,
+    scratch: int = SCRATCH_BYTES,
 ) -> list[Place]:
     """Return the places that a sandbox shows, outer ones first.
 
@@ -232,14 +263,14 @@ def visible_places(
         read: files and folders that it may read, besides the system, Python and the toolkit.
         write: folders that it may write to.
         hidden: folders that stay empty even inside a folder that it may read.
-        program: the program that is started; a Python environment that it lies in is shown.
+        scratch: size of each scratch folder, bytes.
     """
     chosen: dict[str, tuple[str, str]] = {
         "/proc": ("proc", ""),
         "/dev/fd": ("link", "/proc/self/fd"),
     }
-    chosen |= dict.fromkeys(_SCRATCH, ("scratch", ""))
-    shown = [*_system(), *python_places(), *environment_of(program), *map(os.fspath, read)]
+    chosen |= dict.fromkeys(SCRATCH, ("scratch", str(scratch)))
+    shown = [*_system(), *python_places(), *map(os.fspath, read)]
     rooms = secluded_rooms([*shown, "/usr/local", *glob("/opt/*")])
     groups: Sequence[tuple[str, Iterable[str | Path]]] = (
         ("read", shown),
@@ -258,9 +289,10 @@ def visible_places(
 
 
 def _system() -> list[str]:
-    devices = [path for name in _DEVICES for path in glob(f"/dev/{name}")]
+    names = (*_DEVICES, *_ACCELERATORS)
+    devices = [path for name in names for path in glob(f"/dev/{name}")]
     named = {"/": _SYSTEM, "/etc/": _ETC, "/sys/": _SYS}
-    return [f"{top}{name}" for top, names in named.items() for name in names] + devices
+    return [f"{top}{name}" for top, below in named.items() for name in below] + devices
 
 
 def _resolved(path: str) -> tuple[list[tuple[str, str]], str]:

@@ -18,6 +18,7 @@ from typing import Any, NoReturn
 
 from hwp_bench.run.sandbox import syscalls
 from hwp_bench.run.sandbox.root import enter_root, raise_loopback
+from hwp_bench.run.sandbox.system_calls import refuse_calls
 
 _NAMESPACES = (
     syscalls.CLONE_NEWUSER
@@ -33,8 +34,9 @@ _PATIENCE = 5.0
 def main(report: int) -> None:
     """Carry out one order.
 
-    The order holds `command`, `folder`, `environment`, `parent` (process id of whoever waits) and
-    `places` (null for a run without namespaces). The report is one JSON object: `status` (an exit
+    The order holds `command`, `folder`, `environment`, `parent` (process id of whoever waits),
+    `places` (null for a run without namespaces) and `memory_files` (whether `memfd_create` stays).
+    The report is one JSON object: `status` (an exit
     status, or a signal's number below 0), or `problem` with `stage` (`sandbox` or `command`).
 
     Args:
@@ -47,6 +49,9 @@ def main(report: int) -> None:
     os.close(silence)
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     _offer_to_oom_killer()
+    # Where the system has no keys or forbids the call, there is nothing to be left behind.
+    with contextlib.suppress(OSError):
+        syscalls.leave_session_keyring()
     try:
         run = _run_in_namespaces if order["places"] is not None else _run_watched
         answer = run(order)
@@ -132,6 +137,7 @@ def _be_first(order: dict[str, Any], go: int, answer: int) -> NoReturn:
             raise_loopback()
         syscalls.give_up_privileges()
         syscalls.hide_from_peers()
+        refuse_calls(memory_files=order["memory_files"])
         child, problem = _start(order)
         if problem:
             result = {"stage": "command", "problem": problem}

@@ -1,4 +1,7 @@
-"""The folders of Python that a sandbox shows: interpreters, their packages, the toolkit."""
+"""The folders of Python that a sandbox shows: the interpreter, its packages, the toolkit.
+
+The list is fixed: another interpreter is shown only where a person names it (`--expose`).
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,8 @@ from pathlib import Path
 
 from hwp_bench.base.packages import PACKAGES
 
-_ENVIRONMENT_MARKS = ("pyvenv.cfg", "conda-meta")
+#: Files that a project has at its top, next to what nobody needs who imports it.
+_PROJECT_MARKS = ("pyproject.toml", "setup.py", "setup.cfg", ".git")
 
 
 def python_places() -> list[str]:
@@ -26,14 +30,16 @@ def _sites() -> list[str]:
 
 
 def of_packages(folder: str) -> list[str]:
-    """Return what is shown of a folder on the path: of a checkout of the toolkit, its packages.
+    """Return what is shown of a folder on the path: of a project, its packages and modules.
 
-    Methods need nothing else of it, such as tests, runs and history.
+    Methods need nothing else of it, such as tests, runs, history and files with secrets.
     """
     real = os.path.realpath(folder)
-    if not _is_checkout(real):
+    if not any(os.path.exists(os.path.join(real, mark)) for mark in _PROJECT_MARKS):
         return [folder]
-    return [os.path.dirname(path) for path in glob(f"{escape(real)}/*/__init__.py")]
+    packages = [os.path.dirname(path) for path in glob(f"{escape(real)}/*/__init__.py")]
+    modules = [path for end in ("py", "so") for path in glob(f"{escape(real)}/*.{end}")]
+    return packages if _is_checkout(real) else [*packages, *modules]
 
 
 def checkout() -> list[str]:
@@ -52,16 +58,3 @@ def _linked(sites: Iterable[str]) -> list[str]:
     files = [path for folder in sites for path in glob(f"{folder}/*.pth")]
     lines = [line for path in files for line in Path(path).read_text(errors="replace").splitlines()]
     return [line.strip() for line in lines if os.path.isabs(line) and os.path.isdir(line.strip())]
-
-
-def environment_of(program: str | None) -> list[str]:
-    """Return the Python environment that a program lies in, and the one that it was made from.
-
-    Nothing for other programs: an untrusted command must not choose what is shown.
-    """
-    if program is None or not os.path.isabs(program):
-        return []
-    prefix = os.path.dirname(os.path.dirname(program))
-    if not any(os.path.exists(f"{prefix}/{mark}") for mark in _ENVIRONMENT_MARKS):
-        return []
-    return [prefix, os.path.dirname(os.path.dirname(os.path.realpath(program)))]

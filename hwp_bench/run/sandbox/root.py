@@ -14,16 +14,14 @@ from collections.abc import Sequence
 
 from hwp_bench.run.sandbox import syscalls
 
-#: Size of a scratch folder, bytes; it counts as memory.
-SCRATCH_BYTES = 1 << 30
-
 # A folder that exists everywhere; its content is bound out of the old root.
 _STAGE = "/tmp"
 _OLD, _NEW = "/old", "/new"
 
-#: One place: kind, path, and the target of a link (empty for the others). The kinds are `read` and
-#: `write` (the place as it is, read-only or writable), `hidden` (an empty folder), `scratch` (a
-#: private writable folder), `link` (a symbolic link) and `proc` (the process table, read-only).
+#: One place: kind, path, and a third word that is empty for most. The kinds are `read` and `write`
+#: (the place as it is, read-only or writable), `hidden` (an empty folder), `scratch` (a private
+#: writable folder; the third word is its size, bytes), `link` (a symbolic link; its target) and
+#: `proc` (the process table, read-only).
 Place = tuple[str, str, str]
 
 
@@ -83,7 +81,7 @@ def _show(place: Place) -> str | None:
         _restrict_machine(here)
     elif kind == "scratch":
         os.makedirs(here, exist_ok=True)
-        _tmpfs(here, f"size={SCRATCH_BYTES},mode=1777")
+        _tmpfs(here, f"size={target},mode=1777")
     elif os.path.isdir(here):
         _tmpfs(here, "size=1m,mode=755")
         return here

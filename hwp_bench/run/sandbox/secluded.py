@@ -51,7 +51,9 @@ def _parts(package: str) -> list[str]:
         return [
             entry.path
             for entry in entries
-            if entry.is_dir() and entry.name not in SHOWN_ROOMS | {"__pycache__"}
+            # A link would have another place hidden.
+            if entry.is_dir(follow_symlinks=False)
+            and entry.name not in SHOWN_ROOMS | {"__pycache__"}
         ]
 
 

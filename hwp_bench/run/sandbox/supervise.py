@@ -14,15 +14,15 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, TYPE_CHECKING, Any
+from typing import IO, Any
 
 from hwp_bench.base.errors import MethodFailed
 from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.text import shown
 from hwp_bench.base.trees import open_up
+from hwp_bench.run.sandbox import memory
+from hwp_bench.run.sandbox.memory import ControlGroup, Measure
 from hwp_bench.run.sandbox.root import Place
-
-if TYPE_CHECKING:
-    import psutil
 
 #: Bytes of a program's output that are kept, half of its beginning and half of its end; the middle
 #: is counted and thrown away.
@@ -31,6 +31,7 @@ MAX_LOG_BYTES = 1024 * 1024
 MAX_PROCESSES = 1024
 
 _POLL_SECONDS = 0.05
+# Memory is measured this often, and at every poll where more than half of the limit is taken.
 _MEASURE_SECONDS = 0.2
 # A bare interpreter, so that a run starts within a few hundredths of a second.
 _LAUNCH = (
@@ -52,6 +53,9 @@ class Program:
     places: Sequence[Place] | None
     #: File that takes what it prints.
     log: Path
+    #: Whether files that exist in memory alone can be made inside the walls; drivers of
+    #: accelerators may need them.
+    memory_files: bool = False
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,11 @@ class ProcessOutcome:
 
     #: Exit status, below 0 a signal's number; None where it was stopped or never started.
     status: int | None
-    #: Which limit stopped it (`time`, `memory`, `processes`), or None.
+    #: Which limit stopped it (`time`, `memory`, `processes`), `machine` where the machine's memory
+    #: ran out, or None.
     stopped: str | None = None
+    #: Whether the kernel ended processes meanwhile, of this program or another, for want of memory.
+    starved: bool = False
     #: Why there was no sandbox, or None.
     refused: str | None = None
     #: Why not all of the log could be written, or None.
@@ -108,6 +115,7 @@ def run_confined(
         pass_fds=(write,),
     )
     os.close(write)
+    watch = _Watch(process, limits, _join_group(process, limits))
     assert process.stdin is not None
     assert process.stdout is not None
     drain = threading.Thread(target=_drain, args=(process.stdout, log, log_problems), daemon=True)
@@ -117,16 +125,19 @@ def run_confined(
             with contextlib.suppress(BrokenPipeError):
                 process.stdin.write(_order(program))
                 process.stdin.close()
-            stopped = _watch(process, limits, on_poll)
+            stopped = watch.wait(on_poll)
         finally:
             _end(process)
             drain.join(timeout=5)
             if not drain.is_alive():  # what it reads from must not be taken from it
                 process.stdout.close()
+            starved = watch.finish()
         text = report.read()
     lost = log_problems[0] if log_problems else None
     if stopped is not None:
         return ProcessOutcome(None, stopped, log_problem=lost)
+    if watch.over:
+        return ProcessOutcome(None, "memory", log_problem=lost)
     answer: dict[str, Any] = json.loads(text) if text else {"status": process.returncode}
     if answer.get("stage") == "sandbox":
         return ProcessOutcome(None, refused=answer["problem"])
@@ -135,8 +146,22 @@ def run_confined(
             f"cannot be started ({answer['problem']})",
             where=program.command[0],
             field="entry.command",
+            remedy=_unseen(program.command[0]) if program.places is not None else None,
         )
-    return ProcessOutcome(answer["status"], log_problem=lost)
+    return ProcessOutcome(answer["status"], starved=starved, log_problem=lost)
+
+
+def _unseen(word: str) -> str:
+    """What may be wrong with a program that cannot be started inside the walls."""
+    leads = ""
+    with contextlib.suppress(OSError):  # links of the process table are closed to most
+        real = os.path.realpath(word)
+        leads = f" It leads to {shown(real)}." if os.path.isabs(word) and real != word else ""
+    return (
+        "A method sees the programs of the system, the toolkit's Python and its own folder, but "
+        f"not what links in that folder lead to.{leads} If you trust it and it needs another "
+        "interpreter, show it with --expose, its environment and what that was made from."
+    )
 
 
 def remove_odd_files(folder: Path) -> None:
@@ -155,31 +180,78 @@ def _order(program: Program) -> bytes:
         "environment": dict(program.environment),
         "places": program.places,
         "parent": os.getpid(),
+        "memory_files": program.memory_files,
     }
     return json.dumps(order).encode()
 
 
-def _watch(
-    process: subprocess.Popen[bytes], limits: Limits, on_poll: Callable[[], None] | None
-) -> str | None:
-    """Wait for the end of a process; returns the limit that it broke, if any."""
-    deadline = time.monotonic() + limits.seconds
-    measure = 0.0
-    while process.poll() is None:
-        now = time.monotonic()
-        if now > deadline:
-            return "time"
-        if now >= measure:
-            measure = now + _MEASURE_SECONDS
-            family = _processes_of(process.pid)
-            if len(family) > MAX_PROCESSES:
-                return "processes"
-            if _memory_of(family, limits.memory) > limits.memory:
-                return "memory"
-            if on_poll is not None:
-                on_poll()
-        time.sleep(_POLL_SECONDS)
-    return None
+def _join_group(process: subprocess.Popen[bytes], limits: Limits) -> ControlGroup | None:
+    """Put a launcher into a control group, where there can be one; it still waits for its order."""
+    group = memory.control_group(limits.memory)
+    if group is None:
+        return None
+    try:
+        group.take(process.pid)
+    except OSError:
+        group.remove()
+        return None
+    return group
+
+
+class _Watch:
+    """Waits for the end of a program, and looks how long it runs and what it takes.
+
+    Args:
+        process: the launcher.
+        limits: when the program is to be stopped.
+        group: the control group of its processes, if there is one.
+    """
+
+    def __init__(
+        self, process: subprocess.Popen[bytes], limits: Limits, group: ControlGroup | None
+    ) -> None:
+        self._process = process
+        self._limits = limits
+        self._group = group
+        self._measure = Measure()
+        self._kills = memory.kernel_kills()
+        #: Whether the kernel ended processes because they took more than the limit.
+        self.over = False
+
+    def wait(self, on_poll: Callable[[], None] | None) -> str | None:
+        """Wait for the end; returns the limit that the program broke, if any."""
+        deadline = time.monotonic() + self._limits.seconds
+        due = 0.0
+        while self._process.poll() is None:
+            now = time.monotonic()
+            if now > deadline:
+                return "time"
+            if now >= due:
+                family = _processes_of(self._process.pid)
+                memory.offer_to_kernel(family)
+                used = self._measure.used(family, self._limits.memory)
+                broken = self._broken(family, used)
+                if broken is not None:
+                    return broken
+                due = now + (0.0 if used > self._limits.memory / 2 else _MEASURE_SECONDS)
+                if on_poll is not None:
+                    on_poll()
+            time.sleep(_POLL_SECONDS)
+        return None
+
+    def _broken(self, family: Sequence[int], used: int) -> str | None:
+        if len(family) > MAX_PROCESSES:
+            return "processes"
+        if used > self._limits.memory or (self._group is not None and self._group.kills()):
+            return "memory"
+        return "machine" if memory.machine_is_short() else None
+
+    def finish(self) -> bool:
+        """Remove the control group when all has ended; returns whether the kernel lacked memory."""
+        if self._group is not None:
+            self.over = self._group.kills() > 0
+            self._group.remove()
+        return memory.kernel_kills() > self._kills
 
 
 def _end(process: subprocess.Popen[bytes]) -> None:
@@ -257,36 +329,10 @@ def _write_all(target: io.FileIO, data: bytes | bytearray) -> None:
         rest = rest[target.write(rest) :]
 
 
-def _processes_of(root: int) -> list[psutil.Process]:
+def _processes_of(root: int) -> list[int]:
     """Return the running descendants of a process, as far as the system shows them."""
     import psutil
 
     with contextlib.suppress(psutil.Error):
-        return psutil.Process(root).children(recursive=True)
+        return [child.pid for child in psutil.Process(root).children(recursive=True)]
     return []
-
-
-def _memory_of(processes: Sequence[psutil.Process], enough: int) -> int:
-    """Return the memory of some processes together, bytes.
-
-    Shared memory is counted once. That is slow to find out, so it is done only where the plain
-    sum, which is never smaller, is above `enough`.
-    """
-    total = sum(_resident(process) for process in processes)
-    return total if total <= enough else sum(_proportional(process) for process in processes)
-
-
-def _resident(process: psutil.Process) -> int:
-    import psutil
-
-    with contextlib.suppress(psutil.Error):
-        return process.memory_info().rss
-    return 0
-
-
-def _proportional(process: psutil.Process) -> int:
-    import psutil
-
-    with contextlib.suppress(psutil.Error, AttributeError):
-        return process.memory_full_info().pss
-    return _resident(process)

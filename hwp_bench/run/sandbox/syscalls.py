@@ -29,6 +29,11 @@ _AT_FDCWD = -100
 _AT_RECURSIVE = 0x8000
 #: The same number on every architecture, unlike those of older calls.
 _SYS_MOUNT_SETATTR = 442
+# keyctl(2), add_key(2) and their kind have numbers that differ.
+_SYS_KEYCTL = {"x86_64": 250, "aarch64": 219, "riscv64": 219}
+_KEYCTL_JOIN_SESSION_KEYRING = 1
+_PR_SET_SECCOMP = 22
+_SECCOMP_MODE_FILTER = 2
 _PR_SET_PDEATHSIG = 1
 _PR_SET_DUMPABLE = 4
 _PR_CAPBSET_DROP = 24
@@ -50,6 +55,12 @@ class _MountAttributes(ctypes.Structure):
         ("propagation", ctypes.c_uint64),
         ("userns_fd", ctypes.c_uint64),
     )
+
+
+class _FilterProgram(ctypes.Structure):
+    """`struct sock_fprog` of seccomp(2)."""
+
+    _fields_ = (("length", ctypes.c_ushort), ("instructions", ctypes.c_char_p))
 
 
 def _checked(result: int, step: str) -> None:
@@ -137,3 +148,27 @@ def give_up_privileges() -> None:
     header = (ctypes.c_uint32 * 2)(_CAPABILITY_VERSION_3, 0)
     none = (ctypes.c_uint32 * 6)()
     _checked(libc.capset(header, none), "dropping capabilities")
+
+
+def leave_session_keyring() -> None:
+    """Take a new, empty session keyring in place of the caller's (keyctl(2))."""
+    number = _SYS_KEYCTL.get(os.uname().machine)
+    if number is not None:
+        joined = _libc().syscall(number, _KEYCTL_JOIN_SESSION_KEYRING, None)
+        _checked(joined, "a new session keyring")
+
+
+def set_filter(program: bytes) -> None:
+    """Have the kernel run a filter on every system call from now on (seccomp(2)).
+
+    Args:
+        program: instructions of classic BPF, eight bytes each.
+
+    Raises:
+        Refused: there is no program, or the kernel takes none.
+    """
+    if not program:
+        raise Refused(errno.ENOSYS, f"filter of system calls: not known on {os.uname().machine}")
+    order = _FilterProgram(len(program) // 8, program)
+    done = _libc().prctl(_PR_SET_SECCOMP, _SECCOMP_MODE_FILTER, ctypes.byref(order), 0, 0)
+    _checked(done, "filter of system calls")

@@ -54,6 +54,12 @@ def test_an_untouched_result_holds(result: Path, capture: Capture, capsys) -> No
     assert found["cross_checked"] == 2
 
 
+def test_a_run_that_may_have_begun_with_anothers_cache_is_named(result, capture, capsys) -> None:
+    edit(result, lambda value: value["environment"].pop("caches"))
+    _, found = verify(result, capture, capsys)
+    assert any("code that another method left may have run" in note for note in found["notes"])
+
+
 @pytest.mark.parametrize(("formula", "metric"), [("ssim_map", "ssim"), ("squared_error", "psnr")])
 def test_a_fault_of_our_own_formula_is_found_out(
     capture: Capture, tmp_path: Path, capsys, monkeypatch, formula: str, metric: str

@@ -6,8 +6,10 @@ their log, and the process table outside.
 
 from __future__ import annotations
 
+import ctypes
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -276,3 +278,91 @@ def test_a_command_that_is_not_there_is_one_message(tmp_path: Path, mode: str) -
             tmp_path / "output",
             confinement=Confinement(mode),
         )
+
+
+def _environment_of_the_author(tmp_path: Path, script: str) -> tuple[Path, Path]:
+    """A method whose own `env` leads to a program of the user; returns it and the user's home."""
+    home = tmp_path / "home"
+    (home / "bin").mkdir(parents=True)
+    (home / "secret").write_text("PRIVATE-KEY")
+    tool = home / "bin" / "tool"
+    tool.write_text(f'#!{shutil.which("sh")}\n. "$1"\n')
+    tool.chmod(0o755)
+    method = tmp_path / "method"
+    (method / "env" / "bin").mkdir(parents=True)
+    (method / "env" / "pyvenv.cfg").write_text("home = /usr/bin\n")
+    (method / "env" / "bin" / "python").symlink_to(tool)
+    (method / "go.sh").write_text(script)
+    (method / "method.toml").write_text(
+        'schema = "hwp-method/1"\nname = "et"\n[entry]\n'
+        'command = ["{method}/env/bin/python", "{method}/go.sh"]\n'
+    )
+    return method, home
+
+
+def test_an_environment_in_a_method_opens_nothing(tmp_path: Path, namespaces: bool) -> None:
+    """A link in it to a program of the user showed the folder two levels above that program."""
+    if not namespaces:
+        pytest.skip("no user namespaces on this machine")
+    method, home = _environment_of_the_author(tmp_path, f"cat {tmp_path}/home/secret; exit 3\n")
+    places = read_manifest(method), "tiny", folder_of(tmp_path / "request"), tmp_path / "output"
+    with pytest.raises(MethodFailed, match=r"cannot be started \(No such file") as caught:
+        run_method(*places, confinement=Confinement("required"))
+    assert f"It leads to {home}/bin/tool" in str(caught.value)
+    assert "--expose" in str(caught.value)
+    assert (tmp_path / "output" / "log.txt").read_text() == ""
+
+
+def test_an_interpreter_that_a_person_names_runs(tmp_path: Path, namespaces: bool) -> None:
+    """And no more than what was named is seen."""
+    if not namespaces:
+        pytest.skip("no user namespaces on this machine")
+    script = f"cat {tmp_path}/home/secret 2> /dev/null || echo hidden\n"
+    method, home = _environment_of_the_author(tmp_path, script)
+    places = read_manifest(method), "tiny", folder_of(tmp_path / "request"), tmp_path / "output"
+    run_method(*places, confinement=Confinement("required", exposed=(home / "bin",)))
+    assert (tmp_path / "output" / "log.txt").read_text() == "hidden\n"
+
+
+def test_a_program_behind_the_process_table_is_one_message(
+    tmp_path: Path, namespaces: bool
+) -> None:
+    if not namespaces:
+        pytest.skip("no user namespaces on this machine")
+    method, _ = _environment_of_the_author(tmp_path, "")
+    program = method / "env" / "bin" / "python"
+    program.unlink()
+    program.symlink_to("/proc/1/cwd/bin/python3")
+    places = read_manifest(method), "tiny", folder_of(tmp_path / "request"), tmp_path / "output"
+    with pytest.raises(MethodFailed, match="cannot be started") as caught:
+        run_method(*places, confinement=Confinement("required"))
+    assert "but not what links in that folder lead to" in str(caught.value)
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_keys_of_the_caller_stay_with_the_caller(attack, mode: str) -> None:
+    """Inside the walls there are no keys; without them there is another session keyring.
+
+    Where the machine has no keys at all, all answers are -1.
+    """
+    script = """
+import ctypes
+libc = ctypes.CDLL(None, use_errno=True)
+x86 = os.uname().machine == "x86_64"
+keyctl, add_key = (250, 248) if x86 else (219, 217)
+print(json.dumps({
+    "keyring": libc.syscall(keyctl, 0, ctypes.c_long(-3), 0),
+    "left": libc.syscall(add_key, b"user", b"left-by-method", b"x", ctypes.c_long(1),
+                         ctypes.c_long(-3)),
+}))
+"""
+    x86 = os.uname().machine == "x86_64"
+    libc = ctypes.CDLL(None, use_errno=True)
+    keyctl = 250 if x86 else 219
+    mine = libc.syscall(keyctl, 0, ctypes.c_long(-3), 0)
+    _, said = attack(script, mode)
+    if mode == "required":
+        assert said == {"keyring": -1, "left": -1}
+    assert said["keyring"] == -1 or said["keyring"] != mine
+    # keyctl(KEYCTL_SEARCH): what a method leaves is not found outside.
+    assert libc.syscall(keyctl, 10, ctypes.c_long(-3), b"user", b"left-by-method", 0) == -1

@@ -8,8 +8,14 @@ from pathlib import Path
 import pytest
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.run.sandbox import confinement
-from hwp_bench.run.sandbox.confinement import Confinement, visible_places
+from hwp_bench.base.machine_code import KEPT
+from hwp_bench.base.packages import data_folder
+from hwp_bench.run.sandbox.confinement import (
+    Confinement,
+    sandbox_environment,
+    visible_places,
+)
+from hwp_bench.run.sandbox.pythons import of_packages
 
 
 def test_outer_places_come_first_and_the_deeper_rule_wins(tmp_path: Path) -> None:
@@ -45,18 +51,32 @@ def test_a_circle_of_links_ends(tmp_path: Path) -> None:
     assert visible_places(read=[tmp_path / "a"], write=[])
 
 
-def test_a_command_shows_its_python_environment_and_nothing_else_that_it_names(
-    tmp_path: Path,
-) -> None:
-    for name in ("env", "home"):
+def test_the_interpreters_that_are_shown_are_a_fixed_list(tmp_path: Path) -> None:
+    """Another one is shown where a person names it, and not where a method does."""
+    for name in ("env", "base"):
         (tmp_path / name / "bin").mkdir(parents=True)
-        (tmp_path / name / "bin" / "tool").touch()
+    (tmp_path / "base" / "bin" / "python").touch()
+    (tmp_path / "env" / "bin" / "python").symlink_to(tmp_path / "base" / "bin" / "python")
     (tmp_path / "env" / "pyvenv.cfg").touch()
-    for name, shown in (("env", True), ("home", False)):
-        program = str(tmp_path / name / "bin" / "tool")
-        paths = [path for _, path, _ in visible_places(read=[], write=[], program=program)]
-        assert (str(tmp_path / name) in paths) == shown
-    assert sys.prefix in [path for _, path, _ in visible_places(read=[], write=[])]
+    places = visible_places(read=[tmp_path / "env"], write=[])
+    paths = [path for _, path, _ in places]
+    assert str(tmp_path / "env") in paths
+    assert not any(str(tmp_path / "base") in word for place in places for word in place)
+    assert sys.prefix in paths
+    both = visible_places(read=[tmp_path / "env", tmp_path / "base"], write=[])
+    assert str(tmp_path / "base") in [path for _, path, _ in both]
+
+
+def test_of_a_project_on_the_path_only_what_is_imported_is_shown(tmp_path: Path) -> None:
+    (tmp_path / "package").mkdir()
+    (tmp_path / "package" / "__init__.py").touch()
+    (tmp_path / "secrets").mkdir()
+    for name in ("module.py", ".env", "notes.txt"):
+        (tmp_path / name).touch()
+    assert of_packages(str(tmp_path)) == [str(tmp_path)]  # a folder of packages, such as src/
+    (tmp_path / "pyproject.toml").touch()
+    shown = sorted(Path(path).name for path in of_packages(str(tmp_path)))
+    assert shown == ["module.py", "package"]
 
 
 @pytest.mark.parametrize("wrong", [{"mode": "maybe"}, {"memory_limit": 0}])
@@ -65,21 +85,31 @@ def test_wrong_settings_are_named(wrong: dict) -> None:
         Confinement(**wrong)
 
 
-def test_a_method_that_ships_has_one_cache_in_every_installation(
+@pytest.mark.parametrize("place", ["/", "/proc", "/proc/1/cwd", "/dev/../sys", "/dev/shm"])
+def test_what_would_open_the_machine_is_not_exposed(place: str) -> None:
+    with pytest.raises(UsageError, match="would open the whole machine") as caught:
+        Confinement(exposed=(Path(place),))
+    assert caught.value.field == "--expose"
+
+
+def test_only_methods_that_ship_compile_for_others(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Its machine code is found after an update; methods elsewhere have one for each place."""
-    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "cache"))
-    found = []
-    for name in ("one", "two"):
-        root = tmp_path / name
-        for method in ("baselines/plain", "baselines/other", "wildghand", "mine"):
-            (root / method).mkdir(parents=True)
-        monkeypatch.setattr(confinement, "PACKAGES", root)
-        monkeypatch.setattr(confinement, "data_folder", root.joinpath)
-        places = ("baselines/plain", "baselines/other", "wildghand", "mine")
-        found.append([confinement._own_cache(root / place, root) for place in places])
-    one, two = found
-    assert one[:3] == two[:3]
-    assert one[3] != two[3]
-    assert len({*one, *two}) == 5
+    """A copy of a shipped method in another place is somebody else's."""
+    monkeypatch.setenv("HWP_CACHE", str(tmp_path / "toolkit"))
+    copy = tmp_path / "plain"
+    copy.mkdir()
+    (tmp_path / "request").mkdir()
+    for method, ships in ((data_folder("baselines") / "plain", True), (copy, False)):
+        output = tmp_path / f"output-{ships}"
+        output.mkdir()
+        environment, places = sandbox_environment(
+            method, tmp_path / "request", output, Confinement()
+        )
+        kernels = str(tmp_path / "toolkit" / "kernels")
+        assert environment["HWP_CACHE"] == str(output / "cache")
+        assert environment["HWP_KERNELS"] == kernels
+        assert (environment.get(KEPT) == kernels) == ships
+        kinds = {path: kind for kind, path, _ in places}
+        assert kinds[kernels] == ("write" if ships else "read")
+        assert kinds[str(tmp_path / "toolkit")] == "hidden"

@@ -103,7 +103,7 @@ def test_of_a_checkout_only_packages_are_shown(tmp_path: Path) -> None:
     for name in ("hwp_bench", "wildghand"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "__init__.py").touch()
-    for name in (".git", "runs", "tests"):
+    for name in ("runs", "tests"):
         (tmp_path / name).mkdir()
     assert of_packages(str(tmp_path)) == [str(tmp_path)]
     (tmp_path / "pyproject.toml").touch()
