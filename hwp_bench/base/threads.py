@@ -1,4 +1,4 @@
-"""What the environment tells numerical libraries of their threads: how they wait, how many.
+"""Variables that tell numerical libraries how their threads wait, and how many there are.
 
 A library reads its variables when it is loaded, so they are set before: how threads wait when
 `hwp_bench` is imported, and how many BLAS has before a process of ours imports its work.
@@ -7,7 +7,7 @@ Processes that we start inherit both. What a person has set stays.
 Threads that wait for their next piece of work either sleep or spin. Beside another busy process
 those that spin take the processor from the one that they wait for, so that a step takes ten times
 as long. torch's OpenMP (GNU's, LLVM's and Intel's) and OpenCV's pool can be told to sleep. The pool
-of OpenBLAS, which NumPy and SciPy have, cannot: it gets one thread. Numba's pool sleeps, and starts
+of OpenBLAS, which NumPy and SciPy have, cannot: it gets one thread. Numba's pool starts
 only with functions that are compiled with `parallel=True`, of which we have none.
 """
 

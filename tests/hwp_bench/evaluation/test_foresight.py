@@ -58,8 +58,9 @@ def _method(folder: Path, entry: str = 'python = "mine:Method"', code: str = MET
         (["--set", "light.degre=1"], 1, "Did you mean 'light.degree'?"),
         (["--preset", "fast"], 1, "has no preset 'fast'"),
         (["--expose", "nowhere"], 2, "nowhere: --expose: does not exist"),
-        (["--out", "mine/mine.py"], 1, "cannot be a results folder"),
-        (["--out", "mine/mine.py/deeper"], 1, "cannot be a results folder"),
+        (["--out", "mine/mine.py"], 2, "--out: lies in the input METHOD"),
+        (["--out", "file"], 1, "cannot be a results folder"),
+        (["--out", "file/deeper"], 1, "cannot be a results folder"),
         (["--splits", "nowhere.json"], 1, "nowhere.json: does not exist"),
         (["--engine", "rai"], 2, "is not an engine"),
         (["--set", "level=bright"], 1, "mine cannot be made: ValueError: could not convert"),
@@ -69,6 +70,7 @@ def test_a_wrong_call_renders_nothing(
     command: str, words: list[str], status: int, problem: str, tmp_path: Path, capsys
 ) -> None:
     _method(tmp_path / "mine")
+    (tmp_path / "file").write_text("mine")
     with open(tmp_path / "mine" / "method.toml", "a") as stream:
         stream.write("[switches.a]\nsettings_off = {level = 0.1}\n")
     assert main([command, "mine", "--suite", "smoke", *words]) == status

@@ -34,7 +34,7 @@ _FEW = settings(_MANY, max_examples=5)
 
 
 def _sound() -> Results:
-    results = complete_results("plain", lambda number, frame: 20.0 + number + frame % 3)
+    results = complete_results("ours", lambda number, frame: 20.0 + number + frame % 3)
     curve = [CurvePoint(0, 0.5, 10**8, {"psnr": 15.0}), CurvePoint(9, 1.5, 10**8, {"psnr": 19.0})]
     return replace(results, captures=[replace(c, curve=curve) for c in results.captures])
 
