@@ -19,7 +19,7 @@ from wildghand.evidence.settings import EvidenceSettings
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.kept_tensors import kept_tensor
 
-_OFFSETS, _SHAPES = "evidence_offsets_", "evidence_shapes_"
+_OFFSETS, _SHAPES, _WALLS = "evidence_offsets_", "evidence_shapes_", "evidence_wall_"
 # The disc: standard deviations along the skin and across it, in spacings of the anchors, and its
 # opacity before the sigmoid.
 _WIDE, _THIN, _OPAQUE = 0.6, 0.2, 4.0
@@ -33,6 +33,8 @@ class Evidence:
     offsets: Mapping[str, Tensor]
     #: (N,) by side, of scales, orientation and transparency.
     shapes: Mapping[str, Tensor]
+    #: Sides whose open wrist is drawn without the wall that closes it.
+    open_wrists: frozenset[str] = frozenset()
 
     def settle(
         self, side: str, raw: RawAttributes, spacing: float, log_scale_bias: float
@@ -63,11 +65,41 @@ class Evidence:
             logit_colors=raw.logit_colors,
         )
 
+    def spare(self, chosen: Mapping[str, Tensor]) -> Evidence:
+        """Keep all of some Gaussians.
+
+        Args:
+            chosen: (N,) bool by side, which.
+        """
+
+        def kept(shares: Mapping[str, Tensor]) -> dict[str, Tensor]:
+            return {
+                side: torch.where(chosen[side], torch.ones_like(share), share)
+                for side, share in shares.items()
+            }
+
+        return replace(self, offsets=kept(self.offsets), shapes=kept(self.shapes))
+
+    def spare_all(self) -> Evidence:
+        """Keep all of all Gaussians."""
+        return self.spare({side: torch.ones_like(share) > 0 for side, share in self.shapes.items()})
+
+    def equals(self, other: Evidence | None) -> bool:
+        """Whether another has the same shares."""
+        if other is None:
+            return False
+        mine, theirs = self.to_tensors(), other.to_tensors()
+        return all(torch.equal(shares, theirs[name]) for name, shares in mine.items())
+
     def to_tensors(self) -> dict[str, Tensor]:
         """The shares by the names under which an avatar keeps them."""
         return {
             **{f"{_OFFSETS}{side}": shares for side, shares in self.offsets.items()},
             **{f"{_SHAPES}{side}": shares for side, shares in self.shapes.items()},
+            **{
+                f"{_WALLS}{side}": shares.new_tensor([float(side not in self.open_wrists)])
+                for side, shares in self.shapes.items()
+            },
         }
 
     @classmethod
@@ -92,9 +124,11 @@ class Evidence:
         for side, count in counts.items():
             for name in (f"{_OFFSETS}{side}", f"{_SHAPES}{side}"):
                 kept_tensor(tensors, name, (count,), (0, 1), where)
+            kept_tensor(tensors, f"{_WALLS}{side}", (1,), (0, 1), where)
         return cls(
             {side: tensors[f"{_OFFSETS}{side}"].float() for side in counts},
             {side: tensors[f"{_SHAPES}{side}"].float() for side in counts},
+            frozenset(side for side in counts if not bool(tensors[f"{_WALLS}{side}"] > 0.5)),
         )
 
 
@@ -130,8 +164,6 @@ def strengths(settings: EvidenceSettings) -> list[EvidenceSettings]:
     """The strengths among which validation frames choose, the settings' own first.
 
     The others are a quarter and four times of its `offset_share`, and offsets as they were learnt.
-    Discs stay in each of them: they close what no frame shows, which validation frames, taken from
-    where the camera stood, show neither.
     """
     share = settings.offset_share
     return [settings, *(replace(settings, offset_share=factor * share) for factor in (0.25, 4, 0))]

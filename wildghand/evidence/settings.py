@@ -27,6 +27,6 @@ class EvidenceSettings:
     #: rest is that of the skin around it. 0: all of it is its own.
     fill_share: float = number(0.02, 0.0, 100.0)
     #: After the last step, take a quarter or four times of `offset_share`, or 0, where that draws
-    #: the validation frames better; then five times of `fill_share`, or 0. With fewer than four of
-    #: these frames the settings hold.
+    #: the validation frames better, and nothing of it where that draws them much better; then five
+    #: times of `fill_share`, or 0. With fewer than four of these frames the settings hold.
     validated: bool = True

@@ -22,7 +22,7 @@ from wildghand.fitting.believed_poses import in_believed_poses
 from wildghand.fitting.borrowed_colors import BorrowedColors
 from wildghand.fitting.cast_shadows import cast_shadows, shadows_in
 from wildghand.fitting.closing import MOST_OF_BUDGET, LightFit, weight_masks
-from wildghand.fitting.evidence_choice import EvidenceChoice
+from wildghand.fitting.evidence_choice import EvidenceChoice, Gaps
 from wildghand.fitting.filled_colors import FilledColors
 from wildghand.fitting.hand_masks import hand_masks
 from wildghand.fitting.judged_drawings import JudgedDrawings
@@ -122,6 +122,7 @@ class Fit:
             count,
             judged,
             FilledColors(self.model, self.borrowed, shown, count),
+            Gaps(self.model, self.clip, self.weighting.visible, count),
         )
         temporal = begin_temporal_weights(self.model, self.weighting, settings)
         self.objective = Objective(settings, self.model.rigs, temporal, device)

@@ -11,6 +11,8 @@ import torch
 from torch import Tensor
 
 from hwp_bench.methods.contract import TrainingCapture
+from hwp_bench.metrics.pixels import scored_pixels
+from hwp_bench.metrics.protocol import HWP_V1
 from wildghand.evidence import ColorChanges, Evidence
 from wildghand.fitting.cast_shadows import Dark, shadows_in
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
@@ -98,7 +100,7 @@ class JudgedDrawings:
         evidence: Evidence | None,
         changes: ColorChanges | None,
     ) -> float:
-        """Mean squared error of sRGB over the hand.
+        """Mean squared error of sRGB over the pixels of the hand that scoring looks at.
 
         Args:
             predicted: the frames, by row.
@@ -113,11 +115,11 @@ class JudgedDrawings:
             for row, hands in predicted.items():
                 image, hand = self._truth(row)
                 off = (self._drawn(row, hands).clamp(0.0, 1.0) - image).square().mean(dim=-1)
-                squares += float((off * hand).sum())
+                squares += float(off[hand].sum())
                 pixels += float(hand.sum())
         finally:
             model.evidence, model.color_changes = before
-        return squares / pixels
+        return squares / max(pixels, 1.0)
 
     @functools.cached_property
     def seconds(self) -> DrawingSeconds:
@@ -146,10 +148,14 @@ class JudgedDrawings:
         return dark
 
     def _truth(self, row: int) -> tuple[Tensor, Tensor]:
-        """(H, W, 3) image and (H, W) coverage of the hand."""
+        """(H, W, 3) image, and (H, W) bool, the pixels that are judged.
+
+        Masks are estimates: the pixels at their border mix hand and background.
+        """
         device = self.model.log_gains.device
         image = self.frames.images[row].to(device).float() / 255.0
-        return image, self.frames.masks[row].to(device).float() / 255.0
+        hand = scored_pixels(self.frames.masks[row].numpy(), erosion=HWP_V1.mask_erosion)
+        return image, torch.from_numpy(hand).to(device)
 
     def _drawn(self, row: int, predicted: Predicted) -> Tensor:
         """(H, W, 3) sRGB over black."""

@@ -48,10 +48,13 @@ class StateChoice:
         return None if self.judges is None else self.states.choose(self.error)
 
     def error(self) -> float:
-        """Mean squared error of the validation frames as the model draws them now."""
+        """Mean squared error of the validation frames as the model draws them now.
+
+        Evidence is chosen for the state that is kept, and has no say before.
+        """
         assert self.judges is not None
-        model = self.judges.model
-        return self.judges.error(self.judges.predict_all(), model.evidence, model.color_changes)
+        changes = self.judges.model.color_changes
+        return self.judges.error(self.judges.predict_all(), None, changes)
 
     def seconds(self) -> float:
         """Return about how long `choose` would take now; nothing of the model changes."""

@@ -281,7 +281,9 @@ class WildGHandModel(nn.Module):
         return rasterize_hands(parts, viewmats, Ks, width, height)
 
     def wall(self, side: str) -> WristWall | None:
-        """What closes the wrist of one hand; None while there is no evidence, or no open end."""
+        """What closes the wrist of one hand; None without evidence, or where it stays open."""
+        if self.evidence is None or side in self.evidence.open_wrists:
+            return None
         return self._walls.get(side)
 
     def walls(self, found: Mapping[str, tuple[Gaussians, Hand]]) -> list[Gaussians]:
@@ -290,11 +292,8 @@ class WildGHandModel(nn.Module):
         Args:
             found: by side, as `gaussians` returns them.
         """
-        return [
-            self._walls[side].close(made, *hand)
-            for side, (made, hand) in found.items()
-            if side in self._walls
-        ]
+        several = ((self.wall(side), *each) for side, each in found.items())
+        return [wall.close(made, *hand) for wall, made, hand in several if wall is not None]
 
     def gaussians(
         self,

@@ -133,6 +133,7 @@ def test_an_avatar_keeps_its_evidence(make_training: TrainingMaker, tmp_path: Pa
         ({"evidence_shapes_right": None}, "shape"),
         ({"evidence_shapes_right": torch.full((4,), 1.5)}, "0 to 1"),
         ({"evidence_offsets_right": torch.full((4,), float("nan"))}, "0 to 1"),
+        ({"evidence_wall_right": None}, "shape"),
     ],
 )
 def test_damaged_evidence_is_refused(change: dict[str, torch.Tensor | None], message: str) -> None:

@@ -5,8 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -24,9 +26,11 @@ from wildghand.evidence import (
     strengths,
     weigh_evidence,
 )
-from wildghand.fitting.evidence_choice import EvidenceChoice
+from wildghand.fitting.evidence_choice import EvidenceChoice, Gaps
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.training import load_validation_frames
+from wildghand.model.dress import Gaussians
+from wildghand.model.rasterize_hands import rasterize_hands
 from wildghand.subject.fit_subject import LEAST_CHOOSING
 
 QUICK: dict[str, Any] = {**UNJUDGED, "light.enabled": False}
@@ -48,11 +52,18 @@ def training(make_training: TrainingMaker) -> TrainingCapture:
     return made
 
 
+def spared(fit: Fit, index: int) -> Evidence:
+    """The evidence of one of the strengths, without the Gaussians that close gaps."""
+    several = strengths(fit.settings.evidence)
+    evidence = [weigh_evidence(fit.choice.shown, len(fit.frames), each) for each in several]
+    # The third opens the most: it asks for four times the frames.
+    return evidence[index].spare(fit.choice.gaps.closers(evidence[2]))
+
+
 def drawn_with(fit: Fit, training: TrainingCapture, index: int) -> np.ndarray:
     """(F, H, W, 3) validation frames as the avatar draws them with one of the strengths."""
-    chosen = strengths(fit.settings.evidence)[index]
     before = fit.model.evidence
-    fit.model.evidence = weigh_evidence(fit.choice.shown, len(fit.frames), chosen)
+    fit.model.evidence = spared(fit, index)
     avatar = fit.avatar(0)
     images = [
         avatar.render(training.hand_poses(frame), training.camera(frame))[..., :3]
@@ -83,14 +94,14 @@ def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> 
     fit = begun(training)
     assert fit.choice.drawings is not None
     frames = fit.choice.drawings.frames
-    hand = frames.masks.numpy()[..., None] / 255.0
+    erode = np.ones((3, 3), np.uint8)
+    inside = [cv2.erode((mask > 127).astype(np.uint8), erode) for mask in frames.masks.numpy()]
+    hand = np.stack(inside)[..., None]
     truth = frames.images.numpy() / 255.0
-    for index, settings in enumerate(strengths(fit.settings.evidence)):
+    for index in range(len(strengths(fit.settings.evidence))):
         off = (drawn_with(fit, training, index) - truth) ** 2 * hand
         expected = off.sum() / hand.sum() / 3.0
-        found = error_with(
-            fit.choice, weigh_evidence(fit.choice.shown, len(fit.frames), settings), None
-        )
+        found = error_with(fit.choice, spared(fit, index), None)
         assert found == pytest.approx(expected, rel=1e-4)
 
 
@@ -101,16 +112,136 @@ def test_the_strength_that_draws_the_frames_best_is_chosen(
     fit = begun(training)
     images = torch.from_numpy((255.0 * drawn_with(fit, training, index)).round().astype(np.uint8))
     choice = judged_by(fit.choice, images)
-    found = choice.best()
-    if index == 0:  # the model has it already
-        assert found == []
-        return
-    (evidence,) = found
+    (evidence,) = choice.best()
     assert isinstance(evidence, Evidence)
-    chosen = strengths(fit.settings.evidence)[index]
-    expected = weigh_evidence(fit.choice.shown, len(fit.frames), chosen).to_tensors()
-    for name, shares in evidence.to_tensors().items():
-        assert torch.equal(shares, expected[name])
+    assert evidence.equals(spared(fit, index))
+    fit.model.keep(evidence)
+    assert choice.best() == []  # the model has it already
+
+
+def test_gaussians_stay_as_learnt_where_that_draws_the_frames_much_better(
+    training: TrainingCapture,
+) -> None:
+    fit = begun(training)
+    learnt = spared(fit, 0).spare_all()
+    before, fit.model.evidence = fit.model.evidence, learnt
+    avatar = fit.avatar(0)
+    drawn = [
+        avatar.render(training.hand_poses(frame), training.camera(frame))[..., :3]
+        for frame in training.validation.tolist()
+    ]
+    fit.model.evidence = before
+    images = torch.from_numpy((255.0 * np.clip(np.stack(drawn), 0.0, 1.0)).round().astype(np.uint8))
+    (evidence,) = judged_by(fit.choice, images).best()
+    assert isinstance(evidence, Evidence)
+    assert evidence.equals(learnt)
+    assert all(bool((shares == 1.0).all()) for shares in evidence.shapes.values())
+
+
+def test_a_wall_in_the_way_is_left_out_and_stays_out_of_a_file(
+    training: TrainingCapture, tmp_path: Path
+) -> None:
+    fit = begun(training)
+    side = next(iter(fit.model.rigs))
+    assert fit.model.wall(side) is not None
+    opened = dataclasses.replace(spared(fit, 0), open_wrists=frozenset({side}))
+    fit.model.keep(opened)
+    assert fit.model.wall(side) is None
+    save_avatar(fit.avatar(0), tmp_path / "avatar")
+    assert load_avatar(tmp_path / "avatar").model.wall(side) is None
+
+    # The error of a drawing with walls is twice that without.
+    class Walls:
+        def predict_all(self) -> dict[int, Any]:
+            return {}
+
+        def error(self, _: Any, evidence: Evidence, __: Any) -> float:
+            return 1.0 if side in evidence.open_wrists else 2.0
+
+    choice = dataclasses.replace(fit.choice, judges=Walls())  # type: ignore[arg-type]
+    fit.model.keep(spared(fit, 0))
+    (evidence,) = choice.best()
+    assert isinstance(evidence, Evidence)
+    assert evidence.equals(opened)
+
+
+def test_evidence_has_no_say_in_the_choice_of_a_state(training: TrainingCapture) -> None:
+    fit = odd_fit(training, {**QUICK, "schedule.validated": True})
+    expected = fit.state_choice.error()
+    discs = weigh_evidence(
+        {side: torch.zeros_like(count) for side, count in fit.choice.shown.items()},
+        len(fit.frames),
+        fit.settings.evidence,
+    )
+    fit.model.keep(discs)
+    assert fit.state_choice.error() == expected
+
+
+class GapModel:
+    """Nine Gaussians side by side and a tenth apart from them, which evidence takes away."""
+
+    def __init__(self) -> None:
+        self.rigs = {"right": range(10)}
+        self.log_gains = torch.zeros(1, 3)
+        self.evidence: Evidence | None = None
+
+    def gaussians(self, side: str, *hand: torch.Tensor) -> tuple[Gaussians, Any]:
+        """Fill a square of 12 px on the left; the last one is a spot on the right."""
+        grid = torch.tensor([-8.0, -4.0, 0.0])
+        means = torch.stack(
+            [*torch.meshgrid(grid - 4.0, grid + 4.0, indexing="ij"), torch.full((3, 3), 32.0)], -1
+        ).reshape(1, 9, 3)
+        far = means[:, :1] if self.evidence is not None else torch.tensor([[[10.0, 0.0, 32.0]]])
+        made = Gaussians(
+            means=torch.cat([means, far], dim=1),
+            quats=torch.tensor([1.0, 0.0, 0.0, 0.0]).expand(1, 10, 4),
+            scales=torch.full((10, 3), 2.0),
+            opacities=torch.full((10,), 0.95),
+            colors=torch.full((1, 10, 3), 0.5),
+        )
+        return made, hand
+
+    def rasterize(self, found: Any, *camera: Any) -> tuple[torch.Tensor, torch.Tensor]:
+        """Draw them."""
+        return rasterize_hands([made for made, _ in found.values()], *camera)
+
+
+@pytest.mark.parametrize("seen", [True, False])
+def test_gaussians_that_close_a_gap_are_found(seen: bool) -> None:
+    model, frames = GapModel(), 3
+    camera = torch.tensor([[32.0, 0.0, 16.0], [0.0, 32.0, 16.0], [0.0, 0.0, 1.0]])
+    clip = SimpleNamespace(
+        parameters={"right": (torch.zeros(frames, 16, 3), torch.zeros(10), torch.zeros(frames, 3))},
+        viewmats=torch.eye(4).expand(frames, 4, 4),
+        Ks=camera.expand(frames, 3, 3),
+    )
+    visible = torch.full((1, 32, 32), float(seen))
+    gaps = Gaps(model, clip, lambda rows: visible, frames)  # type: ignore[arg-type]
+    found = gaps.closers(Evidence({}, {}))["right"]
+    assert found.tolist() == [False] * 9 + [seen]
+    assert model.evidence is None
+
+
+def test_all_of_what_is_spared_is_kept() -> None:
+    shares = {"right": torch.tensor([0.0, 0.25, 0.5])}
+    chosen = {"right": torch.tensor([True, False, False])}
+    spared = Evidence(shares, shares, frozenset({"right"})).spare(chosen)
+    assert spared.offsets["right"].tolist() == [1.0, 0.25, 0.5]
+    assert spared.shapes["right"].tolist() == [1.0, 0.25, 0.5]
+    assert spared.open_wrists == {"right"}
+
+
+def test_the_border_of_an_estimated_mask_judges_nothing(training: TrainingCapture) -> None:
+    fit = begun(training)
+    drawings = fit.choice.drawings
+    assert drawings is not None
+    expected = error_with(fit.choice, spared(fit, 0), None)
+    frames, images = drawings.frames, drawings.frames.images.clone()
+    kernel = np.ones((3, 3), np.uint8)
+    for image, mask in zip(images, frames.masks.numpy(), strict=True):
+        hand = (mask > 127).astype(np.uint8)
+        image[torch.from_numpy(hand != cv2.erode(hand, kernel))] = 255
+    assert error_with(judged_by(fit.choice, images), spared(fit, 0), None) == expected
 
 
 def test_strengths_are_around_the_settings_own() -> None:
@@ -133,6 +264,7 @@ def test_the_fill_that_draws_the_frames_best_is_chosen(
     fit.model.color_changes = fills[index]
     images = torch.from_numpy((255.0 * drawn_with(fit, training, 0)).round().astype(np.uint8))
     fit.model.color_changes = None
+    fit.model.keep(spared(fit, 0))
     found = judged_by(choice, images).best()
     if index == 2:  # as they were learnt
         assert found == []
@@ -180,8 +312,13 @@ def test_nothing_is_chosen_where_it_is_off(
 ) -> None:
     fit = begun(training, **changes)
     assert fit.choice.drawings is None
+    if fit.settings.evidence.enabled:
+        # Gaps are closed all the same.
+        assert fit.choice.seconds() > 0.0
+        fit.model.keep(spared(fit, 0))
+    else:
+        assert fit.choice.seconds() == 0.0
     assert fit.choice.best() == []
-    assert fit.choice.seconds() == 0.0
 
 
 def test_a_frame_or_two_do_not_judge(training: TrainingCapture) -> None:
