@@ -180,7 +180,7 @@ def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Pa
     if field not in content:
         raise BadHandModel("is missing", where=file, field=field, remedy=_REMEDY)
     try:
-        array = _real(_unwrap(content[field]))
+        array = np.asarray(_unwrap(content[field]), dtype=np.float64)
         # chumpy selections are stored flat.
         array = array.reshape(shape) if array.ndim == 1 else _of_shape(array, shape)
     # An integer beyond the floats overflows.
@@ -194,14 +194,6 @@ def _dense(content: dict[str, Any], field: str, shape: tuple[int, ...], file: Pa
     if not np.isfinite(array).all():
         raise BadHandModel("holds NaN or infinity", where=file, field=field, remedy=_REMEDY)
     return array
-
-
-def _real(value: Any, dtype: type = np.float64) -> np.ndarray:
-    """An array of real numbers; numpy would drop the imaginary parts of complex ones."""
-    array = np.asarray(value)
-    if array.dtype.kind == "c":
-        raise TypeError("its numbers are complex")
-    return array.astype(dtype, copy=False)
 
 
 def _of_shape(array: np.ndarray, shape: tuple[int, ...]) -> np.ndarray:
@@ -218,8 +210,8 @@ def _unwrap(value: Any) -> Any:
     if value.origin.endswith("csc_matrix"):
         return _densify(state)
     if "idxs" in state:
-        chosen = _real(state["idxs"], np.int64)
-        return _real(_unwrap(state["a"])).ravel()[chosen]
+        chosen = np.asarray(state["idxs"], dtype=np.int64)
+        return np.asarray(_unwrap(state["a"]), dtype=np.float64).ravel()[chosen]
     return state["x"]
 
 
@@ -231,8 +223,8 @@ def _densify(state: dict[str, Any]) -> np.ndarray:
     if rows > JOINT_COUNT or columns > VERTEX_COUNT:
         raise ValueError(f"its shape is {shape}")
     # With their types: text among numbers would make numpy give every number room for the text.
-    data = _real(state["data"])
-    indices, indptr = (_real(state[key], np.int64) for key in ("indices", "indptr"))
+    data = np.asarray(state["data"], dtype=np.float64)
+    indices, indptr = (np.asarray(state[key], dtype=np.int64) for key in ("indices", "indptr"))
     matrix = csc_matrix((data, indices, indptr), shape=(rows, columns))
     matrix.check_format(full_check=True)
     return matrix.toarray()

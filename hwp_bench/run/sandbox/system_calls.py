@@ -28,6 +28,7 @@ _X86 = {
     "fchmod": 91,
     "syslog": 103,
     "mknod": 133,
+    "sched_setscheduler": 144,
     "pivot_root": 155,
     "prctl": 157,
     "mount": 165,
@@ -42,6 +43,7 @@ _X86 = {
     "perf_event_open": 298,
     "open_by_handle_at": 304,
     "setns": 308,
+    "sched_setattr": 314,
     "memfd_create": 319,
     "bpf": 321,
     "userfaultfd": 323,
@@ -56,6 +58,7 @@ _SHARED = {
     "openat": 56,
     "unshare": 97,
     "syslog": 116,
+    "sched_setscheduler": 119,
     "prctl": 167,
     "msgget": 186,
     "shmget": 194,
@@ -68,6 +71,7 @@ _SHARED = {
     "perf_event_open": 241,
     "open_by_handle_at": 265,
     "setns": 268,
+    "sched_setattr": 274,
     "memfd_create": 279,
     "bpf": 280,
     "userfaultfd": 282,
@@ -107,11 +111,12 @@ _NOT_THERE = (
     *("clone3", "openat2", "io_uring_setup", "io_uring_enter", "io_uring_register"),
     *("userfaultfd", "bpf", "perf_event_open"),
 )
-#: Refused whole: what would change the walls.
+#: Refused whole: what would change the walls, or take the processor from everything else.
 _FORBIDDEN = (
     *("mount", "umount2", "pivot_root", "open_tree", "open_tree_attr", "move_mount"),
     *("fsopen", "fsconfig", "fsmount", "fspick", "mount_setattr"),
     *("setns", "open_by_handle_at", "syslog"),
+    *("sched_setscheduler", "sched_setattr"),
 )
 _SET_ID = 0o6000
 #: `O_CREAT`, `O_TMPFILE`.

@@ -18,7 +18,7 @@ from made_results import made_results
 from small_captures import CaptureMaker
 from synthetic_mano import mano_content
 
-from hwp_bench.base.errors import BadHandModel, HwpError, reason_of
+from hwp_bench.base.errors import BadInput, HwpError, reason_of
 from hwp_bench.base.files import atomic_write, cache_root
 from hwp_bench.cli.main import main
 from hwp_bench.hands.mano import load_mano
@@ -137,9 +137,8 @@ def test_complex_numbers_of_a_hand_model_are_refused(field: str, tmp_path: Path)
     (tmp_path / "MANO_RIGHT.pkl").write_bytes(pickle.dumps(content))
     with warnings.catch_warnings():
         warnings.simplefilter("error")
-        with pytest.raises(BadHandModel, match="complex") as error:
+        with pytest.raises(BadInput, match="not plain numbers"):
             load_mano(str(tmp_path), "right")
-    assert error.value.field == field
 
 
 def test_the_sheet_is_explained_with_the_words_on_it() -> None:

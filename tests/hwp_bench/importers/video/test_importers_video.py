@@ -92,6 +92,7 @@ def test_the_capture_is_sound(capture: Capture, clip: SyntheticClip) -> None:
     assert info.source["fit"]["frames_detected"] == FRAMES - 1
     np.testing.assert_array_equal(capture.hands["right"].valid, np.arange(FRAMES) != 5)
     extra = json.loads((capture.root / "extra" / "import.json").read_text())
+    assert len(extra.pop("call")) == 64
     assert extra == info.source["fit"]
     assert read_rgb(capture.root / "extra" / "overlay.png").shape[2] == 3
 
