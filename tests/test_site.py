@@ -46,7 +46,7 @@ def test_every_page_of_docs_is_there(site: Path) -> None:
     pages = {path.stem for path in (ROOT / "docs").glob("*.md")}
     assert len(pages) > 15
     assert {page for page in pages if not (site / f"{page}.html").is_file()} == set()
-    assert "A first result" in (site / "index.html").read_text(encoding="utf-8")
+    assert "Cite it" in (site / "index.html").read_text(encoding="utf-8")
     assert "glossary" in (site / "contributing.html").read_text(encoding="utf-8")
 
 

@@ -171,7 +171,13 @@ def test_an_overwrite_that_is_stopped_leaves_the_old_results_whole(
     words = [sys.executable, "-m", "hwp_bench.cli.main", "evaluate", str(method), "-o", str(out)]
     words += ["--isolation", "none", "--seed", "1", "--set", "wait=second", "--overwrite"]
     words += ["--capture", *(str(capture.root) for capture in captures)]
-    process = subprocess.Popen(words, stderr=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        words,
+        stderr=subprocess.PIPE,
+        text=True,
+        # Where the tests run in the background, a child would ignore the signal as they do.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
+    )
     patience = Patience(spent_by(process.pid))
     while "second 1" not in fits(method):
         assert process.poll() is None, process.communicate()

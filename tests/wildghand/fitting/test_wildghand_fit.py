@@ -229,10 +229,10 @@ def test_the_commands_make_draw_and_export_an_avatar(
     header, _, body = (tmp_path / "hand.ply").read_bytes().partition(b"end_header\n")
     count = len(load_avatar(avatar).pose(load_avatar(avatar).rest_poses(), closed=True))
     assert f"element vertex {count}".encode() in header
-    # x y z, normal, f_dc, opacity, scale, rotation.
-    table = np.frombuffer(body, "<f4").reshape(count, 17)
+    # x y z, normal, f_dc, 45 of f_rest, opacity, scale, rotation.
+    table = np.frombuffer(body, "<f4").reshape(count, 62)
     assert np.isfinite(table).all()
-    np.testing.assert_allclose(np.linalg.norm(table[:, 13:], axis=1), 1.0, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.norm(table[:, 58:], axis=1), 1.0, atol=1e-5)
     assert (
         main(["render", str(avatar), "--poses", str(capture), "-o", "x", "--frames", "9:99"]) == 2
     )
