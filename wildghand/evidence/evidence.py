@@ -142,10 +142,11 @@ def weigh_evidence(shown: Mapping[str, Tensor], count: int, settings: EvidenceSe
         count: of all training frames, at least 1.
         settings: which share outweighs the prior.
     """
-    halves = settings.offset_share * count, settings.shape_share * count
-    return Evidence(
-        *({side: kept_share(frames, half) for side, frames in shown.items()} for half in halves)
-    )
+
+    def shares(half: float) -> dict[str, Tensor]:
+        return {side: kept_share(frames, half) for side, frames in shown.items()}
+
+    return Evidence(shares(settings.offset_share * count), shares(settings.shape_share * count))
 
 
 def kept_share(frames: Tensor, half: float) -> Tensor:
