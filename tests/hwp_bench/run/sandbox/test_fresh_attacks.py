@@ -14,6 +14,8 @@ from typing import Any
 import pytest
 from walled_script import run_walled
 
+from hwp_bench.base.files import cache_root
+
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="walls are Linux's")
 
 HEAD = """
@@ -128,9 +130,10 @@ ATTACKS: dict[str, tuple[str, set[str]]] = {
     "calls of the second table": ("call(0x40000000 | number(250, 0), 0, 0)", {"ENOSYS", "EACCES"}),
     # Caches.
     "code of the toolkit": ('write(os.environ["HWP_KERNELS"] + "/x.code")', {"EROFS", "ENOENT"}),
+    # Of a cache below /tmp the walls show the kernels alone, in a folder of scratch files.
     "the toolkit's cache": (
-        'write(os.path.dirname(os.environ["HWP_KERNELS"]) + "/x")',
-        {"EROFS", "ENOENT"},
+        'write(os.path.dirname(os.environ["HWP_KERNELS"]) + "/left-by-an-attack")',
+        {"EROFS", "ENOENT", "done None"},
     ),
     "packages of Python": ('write(os.path.dirname(json.__file__) + "/x.py")', {"EROFS"}),
 }
@@ -154,6 +157,11 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
 @pytest.mark.parametrize("name", sorted(ATTACKS))
 def test_an_attack_is_refused(answers: dict[str, Any], name: str) -> None:
     assert answers[name] in ATTACKS[name][1]
+
+
+def test_nothing_is_left_in_the_toolkits_cache(answers: dict[str, Any]) -> None:
+    assert "the toolkit's cache" in answers
+    assert not (cache_root() / "left-by-an-attack").exists()
 
 
 def test_the_first_to_be_ended_stays_the_first(tmp_path: Path) -> None:
