@@ -16,7 +16,6 @@ from hwp_bench.base.files import atomic_write
 from hwp_bench.capture import Capture
 from hwp_bench.report.page.render import render_template
 from wildghand.avatar import WildGHandAvatar, load_avatar
-from wildghand.evidence import Evidence
 from wildghand.page.bake import BakedHand, PoseBasis, bake_hand
 from wildghand.page.biases import FrameBiases, bake_biases
 from wildghand.page.measure import Fidelity, fidelity, still_image
@@ -181,10 +180,7 @@ def _seen(avatar: WildGHandAvatar, side: str, count: int) -> str | None:
     255 is the share of the frames at which the fit keeps half of an offset from the skin
     (`wildghand.evidence`), or more of them.
     """
-    rigs, buffers = avatar.model.rigs, dict(avatar.model.named_buffers())
-    evidence = Evidence.from_tensors(
-        buffers, {name: len(rig) for name, rig in rigs.items()}, "avatar"
-    )
+    evidence = avatar.model.evidence
     if evidence is None:
         return None
     kept = evidence.offsets[side].double().cpu().numpy()
