@@ -14,7 +14,7 @@ from hwp_bench.base.ray_mesh import ray_mesh
 from hwp_bench.hands import HandTemplate, pose_hand, vertex_normals
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.export.all_round import TURNS, middle, turned, view_turn
+from wildghand.export.splats import TURNS, middle, turned, view_turn
 
 #: Texels along an edge.
 SIZE = 1024
