@@ -77,8 +77,6 @@ def still(rgba: np.ndarray, background: tuple[int, int, int], text: str) -> Inli
 
     Args:
         rgba: (H, W, 4) float as `Avatar.render` gives it.
-        background: sRGB, 0 to 255.
-        text: what it shows.
     """
     from PIL import Image
 
@@ -94,8 +92,6 @@ def turntable(
 
     Args:
         draw: takes degrees about the vertical, gives (H, W, 4) float as `Avatar.render` does.
-        background: sRGB, 0 to 255.
-        text: what it shows.
     """
     from PIL import Image
 
@@ -119,18 +115,13 @@ def over(rgba: np.ndarray, background: tuple[int, int, int]) -> np.ndarray:
 
     Args:
         rgba: (H, W, 4) float in [0, 1], premultiplied.
-        background: sRGB, 0 to 255.
     """
     behind = (1.0 - rgba[..., 3:]) * (np.array(background, dtype=np.float32) / 255.0)
     return as_uint8(rgba[..., :3] + behind)
 
 
 def check_edge(size: int) -> None:
-    """Check the edge of an inline picture.
-
-    Raises:
-        UsageError: it is not from 16 px to `MAX_EDGE`.
-    """
+    """Check the edge of an inline picture."""
     if not 16 <= size <= MAX_EDGE:
         raise UsageError(f"is {size}", field="size", remedy=f"Use 16 to {MAX_EDGE} px.")
 
@@ -195,11 +186,7 @@ class PosedGaussians:
         return f"PosedGaussians({len(self)} Gaussians)"
 
     def require_finite(self) -> None:
-        """Refuse Gaussians with a number that is NaN or infinite, before they are written.
-
-        Raises:
-            BadInput: there is one; the field is named.
-        """
+        """Refuse Gaussians with a number that is NaN or infinite, before they are written."""
         for item in fields(self):
             bad = int((~np.isfinite(getattr(self, item.name))).sum())
             if bad:
@@ -345,11 +332,7 @@ class WildGHandAvatar(HandAvatar):
         return self.pose(self.rest_poses())
 
     def posed(self, hands: Mapping[str, HandPose]) -> PosedHands:
-        """Return the hands as tensors; one in a pose of the clip in that which the fit believes.
-
-        Raises:
-            UsageError: no hand, or one that was not fitted.
-        """
+        """Return the hands as tensors; one in a pose of the clip in that which the fit believes."""
         return super().posed(self.believed(hands))
 
     def believed(self, hands: Mapping[str, HandPose]) -> dict[str, HandPose]:

@@ -54,16 +54,7 @@ def read_tensors(
     """Read the tensors of an avatar.
 
     Args:
-        file: a safetensors file.
-        settings: those that the avatar's description states.
-        sides: its hands.
-        frame_count: its training frames.
         declared: names of all tensors; None: the description does not say.
-
-    Raises:
-        BadInput: the file is missing, too large or damaged, or a tensor is missing, not declared,
-            of integers, not finite, out of range, or has another shape than the description says;
-            the tensor is named.
     """
     from safetensors import SafetensorError, safe_open
 
@@ -149,15 +140,8 @@ def write_weight_masks(avatar: WildGHandAvatar, folder: Path) -> None:
 def read_weight_masks(folder: Path, frames: list[int]) -> dict[int, np.ndarray]:
     """Read the weight masks of frames that an avatar was fitted to.
 
-    Args:
-        folder: of the images; it may be absent.
-        frames: those that were fitted; images of other frames are left out.
-
     Returns:
         (H, W) uint8 by frame.
-
-    Raises:
-        BadInput: an image is damaged.
     """
     named = {frame: folder / f"{frame:06d}.png" for frame in frames}
     found = sorted(path.name for path in folder.glob("*.png")) if folder.is_dir() else []

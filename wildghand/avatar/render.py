@@ -78,11 +78,7 @@ def render_clip(
 
 
 def shown_sides(avatar: WildGHandAvatar, capture: Capture) -> list[str]:
-    """Return the hands of a capture that an avatar has.
-
-    Raises:
-        UsageError: there are none, or the capture belongs to another hand model.
-    """
+    """Return the hands of a capture that an avatar has."""
     sides = [side for side in capture.info.sides if side in avatar.sides]
     if not sides:
         raise UsageError(
@@ -128,13 +124,7 @@ def explain_frames(
     """Draw training frames without and with what is particular to them.
 
     Args:
-        avatar: fitted to the capture.
-        capture: what it was fitted to.
         frames: of the capture; None: the eight of largest temporal weight, in order of time.
-
-    Raises:
-        UsageError: a frame was not fitted, the avatar has no biases, or it comes from another
-            capture.
     """
     model, fitted = avatar.model, avatar.record.frames
     if not model.perturbation:
@@ -174,10 +164,6 @@ def explanation_sheet(
     found: Sequence[Explanation], names: Mapping[int, str] | None = None
 ) -> np.ndarray:
     """A sheet with a row for each frame.
-
-    Args:
-        found: at least one.
-        names: what acts in a frame, for its caption.
 
     Returns:
         (H, W, 3) uint8: frame, without biases, with biases, and the difference of the two, grey

@@ -69,11 +69,7 @@ class HandAngles:
 
     @classmethod
     def of(cls, source: str, side: str) -> HandAngles:
-        """Return the angles of a hand model (`anny`, `mano:PATH`).
-
-        Raises:
-            BadHandModel: its file is missing or damaged.
-        """
+        """Return the angles of a hand model (`anny`, `mano:PATH`)."""
         return cls(load_template(source, side), load_template(source, "right"))
 
     def pose(self, angles: np.ndarray) -> np.ndarray:
@@ -113,11 +109,7 @@ class HandAngles:
         return found
 
     def named_pose(self, name: str) -> np.ndarray:
-        """Return the angles of one named pose.
-
-        Raises:
-            UsageError: there is none of this name.
-        """
+        """Return the angles of one named pose."""
         poses = self.named_poses()
         if name not in poses:
             raise UsageError(
@@ -132,9 +124,6 @@ class HandAngles:
 
         Args:
             given: degrees by name of `ANGLE_NAMES`, as `{"index1 flexion": 60}`.
-
-        Raises:
-            UsageError: a name is unknown, or an angle is not within its range.
         """
         angles = np.zeros((len(JOINT_NAMES), 3))
         for name, degrees in given.items():
@@ -231,12 +220,7 @@ class Studio:
         """Return every hand in one pose, as it stands in the studio.
 
         Args:
-            pose: see `Pose`; two hands are posed alike.
             turn: about the vertical, degrees.
-
-        Raises:
-            UsageError: a name is unknown, an angle is out of range, or an array has another shape
-                or is not finite.
         """
         return {
             side: self._standing(side, _axis_angles(pose, angles), turn)
@@ -253,11 +237,7 @@ class Studio:
         return HandPose(side, pose, self._betas[side], transl)
 
     def camera(self, width: int, height: int) -> Camera:
-        """Return the camera: at the origin, along z, with all of the hands in its picture.
-
-        Raises:
-            UsageError: a size is not positive.
-        """
+        """Return the camera: at the origin, along z, with all of the hands in its picture."""
         if min(width, height) < 1:
             raise UsageError(f"is {width}x{height}", field="size", remedy="Use 1 px or more.")
         focal = 0.5 * min(width, height) / math.tan(math.radians(FIELD_OF_VIEW / 2))

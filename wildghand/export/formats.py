@@ -64,12 +64,7 @@ class ExportSettings:
 
 
 def check_target(path: Path, settings: ExportSettings, *, overwrite: bool) -> None:
-    """Refuse what cannot be written, before anything is read.
-
-    Raises:
-        UsageError: the extension is not known, does not go with the settings, or the file is
-            there and may not be replaced.
-    """
+    """Refuse what cannot be written, before anything is read."""
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
         known = "; ".join(f"{name}: {text}" for name, text in FORMATS.items())

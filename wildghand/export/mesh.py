@@ -43,16 +43,7 @@ class Motion:
 
 
 def capture_motion(avatar: WildGHandAvatar, capture: Capture, sides: tuple[str, ...]) -> Motion:
-    """Return the motion of a capture; frames in which a hand was not found are left out.
-
-    Args:
-        avatar: what moves, in the poses that it believes in.
-        capture: whose hand parameters are taken.
-        sides: the hands.
-
-    Raises:
-        UsageError: no frame shows all of the hands.
-    """
+    """Return the motion of a capture; frames in which a hand was not found are left out."""
     hands = {side: capture.hands[side] for side in sides}
     kept = np.flatnonzero(np.all([hand.valid for hand in hands.values()], axis=0))
     if not len(kept):
@@ -70,12 +61,7 @@ def capture_motion(avatar: WildGHandAvatar, capture: Capture, sides: tuple[str, 
 
 
 def closing_motion(templates: Mapping[str, HandTemplate], rest: Mapping[str, HandPose]) -> Motion:
-    """Return a motion in which the fingers close and open once.
-
-    Args:
-        templates: by side.
-        rest: where the hands lie.
-    """
+    """Return a motion in which the fingers close and open once."""
     times = np.arange(round(SECONDS * FPS) + 1) / FPS
     share = 0.5 - 0.5 * np.cos(2.0 * math.pi * times / SECONDS)
     flexion = np.radians([*(4 * _FINGER), *_THUMB])
@@ -117,14 +103,6 @@ def skinned_glb_bytes(hands: Mapping[str, SkinnedHand], motion: Motion, generato
     """Return hands with skeletons, in glTF's axes: y up, metres.
 
     The wrist's node moves the hand; the middle of the motion lies at the origin.
-
-    Args:
-        hands: by side.
-        motion: of all of them.
-        generator: the program that writes it.
-
-    Raises:
-        UsageError: the hand model changes its shape with the pose beyond skinning.
     """
     made = GlbBuilder(generator)
     content = made.content
@@ -149,11 +127,7 @@ def skinned_glb_bytes(hands: Mapping[str, SkinnedHand], motion: Motion, generato
 
 
 def require_skinning(template: TemplateTensors) -> None:
-    """Refuse a hand model that changes its shape with the pose beyond skinning.
-
-    Raises:
-        UsageError: it does.
-    """
+    """Refuse a hand model that changes its shape with the pose beyond skinning."""
     if template.pose_basis is not None:
         raise UsageError(
             "changes its shape with the pose, which a skinned mesh cannot",
@@ -261,7 +235,6 @@ def wrist_cap(border: np.ndarray, weights: np.ndarray, texture: SkinTexture) -> 
     Args:
         border: (L, 3) m, vertices around it in the direction of the faces' own edges.
         weights: (L, 16) skinning weights.
-        texture: it has a place for the cap.
     """
     count = len(border)
     around = 2.0 * np.pi * np.arange(count) / count

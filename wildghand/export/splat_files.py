@@ -42,11 +42,6 @@ class GlbBuilder:
         Args:
             values: (N,), (N, 2), (N, 3), (N, 4) or (N, 4, 4) of a type that glTF has; matrices are
                 given by rows and kept by columns.
-            target: one of this module's.
-            bounds: write the least and the largest value, which positions and times need.
-
-        Raises:
-            BadInput: a number is NaN or infinite.
         """
         if not np.isfinite(values).all():
             raise BadInput(
@@ -114,13 +109,8 @@ def ply_bytes(
     """Return N Gaussians as binary little-endian PLY.
 
     Args:
-        splats: the Gaussians.
-        comments: lines for the header, such as the unit; ASCII.
         harmonics: (N, K, 3) of their colours (`wildghand.export.splats`); None: the colours of
             the Gaussians in every direction.
-
-    Source: the layout of the 3DGS authors' point clouds: logit opacities, logarithms of the
-    scales, colour = 0.5 + constant harmonic * f_dc + the others * f_rest, channel by channel.
     """
     count = len(splats)
     visible = np.clip(splats.opacities, *OPACITIES)
@@ -162,16 +152,8 @@ def spz_bytes(splats: PosedGaussians, harmonics: np.ndarray | None = None) -> by
     """Return N Gaussians as SPZ.
 
     Args:
-        splats: in the axes of the format: x right, y up, z back; within 64 units of the origin.
         harmonics: (N, K, 3) of their colours (`wildghand.export.splats`); None: the colours of
             the Gaussians in every direction. Those of degree 1 and more are cut to [-1, 1].
-
-    Raises:
-        UsageError: a coordinate is beyond the format's reach.
-
-    Source: the public description of the format by Niantic (nianticlabs/spz, version 3): gzip of
-    16 bytes of header and, one array after the other, positions, opacities, colours, scales,
-    rotations and harmonics. The same Gaussians give the same bytes.
     """
     fixed = np.rint(splats.means.astype(np.float64) * 2**FRACTIONAL_BITS)
     if len(fixed) and np.abs(fixed).max() >= 2**23:
@@ -236,13 +218,8 @@ def splat_glb_bytes(
     Programs that do not know the extension show coloured points.
 
     Args:
-        splats: in glTF's axes: y up, z back.
-        generator: the program that writes it.
         harmonics: (N, K, 3) of their colours (`wildghand.export.splats`); None: the colours of
             the Gaussians in every direction.
-
-    Source: Khronos, KHR_gaussian_splatting, release candidate of 2026: the kernel `ellipse`,
-    display-referred sRGB, quaternions (x, y, z, w), scales and opacities as they are.
     """
     made = GlbBuilder(generator)
     colors = np.concatenate((splats.colors, splats.opacities[:, None]), axis=1).clip(0.0, 1.0)

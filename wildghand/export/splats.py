@@ -93,11 +93,7 @@ class SeenGaussians:
 
 
 def standing(avatar: WildGHandAvatar, capture: Capture | None, frame: int) -> Standing:
-    """Hands as a frame of a capture shows them; without a capture, as they stand in the studio.
-
-    Raises:
-        UsageError: the capture shows none of the avatar's hands, or belongs to another hand model.
-    """
+    """Hands as a frame of a capture shows them; without a capture, as they stand in the studio."""
     if capture is None:
         return Standing(avatar.studio.posed(), np.eye(4))
     shown = capture.hand_poses(frame)
@@ -111,8 +107,6 @@ def turned(
     """Hands after x -> turn (x - centre) + centre.
 
     Args:
-        avatar: whose hands they are.
-        hands: by side.
         turn: (3, 3) rotation.
         centre: (3,) m.
     """
@@ -146,15 +140,7 @@ def middle(splats: PosedGaussians) -> np.ndarray:
 
 
 def seen(avatar: WildGHandAvatar, place: Standing) -> SeenGaussians:
-    """The Gaussians of hands, and their colours while they turn in front of the camera.
-
-    Args:
-        avatar: what is seen.
-        place: the hands, and the camera.
-
-    Raises:
-        BadInput: the avatar gives numbers that are not finite.
-    """
+    """The Gaussians of hands, and their colours while they turn in front of the camera."""
     front = avatar.pose(place.hands, closed=True, viewmat=place.viewmat)
     front.require_finite()
     centre = middle(front)
@@ -180,11 +166,6 @@ def harmonics(given: SeenGaussians, degree: int) -> np.ndarray:
     """Spherical harmonics of the colours of N Gaussians, as splat formats keep them.
 
     A viewer draws 0.5 + sum of harmonics, cut at 0, in the direction from it to the Gaussian.
-
-    Args:
-        given: in the place in which they are written.
-        degree: 0 to 3. 0: one colour; up to the rim that of the front, behind it that of the sides
-            to which a Gaussian turns.
 
     Returns:
         (N, (degree + 1)^2, 3) float32, degree by degree.
@@ -213,17 +194,7 @@ def harmonics(given: SeenGaussians, degree: int) -> np.ndarray:
 
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """Real spherical harmonics in the order and with the signs of splat formats.
-
-    Args:
-        directions: (..., 3) of length 1.
-        degree: 0 to 3.
-
-    Returns:
-        (..., (degree + 1)^2).
-
-    Source: Kerbl et al. 2023, the authors' code; the same in SPZ and KHR_gaussian_splatting.
-    """
+    """Real spherical harmonics in the order and with the signs of splat formats."""
     x, y, z = np.moveaxis(directions, -1, 0)
     terms = [np.full_like(x, SH_CONSTANT)]
     if degree >= 1:
@@ -257,10 +228,6 @@ def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
 
     Args:
         splats: the Gaussians, m.
-        factor: units of the file in a metre, above 0.
-
-    Raises:
-        UsageError: the factor is not a number above 0, or numbers become infinite by it.
     """
     require_scale(factor)
     with np.errstate(over="ignore"):
@@ -279,11 +246,7 @@ def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
 
 
 def require_scale(factor: float) -> None:
-    """Refuse a scale that is none.
-
-    Raises:
-        UsageError: the factor is not a number above 0.
-    """
+    """Refuse a scale that is none."""
     if not (np.isfinite(factor) and factor > 0.0):
         raise UsageError(f"is {factor}", field="--scale", remedy="Use a number above 0.")
 
@@ -291,13 +254,7 @@ def require_scale(factor: float) -> None:
 def laid_to_rest(
     avatar: WildGHandAvatar, given: SeenGaussians, hands: Mapping[str, HandPose]
 ) -> SeenGaussians:
-    """Move hands from the studio to where the hand model lies at rest, with their colours.
-
-    Args:
-        avatar: whose hands they are.
-        given: of all hands.
-        hands: by side, as they stand in the studio; only the first rotation differs from rest.
-    """
+    """Move hands from the studio to where the hand model lies at rest, with their colours."""
     rest, owners = avatar.rest_poses(), _owners(avatar, tuple(hands))
     turns, shifts = np.empty((len(owners), 3, 3)), np.empty((len(owners), 3))
     for number, (side, hand) in enumerate(hands.items()):
@@ -315,11 +272,6 @@ def for_supersplat(
     """Turn hands so that SuperSplat opens them upright, palms to the viewer; y is down.
 
     Two hands keep their places to each other: what is upright is the mean of both.
-
-    Args:
-        avatar: whose hands they are.
-        given: of all hands.
-        hands: by side, as they stand.
     """
     angles = avatar.studio.angles
     upright = Rotation.concatenate(

@@ -125,11 +125,7 @@ def bake_hand(
     """Bake one hand from its Gaussians in some poses.
 
     Args:
-        avatar: what is baked.
-        side: which of its hands.
         poses: (P, 16, 3) rad, at least one; covariances are those of the first.
-        geometry_rank: components of the places; 0: they follow the joints alone.
-        color_rank: components of the colours; 0: they are those of the mean.
     """
     rig, betas = avatar.model.rigs[side], avatar.betas[side]
     shape = torch.as_tensor(betas, dtype=torch.float32, device=rig.template.joints.device)
@@ -165,11 +161,7 @@ def bake_hand(
 def gaussians_of(
     avatar: WildGHandAvatar, side: str, pose: np.ndarray, transl: np.ndarray
 ) -> PosedGaussians:
-    """The Gaussians of one hand and its wall as the avatar poses them, with its own shape.
-
-    Raises:
-        BadInput: numbers of them are not finite.
-    """
+    """The Gaussians of one hand and its wall as the avatar poses them, with its own shape."""
     from hwp_bench.methods.contract import HandPose
 
     hand = HandPose(side, pose, avatar.betas[side], transl)
@@ -306,12 +298,7 @@ def bake_biases(
     """Bake the biases of some training frames; None where the avatar has none.
 
     Args:
-        avatar: of the frames; it knows their biases.
-        side: which of its hands.
-        hand: this hand as it was baked.
-        frames: F numbers of frames that were fitted.
         motion: (F, 51) their poses (48, rad) and translations (m).
-        rank: components that are kept.
     """
     model = avatar.model
     if side not in model.perturbation or not len(frames) or rank < 1:

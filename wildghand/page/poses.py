@@ -69,11 +69,7 @@ class PoseSamples:
 def sample_poses(
     avatar: WildGHandAvatar, capture: Capture | None, settings: PageSettings
 ) -> PoseSamples:
-    """Choose poses.
-
-    Raises:
-        UsageError: the capture is of other hands, of another hand model, or not what was fitted.
-    """
+    """Choose poses."""
     random = np.random.default_rng(settings.seed)
     if capture is None:
         # In the studio, where the light is as frames have shown it.
@@ -246,8 +242,6 @@ def mean_weights(
     """Average weight masks over the frames that show each Gaussian's anchor.
 
     Args:
-        avatar: of the capture.
-        capture: hands and cameras.
         masks: (H, W) uint8 weights of some training frames, 255 = full weight.
 
     Returns:

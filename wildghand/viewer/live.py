@@ -29,11 +29,6 @@ _GAP = 8
 def live_sheet(look: Glance, aspect: float) -> np.ndarray:
     """Return the three pictures of a glance on a sheet.
 
-    Args:
-        look: what was seen.
-        aspect: width over height of the sheet, from 0.1 to 10; the pictures stand in a row or in
-            a column, where they are larger.
-
     Returns:
         (H, W, 3) uint8, H and W as `aspect` asks for.
     """

@@ -93,7 +93,6 @@ def viewpoint(camera: Camera, centre: np.ndarray) -> Viewpoint:
     """Return the viewpoint of one of our cameras.
 
     Args:
-        camera: its principal point counts as the middle of the picture.
         centre: (3,) m, world, about what the page's camera turns; the nearest point to it on the
             camera's axis is taken, so that the picture stays the camera's.
     """
@@ -152,10 +151,6 @@ def with_angle(
     """Return hands of which one has another angle; everything else stays.
 
     Args:
-        hands: by side.
-        angles: of the hand that changes.
-        joint: 0 the wrist, then MANO's order.
-        angle: 0 flexion, 1 abduction, 2 twist.
         degrees: cut to the range of the joint.
     """
     hand = hands[angles.side]
@@ -170,8 +165,6 @@ def with_fingers(
     """Return hands with other fingers, where they are and as they are turned.
 
     Args:
-        hands: by side.
-        angles: of every hand, by side.
         named: (16, 3) degrees by side; the wrist's are left out.
     """
     changed = {}
@@ -225,13 +218,7 @@ class Painter:
         self._posed: tuple[Hands, PosedGaussians] | None = None
 
     def full(self, hands: Hands, camera: Camera, background: tuple[int, int, int]) -> Picture:
-        """Draw as `wildghand render` does.
-
-        Args:
-            hands: by side.
-            camera: the camera.
-            background: sRGB, 0 to 255.
-        """
+        """Draw as `wildghand render` does."""
         began = time.perf_counter()
         image = over(self._avatar.render(hands, camera), background)
         return Picture(image, False, time.perf_counter() - began, 0.0)
@@ -239,13 +226,7 @@ class Painter:
     @denormals_flushed()
     @torch.no_grad()
     def draft(self, hands: Hands, camera: Camera, background: tuple[int, int, int]) -> Picture:
-        """Draw sooner; see `full`.
-
-        Args:
-            hands: by side; the same object again costs no posing.
-            camera: the camera.
-            background: sRGB, 0 to 255.
-        """
+        """Draw sooner; see `full`."""
         began = time.perf_counter()
         if self._posed is None or self._posed[0] is not hands:
             self._posed = hands, self._avatar.pose(hands, closed=True)

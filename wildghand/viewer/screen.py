@@ -38,8 +38,6 @@ class Pace:
 
         Args:
             edge: its larger side, px.
-            pixels: seconds that grow with the number of its pixels.
-            other: seconds of what does not, such as posing.
         """
         # At least a third of the time goes to the pixels: smaller pictures would not help.
         left = max(TARGET - other, TARGET / 3)

@@ -29,13 +29,7 @@ LOOPBACK = ("127.0.0.1", "localhost", "::1")
 
 
 def refusal(headers: Mapping[str, str], loopback: bool) -> str | None:
-    """Say why a request is refused; None where it is answered.
-
-    Args:
-        headers: of the request; only `Host` and `Origin` are read.
-        loopback: the view is meant for this machine only, so that names of other machines are
-            those of pages that point them here (DNS rebinding).
-    """
+    """Say why a request is refused; None where it is answered."""
     host = headers.get("Host", "")
     if loopback and urlsplit(f"//{host}").hostname not in LOOPBACK:
         return "This view is for the machine that it runs on."
@@ -99,11 +93,7 @@ class Address:
 
 
 def require_viser() -> None:
-    """Check that the extra is installed, before work begins.
-
-    Raises:
-        MissingDependency: it is not.
-    """
+    """Check that the extra is installed, before work begins."""
     try:
         import viser  # noqa: F401
     except ImportError as error:
@@ -115,16 +105,7 @@ def require_viser() -> None:
 
 @contextlib.contextmanager
 def serving(address: Address, title: str) -> Iterator[ViserServer]:
-    """Serve a page while the block runs; standard output stays free of viser's own messages.
-
-    Args:
-        address: where.
-        title: over the panel of the page.
-
-    Raises:
-        MissingDependency: viser is not installed.
-        UsageError: the address cannot be used.
-    """
+    """Serve a page while the block runs; standard output stays free of viser's own messages."""
     require_viser()
     _check(address)
     import viser
