@@ -1,4 +1,12 @@
-"""The tensors of an avatar from a file, compared with its description before memory is taken."""
+"""An avatar as a folder: safetensors, JSON and images, without the training data.
+
+avatar.json           what it is, of which hand model, how it was fitted
+model.safetensors     every tensor of the model
+weights/000012.png    weight mask of a training frame, to look at
+call.json             digest of the call that made it, where one call made it of a capture
+
+Tensors are compared with the description before memory is taken.
+"""
 
 from __future__ import annotations
 

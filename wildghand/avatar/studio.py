@@ -1,4 +1,9 @@
-"""A hand's pose as named angles in degrees, with the ranges of its joints, and named poses."""
+"""Poses as named angles, and where an avatar stands when nobody says where.
+
+It stands upright, in front of a camera that sees all of it. The hand turns, and not the camera,
+because what a clip taught of its light holds in front of its camera: so every side is shown in a
+light that frames have shown.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Motion for an exported mesh: a capture's, or fingers that close and open."""
+"""A skinned mesh as binary glTF: sixteen joints a hand, a baked texture, and a motion.
+
+The motion is a capture's, or fingers that close and open.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""An avatar as its turntable shows it: colours of its Gaussians from all around.
+"""Gaussians for other programs: colours from all around, scale, and the axes of those programs.
 
 What a clip taught of its light holds in front of its camera. Hands are therefore turned in front of
 the camera, as the turntable does it, and a file remembers which colour each Gaussian had from which

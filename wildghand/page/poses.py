@@ -1,4 +1,4 @@
-"""How much of an avatar its page holds."""
+"""What a page holds: its poses, controls and still image, and how near it comes to the avatar."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture of a fit that runs: frame, avatar and weights next to each other."""
+"""A fit that is watched in the browser while it runs: `wildghand fit --live`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Between the camera of a page and ours: both are pinholes with OpenCV axes."""
+"""An avatar that is posed and drawn for a page: cameras, motion, pictures, and their state.
+
+The camera of a page and ours are both pinholes with OpenCV axes.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How large a picture may be so that the next one comes soon."""
+"""The pictures behind a page: drafts while something moves, the full picture when it is still."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
-"""Who may connect to a view: pages that the view itself has served.
+"""The web server of a view: viser, on this machine only unless asked otherwise.
 
 A browser lets any web page open a WebSocket to this machine. Viser answers all of them, so that a
-page elsewhere could look at the hand of a person who has a view open.
+page elsewhere could look at the hand of a person who has a view open; `guarded` refuses pages that
+the view itself has not served.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""The panel of an avatar's page: sliders of joints, named poses, playback, background."""
+"""The page on which an avatar is turned and posed: `wildghand view`, and its panel."""
 
 from __future__ import annotations
 
