@@ -287,19 +287,20 @@ def load_avatar(
     file = root / MODEL
     tensors = rename_former(read_tensors(file, settings, value.sides, frame_count, value.tensors))
     try:
-        subject = SubjectShape.from_tensors(tensors, next(iter(templates.values())), str(file))
+        vertices = len(next(iter(templates.values())).vertices)
+        subject = SubjectShape.from_tensors(tensors, str(file), V=vertices)
         model = make_model(
             templates, settings, mean_color, frame_count, value.seed, device, subject
         )
         light = KnownLight.from_tensors(tensors, str(file))
         cast = CastLight.from_tensors(tensors, str(file))
-        poses = ClipPoses.from_tensors(tensors, tuple(value.sides), str(file))
+        poses = ClipPoses.from_tensors(tensors, str(file))
         for found in (light, cast, poses):
             if found is not None:
                 model.keep(found)
         counts = {side: len(rig) for side, rig in model.rigs.items()}
-        evidence = Evidence.from_tensors(tensors, counts, str(file))
-        colors = ColorChanges.from_tensors(tensors, counts, str(file))
+        evidence = Evidence.from_tensors(tensors, str(file), N=counts)
+        colors = ColorChanges.from_tensors(tensors, str(file), N=counts)
         for kept in (evidence, colors):
             if kept is not None:
                 model.keep(kept)

@@ -20,7 +20,6 @@ from hwp_bench.report.page.render import render_template
 from wildghand.avatar import WildGHandAvatar, load_avatar
 from wildghand.avatar.avatar import InlinePicture
 from wildghand.avatar.studio import REST
-from wildghand.evidence import Evidence
 from wildghand.page.bake import BakedHand, FrameBiases, PoseBasis, bake_biases, bake_hand
 from wildghand.page.poses import (
     Fidelity,
@@ -210,10 +209,7 @@ def _seen(avatar: WildGHandAvatar, side: str, count: int) -> str | None:
     255 is the share of the frames at which the fit keeps half of an offset from the skin
     (`wildghand.evidence`), or more of them.
     """
-    rigs, buffers = avatar.model.rigs, dict(avatar.model.named_buffers())
-    evidence = Evidence.from_tensors(
-        buffers, {name: len(rig) for name, rig in rigs.items()}, "avatar"
-    )
+    evidence = avatar.model.evidence
     if evidence is None:
         return None
     kept = evidence.offsets[side].double().cpu().numpy()
