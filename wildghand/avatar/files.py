@@ -18,8 +18,7 @@ import numpy as np
 import torch
 from msgspec import Meta
 
-from hwp_bench.base.arguments import place
-from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.base.errors import BadInput, HwpError, place
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.records import Seed, parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from hwp_bench.base.errors import UsageError
-from hwp_bench.base.text import did_you_mean
+from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.hands import (
     HandTemplate,
     anatomical_limits,
@@ -17,7 +16,7 @@ from hwp_bench.hands import (
     load_template,
     pose_from_joint_angles,
 )
-from hwp_bench.hands.gestures import finger_pose, gestures, mirrored
+from hwp_bench.hands.poses import finger_pose, gestures, mirrored
 from hwp_bench.hands.skeleton import JOINT_NAMES, palm_directions, unit
 
 #: The three angles of a joint.

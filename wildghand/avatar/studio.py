@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import TemplateTensors, pose_hand
-from hwp_bench.hands.parameters import Camera, HandPose
+from hwp_bench.hands.skeleton import Camera, HandPose
 from wildghand.avatar.hand_angles import REST, HandAngles
 
 #: A pose for every hand of an avatar: the name of one, named angles in degrees, or an array of

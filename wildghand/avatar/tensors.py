@@ -7,8 +7,7 @@ from pathlib import Path
 
 import torch
 
-from hwp_bench.base.errors import BadInput
-from hwp_bench.base.text import shown
+from hwp_bench.base.errors import BadInput, shown
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network.weight_shapes import MAPS, shapes_of_settings
 

@@ -12,7 +12,7 @@ import numpy as np
 from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import HandTemplate, TemplateTensors
 from hwp_bench.hands.skeleton import JOINT_NAMES, PARENTS
-from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.hands.template import boundary_loop
 from wildghand.export.glb import ATTRIBUTES, INDICES, GlbBuilder
 from wildghand.export.motion import Motion
 from wildghand.export.texture import SkinTexture

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
-from hwp_bench.base.progress import notice
+from hwp_bench.base.console import notice
 from hwp_bench.methods.contract import Camera
 from wildghand.viewer.cameras import PageCamera, Viewpoint
 from wildghand.viewer.pace import Pace

@@ -7,8 +7,7 @@ from dataclasses import replace
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.base.tables import Column, Table, print_table
-from hwp_bench.base.terminal_tables import table_lines
+from hwp_bench.base.tables import Column, Table, print_table, table_lines
 
 WORDS = st.text("abcdefgh", min_size=1, max_size=9)
 TITLES = st.lists(WORDS, min_size=1, max_size=4).map(" ".join)
