@@ -5,15 +5,17 @@ from __future__ import annotations
 import csv
 import io
 import json
+import shutil
 import sys
 import textwrap
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
+from functools import partial
+from itertools import groupby, product
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.console import encoding_of, expressed
+from hwp_bench.base.console import encoding_of, expressed, on_terminal
 from hwp_bench.base.files import atomic_write
 
 #: Formats of a table by file ending.
@@ -274,6 +276,13 @@ def to_object(table: Table) -> dict[str, Any]:
     }
 
 
+def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
+    """Write every table in every format: `overall.md`, `overall.tex`, ..."""
+    for name, table in tables.items():
+        for ending in FORMATS:
+            atomic_write(folder / f"{name}.{ending}", format_table(table, ending))
+
+
 def print_table(table: Table, width: int | None = None) -> None:
     """Print a table on standard output: styled on a terminal, plain text elsewhere.
 
@@ -283,354 +292,213 @@ def print_table(table: Table, width: int | None = None) -> None:
         table: the table.
         width: in characters; None takes that of the terminal, `COLUMNS`, or 80.
     """
-    import shutil
-
-    from rich.console import Console
-    from rich.text import Text
-
-    class Output(Console):
-        def on_broken_pipe(self) -> None:
-            # Of rich's own it would be the end of the program, with status 1.
-            raise
-
-    width = width or shutil.get_terminal_size((WIDTH, 24)).columns
-    console = Output(width=width)
-    encoding = encoding_of(sys.stdout)
-    for line in table_lines(table, width, marks=not console.is_terminal, encoding=encoding):
-        whole = Text.assemble(*line.pieces)
-        whole.rstrip()
-        console.print(whole, no_wrap=True, overflow="ignore", crop=False)
+    width = width or shutil.get_terminal_size((_WIDTH, 24)).columns
+    styled = on_terminal(sys.stdout)
+    print(draw_table(table, width, styled=styled, encoding=encoding_of(sys.stdout)), end="")
 
 
-def write_tables(folder: Path, tables: Mapping[str, Table]) -> None:
-    """Write every table in every format: `overall.md`, `overall.tex`, ..."""
-    for name, table in tables.items():
-        for ending in FORMATS:
-            atomic_write(folder / f"{name}.{ending}", format_table(table, ending))
-
-
-#: Columns where no terminal says how wide it is.
-WIDTH = 80
-#: Spaces between two columns.
-_GAP = 2
-#: Narrowest that a column of text is folded to, and widest that one keeps if others lack space.
-_FOLDED = (12, 24)
-#: Marks the best value where nothing can be bold.
-_BEST = "*"
-#: Under a table with such a mark.
-_LEGEND = f"{_BEST} the best of the rows on the same data."
-#: What rules are drawn with.
-_RULE = "─"
-
-
-@dataclass(frozen=True)
-class Line:
-    """One printed line: pieces of text with their styles."""
-
-    #: (text, style of `rich`, empty for plain).
-    pieces: tuple[tuple[str, str], ...]
-
-    @property
-    def text(self) -> str:
-        """The line without styles."""
-        return "".join(piece for piece, _ in self.pieces).rstrip()
-
-
-@dataclass(frozen=True)
-class _FittedColumn:
-    """A column in characters that an encoding has."""
-
-    heading: str
-    higher_is_better: bool | None
-    group: str
-
-
-@dataclass(frozen=True)
-class _FittedTable:
-    """A table in characters that an encoding has."""
-
-    table: Table
-    encoding: str
-    columns: Sequence[_FittedColumn]
-
-    @property
-    def caption(self) -> str:
-        return self.fit(self.table.caption)
-
-    @property
-    def rows(self) -> Sequence[Sequence[str | float | int | None]]:
-        return self.table.rows
-
-    @property
-    def notes(self) -> Sequence[str]:
-        notes = [self.fit(note) for note in self.table.notes]
-        if any(column.higher_is_better is not None for column in self.columns):
-            up, down = self.fit("↑"), self.fit("↓")
-            notes += [f"{up} higher is better, {down} lower is better."] if up != "↑" else []
-        return notes
-
-    @property
-    def breaks(self) -> Sequence[int]:
-        return self.table.breaks
-
-    def text(self, row: int, column: int) -> str:
-        return self.fit(self.table.text(row, column))
-
-    def rank(self, row: int, column: int) -> int | None:
-        return self.table.rank(row, column)
-
-    def fit(self, text: str) -> str:
-        return expressed(text, self.encoding)
-
-
-def _fitted(table: Table, encoding: str) -> _FittedTable:
-    columns = [
-        _FittedColumn(
-            expressed(column.heading, encoding),
-            column.higher_is_better,
-            expressed(column.group, encoding),
-        )
-        for column in table.columns
-    ]
-    return _FittedTable(table, encoding, columns)
-
-
-def table_lines(
-    table: Table, width: int, *, marks: bool = False, encoding: str = "utf-8"
-) -> list[Line]:
-    """Return the lines of a table.
+def draw_table(table: Table, width: int, *, styled: bool = False, encoding: str = "utf-8") -> str:
+    """Return a table as it stands on a terminal.
 
     The columns that name a row stand in front of every block of the others. Columns of one group
     stay together where they fit. Texts are folded; numbers never are.
 
     Args:
         table: the table.
-        width: in characters; a table whose narrowest form is wider is printed wider.
-        marks: mark best values with a character.
-        encoding: of what the lines are printed on; what it lacks is said in ASCII.
+        width: in characters; a table whose narrowest form is wider is drawn wider.
+        styled: with the codes of a terminal; without them a character marks best values.
+        encoding: what it lacks is said in ASCII.
     """
-    table = _fitted(table, encoding)
-    lines = _folded(table.caption, width, "italic")
-    keys = _keys(table)
-    widths = [_natural(table, index, marks) for index in range(len(table.columns))]
-    if _total(widths) > width:
-        widths = _narrowed(table, widths, keys, width)
-    rule = table.fit(_RULE)
-    for number, block in enumerate(_blocks(table, widths, keys, width)):
-        lines += [Line((("", ""),))] if number else []
-        columns = [*range(keys), *block]
-        spread = _spread(table, columns, widths, width)
-        lines += _block_lines(table, columns, spread, marks, rule)
-    notes = list(table.notes)
-    if marks and any(
-        table.rank(row, column) == 0
-        for row in range(len(table.rows))
-        for column in range(len(table.columns))
-    ):
-        notes.append(_LEGEND)
-    return lines + [line for note in notes for line in _folded(note, width, "dim")]
+    from rich.console import Console
+
+    drawing = _Drawing(table, width, "" if styled else _BEST, encoding)
+    widest = max(_total(drawing.widths, columns) for columns in drawing.blocks())
+    console = Console(
+        width=max(width, widest), force_terminal=styled, highlight=False, file=io.StringIO()
+    )
+    with console.capture() as drawn:
+        for part in drawing.parts():
+            console.print(part)
+    return "".join(f"{line.rstrip()}\n" for line in drawn.get().splitlines())
 
 
-def _folded(text: str, width: int, style: str) -> list[Line]:
-    return [Line(((part, style),)) for part in _wrapped(text, width)]
+#: Columns where no terminal says how wide it is.
+_WIDTH = 80
+#: Spaces between two columns.
+_GAP = 2
+#: Narrowest that a column of text is folded to, and widest that one keeps if others lack space.
+_FOLDED = (12, 24)
+#: Marks the best value where nothing can be bold.
+_BEST = "*"
+_STYLES = {0: "bold", 1: "underline", None: ""}
 
 
-def _wrapped(text: str, width: int) -> list[str]:
-    return textwrap.wrap(text, width, break_on_hyphens=False) or [""]
+def _total(widths: Sequence[int], columns: Sequence[int]) -> int:
+    """The width of some columns side by side."""
+    return sum(widths[index] for index in columns) + _GAP * (len(columns) - 1)
 
 
-def _is_number(table: Table, column: int) -> bool:
-    return any(isinstance(cells[column], int | float) for cells in table.rows)
+class _Drawing:
+    """A table in characters that an encoding has, cut into blocks that fit a width."""
 
+    def __init__(self, table: Table, width: int, mark: str, encoding: str) -> None:
+        self.fit = partial(expressed, encoding=encoding)
+        self.table = table
+        self.width = width
+        self.mark = mark
+        #: Of all cells, as they are printed.
+        self.cells = [
+            [self._cell(row, column) for column in range(len(table.columns))]
+            for row in range(len(table.rows))
+        ]
+        self.headings = [self.fit(column.heading) for column in table.columns]
+        self.numbers = [
+            any(isinstance(cells[index], int | float) for cells in table.rows)
+            for index in range(len(table.columns))
+        ]
+        #: How many columns name a row: all before the first with a measurement.
+        self.keys = 1
+        for index, column in enumerate(table.columns):
+            measured = any(isinstance(cells[index], float) for cells in table.rows)
+            if measured or column.higher_is_better is not None or column.group:
+                self.keys = max(index, 1)
+                break
+        self.widths = self._widths()
 
-def _keys(table: Table) -> int:
-    """Return the number of columns that name a row: all before the first with a measurement."""
-    for index, column in enumerate(table.columns):
-        measured = any(isinstance(cells[index], float) for cells in table.rows)
-        if measured or column.higher_is_better is not None or column.group:
-            return max(index, 1)
-    return 1
+    def parts(self) -> Iterator[Any]:
+        """What `rich` prints: the caption, the blocks, and what is said under them."""
+        from rich.text import Text
 
+        yield Text(self.fit(self.table.caption), "italic")
+        for number, columns in enumerate(self.blocks()):
+            yield from [""] if number else []
+            yield from self._block(columns)
+        notes = [self.fit(note) for note in self.table.notes]
+        ranked = any(column.higher_is_better is not None for column in self.table.columns)
+        if ranked and self.fit("↑") != "↑":
+            notes.append(f"{self.fit('↑')} higher is better, {self.fit('↓')} lower is better.")
+        everything = product(range(len(self.cells)), range(len(self.headings)))
+        if self.mark and any(self.table.rank(*place) == 0 for place in everything):
+            notes.append(f"{self.mark} the best of the rows on the same data.")
+        yield from (Text(note, "dim") for note in notes)
 
-def _cell(table: Table, row: int, column: int, marks: bool) -> str:
-    text = table.text(row, column)
-    if not marks or table.columns[column].higher_is_better is None:
-        return text
-    return text + (_BEST if table.rank(row, column) == 0 else " ")
-
-
-def _natural(table: Table, column: int, marks: bool) -> int:
-    """Return the width of a column that folds its heading only."""
-    words = table.columns[column].heading.split()
-    cells = [len(_cell(table, row, column, marks)) for row in range(len(table.rows))]
-    return max([1, *map(len, words), *cells])
-
-
-def _total(widths: Sequence[int]) -> int:
-    return sum(widths) + _GAP * (len(widths) - 1)
-
-
-def _narrowed(table: Table, widths: Sequence[int], keys: int, width: int) -> list[int]:
-    """Return widths with texts folded.
-
-    Those that name rows are folded until all fits, or until they leave half of the line to numbers.
-    """
-    least, most = _FOLDED
-    found = list(widths)
-    for index in range(keys):
-        if not _is_number(table, index):
-            found[index] = min(found[index], most)
-    while _total(found[:keys]) > max(width // 2, least) and _total(found) > width:
-        wide = [i for i in range(keys) if not _is_number(table, i) and found[i] > least]
-        if not wide:
-            break
-        found[max(wide, key=lambda i: found[i])] -= 1
-    room = max(width - _total(found[:keys]) - _GAP, most)
-    for index in range(keys, len(found)):
-        # A name that fits a line stays whole, so that it can be copied; prose is folded.
-        if not _is_number(table, index) and found[index] > min(room, 2 * most):
-            found[index] = min(room, max(most, width // 2))
-    return found
-
-
-def _blocks(table: Table, widths: Sequence[int], keys: int, width: int) -> list[list[int]]:
-    """Return the columns of each block, without those that name the rows."""
-    room = width - _total(widths[:keys]) - _GAP if keys else width
-    rest = range(keys, len(table.columns))
-    units = [
-        list(unit) for _, unit in groupby(rest, key=lambda i: (table.columns[i].group or f"\0{i}",))
-    ]
-    blocks: list[list[int]] = [[]]
-    for unit in units:
-        whole = [widths[i] for i in unit]
-        pieces = [unit] if _total(whole) <= room else [[i] for i in unit]
-        for piece in pieces:
-            taken = [widths[i] for i in [*blocks[-1], *piece]]
-            if blocks[-1] and _total(taken) > room:
-                blocks.append([])
-            blocks[-1] += piece
-    return blocks
-
-
-def _spread(
-    table: Table, columns: Sequence[int], widths: Sequence[int], width: int
-) -> Sequence[int]:
-    """Widen the last column of each group whose name has a longer word, where there is room."""
-    found = list(widths)
-    for group, run in groupby(columns, key=lambda i: table.columns[i].group):
-        members = list(run)
-        word = max((len(part) for part in group.split()), default=0)
-        lacks = word - _total([found[i] for i in members])
-        if 0 < lacks <= width - _total([found[i] for i in columns]):
-            found[members[-1]] += lacks
-    return found
-
-
-def _block_lines(
-    table: Table, columns: Sequence[int], widths: Sequence[int], marks: bool, stroke: str
-) -> list[Line]:
-    """Return heading, rule (of strokes) and rows of one block."""
-    rule = Line(((stroke * _total([widths[i] for i in columns]), "dim"),))
-    lines = _group_line(table, columns, widths, stroke)
-    heads = [_wrapped(table.columns[i].heading, widths[i]) for i in columns]
-    deepest = max(map(len, heads))
-    heads = [[""] * (deepest - len(head)) + head for head in heads]
-    for depth in range(deepest):
-        lines.append(_joined(table, columns, widths, [head[depth] for head in heads], "bold"))
-    lines.append(rule)
-    styles = {0: "bold", 1: "underline", None: ""}
-    cells = _row_parts(table, columns, widths, marks)
-    for row, parts in enumerate(cells):
-        lines += [rule] if row in table.breaks else []
-        ranks = [styles[table.rank(row, i)] for i in columns]
-        for depth in range(max(map(len, parts))):
-            pieces = [part[depth] if depth < len(part) else "" for part in parts]
-            lines.append(_joined(table, columns, widths, pieces, ranks))
-    return lines
-
-
-def _row_parts(
-    table: Table, columns: Sequence[int], widths: Sequence[int], marks: bool
-) -> list[list[list[str]]]:
-    """Return the folded lines of each cell of each row.
-
-    Where blocks of rows begin with the same texts, a text stands once and flows down over the rows
-    that repeat it. The last column that names rows is always printed.
-    """
-    found = [
-        [_parts(_cell(table, row, i, marks), widths[i]) for i in columns]
-        for row in range(len(table.rows))
-    ]
-    if not table.breaks:
+    def blocks(self) -> list[list[int]]:
+        """The columns of each block: those that name the rows, and as many others as fit."""
+        names = list(range(self.keys))
+        rest = range(self.keys, len(self.table.columns))
+        found: list[list[int]] = [names]
+        for _, unit in groupby(rest, key=lambda i: self.table.columns[i].group or i):
+            together = list(unit)
+            fits = _total(self.widths, [*names, *together]) <= self.width
+            for piece in [together] if fits else [[index] for index in together]:
+                if found[-1] != names and _total(self.widths, [*found[-1], *piece]) > self.width:
+                    found.append(names)
+                found[-1] = [*found[-1], *piece]
         return found
-    named = sum(1 for i in columns if i < _keys(table)) - 1
-    for place in range(named):
-        for run in _repeats(table, columns[: place + 1]):
-            left = found[run[0]][place]
-            for row in run:
-                own = max(len(part) for part in found[row][place + 1 :])
-                room = len(left) if row == run[-1] else own
-                found[row][place], left = left[:room], left[room:]
-    return found
 
+    def _cell(self, row: int, column: int) -> str:
+        text = self.fit(self.table.text(row, column))
+        if not self.mark or self.table.columns[column].higher_is_better is None:
+            return text
+        return text + (self.mark if self.table.rank(row, column) == 0 else " ")
 
-def _repeats(table: Table, columns: Sequence[int]) -> list[list[int]]:
-    """Return the runs of rows of one block that have the same texts in some columns."""
-    runs: list[list[int]] = []
-    for row in range(len(table.rows)):
-        texts = [table.text(row, i) for i in columns]
-        again = runs and row not in table.breaks
-        if again and texts == [table.text(runs[-1][0], i) for i in columns]:
-            runs[-1].append(row)
-        else:
-            runs.append([row])
-    return runs
+    def _widths(self) -> list[int]:
+        """The width of each column; texts are folded where not all fit, numbers never."""
+        least, most = _FOLDED
+        natural = [
+            max([1, *map(len, heading.split()), *(len(cells[index]) for cells in self.cells)])
+            for index, heading in enumerate(self.headings)
+        ]
+        self.widths = natural
+        everything = range(len(natural))
+        # Those that name rows are folded until all fits, or until they leave half to numbers.
+        for limit in range(most, least - 1, -1):
+            if _total(self.widths, everything) <= self.width:
+                return self.widths
+            self.widths = [
+                min(width, limit) if index < self.keys and not self.numbers[index] else width
+                for index, width in enumerate(natural)
+            ]
+            if _total(self.widths, everything[: self.keys]) <= self.width // 2:
+                break
+        # A name that fits a line stays whole, so that it can be copied; prose is folded.
+        room = max(self.width - _total(self.widths, everything[: self.keys]) - _GAP, most)
+        for index in everything[self.keys :]:
+            if not self.numbers[index] and natural[index] > min(room, 2 * most):
+                self.widths[index] = min(room, max(most, self.width // 2))
+        return self.widths
 
+    def _block(self, columns: Sequence[int]) -> Iterator[Any]:
+        """The line that names groups of columns, if there are any; heading, rule and rows."""
+        from rich.box import Box
+        from rich.table import Table as RichTable
+        from rich.text import Text
 
-def _parts(text: str, width: int) -> list[str]:
-    """Return a cell's lines; spaces at its end stay, which keep numbers in line."""
-    if len(text) <= width:
-        return [text]
-    return _wrapped(text, width)
+        widths = self._spread(columns)
+        rule = self.fit("─")
+        if any(self.table.columns[index].group for index in columns):
+            yield self._groups(columns, widths, rule)
+        lines = ["    "] * 8
+        lines[2] = lines[4] = rule * 4
+        box = Box("\n".join(lines), ascii=True)
+        grid = RichTable(box=box, show_edge=False, pad_edge=False, padding=(0, _GAP - 1, 0, 0))
+        grid.show_header, grid.header_style = True, "bold"
+        for index in columns:
+            heading = Text(self.headings[index], justify="right" if self.numbers[index] else "left")
+            grid.add_column(heading, width=widths[index], overflow="fold")
+        for row, cells in enumerate(self._rows(columns, widths)):
+            if row in self.table.breaks:
+                grid.add_section()
+            ranks = [self.table.rank(row, index) for index in columns]
+            grid.add_row(*(Text(c, _STYLES[r]) for c, r in zip(cells, ranks, strict=True)))
+        yield grid
 
+    def _spread(self, columns: Sequence[int]) -> list[int]:
+        """Widen the last column of each group whose name has a longer word, if there is room."""
+        widths = list(self.widths)
+        for group, run in groupby(columns, key=lambda i: self.table.columns[i].group):
+            members = list(run)
+            lacks = max(map(len, group.split()), default=0) - _total(widths, members)
+            if 0 < lacks <= self.width - _total(widths, columns):
+                widths[members[-1]] += lacks
+        return widths
 
-def _joined(
-    table: Table,
-    columns: Sequence[int],
-    widths: Sequence[int],
-    texts: Sequence[str],
-    styles: str | Sequence[str],
-) -> Line:
-    each = [styles] * len(columns) if isinstance(styles, str) else styles
-    pieces: list[tuple[str, str]] = []
-    for place, (index, text, style) in enumerate(zip(columns, texts, each, strict=True)):
-        space = " " * (widths[index] - len(text))
-        gap = " " * (_GAP if place else 0)
-        if _is_number(table, index):
-            pieces += [(gap + space, ""), (text, style)]
-        else:
-            pieces += [(gap, ""), (text, style), (space, "")]
-    return Line(tuple(pieces))
+    def _groups(self, columns: Sequence[int], widths: Sequence[int], rule: str) -> Any:
+        """The names of groups over a block, centred in a rule where there is room for one."""
+        from rich.rule import Rule
+        from rich.table import Table as RichTable
+        from rich.text import Text
 
+        line = RichTable.grid(padding=(0, _GAP, 0, 0))
+        cells: list[Any] = []
+        for group, run in groupby(columns, key=lambda i: self.table.columns[i].group):
+            name, span = self.fit(group), _total(widths, list(run))
+            line.add_column(width=span, justify="center", vertical="bottom")
+            ruled = name and len(name) + 4 <= span
+            cells.append(Rule(name, characters=rule, style="bold") if ruled else Text(name, "bold"))
+        line.add_row(*cells)
+        return line
 
-def _group_line(
-    table: Table, columns: Sequence[int], widths: Sequence[int], stroke: str
-) -> list[Line]:
-    """Return the line over the heading that names groups of columns, if there are any."""
-    if not any(table.columns[i].group for i in columns):
-        return []
-    depths: list[tuple[int, list[str], bool]] = []
-    for group, members in groupby(columns, key=lambda i: table.columns[i].group):
-        span = _total([widths[i] for i in members])
-        depths.append((span, _wrapped(group, span), bool(group)))
-    deepest = max(len(texts) for _, texts, _ in depths)
-    lines = []
-    for depth in range(deepest):
-        parts = []
-        for span, texts, named in depths:
-            padded = [""] * (deepest - len(texts)) + texts
-            text = padded[depth]
-            last = named and depth == deepest - 1 and len(text) + 4 <= span
-            parts.append(f" {text} ".center(span, stroke) if last else text.center(span))
-        lines.append(Line((((" " * _GAP).join(parts), "bold"),)))
-    return lines
+    def _rows(self, columns: Sequence[int], widths: Sequence[int]) -> list[list[str]]:
+        """The cells of each row, numbers to the right.
+
+        Where blocks of rows begin with the same texts, a text stands once and flows down over the
+        rows that repeat it. The last column that names rows is always printed.
+        """
+        found = [
+            [c[i].rjust(widths[i]) if self.numbers[i] else c[i] for i in columns]
+            for c in self.cells
+        ]
+        edges = [*self.table.breaks, len(found)] if self.table.breaks else []
+        for place in range(self.keys - 1):
+            start = 0
+            for edge in edges:
+                block = range(start, edge)
+                for _, run in groupby(block, key=lambda row: self.cells[row][: place + 1]):
+                    rows = list(run)
+                    left = textwrap.wrap(found[rows[0]][place], widths[place])
+                    for row in rows:
+                        here = left if row == rows[-1] else left[:1]
+                        found[row][place], left = "\n".join(here), left[1:]
+                start = edge
+        return found
