@@ -441,8 +441,10 @@ class _Drawing:
         lines = ["    "] * 8
         lines[2] = lines[4] = rule * 4
         box = Box("\n".join(lines), ascii=True)
-        grid = RichTable(box=box, show_edge=False, pad_edge=False, padding=(0, _GAP - 1, 0, 0))
-        grid.show_header, grid.header_style = True, "bold"
+        space = (0, _GAP - 1, 0, 0)
+        grid = RichTable(
+            box=box, show_edge=False, pad_edge=False, padding=space, header_style="bold"
+        )
         for index in columns:
             heading = Text(self.headings[index], justify="right" if self.numbers[index] else "left")
             grid.add_column(heading, width=widths[index], overflow="fold")
