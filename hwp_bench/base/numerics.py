@@ -13,11 +13,21 @@ only with functions that are compiled with `parallel=True`, of which we have non
 
 from __future__ import annotations
 
+import functools
 import os
 import re
-from collections.abc import Mapping
+import sys
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.errors import UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from scipy.spatial import cKDTree
+
 
 #: Variables by which a person says how the threads of OpenMP wait; each speaks for all.
 OPENMP_WAITING = ("OMP_WAIT_POLICY", "GOMP_SPINCOUNT", "KMP_BLOCKTIME", "KMP_LIBRARY")
@@ -99,3 +109,109 @@ def count_is_chosen(environment: Mapping[str, str]) -> bool:
         environment: what is set.
     """
     return any(environment.get(name, "").strip() for name in TORCH_COUNTS)
+
+
+#: Where the C library's `fenv_t` has the control register (in words of 32 bits), and its bits that
+#: flush results (x86-64: and operands) to zero.
+_REGISTERS = {
+    ("linux", "x86_64"): (7, 0x8040),
+    ("linux", "aarch64"): (0, 1 << 24),
+    ("darwin", "x86_64"): (1, 0x8040),
+    ("darwin", "arm64"): (2, 1 << 24),
+}
+#: Room for any `fenv_t`, in words.
+_WORDS = 64
+#: The least normal float64; not a constant, which the interpreter would multiply beforehand.
+_LEAST = [sys.float_info.min]
+
+
+def flushes() -> bool:
+    """Whether the calling thread flushes denormals to zero."""
+    return _LEAST[0] * 0.5 == 0.0
+
+
+def set_flush(on: bool) -> bool:
+    """Switch the calling thread.
+
+    Args:
+        on: flush denormals to zero, or compute with them.
+
+    Returns:
+        Whether it flushed before.
+    """
+    before = flushes()
+    library = _library() if on != before else None
+    if library is not None:
+        place, bits = _REGISTERS[_machine()]
+        state = library.state()
+        if library.fegetenv(state) == 0:
+            state[place] = state[place] | bits if on else state[place] & ~bits
+            library.fesetenv(state)
+    return before
+
+
+@contextmanager
+def flushed() -> Iterator[None]:
+    """Flush denormals in the calling thread, and in threads that it starts, while this holds."""
+    before = set_flush(True)
+    try:
+        yield
+    finally:
+        set_flush(before)
+
+
+@contextmanager
+def flushed_process() -> Iterator[None]:
+    """Flush denormals in a process of ours: around its main function, before it imports NumPy."""
+    with warnings.catch_warnings():
+        # Some versions of NumPy warn when they find the switch set.
+        warnings.filterwarnings("ignore", message="The value of the smallest subnormal")
+        with flushed():
+            yield
+
+
+def _machine() -> tuple[str, str]:
+    return sys.platform, os.uname().machine if hasattr(os, "uname") else ""
+
+
+@functools.cache
+def _library() -> Any:
+    """The C library's functions; None where the register's place is not known."""
+    if _machine() not in _REGISTERS or sys.maxsize < 2**32:
+        return None
+    import ctypes
+
+    names = (None, "libm.so.6", "libm.dylib")
+    for name in names:
+        try:
+            library: Any = ctypes.CDLL(name)
+            for function in (library.fegetenv, library.fesetenv):
+                function.argtypes = [ctypes.c_void_p]
+        except (OSError, AttributeError):
+            continue
+        library.state = ctypes.c_uint32 * _WORDS
+        return library
+    return None
+
+
+def kd_tree(points: np.ndarray) -> cKDTree:
+    """Build a tree over points.
+
+    Where half of the points share their least coordinate, SciPy splits at the next number above
+    it. Above 0 that is a denormal number. A thread that flushes these reads it as 0 again, and
+    the build calls itself until the process dies. So the thread keeps denormals while it builds;
+    queries do not need them.
+
+    Args:
+        points: (N, D), finite.
+
+    Returns:
+        `scipy.spatial.cKDTree`.
+    """
+    from scipy.spatial import cKDTree
+
+    before = set_flush(False)
+    try:
+        return cKDTree(points)
+    finally:
+        set_flush(before)

