@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.tables import format_table, print_table
     from hwp_bench.report.evaluation_tables import HEADLINE
     from hwp_bench.results import read_all
-    from hwp_bench.results.walls import noted
+    from hwp_bench.results.schema import noted
 
     results = read_all(args.results)
     comparison = compare_results(

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hwp_bench.run.engine.options import add_engine_arguments
+from hwp_bench.run.engine.job import add_engine_arguments
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.report.free_view_table import free_view_tables
-    from hwp_bench.run.engine.options import engine_for, needs_of
+    from hwp_bench.run.engine.job import engine_for, needs_of
 
     settings = evaluation_settings(args)
     sealed = _sealed_part(args)
@@ -196,7 +196,7 @@ def look_ahead(
     Raises:
         HwpError: as `check_results_place`, `check_call` and `check_suite`.
     """
-    from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
+    from hwp_bench.evaluation.evaluate import check_call, check_results_place, check_suite
 
     inputs = {
         "--capture": args.capture,
@@ -229,7 +229,7 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
 def report_outcome(out: Path, results: Results) -> int:
     """Print where the results are and which frames failed; returns the exit status."""
     from hwp_bench.base.progress import notice
-    from hwp_bench.evaluation.outcome import outcome_lines
+    from hwp_bench.evaluation.sentences import outcome_lines
 
     for line in outcome_lines(out, results):
         notice(line)
@@ -276,7 +276,7 @@ def chosen_captures(args: argparse.Namespace, engine: Engine) -> list[Path]:
     """Return the capture folders that were named, or the suite, rendered if it is missing."""
     if args.capture:
         return [Path(path) for path in args.capture]
-    from hwp_bench.run.engine.options import needs_of
+    from hwp_bench.run.engine.job import needs_of
     from hwp_bench.sim import ensure_suite
 
     return ensure_suite(args.suite, engine=engine, needs=needs_of(args))

@@ -1,15 +1,20 @@
-"""Evaluate one method on one capture: run it, score its predictions, store the result."""
+"""The key of an evaluation: one digest of everything that decides its scores.
+
+A stored result of the same key is taken as it is. The key also binds a result: whoever changes the
+name, settings, seed or budget of a result by hand leaves a key that is not of its content.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
-from hwp_bench.base.files import disc_errors, read_json, write_json
+from hwp_bench.base.files import disc_errors, read_json, sha256_json, write_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import MAX_TEXT, parse_record
 from hwp_bench.base.scratch import scratch_folder
@@ -19,11 +24,15 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.content import refuse_changed
 from hwp_bench.capture.schema import EXTRA, IMAGE_FOLDERS
 from hwp_bench.capture.splits import Split
-from hwp_bench.evaluation.artifacts import keep_artifacts
-from hwp_bench.evaluation.colour_check import colour_warnings, keep_warnings
-from hwp_bench.evaluation.evaluation_key import evaluation_key
-from hwp_bench.evaluation.free_view import keep_free_view, read_free_targets, score_free_view
+from hwp_bench.evaluation.artifacts import (
+    keep_artifacts,
+    keep_free_view,
+    read_free_targets,
+    score_free_view,
+)
 from hwp_bench.evaluation.scoring import (
+    colour_warnings,
+    keep_warnings,
     mean_scores,
     predictions_digest,
     read_prediction,
@@ -31,26 +40,75 @@ from hwp_bench.evaluation.scoring import (
     read_targets,
     score_predictions,
 )
-from hwp_bench.methods.contents import (
-    digest_of,
-    exposed_digest,
-    left_out_folders,
-    method_files,
-)
+from hwp_bench.methods.contents import digest_of, exposed_digest, left_out_folders, method_files
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
-from hwp_bench.methods.manifest import MethodManifest, read_manifest
+from hwp_bench.methods.manifest import MethodManifest, read_manifest, ships
 from hwp_bench.methods.request import write_request
-from hwp_bench.methods.setting_files import ships
-from hwp_bench.metrics import PROTOCOLS
+from hwp_bench.metrics import METRICS, PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
-from hwp_bench.results import CaptureResult, CurvePoint
-from hwp_bench.results.walls import WALLED
+from hwp_bench.results import CaptureResult, CurvePoint, Results
+from hwp_bench.results.schema import WALLED
 from hwp_bench.run.engine import Folder, Job, Needs
 from hwp_bench.run.engine.job import OnProgress, ignore
-from hwp_bench.run.output import LOG, RunFacts, checkpoint_folder
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
+from hwp_bench.run.worker import LOG, RunFacts, checkpoint_folder
+
+#: Version of the evaluation itself; a stored result of another version is not taken.
+RECIPE = 1
+
+
+def evaluation_key(
+    *,
+    method: tuple[str, str],
+    capture: str,
+    split: str,
+    settings: Mapping[str, Any],
+    seed: int,
+    budget: Mapping[str, float | None],
+    frames: str,
+    protocols: Sequence[Mapping[str, Any]],
+    networks: Iterable[str],
+    exposed: str | None,
+    free_view: str | None,
+) -> str:
+    """Return the SHA-256 (hex) of everything that decides the scores of a capture."""
+    return sha256_json(
+        {
+            "recipe": RECIPE,
+            "method": list(method),
+            "capture": capture,
+            "split": split,
+            "settings": dict(settings),
+            "seed": seed,
+            "budget": dict(budget),
+            "frames": frames,
+            "protocols": list(protocols),
+            "networks": sorted(networks),
+            **({"exposed": exposed} if exposed is not None else {}),
+            **({"free_view": free_view} if free_view is not None else {}),
+        }
+    )
+
+
+def key_of(results: Results, capture: CaptureResult, clip: str | None) -> str:
+    """Return the key of one capture of a result, from the result's other fields."""
+    scored = {name for frame in capture.frames for name in frame.scores}
+    return evaluation_key(
+        method=(results.method.name, results.method.digest),
+        capture=capture.digest,
+        split=capture.split_digest,
+        settings=results.method.settings,
+        seed=results.seed,
+        budget=results.budget,
+        frames=results.frames,
+        protocols=list(results.protocols.values()),
+        networks={item.weights for item in METRICS if item.weights and item.name in scored},
+        exposed=capture.exposed,
+        free_view=clip,
+    )
+
 
 #: The result of one capture, inside its folder.
 RESULT = "result.json"
@@ -111,22 +169,7 @@ class CaptureEvaluation:
 def evaluate_capture(
     evaluation: CaptureEvaluation, folder: Path, on_progress: OnProgress = ignore
 ) -> CaptureResult:
-    """Run a method on a capture and score it; a stored result of the same key is taken as it is.
-
-    Args:
-        evaluation: the method, the capture and the settings.
-        folder: where result, predictions, images and log go.
-        on_progress: called with (done, total) steps of the fit.
-
-    Returns:
-        The result, which `folder/result.json` then holds. A method that fails gives a result
-        with the reason and penalties, not an error.
-
-    Raises:
-        BadCapture, BadImage: the capture itself is damaged, or was changed after it was written.
-        BadMethod: files of the method changed while it ran.
-        HwpError: `folder` cannot be written to.
-    """
+    """Run a method on a capture and score it; a stored result of the same key is taken as it is."""
     stored = stored_result(evaluation, folder)
     if stored is not None:
         return stored
@@ -192,11 +235,7 @@ def _evaluate(
 
 
 def _refuse_edited(evaluation: CaptureEvaluation) -> None:
-    """Refuse to score a run of a method whose files are not those that it began with.
-
-    Raises:
-        BadMethod: files were changed, added or removed since the evaluation was planned.
-    """
+    """Refuse to score a run of a method whose files are not those that it began with."""
     planned = evaluation.method_files
     if planned is None:
         return
@@ -213,11 +252,7 @@ def _refuse_edited(evaluation: CaptureEvaluation) -> None:
 
 
 def _refuse_changed(evaluation: CaptureEvaluation) -> None:
-    """Refuse a capture, or a clip in it, whose content is not that of the digests.
-
-    Raises:
-        BadCapture, BadImage: as `hwp_bench.capture.content.refuse_changed`.
-    """
+    """Refuse a capture, or a clip in it, whose content is not that of the digests."""
     clean = evaluation.run.frames != FRAME_CHOICES[0]
     for capture in (evaluation.capture, evaluation.capture.free_view):
         if capture is None:
@@ -247,11 +282,7 @@ def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult 
 
 
 def read_result(folder: Path) -> CaptureResult:
-    """Read the result that `evaluate_capture` left in a folder.
-
-    Raises:
-        BadInput, BadResult: it is missing or damaged.
-    """
+    """Read the result that `evaluate_capture` left in a folder."""
     path = folder / RESULT
     return parse_record(CaptureResult, read_json(path), where=str(path))
 
@@ -345,14 +376,7 @@ def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list
 
 
 def evaluation_job(evaluation: CaptureEvaluation, folder: Path, text: str, needs: Needs) -> Job:
-    """Return an evaluation as a job of an engine.
-
-    Args:
-        evaluation: the evaluation.
-        folder: where its result goes.
-        text: what a person is shown.
-        needs: the share of a machine that it takes.
-    """
+    """Return an evaluation as a job of an engine."""
     root = evaluation.manifest.root.resolve()
     shipped = root.relative_to(PACKAGES).as_posix() if root.is_relative_to(PACKAGES) else None
     inputs = {"capture": Folder(evaluation.capture.root, (EXTRA,))}
@@ -397,11 +421,7 @@ class EvaluateElsewhere:
     key: str
 
     def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
-        """Evaluate; see `hwp_bench.run.engine.job.Work`.
-
-        Raises:
-            HwpError: method, capture, weights or protocols differ here.
-        """
+        """Evaluate; see `hwp_bench.run.engine.job.Work`."""
         known = load_available() if self.networks else {}
         missing = [name for name in self.networks if name not in known]
         if missing:

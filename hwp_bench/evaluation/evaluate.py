@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from hwp_bench.base.errors import BadCapture, BadMethod
+from hwp_bench.base.errors import BadCapture, BadMethod, HwpError, UsageError
+from hwp_bench.base.files import Places, check_places, inside
 from hwp_bench.base.locks import exclusive
 from hwp_bench.base.progress import notice
 from hwp_bench.base.records import check_json_values, merged, parse_record
@@ -15,27 +16,31 @@ from hwp_bench.base.text import one_line
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
-from hwp_bench.evaluation.capture_evaluation import (
-    CaptureEvaluation,
-    evaluation_job,
-)
+from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation, evaluation_job
 from hwp_bench.evaluation.results_folder import (
     finish_together,
     open_results_folder,
+    refuse_other,
     say_kept,
 )
 from hwp_bench.methods.contents import digest_of, method_files, refuse_links_out
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
-from hwp_bench.methods.manifest import MethodManifest, find_method, read_manifest
-from hwp_bench.methods.setting_files import find_setting_files
+from hwp_bench.methods.manifest import (
+    MethodManifest,
+    check_settings,
+    find_method,
+    find_setting_files,
+    read_manifest,
+)
 from hwp_bench.metrics import PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results
-from hwp_bench.results.environment import environment
+from hwp_bench.results.schema import environment
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, rehearse_method
 from hwp_bench.run.sandbox.confinement import Confinement
+from hwp_bench.sim.produce.suites import SuiteItem, is_rendered, suite
 
 #: Most seconds that a method may take to be made before the first capture.
 REHEARSAL_SECONDS = 600.0
@@ -93,29 +98,6 @@ def evaluate(
     result is on disk before the next begins, and an evaluation that is started again takes
     finished captures as they are, and says so. Results of another evaluation that `out` holds are
     refused, or stay until all new ones are whole.
-
-    Args:
-        method: method directory, or the name of one that ships with the toolkit.
-        captures: capture folders.
-        out: results folder.
-        settings: suite, preset, seed, budget, limits.
-        splits: splits by capture id; None applies the 80/10/10 rule.
-        on_capture: hook for showing progress, where captures are evaluated in turn.
-        engine: where captures are evaluated; one after another in this process if None.
-        needs: the share of a machine that one capture takes.
-        overwrite: results of another evaluation in `out` may be replaced.
-        rehearse: make the method once before the first capture, where any is to be run; not to be
-            asked for where it runs on other machines.
-
-    Returns:
-        The results, which `out/results.json` then holds, with tables in `out/tables`.
-
-    Raises:
-        UsageError: `out` holds results of another evaluation.
-        BadMethod: the method directory is wrong, or its files change meanwhile.
-        MethodFailed: the method cannot be made.
-        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
-        HwpError: another evaluation is writing to `out`, or it cannot be written.
     """
     manifest = read_manifest(find_method(method))
     settings = with_setting_files(manifest, settings)
@@ -171,11 +153,7 @@ def hiding(evaluation: CaptureEvaluation, out: Path) -> CaptureEvaluation:
 def with_setting_files(
     manifest: MethodManifest, settings: EvaluationSettings
 ) -> EvaluationSettings:
-    """Expose the files that a person's settings name, with absolute paths in the settings.
-
-    Raises:
-        UsageError: one of them is not there.
-    """
+    """Expose the files that a person's settings name, with absolute paths in the settings."""
     chosen, files = find_setting_files(manifest, settings.run.settings)
     exposed = tuple(dict.fromkeys((*settings.confinement.exposed, *files)))
     return replace(
@@ -208,12 +186,7 @@ class Plan:
     confinement: Confinement
 
     def rehearse(self) -> None:
-        """Make the method once with its settings: what fails there would fail on every capture.
-
-        Raises:
-            MethodFailed: it cannot be made; its last lines have been printed.
-            BadMethod: there is no such program.
-        """
+        """Make the method once with its settings: what fails there would fail on every capture."""
         limit = min(self.time_limit, REHEARSAL_SECONDS)
         rehearse_method(self.manifest, self.run, time_limit=limit, confinement=self.confinement)
 
@@ -246,19 +219,7 @@ def make_plan(
     settings: EvaluationSettings,
     networks: Mapping[str, Network] | None = None,
 ) -> Plan:
-    """Plan an evaluation; nothing runs yet.
-
-    Args:
-        manifest: the method.
-        captures: what `open_captures` returned.
-        settings: suite, preset, seed, budget, limits.
-        networks: LPIPS by backbone; None loads those whose weights are there.
-
-    Raises:
-        BadMethod: there is no such preset, or an override is not a plain value or not a setting
-            of the method, or the result could not be read again, or the method has a link to what
-            is in no digest.
-    """
+    """Plan an evaluation; nothing runs yet."""
     preset = manifest.preset(settings.preset, settings.suite)
     check_json_values(
         dict(settings.run.settings), where=manifest.name, field="settings", error=BadMethod
@@ -296,15 +257,7 @@ def make_plan(
 def open_captures(
     paths: Sequence[Path], splits: Mapping[str, Split] | None = None
 ) -> list[tuple[Capture, Split]]:
-    """Open captures, each with its split.
-
-    Args:
-        paths: capture folders.
-        splits: splits by capture id; None applies the 80/10/10 rule.
-
-    Raises:
-        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong, or two have one id.
-    """
+    """Open captures, each with its split."""
     opened: list[tuple[Capture, Split]] = []
     for path in paths:
         capture = open_capture(path)
@@ -317,3 +270,80 @@ def open_captures(
             )
         opened.append((capture, split_for(capture.info.id, len(capture), splits)))
     return opened
+
+
+def check_results_place(
+    manifest: MethodManifest, out: Path, inputs: Mapping[str, Places], option: str = "--out"
+) -> None:
+    """Refuse results that would lie in the method or in data, or replace data.
+
+    A method could read results in its own folder, and they would change its digest.
+    """
+    check_places({option: out}, {"METHOD_DIR": manifest.root, **inputs})
+    check_places({f"{option}, captures": out / "captures"}, inputs, replaces=True)
+
+
+def check_call(
+    manifest: MethodManifest,
+    settings: EvaluationSettings,
+    out: Path,
+    field: str = "settings",
+    *,
+    overwrite: bool = False,
+) -> None:
+    """Refuse a call that cannot work, as far as it can be told from the call alone."""
+    check_settings(manifest, settings.run.settings, field)
+    manifest.preset(settings.preset, settings.suite)
+    if settings.run.frames not in FRAME_CHOICES and ":" not in settings.run.frames:
+        known = ", ".join(FRAME_CHOICES)
+        raise UsageError(f"{settings.run.frames!r} is not one of {known}", field="frames")
+    for path in settings.confinement.exposed:
+        if not path.exists():
+            raise UsageError("does not exist", where=path, field="--expose")
+    above = next((place for place in (out, *out.absolute().parents) if place.exists()), out)
+    if above.exists() and not above.is_dir():
+        raise HwpError(
+            "cannot be a results folder, because a file is there",
+            where=above,
+            remedy="Choose another folder with --out.",
+        )
+    if not overwrite:
+        plan = make_plan(manifest, (), with_setting_files(manifest, settings), {})
+        refuse_other(out, plan.results([]))
+
+
+def check_suite(
+    manifest: MethodManifest,
+    settings: EvaluationSettings,
+    out: Path,
+    splits: Mapping[str, Split] | None = None,
+    *,
+    rehearse: bool = True,
+) -> bool:
+    """Refuse what would fail on a suite, before it is rendered."""
+    items = suite(settings.suite)
+    for item in items:
+        split_for(item.scene.id, item.frame_count, splits)
+    if manifest.kind == "predictions":
+        _check_predictions(manifest, items)
+    if is_rendered(settings.suite):
+        return False
+    with exclusive(out):
+        pass
+    if rehearse:
+        make_plan(manifest, (), with_setting_files(manifest, settings), {}).rehearse()
+    return rehearse
+
+
+def _check_predictions(manifest: MethodManifest, items: Sequence[SuiteItem]) -> None:
+    names = [item.scene.id for item in items]
+    folders = {name: inside(manifest.root, f"{manifest.entry}/{name}") for name in names}
+    missing = [name for name, folder in folders.items() if not any(folder.glob("*.png"))]
+    if len(missing) == len(names):
+        raise BadMethod(
+            f"has predictions of no capture of this suite ({', '.join(names)})",
+            where=manifest.root / str(manifest.entry),
+            remedy=f"Put the frames into {manifest.entry}/CAPTURE/, or choose another suite.",
+        )
+    if missing:
+        notice(f"no predictions of {', '.join(missing)}: every frame there gets the penalty")

@@ -1,36 +1,31 @@
-"""Recompute the digests and scores of a result from its stored predictions.
+"""PSNR and SSIM of a frame by scikit-image: a second opinion on the toolkit's own formulas.
 
-PSNR and SSIM of some frames are computed a second time, by scikit-image. What no pixel decides is
-bound otherwise (`hwp_bench/evaluation/bindings.py`).
+Nothing of `hwp_bench.metrics` is used but the protocol's settings, so that a fault of the toolkit's
+code cannot hide in both numbers.
 """
 
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from hwp_bench.base.errors import BadSplit, HwpError
+from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import inside, read_json, sha256_json
+from hwp_bench.base.images import as_float
+from hwp_bench.base.tables import FORMATS, Table, format_table
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import Split, split_for
-from hwp_bench.evaluation import cross_check
-from hwp_bench.evaluation.bindings import (
-    Discrepancy,
-    copy_differences,
-    digest_differences,
-    failure_differences,
-    key_differences,
-    label_differences,
-    suite_differences,
-    table_differences,
-)
-from hwp_bench.evaluation.capture_evaluation import RESULT
-from hwp_bench.evaluation.free_view import PREDICTIONS as FREE_PREDICTIONS
+from hwp_bench.evaluation.artifacts import FREE_PREDICTIONS
+from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
 from hwp_bench.evaluation.scoring import (
     Prediction,
     Target,
@@ -39,12 +34,241 @@ from hwp_bench.evaluation.scoring import (
     read_targets,
     score_predictions,
 )
+from hwp_bench.evaluation.sentences import is_of_suite, missing, other_captures
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.protocol import HWP_V1, Protocol
 from hwp_bench.metrics.score import Network
+from hwp_bench.report.evaluation_tables import all_tables
+from hwp_bench.report.free_view_table import free_view_tables
 from hwp_bench.results import CaptureResult, FrameResult, Results, read_results
-from hwp_bench.results.bounds import MAX_BYTES
-from hwp_bench.results.environment import code_digest, environment
+from hwp_bench.results.schema import MAX_BYTES, code_digest, environment
+from hwp_bench.results.store import content_digest
+from hwp_bench.sim.produce.suites import suite_names
+
+#: Largest difference between a score and scikit-image's: dB of PSNR, or units of SSIM. Both are
+#: computed in float64, where the sums differ only in their order.
+CROSS_TOLERANCE = 1e-6
+#: Most frames of a capture that are cross-checked.
+CROSS_SAMPLE = 4
+
+
+def sample_frames(count: int) -> list[int]:
+    """Return the positions of at most `CROSS_SAMPLE` frames, evenly spread."""
+    return evenly(count, CROSS_SAMPLE).tolist()
+
+
+def reference_scores(
+    prediction: np.ndarray,
+    target: np.ndarray,
+    mask: np.ndarray,
+    *,
+    coverage: bool,
+    protocol: Protocol = HWP_V1,
+) -> dict[str, float]:
+    """Compute PSNR and SSIM of the scored pixels with scikit-image."""
+    from skimage.metrics import structural_similarity
+
+    region = _scored_region(mask, protocol.mask_erosion, coverage)
+    # Black beyond the frame, where scikit-image would mirror the image; only the part of the frame
+    # that the windows of scored pixels reach.
+    settings = protocol.ssim
+    border = 2 * settings.radius
+    rows, columns = (np.flatnonzero(region.any(axis=axis)) for axis in (1, 0))
+    part = (
+        slice(int(rows[0]), int(rows[-1]) + 2 * border + 1),
+        slice(int(columns[0]), int(columns[-1]) + 2 * border + 1),
+    )
+    inside = np.pad(region, border)[part]
+    x, y = (
+        np.pad(np.where(region[..., None], as_float(image), 0.0), ((border,) * 2,) * 2 + ((0, 0),))[
+            part
+        ]
+        for image in (prediction, target)
+    )
+    _, similarity = structural_similarity(
+        x,
+        y,
+        full=True,
+        channel_axis=2,
+        gaussian_weights=True,
+        sigma=settings.sigma,
+        use_sample_covariance=settings.sample_covariance,
+        data_range=settings.data_range,
+        K1=settings.k1,
+        K2=settings.k2,
+    )
+    return {
+        "psnr": _psnr(x[inside], y[inside], protocol.psnr_cap),
+        "ssim": float(similarity.mean(axis=2)[inside].mean()),
+    }
+
+
+def _scored_region(mask: np.ndarray, erosion: int, coverage: bool) -> np.ndarray:
+    """(H, W) bool: the pixels that the hand covers fully."""
+    from skimage.morphology import dilation
+
+    if coverage:
+        return np.asarray(mask == 255)
+    # The hand's border is where the background reaches; the frame's border takes nothing away.
+    background = (mask <= 127).astype(np.uint8)
+    side = 2 * erosion + 1
+    return np.asarray(dilation(background, np.ones((side, side), np.uint8)) == 0)
+
+
+def _psnr(x: np.ndarray, y: np.ndarray, cap: float) -> float:
+    from skimage.metrics import peak_signal_noise_ratio
+
+    # scikit-image divides by zero where the images are equal.
+    if np.array_equal(x, y):
+        return cap
+    value = float(peak_signal_noise_ratio(y, x, data_range=1.0))
+    return cap if math.isnan(value) else min(cap, value)
+
+
+#: Longest value of a field that a difference repeats.
+_SHOWN = 100
+
+
+@dataclass(frozen=True)
+class Discrepancy:
+    """One part of a result that is not as the result says."""
+
+    #: Id of the capture; empty for the whole result.
+    capture: str
+    #: The part that was verified: `capture`, `split`, `frames`, `predictions`, `protocols`, a label
+    #: (`hands`, `perturbations`, `exact_masks`, `made_by`), `key`, `suite`, `digest`, a stored
+    #: copy or table, or a frame and metric.
+    what: str
+    #: Its value in the result.
+    recorded: str
+    #: Its value as it was found.
+    found: str
+
+
+def label_differences(record: CaptureResult, capture: Capture, exact: bool) -> list[Discrepancy]:
+    """Compare what a result says of a capture with what the capture says of itself."""
+    info = capture.info
+    wanted = {
+        "hands": info.hands,
+        "perturbations": list(info.perturbations),
+        "exact_masks": exact,
+        "made_by": info.made_by,
+    }
+    # Who made the parameters was not recorded at first.
+    if record.made_by is None:
+        del wanted["made_by"]
+    return [
+        Discrepancy(record.id, name, _brief(getattr(record, name)), _brief(value))
+        for name, value in wanted.items()
+        if getattr(record, name) != value
+    ]
+
+
+def failure_differences(record: CaptureResult) -> list[Discrepancy]:
+    """Look for scored frames of a method that is said to have failed on the whole capture."""
+    scored = sum(frame.failure is None for frame in record.frames)
+    if record.failure is None or not scored:
+        return []
+    return [Discrepancy(record.id, "failure", "every frame", f"{scored} frames have predictions")]
+
+
+def key_differences(results: Results, record: CaptureResult, clip: str | None) -> list[Discrepancy]:
+    """Compute the key of a capture again: it binds method, settings, seed, budget and protocols."""
+    # A clip that was made after the evaluation is in no key of it.
+    keys = {key_of(results, record, digest) for digest in {None, clip}}
+    if record.free_view is not None:
+        keys = {key_of(results, record, record.free_view.digest)}
+    if record.key in keys:
+        return []
+    found = "another: method, settings, seed, budget, frames, protocols or metrics were changed"
+    return [Discrepancy(record.id, "key", record.key, found)]
+
+
+def suite_differences(
+    results: Results, captures: Sequence[Capture], *, own_splits: bool = False
+) -> list[Discrepancy]:
+    """Compare a result with the suite that it names: captures, splits, frames and scenes."""
+    if results.suite not in suite_names():
+        return []
+    problems = other_captures(results) if own_splits else missing(results)
+    foreign = [item.info.id for item in captures if not is_of_suite(item.info, results.suite)]
+    if foreign:
+        problems.append(f"is of other scenes or sizes: {', '.join(foreign)}")
+    return [Discrepancy("", "suite", results.suite, problem) for problem in problems]
+
+
+def digest_differences(value: Mapping[str, Any], *, expected: bool) -> list[Discrepancy]:
+    """Compare a result file with the digest that it states of its own content."""
+    stated, found = content_digest(value)
+    if stated == found or (stated is None and not expected):
+        return []
+    return [Discrepancy("", "digest", _brief(stated), found)]
+
+
+def copy_differences(root: Path, value: Mapping[str, Any], name: str) -> list[Discrepancy]:
+    """Compare each capture of a result file with the copy of it next to its predictions."""
+    found = []
+    for record in value["captures"]:
+        place = f"captures/{record['id']}/{name}"
+        try:
+            path = inside(root, place)
+            if not path.is_file():
+                continue
+            copy = read_json(path, max_bytes=MAX_BYTES)
+        except HwpError as error:
+            found.append(Discrepancy(record["id"], name, "a copy of this capture", error.problem))
+            continue
+        copy = copy if isinstance(copy, dict) else {}
+        odd = [key for key in {*record, *copy} if record.get(key) != copy.get(key)]
+        found += [
+            Discrepancy(
+                record["id"], f"{name}, {key}", _brief(record.get(key)), _brief(copy.get(key))
+            )
+            for key in sorted(odd)
+        ]
+    return found
+
+
+def table_differences(root: Path, results: Results) -> list[Discrepancy]:
+    """Make the tables that an evaluation wrote next to its result again, and compare them."""
+    try:
+        tables = {**all_tables([results]), **free_view_tables([results])}
+    except HwpError as error:
+        return [Discrepancy("", "tables", "tables of the result", error.problem)]
+    return [item for name, table in tables.items() for item in _one_table(root, name, table)]
+
+
+def _one_table(root: Path, name: str, table: Table) -> list[Discrepancy]:
+    found = []
+    for ending in FORMATS:
+        what = f"tables/{name}.{ending}"
+        try:
+            path = inside(root, what)
+            text = path.read_text("utf-8") if path.is_file() else None
+        except (HwpError, OSError, UnicodeDecodeError):
+            text = ""
+        if text is None or text == format_table(table, ending):
+            continue
+        place = _first_difference(text, format_table(table, ending))
+        found.append(Discrepancy("", what, *place))
+    return found
+
+
+def _first_difference(stored: str, made: str) -> tuple[str, str]:
+    """Return the first line in which two texts differ."""
+    first, second = stored.splitlines(), made.splitlines()
+    size = max(len(first), len(second))
+    lines = zip(
+        [*first, *[""] * (size - len(first))], [*second, *[""] * (size - len(second))], strict=True
+    )
+    return next(((a[:_SHOWN], b[:_SHOWN]) for a, b in lines if a != b), ("", "other line ends"))
+
+
+def _brief(value: Any) -> str:
+    text = value if isinstance(value, str) else json.dumps(value)
+    return text if len(text) <= _SHOWN else f"{text[:_SHOWN]}..."
+
 
 #: Largest difference of a score that rounding on another processor may make.
 TOLERANCE = 1e-6
@@ -84,14 +308,6 @@ def verify_results(
 
     Labels are compared with the captures and the suite, each capture with its stored copy, and
     the whole with the key and the digest that it states.
-
-    Args:
-        file: the result file; the predictions lie in `captures/ID/predictions` next to it.
-        captures: folders of the captures; further ones do no harm.
-        splits: splits by capture id; None applies the 80/10/10 rule.
-
-    Raises:
-        BadInput, BadResult: the result file is missing or damaged.
     """
     file = file / "results.json" if file.is_dir() else file
     results = read_results(file)
@@ -99,7 +315,11 @@ def verify_results(
     found: list[Discrepancy] = []
     ours = json.loads(json.dumps({protocol.name: protocol.as_dict() for protocol in PROTOCOLS}))
     if results.protocols != ours:
-        found.append(Discrepancy("", "protocols", _brief(results.protocols), _brief(ours)))
+        found.append(
+            Discrepancy(
+                "", "protocols", _protocol_digests(results.protocols), _protocol_digests(ours)
+            )
+        )
     known = _by_id(captures)
     networks = load_available()
     frames = scored = checked = 0
@@ -226,16 +446,14 @@ def _cross_check(
     """Compare some recorded scores with scikit-image's; returns differences and frames."""
     found = []
     valid = [place for place, item in enumerate(predictions) if item.pixels is not None]
-    sample = [valid[place] for place in cross_check.sample_frames(len(valid))] if valid else []
+    sample = [valid[place] for place in sample_frames(len(valid))] if valid else []
     for place in sample:
         target, pixels, old = targets[place], predictions[place].pixels, frames[place]
         assert pixels is not None
-        scores = cross_check.reference_scores(
-            pixels, target.pixels, target.mask, coverage=target.exact
-        )
+        scores = reference_scores(pixels, target.pixels, target.mask, coverage=target.exact)
         for metric, value in scores.items():
             recorded = old.scores.get(metric)
-            if recorded is None or abs(recorded - value) > cross_check.TOLERANCE:
+            if recorded is None or abs(recorded - value) > CROSS_TOLERANCE:
                 what = f"frame {old.frame}, {metric} by scikit-image"
                 found.append(Discrepancy(name, what, repr(recorded), repr(value)))
     return found, len(sample)
@@ -297,6 +515,6 @@ def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
     return notes
 
 
-def _brief(protocols: Mapping[str, Any]) -> str:
+def _protocol_digests(protocols: Mapping[str, Any]) -> str:
     digests = [f"{name} {sha256_json(value)[:12]}" for name, value in sorted(protocols.items())]
     return ", ".join(digests) or "none"

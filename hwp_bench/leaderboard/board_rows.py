@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from hwp_bench.analysis.statistics.pairing import same_but_seed
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import missing
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.records import BADGES, LEVELS
 from hwp_bench.leaderboard.rules import current, source_of

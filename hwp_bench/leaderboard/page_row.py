@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import missing
 from hwp_bench.leaderboard.board_rows import BoardRow
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.records import LEVELS

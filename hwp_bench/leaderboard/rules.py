@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import BadResult, UsageError
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import missing
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.names import is_shipped
 from hwp_bench.leaderboard.records import LEVELS

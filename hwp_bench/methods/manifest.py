@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import itertools
 import os
 from collections.abc import Mapping
@@ -15,13 +16,7 @@ from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.base.files import inside
 from hwp_bench.base.packages import PACKAGES, data_folder
 from hwp_bench.base.progress import notice
-from hwp_bench.base.records import (
-    Line,
-    check_json_values,
-    flattened,
-    parse_record,
-    without_schema,
-)
+from hwp_bench.base.records import Line, check_json_values, flattened, parse_record, without_schema
 from hwp_bench.base.text import nearest
 from hwp_bench.base.toml_text import parse_toml
 from hwp_bench.methods.contents import method_digest
@@ -157,13 +152,6 @@ class MethodManifest:
 
         Such a method takes any name, so that a mistyped one would run without an effect. A name
         that resembles none is let through, and said.
-
-        Args:
-            values: a person's settings by name.
-            field: where they come from, for the message.
-
-        Raises:
-            BadMethod: a name is nearly, but not, one that a preset or switch has.
         """
         tables = [*self.presets.values(), *(switch.settings for switch in self.switches.values())]
         known = {name for table in tables for name, _ in flattened(table)}
@@ -411,3 +399,63 @@ class _Manifest:
     presets: dict[str, dict[str, Any]] = field(default_factory=dict)
     switches: dict[_SwitchName, _SwitchTable] = field(default_factory=dict)
     crossed: Annotated[list[_SwitchName], Meta(max_length=4)] = field(default_factory=list)
+
+
+def find_setting_files(
+    manifest: MethodManifest, values: Mapping[str, Any]
+) -> tuple[dict[str, Any], tuple[Path, ...]]:
+    """Make the paths in a person's settings absolute, since a method runs in another folder."""
+    found: list[Path] = []
+
+    def resolve(table: Mapping[str, Any], prefix: str) -> dict[str, Any]:
+        made: dict[str, Any] = {}
+        for name, value in table.items():
+            full = f"{prefix}{name}"
+            if isinstance(value, Mapping):
+                made[name] = resolve(value, f"{full}.")
+            elif isinstance(value, str):
+                made[name] = _absolute(manifest.files.get(full, ()), full, value, found)
+            else:
+                made[name] = value
+        return made
+
+    return resolve(values, ""), tuple(dict.fromkeys(found))
+
+
+def check_settings(
+    manifest: MethodManifest, values: Mapping[str, Any], field: str = "settings"
+) -> None:
+    """Refuse settings that cannot work, before anything is rendered or run.
+
+    Names are checked, and files that settings name must be there. What a method that ships has to
+    say of those files (`check_files` in its `method.toml`) is asked too. Of another method
+    nothing is imported here: its code runs in the sandbox only.
+    """
+    manifest.check_setting_names(values, field)
+    manifest.doubt_setting_names(values, field)
+    resolved, files = find_setting_files(manifest, values)
+    if files and manifest.check_files and ships(manifest.root):
+        module, _, function = manifest.check_files.partition(":")
+        getattr(importlib.import_module(module), function)(resolved)
+
+
+def _absolute(kinds: tuple[str, ...], name: str, value: str, found: list[Path]) -> str:
+    kind, colon, place = value.partition(":")
+    if not colon or kind not in kinds:
+        return value
+    path = Path(os.path.abspath(Path(place).expanduser()))
+    if not place or not path.exists():
+        raise UsageError(
+            "does not exist" if place else "names no file",
+            where=path if place else None,
+            field=name,
+            remedy=f"Give {kind}:PATH with a file or folder of yours; nothing is downloaded.",
+        )
+    found.append(path)
+    return f"{kind}:{path}"
+
+
+def ships(root: Path) -> bool:
+    """Return whether a method directory is one that ships with the toolkit."""
+    places = (PACKAGES / "wildghand", data_folder("baselines"))
+    return any(root.resolve().is_relative_to(place.resolve()) for place in places)

@@ -1,39 +1,187 @@
-"""The folder that a method is given: everything it may see of a capture, and nothing more.
+"""The frames, masks and hands that a method is given of a capture: its own, or an oracle's.
 
-A request holds the training and validation frames with their masks, and for every frame,
-test frames included, the estimated hand parameters and the cameras. It holds no test pixel, no
-truth and no word about the perturbations. Of the free-view clip it holds parameters and cameras.
-
-The frames are those that were captured, or an oracle's choice of them
-(`hwp_bench/methods/material.py`).
+Oracles bound what a method can reach on a simulated capture. `clean` gives the clean version of
+every frame, `unperturbed-only` just those frames that nothing perturbs. `true:NAMES` replaces
+single estimates by the truth, so that an error budget can tell what each of them costs.
 """
 
 from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from hwp_bench.base.errors import BadInput
+import numpy as np
+
+from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.records import parse_record, without_schema
-from hwp_bench.capture.schema import CAMERAS, FREE_VIEW, HANDS, image_path
+from hwp_bench.capture.schema import CAMERAS, FREE_VIEW, HANDS, IMAGE_FOLDERS, image_path
 from hwp_bench.capture.splits import Split
 from hwp_bench.capture.subject_mesh import write_subject_mesh
 from hwp_bench.capture.tracks import write_cameras, write_hands
+from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.methods.contract import (
+    FRAME_CHOICES,
     REQUEST,
     TEMPLATE,
     RequestRecord,
     RunSettings,
     TrainingCapture,
 )
-from hwp_bench.methods.material import free_view_hands, gives_mesh, training_material
 
 if TYPE_CHECKING:
     from hwp_bench.capture import Capture
+
+
+#: The estimates that the truth can replace, by name, in the order of tables.
+TRUTHS: Mapping[str, str] = MappingProxyType(
+    {
+        "pixels": "clean versions of the training frames, with their masks",
+        "masks": "exact masks of the visible hand in the training frames",
+        "poses": "pose and translation in the training frames",
+        "test-poses": "pose and translation in the frames that are rendered",
+        "betas": "shape parameters",
+        "mesh": "the subject's own rest mesh and joints, in place of the hand model's template",
+    }
+)
+_PREFIX = "true:"
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingMaterial:
+    """Where the training part of a request comes from."""
+
+    #: Indices of the training frames.
+    train: np.ndarray
+    #: Kind of image that is given as frames, a key of `IMAGE_FOLDERS`.
+    frames: str
+    #: Kind of image that is given as masks.
+    masks: str
+    #: Hand parameters by side.
+    hands: dict[str, HandParameters]
+
+
+def frames_with(truths: Iterable[str]) -> str:
+    """The choice of frames in which the truth replaces some estimates."""
+    asked = set(truths)
+    return _PREFIX + ",".join(name for name in TRUTHS if name in asked) if asked else "perturbed"
+
+
+def known_truths(capture: Capture) -> tuple[str, ...]:
+    """The estimates of a capture whose truth is stored with it, in the order of `TRUTHS`."""
+    known = set()
+    if capture.true_hands is not None:
+        known |= {"poses", "test-poses", "betas"}
+    if capture.has_true_masks:
+        known.add("masks")
+    if capture.has_true_template:
+        known.add("mesh")
+    if all((capture.root / IMAGE_FOLDERS[kind]).is_dir() for kind in ("clean", "clean_masks")):
+        known.add("pixels")
+    return tuple(name for name in TRUTHS if name in known)
+
+
+def training_material(capture: Capture, split: Split, choice: str) -> TrainingMaterial:
+    """Return the training part that a method is given of a capture."""
+    if choice.startswith(_PREFIX):
+        return _with_truths(capture, split, _replaced_by(choice))
+    if choice not in FRAME_CHOICES:
+        raise UsageError(f"{choice!r} is not one of {', '.join(FRAME_CHOICES)}", field="frames")
+    hands = dict(capture.hands)
+    if choice == "perturbed":
+        return TrainingMaterial(split.train, "frames", "masks", hands)
+    perturbed = _perturbed(capture)
+    if choice == "unperturbed-only":
+        train = split.train[~perturbed[split.train]]
+        if not len(train):
+            raise UsageError("has no unperturbed training frame", where=capture.root)
+        return TrainingMaterial(train, "frames", "masks", hands)
+    truth = capture.true_hands
+    if truth is None or "pixels" not in known_truths(capture):
+        raise UsageError(
+            "does not know its clean frames",
+            where=capture.root,
+            remedy="Only simulated captures do; use --frames perturbed.",
+        )
+    repaired = {side: _replaced(hand, truth[side], perturbed) for side, hand in hands.items()}
+    return TrainingMaterial(split.train, "clean", "clean_masks", repaired)
+
+
+def free_view_hands(clip: Capture, choice: str) -> dict[str, HandParameters]:
+    """Return the hand parameters of a free-view clip that a method is given."""
+    truth = clip.true_hands
+    # The subject's mesh has the true shape in it, and so belongs in the places of that shape.
+    exact = bool({"betas", "mesh"} & set(_replaced_by(choice)))
+    return dict(truth if exact and truth is not None else clip.hands)
+
+
+def gives_mesh(choice: str) -> bool:
+    """Whether a choice of frames replaces the template by the subject's own mesh."""
+    return "mesh" in _replaced_by(choice)
+
+
+def _replaced_by(choice: str) -> list[str]:
+    """The estimates that a choice of frames replaces by the truth."""
+    return choice.removeprefix(_PREFIX).split(",") if choice.startswith(_PREFIX) else []
+
+
+def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingMaterial:
+    """The capture as it is, but for some estimates."""
+    known = known_truths(capture)
+    for name in names:
+        if name not in TRUTHS:
+            raise UsageError(f"{name!r} is not one of {', '.join(TRUTHS)}", field="frames")
+        if name not in known:
+            raise UsageError(
+                f"does not know its true {name}",
+                where=capture.root,
+                remedy="Only simulated captures do.",
+            )
+    frames, masks = ("clean", "clean_masks") if "pixels" in names else ("frames", "masks")
+    if "masks" in names and "pixels" not in names:
+        masks = "true_masks"
+    rows = np.zeros(len(capture), dtype=bool)
+    if "poses" in names:
+        rows[split.train] = True
+    if "test-poses" in names:
+        rows[split.validation] = rows[split.test] = True
+    hands = dict(capture.hands)
+    for side, truth in (capture.true_hands or {}).items():
+        hands[side] = _replaced(hands[side], truth, rows)
+        if "betas" in names:
+            hands[side] = replace(hands[side], betas=truth.betas)
+    return TrainingMaterial(split.train, frames, masks, hands)
+
+
+def _perturbed(capture: Capture) -> np.ndarray:
+    """(F,) bool, true where any perturbation acts."""
+    acts = np.zeros(len(capture), dtype=bool)
+    for name, severities in capture.info.perturbations.items():
+        if severities is None:
+            raise UsageError(
+                f"does not know in which frames {name} acts",
+                where=capture.root,
+                remedy="Use --frames perturbed.",
+            )
+        acts |= np.array(severities) > 0
+    return acts
+
+
+def _replaced(estimate: HandParameters, truth: HandParameters, rows: np.ndarray) -> HandParameters:
+    """The estimate with the truth's pose and translation in some frames, (F,) bool."""
+    return replace(
+        estimate,
+        pose=np.where(rows[:, None, None], truth.pose, estimate.pose),
+        transl=np.where(rows[:, None], truth.transl, estimate.transl),
+        valid=estimate.valid | (rows & truth.valid),
+    )
+
 
 #: Version of the request folder.
 SCHEMA = "hwp-request/1"

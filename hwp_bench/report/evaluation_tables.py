@@ -10,9 +10,13 @@ from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
 from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import CaptureResult, Results
-from hwp_bench.results.bounds import per_second
-from hwp_bench.results.schema import differing_makers, differing_settings, score_rows
-from hwp_bench.results.walls import noted
+from hwp_bench.results.schema import (
+    differing_makers,
+    differing_settings,
+    noted,
+    per_second,
+    score_rows,
+)
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: Metrics of the headline tables, where an evaluation has them.

@@ -12,7 +12,7 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.report.evaluation_tables import score_column
 from hwp_bench.results import FreeViewResult, Results
-from hwp_bench.results.walls import noted
+from hwp_bench.results.schema import noted
 
 #: Name of the table.
 NAME = "free-view"

@@ -44,8 +44,8 @@ from hwp_bench.report.study_tables import (
     severity_table,
 )
 from hwp_bench.results import read_results
+from hwp_bench.results.schema import noted
 from hwp_bench.results.store import ABLATION
-from hwp_bench.results.walls import noted
 
 #: The paper's table with the same content, by name of our table.
 PAPER_OF = {"overall": 3, "paper": 3, "perturbations": 5, "bias": 9, "seeds": 10}

@@ -10,7 +10,7 @@ from hwp_bench.analysis.statistics.pairing import MethodRuns
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.results import CaptureResult, Results
-from hwp_bench.results.walls import walls_note
+from hwp_bench.results.schema import walls_note
 
 #: The parts of a run, in the order of time, with what they hold.
 PARTS: Mapping[str, str] = {

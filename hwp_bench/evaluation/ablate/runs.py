@@ -1,15 +1,18 @@
-"""Run every variant of a method on every capture with every seed."""
+"""The design of an ablation: its variants, and the effects that they make known."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations, product
 from pathlib import Path
+from typing import Any
 
 from hwp_bench.analysis.statistics.pairing import MethodRuns
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.locks import exclusive
+from hwp_bench.base.text import did_you_mean
 from hwp_bench.capture.splits import Split
-from hwp_bench.evaluation.ablate.design import Design, Variant
 from hwp_bench.evaluation.capture_evaluation import evaluation_job
 from hwp_bench.evaluation.evaluate import (
     EvaluationSettings,
@@ -25,10 +28,169 @@ from hwp_bench.evaluation.results_folder import (
     open_results_folder,
     say_kept,
 )
-from hwp_bench.methods.manifest import MethodManifest
+from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.results import CaptureResult, Results, write_results
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
+
+#: Components that are crossed when nothing is asked for and the method names none.
+DEFAULT_FACTORS = 2
+#: Most components that are crossed: 2^4 variants.
+MAX_FACTORS = 4
+#: Name of the variant with no switch thrown.
+FULL = "full"
+
+
+@dataclass(frozen=True)
+class Variant:
+    """The method with some switches thrown."""
+
+    #: `full`, `no-dpd`, `no-dpd+no-pao`, `binary-mask`.
+    name: str
+    #: Its name in tables, without the method's name; empty for the full method.
+    title: str
+    #: Names of the switches that are thrown.
+    thrown: tuple[str, ...]
+    #: Settings that override the preset.
+    settings: Mapping[str, Any]
+
+
+@dataclass(frozen=True)
+class AblationEffect:
+    """A difference between variants that answers one question."""
+
+    #: In tables: `DPD`, `DPD x PAO`.
+    title: str
+    #: `main` (mean over the other components in and out), `interaction`, `out` (of the full
+    #: method), or `alternative` (the full method less the one with the alternative).
+    kind: str
+    #: Coefficient of each variant by name. All add up to 0; the positive ones to 1, or in an
+    #: interaction to 2.
+    contrast: Mapping[str, float]
+
+
+@dataclass(frozen=True)
+class Design:
+    """The variants that an ablation runs and the effects that it measures."""
+
+    #: Components that are taken out.
+    components: tuple[Switch, ...]
+    #: Alternatives that are put in.
+    alternatives: tuple[Switch, ...]
+    #: Variants, the barest first, the full method last before the alternatives.
+    variants: tuple[Variant, ...]
+    #: Effects.
+    effects: tuple[AblationEffect, ...]
+
+
+def make_design(
+    manifest: MethodManifest, thrown: Sequence[str] = (), crossed: Sequence[str] = ()
+) -> Design:
+    """Choose the variants.
+
+    Without names those components are crossed that the method names for it, or else the first two
+    that it declares: 2^k variants.
+    `crossed` crosses the named components instead: 2^k variants. `thrown` asks what each named
+    switch does to the full method: the full method, the method with only one of them thrown,
+    and, of two components or more, with all of them out. (With two that is the 2 x 2 again.)
+    """
+    if thrown and crossed:
+        raise UsageError(
+            "components are either crossed or taken out one by one", remedy="Leave one out."
+        )
+    switches = [_switch(manifest, name) for name in dict.fromkeys([*thrown, *crossed])]
+    if not switches:
+        declared = [item for item in manifest.switches.values() if not item.alternative]
+        named = [manifest.switches[name] for name in manifest.crossed]
+        switches = named or declared[:DEFAULT_FACTORS]
+        crossed = [item.name for item in switches]
+        if not switches:
+            raise UsageError(
+                "declares no component that could be taken out",
+                where=manifest.root / MANIFEST,
+                field="switches",
+                remedy="docs/methods.md shows how a method declares its switches.",
+            )
+    components = tuple(item for item in switches if not item.alternative)
+    alternatives = tuple(item for item in switches if item.alternative)
+    if crossed and (alternatives or len(components) > MAX_FACTORS):
+        raise UsageError(f"at most {MAX_FACTORS} components, no alternatives, can be crossed")
+    factorial = bool(crossed) or len(components) <= DEFAULT_FACTORS
+    outs = _all_subsets(components) if factorial else _one_by_one(components)
+    variants = [_variant(out) for out in sorted(outs, key=len, reverse=True)]
+    effects = _factorial_effects(components) if factorial else _out_effects(components)
+    if factorial and len(components) > DEFAULT_FACTORS:
+        # With two they follow from the main effects and the interaction at a glance.
+        effects += _out_effects(components)
+    for alternative in alternatives:
+        variants.append(_variant((alternative,)))
+        contrast = {FULL: 1.0, alternative.variant_name: -1.0}
+        effects.append(AblationEffect(f"not {alternative.title}", "alternative", contrast))
+    return Design(components, alternatives, tuple(variants), tuple(effects))
+
+
+def _switch(manifest: MethodManifest, name: str) -> Switch:
+    if name in manifest.switches:
+        return manifest.switches[name]
+    known = ", ".join(manifest.switches) or "none"
+    raise UsageError(
+        f"{manifest.name} has no switch {name!r}",
+        where=manifest.root / MANIFEST,
+        field="switches",
+        remedy=did_you_mean(name, manifest.switches) or f"It declares: {known}.",
+    )
+
+
+def _all_subsets(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
+    counts = range(len(components) + 1)
+    return [subset for count in counts for subset in combinations(components, count)]
+
+
+def _one_by_one(components: Sequence[Switch]) -> list[tuple[Switch, ...]]:
+    return [(), *((item,) for item in components), tuple(components)]
+
+
+def _variant(thrown: tuple[Switch, ...]) -> Variant:
+    out = [item.title for item in thrown if not item.alternative]
+    alternatives = [item.title for item in thrown if item.alternative]
+    titles = ([f"without {', '.join(out)}"] if out else []) + [f"with {t}" for t in alternatives]
+    settings: dict[str, Any] = {}
+    for item in thrown:
+        settings |= item.settings
+    return Variant(name_of(thrown), ", ".join(titles), tuple(i.name for i in thrown), settings)
+
+
+def name_of(thrown: Sequence[Switch]) -> str:
+    """Return the name of the variant with these switches thrown."""
+    return "+".join(item.variant_name for item in thrown) or FULL
+
+
+def _factorial_effects(components: Sequence[Switch]) -> list[AblationEffect]:
+    """Main effects and interactions of two; each a mean over the other components in and out."""
+    effects = []
+    count = len(components)
+    for order in (1, 2):
+        for chosen in combinations(range(count), order):
+            contrast = {}
+            for present in product((True, False), repeat=count):
+                sign = 1
+                for index in chosen:
+                    sign *= 1 if present[index] else -1
+                out = [c for c, there in zip(components, present, strict=True) if not there]
+                contrast[name_of(out)] = sign / 2.0 ** (count - order)
+            title = " x ".join(components[index].title for index in chosen)
+            effects.append(AblationEffect(title, "main" if order == 1 else "interaction", contrast))
+    return effects
+
+
+def _out_effects(components: Sequence[Switch]) -> list[AblationEffect]:
+    effects = [
+        AblationEffect(item.title, "out", {FULL: 1.0, name_of((item,)): -1.0})
+        for item in components
+    ]
+    together = {FULL: 1.0, name_of(components): -1.0}
+    return [*effects, AblationEffect("all of them", "out", together)]
+
 
 #: Called when a job begins, with (index, count, text); returns what is to be called with
 #: (done, total) steps meanwhile.
@@ -77,28 +239,6 @@ def run_ablation(
     The jobs go seed by seed and capture by capture, all variants of a capture after each other:
     the variants are then timed under the same load, and whenever the run is stopped, all have
     been given the same captures. Which variant goes first changes from capture to capture.
-
-    Args:
-        manifest: the method.
-        design: the variants.
-        captures: capture folders.
-        out: folder of the ablation.
-        settings: of every evaluation; its seed is not used.
-        seeds: the seeds.
-        splits: splits by capture id; None applies the 80/10/10 rule.
-        on_job: hook for showing progress, where jobs run in turn.
-        engine: where jobs run; one after another in this process if None.
-        needs: what one job takes of a machine.
-        overwrite: results of another ablation in `out` may be replaced.
-        rehearse: make each variant of the method once before the first job, where any of its
-            jobs is to be run; not to be asked for where they run on other machines.
-
-    Raises:
-        UsageError: `out` holds results of another ablation.
-        MethodFailed: a variant cannot be made.
-        BadMethod: there is no such preset.
-        BadCapture, BadInput, BadImage, BadSplit: a capture is wrong.
-        HwpError: another run is writing to `out`, or nobody can.
     """
     settings = with_setting_files(manifest, settings)
     opened = open_captures(captures, splits)

@@ -29,7 +29,7 @@ from hwp_bench.report.ranking_tables import rank_table
 from hwp_bench.report.sources import ResultsSource, find_captures, sound_temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
 from hwp_bench.results import Results
-from hwp_bench.results.walls import noted
+from hwp_bench.results.schema import noted
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: The metric of the plots and of the summary sentence.

@@ -15,7 +15,7 @@ from made_entries import OTHER_SCORES, complete_results, with_keys
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.packages import data_folder
 from hwp_bench.cli.main import main
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import missing
 from hwp_bench.leaderboard.entries import entry_name, read_entries
 from hwp_bench.leaderboard.entries import make_entry as entry_of
 from hwp_bench.leaderboard.rules import check_complete, check_entries, check_unchanged

@@ -14,7 +14,7 @@ from hwp_bench.capture.schema import TRUE_TEMPLATE
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.capture.subject_mesh import write_subject_mesh
 from hwp_bench.hands import load_template
-from hwp_bench.methods.material import TRUTHS, frames_with, known_truths, training_material
+from hwp_bench.methods.request import TRUTHS, frames_with, known_truths, training_material
 
 SPLIT = contiguous_split("tiny", 20)
 

@@ -10,8 +10,7 @@ from hwp_bench.base.errors import BadMethod, UsageError
 from hwp_bench.evaluation.evaluate import EvaluationSettings, with_setting_files
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import RunSettings
-from hwp_bench.methods.manifest import MethodManifest
-from hwp_bench.methods.setting_files import check_settings, find_setting_files
+from hwp_bench.methods.manifest import MethodManifest, check_settings, find_setting_files
 from hwp_bench.methods.settings import check_source, source_path
 
 MANIFEST = """schema = "hwp-method/1"

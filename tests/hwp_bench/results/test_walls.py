@@ -10,10 +10,10 @@ from small_captures import results_example
 
 from hwp_bench.analysis.cost.cost_tables import machine_notes
 from hwp_bench.base.tables import to_markdown
-from hwp_bench.evaluation.outcome import outcome_lines
+from hwp_bench.evaluation.sentences import outcome_lines
 from hwp_bench.report.evaluation_tables import all_tables
 from hwp_bench.results import Results
-from hwp_bench.results.walls import noted, walls_note, walls_text
+from hwp_bench.results.schema import noted, walls_note, walls_text
 
 
 def _made(isolation: str | None, name: str = "plain") -> Results:

@@ -17,10 +17,10 @@ from hwp_bench.capture import Capture, CaptureWriter, open_capture
 from hwp_bench.capture.schema import TRUE_TEMPLATE
 from hwp_bench.capture.subject_mesh import write_subject_mesh
 from hwp_bench.cli.main import main
-from hwp_bench.evaluation.budget.runs import run_budget, variants_of
+from hwp_bench.evaluation.budget.budget import run_budget, variants_of
 from hwp_bench.evaluation.evaluate import EvaluationSettings
 from hwp_bench.methods.contract import RunSettings
-from hwp_bench.methods.material import TRUTHS
+from hwp_bench.methods.request import TRUTHS
 
 _MANIFEST = """
 schema = "hwp-method/1"

@@ -11,7 +11,7 @@ from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
 from hwp_bench.base.harmonics import harmonics
 from hwp_bench.evaluation.budget.budget import gained
 from hwp_bench.evaluation.budget.corrections import CORRECTIONS
-from hwp_bench.evaluation.budget.pair import Pair
+from hwp_bench.evaluation.budget.surface import Pair
 
 SIZE = 48
 ROWS, COLUMNS = np.mgrid[:SIZE, :SIZE] / SIZE - 0.5

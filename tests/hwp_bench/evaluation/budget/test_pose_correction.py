@@ -12,9 +12,8 @@ import torch
 
 from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
 from hwp_bench.evaluation.budget.budget import gained
-from hwp_bench.evaluation.budget.motion import motion, pose
-from hwp_bench.evaluation.budget.pair import Pair
-from hwp_bench.evaluation.budget.surface import MovingSurface
+from hwp_bench.evaluation.budget.corrections import motion, pose
+from hwp_bench.evaluation.budget.surface import MovingSurface, Pair
 from hwp_bench.hands import load_template
 from hwp_bench.hands.parameters import Camera, HandPose
 from hwp_bench.hands.raster import draw_faces, mix_corners

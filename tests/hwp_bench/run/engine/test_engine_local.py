@@ -11,7 +11,7 @@ from engine_jobs import Told, Write, write_job
 
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.run.engine import Engine, LocalEngine, Needs
-from hwp_bench.run.engine.parallel import ParallelEngine, shares
+from hwp_bench.run.engine.processes import ParallelEngine, shares
 
 
 def texts(folder: Path) -> dict[str, str]:
@@ -109,7 +109,7 @@ def test_a_stop_ends_the_jobs_and_leaves_what_was_finished(tmp_path: Path) -> No
     assert set(texts(tmp_path)) == {"quick"}
     left = [child.cmdline() for child in psutil.Process().children(recursive=True)]
     assert not [
-        words for words in left if any("hwp_bench.run.engine.process" in word for word in words)
+        words for words in left if any("hwp_bench.run.engine.processes" in word for word in words)
     ]
 
 

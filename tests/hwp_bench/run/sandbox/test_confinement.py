@@ -12,10 +12,10 @@ from hwp_bench.base.machine_code import KEPT
 from hwp_bench.base.packages import data_folder
 from hwp_bench.run.sandbox.confinement import (
     Confinement,
+    of_packages,
     sandbox_environment,
     visible_places,
 )
-from hwp_bench.run.sandbox.pythons import of_packages
 
 
 def test_outer_places_come_first_and_the_deeper_rule_wins(tmp_path: Path) -> None:

@@ -13,9 +13,10 @@ from pathlib import Path
 import pytest
 
 from hwp_bench.base.errors import MethodFailed
-from hwp_bench.run.sandbox import memory, supervise
+from hwp_bench.run.sandbox import supervise
+from hwp_bench.run.sandbox import supervise as memory
 from hwp_bench.run.sandbox.confinement import Confinement
-from hwp_bench.run.sandbox.memory import ControlGroup, Measure, control_group, scratch_bytes
+from hwp_bench.run.sandbox.supervise import ControlGroup, Measure, control_group, scratch_bytes
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="process control is Linux's")
 LIMIT = 200_000_000

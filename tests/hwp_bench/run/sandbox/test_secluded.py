@@ -11,13 +11,13 @@ from walled_script import run_walled
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.run.sandbox import secluded
-from hwp_bench.run.sandbox.confinement import visible_places
-from hwp_bench.run.sandbox.pythons import of_packages
-from hwp_bench.run.sandbox.secluded import (
+from hwp_bench.run.sandbox import confinement as secluded
+from hwp_bench.run.sandbox.confinement import (
     SHOWN_ROOMS,
     foreign_folders,
+    of_packages,
     secluded_rooms,
+    visible_places,
 )
 
 

@@ -18,8 +18,7 @@ from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.footprint import HandSurfaces
 from hwp_bench.hands.raster import overlap
 from hwp_bench.methods.contract import RunSettings
-from hwp_bench.methods.material import frames_with, known_truths
-from hwp_bench.methods.request import open_request, write_request
+from hwp_bench.methods.request import frames_with, known_truths, open_request, write_request
 from hwp_bench.sim.produce.production import render_capture
 from hwp_bench.sim.produce.subject_mesh import (
     add_subject_mesh,
