@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,19 +18,12 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
 from hwp_bench.evaluation.scoring import (
     MAX_PREDICTION_BYTES,
-    Prediction,
-    Target,
-    predictions_digest,
+    ScoredFrames,
     read_prediction,
-    read_predictions,
     read_targets,
-    score_predictions,
 )
-from hwp_bench.metrics.pixels import scored_pixels
-from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.score import Network
 from hwp_bench.report.sources import ResultsSource
-from hwp_bench.results import CaptureResult, FrameResult, FreeViewResult
+from hwp_bench.results import CaptureResult, FrameResult
 from hwp_bench.run.sandbox.supervise import MAX_LOG_BYTES
 from hwp_bench.run.worker import DIAGNOSTICS, LOG
 
@@ -39,24 +31,32 @@ from hwp_bench.run.worker import DIAGNOSTICS, LOG
 MAX_DIAGNOSTICS = 64 << 20
 #: Larger side of a tile, px.
 EDGE = 256
+#: Folder of the predicted frames inside the result folder of a capture.
+FREE_PREDICTIONS = "free"
+#: The picture of some of them, with the other pictures of a capture.
+FREE_PICTURE = "free_view.png"
+#: Views that the picture shows, and the larger edge of each, px.
+FREE_VIEWS, FREE_EDGE = 6, 176
 
 
 def keep_artifacts(
-    folder: Path,
-    output: Path,
-    source: Path,
-    capture: Capture,
-    scores: Sequence[FrameResult],
-    predictions: Sequence[Prediction],
+    folder: Path, output: Path, frames: ScoredFrames, free_view: ScoredFrames | None
 ) -> None:
-    """Keep predictions, log and diagnostics of a run, and draw images; drop the rest of the run."""
-    keep_predictions(folder / "predictions", source, [item.frame for item in predictions])
+    """Keep what a run left (predictions, log, diagnostics) in the folder of a capture's result.
+
+    Draws pictures of it, and drops the rest of the run.
+    """
+    for scored, name in ((frames, "predictions"), (free_view, FREE_PREDICTIONS)):
+        if scored is not None:
+            keep_predictions(folder / name, scored.source, [one.frame for one in scored.targets])
     if (output / LOG).is_file():
         keep_log(output / LOG, folder / LOG)
     keep_diagnostics(output / DIAGNOSTICS, folder / DIAGNOSTICS)
     remove_tree(output)
-    if any(frame.failure is None for frame in scores):
-        write_pictures(folder / "pictures", capture, scores, predictions)
+    if any(frame.failure is None for frame in frames.scores):
+        write_pictures(folder / "pictures", frames)
+    if free_view is not None:
+        write_image(folder / "pictures" / FREE_PICTURE, free_view_picture(free_view))
 
 
 def keep_log(source: Path, target: Path) -> None:
@@ -102,38 +102,36 @@ def keep_diagnostics(source: Path, target: Path) -> None:
         shutil.copyfile(path, kept)
 
 
-def write_pictures(
-    folder: Path,
-    capture: Capture,
-    frames: Sequence[FrameResult],
-    predictions: Sequence[Prediction],
-) -> Path:
-    """Write `worst.png`, `median.png`, `best.png` and one sheet of the three."""
+def write_pictures(folder: Path, scored: ScoredFrames) -> None:
+    """Write `worst.png`, `median.png`, `best.png` and one sheet of the three, `comparison.png`.
+
+    A row a frame: truth in full, then truth, prediction and error on the scored pixels.
+    """
     tiles = []
-    for name, position in telling_frames(frames).items():
-        row = _row(name, capture, frames[position], predictions[position])
+    for name, place in telling_frames(scored.scores).items():
+        target = scored.targets[place]
+        pixels, label = _prediction(scored, place)
+        wrong = error_map(pixels, target.pixels, target.region)
+        row = [
+            labelled(fitted(image, EDGE), text)
+            for image, text in (
+                (target.pixels, f"{name}: frame {target.frame}"),
+                (target.masked(target.pixels), "truth, scored pixels"),
+                (target.masked(pixels), f"prediction, {label}"),
+                (wrong, "error (yellow: 64 levels)"),
+            )
+        ]
         write_image(folder / f"{name}.png", sheet(row, columns=len(row)))
         tiles += row
-    return write_image(folder / "comparison.png", sheet(tiles, columns=4))
+    write_image(folder / "comparison.png", sheet(tiles, columns=4))
 
 
-def _row(
-    name: str, capture: Capture, result: FrameResult, prediction: Prediction
-) -> list[np.ndarray]:
-    target = capture.frame(result.frame)
-    mask, exact = capture.scoring_mask(result.frame)
-    region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
-    if prediction.pixels is None:
-        pixels, label = np.zeros_like(target), "no prediction"
-    else:
-        pixels, label = prediction.pixels, f"PSNR {result.scores['psnr']:.2f} dB"
-    inside = region[:, :, None]
-    return [
-        labelled(fitted(target, EDGE), f"{name}: frame {result.frame}"),
-        labelled(fitted(np.where(inside, target, 0), EDGE), "truth, scored pixels"),
-        labelled(fitted(np.where(inside, pixels, 0), EDGE), f"prediction, {label}"),
-        labelled(fitted(error_map(pixels, target, region), EDGE), "error (yellow: 64 levels)"),
-    ]
+def _prediction(scored: ScoredFrames, place: int) -> tuple[np.ndarray, str]:
+    """A predicted image (H, W, 3), black where there is none, and what its tile says."""
+    pixels = scored.predictions[place].pixels
+    if pixels is None:
+        return np.zeros_like(scored.targets[place].pixels), "no prediction"
+    return pixels, f"PSNR {scored.scores[place].scores['psnr']:.2f} dB"
 
 
 def telling_frames(frames: Sequence[FrameResult], metric: str = "psnr") -> dict[str, int]:
@@ -146,74 +144,18 @@ def telling_frames(frames: Sequence[FrameResult], metric: str = "psnr") -> dict[
     }
 
 
-#: Folder of the predicted frames inside the result folder of a capture.
-FREE_PREDICTIONS = "free"
-#: The picture of some of them, with the other pictures of a capture.
-FREE_PICTURE = "free_view.png"
-#: Views that the picture shows, and the larger edge of each, px.
-FREE_VIEWS, FREE_EDGE = 6, 176
+def free_view_picture(scored: ScoredFrames) -> np.ndarray:
+    """Draw views spread over the clip, the truth above the prediction, on the scored pixels.
 
-
-@dataclass(frozen=True, eq=False)
-class FreeViewScores:
-    """A scored clip, with what its picture needs."""
-
-    #: The scores.
-    result: FreeViewResult
-    #: The truth.
-    targets: Sequence[Target]
-    #: One for each target.
-    predictions: Sequence[Prediction]
-    #: Folder that the predictions were read from.
-    source: Path
-
-
-def read_free_targets(capture: Capture) -> list[Target]:
-    """Read the truth of the free-view clip; empty where the capture has none."""
-    clip = capture.free_view
-    return [] if clip is None else read_targets(clip, range(len(clip)))
-
-
-def score_free_view(
-    capture: Capture,
-    targets: Sequence[Target],
-    folder: Path | None,
-    networks: Mapping[str, Network],
-) -> FreeViewScores | None:
-    """Score predictions of the clip in every protocol."""
-    clip = capture.free_view
-    if clip is None or folder is None:
-        return None
-    frames = [target.frame for target in targets]
-    predictions = read_predictions(folder, frames, clip.size)
-    scores = score_predictions(targets, predictions, networks)
-    result = FreeViewResult(clip.digest, scores, predictions_digest(predictions))
-    return FreeViewScores(result, targets, predictions, folder)
-
-
-def keep_free_view(folder: Path, scores: FreeViewScores) -> None:
-    """Keep the predictions and a picture in the result folder of a capture."""
-    frames = [target.frame for target in scores.targets]
-    keep_predictions(folder / FREE_PREDICTIONS, scores.source, frames)
-    write_image(folder / "pictures" / FREE_PICTURE, free_view_picture(scores))
-
-
-def free_view_picture(scores: FreeViewScores) -> np.ndarray:
-    """Draw views spread over the clip, the truth above the prediction, on the scored pixels."""
+    (H, W, 3) uint8: a column a view.
+    """
     truths, drawn = [], []
-    for place in evenly(len(scores.targets), FREE_VIEWS).tolist():
-        target, prediction = scores.targets[place], scores.predictions[place]
-        inside = scored_pixels(target.mask, erosion=HWP_V1.mask_erosion, coverage=target.exact)[
-            :, :, None
-        ]
-        label = "no prediction"
-        pixels = np.zeros_like(target.pixels)
-        if prediction.pixels is not None:
-            pixels = prediction.pixels
-            label = f"PSNR {scores.result.frames[place].scores['psnr']:.2f} dB"
-        truth = np.where(inside, target.pixels, 0)
-        truths.append(labelled(fitted(truth, FREE_EDGE), f"truth, frame {target.frame}"))
-        drawn.append(labelled(fitted(np.where(inside, pixels, 0), FREE_EDGE), label))
+    for place in evenly(len(scored.targets), FREE_VIEWS).tolist():
+        target = scored.targets[place]
+        pixels, label = _prediction(scored, place)
+        truth = fitted(target.masked(target.pixels), FREE_EDGE)
+        truths.append(labelled(truth, f"truth, frame {target.frame}"))
+        drawn.append(labelled(fitted(target.masked(pixels), FREE_EDGE), label))
     return sheet([*truths, *drawn], columns=len(truths))
 
 
@@ -226,29 +168,18 @@ def write_side_by_side(
     """
     tiles = []
     for capture in captures:
-        found = [_result(source, capture.info.id) for source in sources]
+        name = capture.info.id
+        found = [next(one for one in s.results.captures if one.id == name) for s in sources]
         frame = _typical_frame(found)
-        target = capture.frame(frame)
-        mask, exact = capture.scoring_mask(frame)
-        region = scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact)
-        box = square_around(region)
-
-        def tile(
-            pixels: np.ndarray | None,
-            text: str,
-            region: np.ndarray = region,
-            box: tuple[slice, slice] = box,
-        ) -> np.ndarray:
-            image = np.zeros((*region.shape, 3), np.uint8) if pixels is None else pixels
-            inside = np.where(region[..., None], image, 0)[box]
-            return labelled(fitted(inside, EDGE), text)
-
-        tiles.append(tile(target, f"truth: {capture.info.id}, frame {frame}"))
+        [target] = read_targets(capture, [frame])
+        images = [(target.pixels, f"truth: {name}, frame {frame}")]
         for source, result in zip(sources, found, strict=True):
             folder = source.place(result.id, "predictions")
             pixels = read_prediction(folder, frame, capture.size).pixels if folder else None
             psnr = next(item.scores["psnr"] for item in result.frames if item.frame == frame)
-            tiles.append(tile(pixels, f"{source.results.method.title}, {psnr:.1f} dB"))
+            images.append((pixels, f"{source.results.method.title}, {psnr:.1f} dB"))
+        box = square_around(target.region)
+        tiles += [labelled(fitted(target.masked(image)[box], EDGE), text) for image, text in images]
     return write_image(path, sheet(tiles, columns=1 + len(sources)))
 
 
@@ -270,7 +201,3 @@ def square_around(region: np.ndarray) -> tuple[slice, slice]:
         start = max(0, min((places[0] + places[-1] + 1 - edge) // 2, size - edge))
         windows.append(slice(int(start), int(start + edge)))
     return windows[0], windows[1]
-
-
-def _result(source: ResultsSource, capture: str) -> CaptureResult:
-    return next(item for item in source.results.captures if item.id == capture)

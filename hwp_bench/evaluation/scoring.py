@@ -10,12 +10,13 @@ import hashlib
 import os
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
 from hwp_bench.base.errors import BadCapture, BadInput, BadPrediction, HwpError
-from hwp_bench.base.files import read_json, write_json
+from hwp_bench.base.files import read_json
 from hwp_bench.base.images import MAX_PIXELS, pixel_digest, read_rgb
 from hwp_bench.base.text import bounded
 from hwp_bench.capture import Capture
@@ -23,6 +24,7 @@ from hwp_bench.capture.schema import frame_name
 from hwp_bench.metrics.batch import Frame, score_frames
 from hwp_bench.metrics.pixels import scored_pixels
 from hwp_bench.metrics.protocol import HWP_V1
+from hwp_bench.metrics.psnr_ssim import decibels
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import FrameResult
 
@@ -43,6 +45,16 @@ class Target:
     #: Whether the mask is exact coverage.
     exact: bool
 
+    @cached_property
+    def region(self) -> np.ndarray:
+        """(H, W) bool: the scored pixels."""
+        return scored_pixels(self.mask, erosion=HWP_V1.mask_erosion, coverage=self.exact)
+
+    def masked(self, image: np.ndarray | None = None) -> np.ndarray:
+        """(H, W, 3): an image, or nothing, black outside the scored pixels."""
+        image = np.zeros_like(self.pixels) if image is None else image
+        return np.where(self.region[..., None], image, np.uint8(0))
+
 
 @dataclass(frozen=True, eq=False)
 class Prediction:
@@ -56,16 +68,42 @@ class Prediction:
     failure: str | None
 
 
+@dataclass(frozen=True, eq=False)
+class ScoredFrames:
+    """Predictions of some frames of a capture, or of its free-view clip, with their scores."""
+
+    #: The truth.
+    targets: Sequence[Target]
+    #: One for each target, in the same order, as the scores.
+    predictions: Sequence[Prediction]
+    scores: list[FrameResult]
+    #: Folder that the predictions were read from.
+    source: Path
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) over the decoded pixels of the predictions."""
+        return predictions_digest(self.predictions)
+
+
+def score_frames_of(
+    targets: Sequence[Target],
+    source: Path,
+    size: tuple[int, int],
+    networks: Mapping[str, Network] | None = None,
+) -> ScoredFrames:
+    """Read and score the predictions of some frames of (height, width) px in a folder."""
+    predictions = read_predictions(source, [target.frame for target in targets], size)
+    scores = score_predictions(targets, predictions, networks)
+    return ScoredFrames(targets, predictions, scores, source)
+
+
 def read_targets(capture: Capture, frames: Sequence[int]) -> list[Target]:
     """Read the truth of the given frames, before any method runs."""
-    targets = []
-    empty = []
-    for frame in frames:
-        mask, exact = capture.scoring_mask(frame)
-        if not scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact).any():
-            empty.append(frame)
-            continue
-        targets.append(Target(frame, capture.frame(frame), mask, exact))
+    targets = [
+        Target(frame, capture.frame(frame), *capture.scoring_mask(frame)) for frame in frames
+    ]
+    empty = [target.frame for target in targets if not target.region.any()]
     if empty:
         several = len(empty) > 1
         raise BadCapture(
@@ -172,12 +210,9 @@ EXCHANGE_FRAMES = 0.75
 def colour_warnings(targets: Sequence[Target], predictions: Sequence[Prediction]) -> list[str]:
     """Return sentences about colours that cannot be meant, with the numbers; mostly none."""
     pairs = [
-        (prediction.pixels[inside].astype(np.float64), target.pixels[inside].astype(np.float64))
+        (image[target.region].astype(np.float64), target.pixels[target.region].astype(np.float64))
         for target, prediction in zip(targets, predictions, strict=True)
-        if prediction.pixels is not None
-        for inside in [
-            scored_pixels(target.mask, erosion=HWP_V1.mask_erosion, coverage=target.exact)
-        ]
+        if (image := prediction.pixels) is not None
     ]
     if not pairs:
         return []
@@ -201,7 +236,7 @@ def _exchange_warning(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[st
     """Compare the squared errors with those of the predictions with red and blue exchanged."""
     kept = np.array([((drawn - true) ** 2).mean() for drawn, true in pairs])
     swapped = np.array([((drawn[:, ::-1] - true) ** 2).mean() for drawn, true in pairs])
-    before, after = _psnr(kept.mean()), _psnr(swapped.mean())
+    before, after = (decibels(float(errors.mean()) / 255.0**2) for errors in (kept, swapped))
     if after - before < EXCHANGE_GAIN or (swapped < kept).mean() < EXCHANGE_FRAMES:
         return []
     return [
@@ -210,18 +245,8 @@ def _exchange_warning(pairs: Sequence[tuple[np.ndarray, np.ndarray]]) -> list[st
     ]
 
 
-def _psnr(squared_error: float) -> float:
-    return float(10 * np.log10(255.0**2 / max(squared_error, 1e-3)))
-
-
-def keep_warnings(folder: Path, warnings: Sequence[str]) -> None:
-    """Write the sentences into the result folder of a capture; nothing where there are none."""
-    if warnings:
-        write_json(folder / WARNINGS, list(warnings))
-
-
 def read_warnings(folder: Path) -> list[str]:
-    """Return the sentences that `keep_warnings` left; none where the file is absent or damaged."""
+    """Return the sentences that an evaluation left; none where the file is absent or damaged."""
     try:
         value = read_json(folder / WARNINGS, max_bytes=100_000)
     except BadInput:

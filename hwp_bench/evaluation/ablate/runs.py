@@ -1,8 +1,8 @@
-"""The design of an ablation: its variants, and the effects that they make known."""
+"""The design of an ablation (its variants, and the effects that they make known), and its runs."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations, product
 from pathlib import Path
@@ -10,28 +10,20 @@ from typing import Any
 
 from hwp_bench.analysis.statistics.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.locks import exclusive
 from hwp_bench.base.text import did_you_mean
 from hwp_bench.capture.splits import Split
-from hwp_bench.evaluation.capture_evaluation import evaluation_job
 from hwp_bench.evaluation.evaluate import (
     EvaluationSettings,
-    Plan,
-    hiding,
+    OnCapture,
     make_plan,
     open_captures,
+    run_plans,
     with_setting_files,
-)
-from hwp_bench.evaluation.results_folder import (
-    RESULTS,
-    finish_together,
-    open_results_folder,
-    say_kept,
 )
 from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
 from hwp_bench.metrics.lpips_weights import load_available
-from hwp_bench.results import CaptureResult, Results, write_results
-from hwp_bench.run.engine import Engine, LocalEngine, Needs
+from hwp_bench.results import Results
+from hwp_bench.run.engine import Engine, Needs
 
 #: Components that are crossed when nothing is asked for and the method names none.
 DEFAULT_FACTORS = 2
@@ -192,11 +184,6 @@ def _out_effects(components: Sequence[Switch]) -> list[AblationEffect]:
     return [*effects, AblationEffect("all of them", "out", together)]
 
 
-#: Called when a job begins, with (index, count, text); returns what is to be called with
-#: (done, total) steps meanwhile.
-OnJob = Callable[[int, int, str], Callable[[int, int], None] | None]
-
-
 @dataclass(frozen=True)
 class AblationRuns:
     """Every evaluation of an ablation."""
@@ -226,7 +213,7 @@ def run_ablation(
     seeds: Sequence[int],
     *,
     splits: Mapping[str, Split] | None = None,
-    on_job: OnJob | None = None,
+    on_job: OnCapture | None = None,
     engine: Engine | None = None,
     needs: Needs | None = None,
     overwrite: bool = False,
@@ -244,61 +231,39 @@ def run_ablation(
     opened = open_captures(captures, splits)
     networks = load_available()
     plans = {
-        (variant.name, seed): make_plan(
-            replace(manifest, title=_title(manifest, variant)),
+        result_folder(variant.name, seed): make_plan(
+            replace(manifest, title=f"{manifest.title} {variant.title}".strip()),
             opened,
             _of_variant(settings, variant, seed),
             networks,
+            f"{variant.name}, seed {seed}",
         )
         for variant in design.variants
         for seed in seeds
     }
     order = [
-        (seed, number, variant)
+        (result_folder(variant.name, seed), number)
         for seed in seeds
         for number in range(len(opened))
         for variant in _rotated(design.variants, number + seed)
     ]
-    with exclusive(out):
-        folders = {
-            key: open_results_folder(
-                out / result_folder(*key), plan.results([]), plan.evaluations, overwrite=overwrite
-            )
-            for key, plan in plans.items()
-        }
-        say_kept(list(folders.values()))
-        # By capture, so that a result file lists captures in one order whichever ended first.
-        finished = {key: dict(folder.kept) for key, folder in folders.items()}
-        missing = [
-            (seed, number, variant)
-            for seed, number, variant in order
-            if number not in folders[variant.name, seed].kept
-        ]
-        if rehearse:
-            for name in dict.fromkeys(variant.name for _, _, variant in missing):
-                plans[name, seeds[0]].rehearse()
-        jobs = []
-        for seed, number, variant in missing:
-            evaluation = hiding(plans[variant.name, seed].evaluations[number], out)
-            folder = folders[variant.name, seed].unfinished(number)
-            text = f"{evaluation.capture.info.id}, {variant.name}, seed {seed}"
-            jobs.append(evaluation_job(evaluation, folder, text, needs or Needs()))
-
-        def on_done(index: int) -> None:
-            seed, number, variant = missing[index]
-            key = variant.name, seed
-            finished[key][number] = folders[key].finish(number)
-            if not folders[key].replaces:
-                write_results(folders[key].root / RESULTS, _results(plans[key], finished[key]))
-
-        (engine or LocalEngine()).run(jobs, on_done, on_job)
-        whole = [(folders[key], _results(plans[key], finished[key])) for key in plans]
-        finish_together(whole, tables=False)
-    return AblationRuns(design, _runs(design, plans, finished, seeds))
-
-
-def _results(plan: Plan, finished: Mapping[int, CaptureResult]) -> Results:
-    return plan.results([result for _, result in sorted(finished.items())])
+    results = run_plans(
+        out,
+        plans,
+        order,
+        on_start=on_job,
+        engine=engine,
+        needs=needs,
+        overwrite=overwrite,
+        rehearse=rehearse,
+        tables=False,
+    )
+    runs = {}
+    for variant in design.variants:
+        by_seed = {seed: results[result_folder(variant.name, seed)] for seed in seeds}
+        title = plans[result_folder(variant.name, seeds[0])].manifest.title
+        runs[variant.name] = MethodRuns(title, by_seed)
+    return AblationRuns(design, runs)
 
 
 def _of_variant(settings: EvaluationSettings, variant: Variant, seed: int) -> EvaluationSettings:
@@ -309,25 +274,3 @@ def _of_variant(settings: EvaluationSettings, variant: Variant, seed: int) -> Ev
 def _rotated(variants: Sequence[Variant], by: int) -> list[Variant]:
     start = by % len(variants)
     return [*variants[start:], *variants[:start]]
-
-
-def _title(manifest: MethodManifest, variant: Variant) -> str:
-    return f"{manifest.title} {variant.title}".strip()
-
-
-def _runs(
-    design: Design,
-    plans: Mapping[tuple[str, int], Plan],
-    finished: Mapping[tuple[str, int], Mapping[int, CaptureResult]],
-    seeds: Sequence[int],
-) -> dict[str, MethodRuns]:
-    return {
-        variant.name: MethodRuns(
-            plans[variant.name, seeds[0]].manifest.title,
-            {
-                seed: _results(plans[variant.name, seed], finished[variant.name, seed])
-                for seed in seeds
-            },
-        )
-        for variant in design.variants
-    }
