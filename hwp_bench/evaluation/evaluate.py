@@ -369,13 +369,16 @@ def check_suite(
 
 def _check_predictions(manifest: MethodManifest, items: Sequence[SuiteItem]) -> None:
     names = [item.scene.id for item in items]
-    folders = {name: inside(manifest.root, f"{manifest.entry}/{name}") for name in names}
+    folders = {
+        name: inside(manifest.root, f"{manifest.entry.predictions}/{name}") for name in names
+    }
     missing = [name for name, folder in folders.items() if not any(folder.glob("*.png"))]
     if len(missing) == len(names):
         raise BadMethod(
             f"has predictions of no capture of this suite ({', '.join(names)})",
-            where=manifest.root / str(manifest.entry),
-            remedy=f"Put the frames into {manifest.entry}/CAPTURE/, or choose another suite.",
+            where=manifest.root / str(manifest.entry.predictions),
+            remedy=f"Put the frames into {manifest.entry.predictions}/CAPTURE/, or choose another "
+            "suite.",
         )
     if missing:
         notice(f"no predictions of {', '.join(missing)}: every frame there gets the penalty")

@@ -146,14 +146,14 @@ def run_method(
 ) -> RunRecord:
     """Run a method on a request."""
     if manifest.kind == "predictions":
-        folder = inside(manifest.root, f"{manifest.entry}/{capture_id}")
+        folder = inside(manifest.root, f"{manifest.entry.predictions}/{capture_id}")
         if not folder.is_dir():
             raise BadMethod(
                 f"has no predictions for {capture_id}",
                 where=folder,
-                remedy=f"Put the frames into {manifest.entry}/{capture_id}/.",
+                remedy=f"Put the frames into {manifest.entry.predictions}/{capture_id}/.",
             )
-        clip = inside(manifest.root, f"{manifest.entry}/{capture_id}/{FREE_VIEW}")
+        clip = inside(manifest.root, f"{manifest.entry.predictions}/{capture_id}/{FREE_VIEW}")
         return RunRecord(folder, RunFacts(), 0.0, free_view=clip if clip.is_dir() else None)
     confinement = confinement or Confinement()
     remove_tree(output)
@@ -247,7 +247,7 @@ def rehearse_method(
 
 def _look_for_program(manifest: MethodManifest) -> None:
     """Refuse a command whose program is not there, or may not be run."""
-    word = str(manifest.entry[0])
+    word = (manifest.entry.command or [""])[0]
     program = word.replace("{method}", str(manifest.root.resolve()))
     if "{" in program or (os.sep in program and not os.path.isabs(program)):
         return
@@ -324,7 +324,7 @@ def _run(
 def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]:
     if manifest.kind == "python":
         worker = [sys.executable, *START, "hwp_bench.run.worker"]
-        method = ["--method", str(manifest.root.resolve()), "--entry", str(manifest.entry)]
+        method = ["--method", str(manifest.root.resolve()), "--entry", str(manifest.entry.python)]
         return [*worker, str(request.resolve()), str(output.resolve()), *method]
     places = {
         "{request}": str(request.resolve()),
@@ -333,7 +333,7 @@ def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]
         "{python}": sys.executable,
     }
     words = []
-    for word in manifest.entry:
+    for word in manifest.entry.command or ():
         for place, value in places.items():
             word = word.replace(place, value)
         words.append(word)

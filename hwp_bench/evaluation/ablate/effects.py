@@ -432,7 +432,16 @@ def ablation_record(
         "captures": [
             {"id": c.id, "digest": c.digest, "split_digest": c.split_digest} for c in first.captures
         ],
-        "switches": [asdict(item) for item in switches],
+        "switches": [
+            {
+                "name": item.name,
+                "title": item.title,
+                "description": item.description,
+                "settings": item.settings,
+                "alternative": item.alternative,
+            }
+            for item in switches
+        ],
         "variants": [
             {
                 **asdict(variant),

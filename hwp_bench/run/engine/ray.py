@@ -236,7 +236,7 @@ def import_ray() -> Any:
 
 
 def head_address(address: str | None) -> str | None:
-    """Return HOST:PORT of the head to join; None where a cluster of this machine is to be started."""
+    """Return HOST:PORT of the head to join; None where a cluster is to be started here."""
     text = os.environ.get("RAY_ADDRESS", "") if address is None else address
     if address is None and text in ("", "auto", "local"):
         return None
