@@ -93,7 +93,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings, look_ahead
     from hwp_bench.evaluation.ablate.runs import make_design, run_ablation
     from hwp_bench.methods.manifest import check_settings, find_method, read_manifest
-    from hwp_bench.run.engine.job import engine_for, needs_of
+    from hwp_bench.run.engine.options import engine_for, needs_of
 
     if not 1 <= args.seeds <= 100:
         raise UsageError(f"{args.seeds} is not between 1 and 100", field="--seeds")

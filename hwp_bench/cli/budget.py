@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.evaluation.budget.budget import check_truths, run_budget
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.methods.request import TRUTHS
-    from hwp_bench.run.engine.job import engine_for, needs_of
+    from hwp_bench.run.engine.options import engine_for, needs_of
 
     settings = evaluation_settings(args)
     manifest = read_manifest(find_method(args.method))

@@ -9,7 +9,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hwp_bench.run.engine.job import add_engine_arguments
+from hwp_bench.run.engine.options import add_engine_arguments
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
@@ -143,7 +143,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.report.free_view_table import free_view_tables
-    from hwp_bench.run.engine.job import engine_for, needs_of
+    from hwp_bench.run.engine.options import engine_for, needs_of
 
     settings = evaluation_settings(args)
     sealed = _sealed_part(args)
@@ -276,7 +276,7 @@ def chosen_captures(args: argparse.Namespace, engine: Engine) -> list[Path]:
     """Return the capture folders that were named, or the suite, rendered if it is missing."""
     if args.capture:
         return [Path(path) for path in args.capture]
-    from hwp_bench.run.engine.job import needs_of
+    from hwp_bench.run.engine.options import needs_of
     from hwp_bench.sim import ensure_suite
 
     return ensure_suite(args.suite, engine=engine, needs=needs_of(args))

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hwp_bench.run.engine.job import add_engine_arguments
+from hwp_bench.run.engine.options import add_engine_arguments
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
@@ -105,7 +105,7 @@ def run(args: argparse.Namespace) -> int:
 
 def _make(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
-    from hwp_bench.run.engine.job import engine_for, needs_of
+    from hwp_bench.run.engine.options import engine_for, needs_of
     from hwp_bench.sealed import make_suite
     from hwp_bench.sealed.secret import read_secret
 

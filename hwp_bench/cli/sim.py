@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 
-from hwp_bench.run.engine.job import add_engine_arguments
+from hwp_bench.run.engine.options import add_engine_arguments
 from hwp_bench.taxonomy import SUITES
 
 _EXAMPLES = """examples:

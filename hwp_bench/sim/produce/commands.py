@@ -84,7 +84,7 @@ def print_plan(args: argparse.Namespace) -> int:
 
 def render(args: argparse.Namespace) -> int:
     """Render captures and print their folders."""
-    from hwp_bench.run.engine.job import engine_for, needs_of
+    from hwp_bench.run.engine.options import engine_for, needs_of
     from hwp_bench.sim.produce.suites import ensure_suite
 
     if (args.suite is None) == (args.scene is None):
@@ -125,7 +125,7 @@ def render(args: argparse.Namespace) -> int:
 
 
 def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine) -> list[Path]:
-    from hwp_bench.run.engine.job import needs_of
+    from hwp_bench.run.engine.options import needs_of
     from hwp_bench.sim.produce.suites import RenderCapture, render_job, workers_each
 
     needs = needs_of(args)
