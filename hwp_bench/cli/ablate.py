@@ -142,13 +142,13 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.evaluation.ablate.runs import result_folder
     from hwp_bench.evaluation.sentences import outcome_lines
     from hwp_bench.report.evaluation_tables import HEADLINE
-    from hwp_bench.results.schema import noted
+    from hwp_bench.results.schema import add_isolation_note
 
     metrics = common_metrics(list(ablation.runs.values()), HEADLINE)
     effects = score_effects(ablation, metrics)
     costs = cost_effects(ablation)
     found = ablation_tables(ablation, effects, costs)
-    tables = {name: noted(table, ablation.results) for name, table in found.items()}
+    tables = {name: add_isolation_note(table, ablation.results) for name, table in found.items()}
     record = ablation_record(ablation, effects, costs, tables)
     write_tables(out / "tables", tables)
     if print_json:

@@ -108,7 +108,7 @@ def write_pictures(folder: Path, scored: ScoredFrames) -> None:
     A row a frame: truth in full, then truth, prediction and error on the scored pixels.
     """
     tiles = []
-    for name, place in telling_frames(scored.scores).items():
+    for name, place in find_extreme_frames(scored.scores).items():
         target = scored.targets[place]
         pixels, label = _prediction(scored, place)
         wrong = error_map(pixels, target.pixels, target.region)
@@ -134,7 +134,7 @@ def _prediction(scored: ScoredFrames, place: int) -> tuple[np.ndarray, str]:
     return pixels, f"PSNR {scored.scores[place].scores['psnr']:.2f} dB"
 
 
-def telling_frames(frames: Sequence[FrameResult], metric: str = "psnr") -> dict[str, int]:
+def find_extreme_frames(frames: Sequence[FrameResult], metric: str = "psnr") -> dict[str, int]:
     """Return the positions of the worst, median and best frame in a list of results."""
     order = np.argsort([frame.scores[metric] for frame in frames], kind="stable")
     return {

@@ -41,9 +41,9 @@ from hwp_bench.metrics import METRICS, PROTOCOLS
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, CurvePoint, FreeViewResult, Results
-from hwp_bench.results.schema import WALLED
+from hwp_bench.results.schema import ISOLATED
 from hwp_bench.run.engine import Folder, Job, Needs
-from hwp_bench.run.engine.job import OnProgress, ignore
+from hwp_bench.run.engine.job import OnProgress, ignore_progress
 from hwp_bench.run.runner import DEFAULT_TIME_LIMIT, RunRecord, run_method
 from hwp_bench.run.sandbox.confinement import Confinement, hand_model_files
 from hwp_bench.run.worker import LOG, RunFacts, checkpoint_folder
@@ -236,7 +236,7 @@ def evaluate_elsewhere(
 
 
 def evaluate_capture(
-    evaluation: CaptureEvaluation, folder: Path, on_progress: OnProgress = ignore
+    evaluation: CaptureEvaluation, folder: Path, on_progress: OnProgress = ignore_progress
 ) -> CaptureResult:
     """Run a method on a capture and score it; a stored result of the same key is taken as it is."""
     stored = stored_result(evaluation, folder)
@@ -347,7 +347,7 @@ def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult 
         result = read_result(folder)
     except HwpError:
         return None
-    if evaluation.confinement.mode == "required" and result.isolation != WALLED:
+    if evaluation.confinement.mode == "required" and result.isolation != ISOLATED:
         return None
     return result if result.key == evaluation.key and result.failure is None else None
 

@@ -23,10 +23,10 @@ from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation
 from hwp_bench.evaluation.results_folder import (
     RESULTS,
+    announce_kept,
     finish_together,
     open_results_folder,
     refuse_other,
-    say_kept,
 )
 from hwp_bench.methods.contents import digest_of, method_files, refuse_links_out
 from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
@@ -161,7 +161,7 @@ def run_plans(
             )
             for name, plan in plans.items()
         }
-        say_kept(list(folders.values()))
+        announce_kept(list(folders.values()))
         found = {name: dict(folder.kept) for name, folder in folders.items()}
         missing = [(name, place) for name, place in order if place not in found[name]]
         if rehearse:

@@ -133,7 +133,7 @@ def open_results_folder(
     return folder
 
 
-def say_kept(folders: Sequence[ResultsFolder]) -> None:
+def announce_kept(folders: Sequence[ResultsFolder]) -> None:
     """Say which results are kept, because their key is that of this evaluation."""
     names = [
         folder.evaluations[place].capture.info.id for folder in folders for place in folder.kept

@@ -9,12 +9,12 @@ from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.capture.splits import split_for
 from hwp_bench.evaluation.scoring import read_warnings
 from hwp_bench.results import CaptureResult, FrameResult, Results
-from hwp_bench.results.schema import walls_text
+from hwp_bench.results.schema import isolation_text
 from hwp_bench.run.worker import LOG
 from hwp_bench.sim.produce.suites import SuiteItem, suite
 
 
-def missing(results: Results) -> list[str]:
+def find_missing(results: Results) -> list[str]:
     """Return what results lack of their suite, in words; empty where they are complete.
 
     Every capture of the suite must be there under its name, with the suite's own split and every
@@ -22,7 +22,7 @@ def missing(results: Results) -> list[str]:
     """
     items = {item.scene.id: item for item in suite(results.suite)}
     given = {capture.id: capture for capture in results.captures}
-    problems = other_captures(results)
+    problems = find_other_captures(results)
     for name in sorted(items.keys() & given.keys()):
         split = split_for(name, items[name].frame_count)
         if given[name].split_digest != split.digest:
@@ -32,7 +32,7 @@ def missing(results: Results) -> list[str]:
     return problems
 
 
-def other_captures(results: Results) -> list[str]:
+def find_other_captures(results: Results) -> list[str]:
     """Return in words which captures of its suite a result lacks or has too many."""
     problems = []
     items = {item.scene.id for item in suite(results.suite)}
@@ -46,7 +46,7 @@ def other_captures(results: Results) -> list[str]:
     return problems
 
 
-def wrong_labels(results: Results) -> list[str]:
+def find_wrong_labels(results: Results) -> list[str]:
     """Return in words which labels of captures are not those of the suite's scenes.
 
     Labels decide which means a capture enters: hands, perturbations, and whether its masks are
@@ -66,12 +66,12 @@ def wrong_labels(results: Results) -> list[str]:
 def _labels(capture: CaptureResult, item: SuiteItem) -> list[tuple[str, object, object]]:
     return [
         ("hands", capture.hands, item.scene.hands),
-        ("perturbations", sorted(capture.perturbations), declared(item)),
+        ("perturbations", sorted(capture.perturbations), declared_perturbations(item)),
         ("exact_masks", capture.exact_masks, True),
     ]
 
 
-def declared(item: SuiteItem) -> list[str]:
+def declared_perturbations(item: SuiteItem) -> list[str]:
     """Return the perturbations that a capture of the suite declares, by name."""
     return sorted({call.kind for call in item.scene.effects})
 
@@ -119,7 +119,7 @@ def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
         if capture.failure and (folder / LOG).is_file():
             lines.append(f"log: {folder / LOG}")
         lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
-    facts = times_text(results, head), walls_text(results, head)
+    facts = times_text(results, head), isolation_text(results, head)
     return lines + [text for text in facts if text]
 
 

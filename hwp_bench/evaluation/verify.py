@@ -28,7 +28,7 @@ from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation.artifacts import FREE_PREDICTIONS
 from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
 from hwp_bench.evaluation.scoring import ScoredFrames, Target, read_targets, score_frames_of
-from hwp_bench.evaluation.sentences import is_of_suite, missing, other_captures
+from hwp_bench.evaluation.sentences import find_missing, find_other_captures, is_of_suite
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips_weights import load_available
 from hwp_bench.metrics.protocol import HWP_V1, Protocol
@@ -115,7 +115,7 @@ def verify_results(
         splits: splits by capture id; None applies the 80/10/10 rule.
 
     Raises:
-        BadInput, BadResult: the result file is missing or damaged.
+        BadInput, BadResult: the result file is find_missing or damaged.
     """
     file = file / "results.json" if file.is_dir() else file
     results = read_results(file)
@@ -414,7 +414,7 @@ def _suite_differences(
     """Compare a result with the suite that it names: captures, splits, frames and scenes."""
     if results.suite not in suite_names():
         return []
-    problems = other_captures(results) if own_splits else missing(results)
+    problems = find_other_captures(results) if own_splits else find_missing(results)
     foreign = [item.info.id for item in captures if not is_of_suite(item.info, results.suite)]
     if foreign:
         problems.append(f"is of other scenes or sizes: {', '.join(foreign)}")
@@ -488,7 +488,9 @@ def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
     here = metric_names(networks=networks)
     absent = [name for name in results.metrics if name in _with_weights() and name not in here]
     if absent:
-        notes.append(f"Not recomputed, because their weights are missing: {', '.join(absent)}.")
+        notes.append(
+            f"Not recomputed, because their weights are find_missing: {', '.join(absent)}."
+        )
     if results.toolkit != __version__:
         notes.append(f"Made with version {results.toolkit}; this is {__version__}.")
     mine = environment()

@@ -16,7 +16,7 @@ from hwp_bench.base.errors import BadResult, HwpError, UsageError
 from hwp_bench.base.files import read_json
 from hwp_bench.base.progress import notice
 from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
-from hwp_bench.evaluation.sentences import wrong_labels
+from hwp_bench.evaluation.sentences import find_wrong_labels
 from hwp_bench.evaluation.verify import Discrepancy, copy_differences, digest_differences
 from hwp_bench.leaderboard.entries import Entry, entry_files, read_checks, read_entry
 from hwp_bench.leaderboard.names import check_names, read_names
@@ -52,7 +52,7 @@ def check_bound(entry: Entry) -> None:
     """
     if entry.protocol != HWP_V1.name:
         return
-    if problems := wrong_labels(entry.results):
+    if problems := find_wrong_labels(entry.results):
         raise _wrong(entry, "captures", "; ".join(problems))
     known = known_data().suites.get(entry.results.suite, {})
     for capture in entry.results.captures:

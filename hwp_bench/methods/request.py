@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 
 
 #: The estimates that the truth can replace, by name, in the order of tables.
-TRUTHS: Mapping[str, str] = MappingProxyType(
+ORACLE_INPUTS: Mapping[str, str] = MappingProxyType(
     {
         "pixels": "clean versions of the training frames, with their masks",
         "masks": "exact masks of the visible hand in the training frames",
@@ -54,7 +54,7 @@ _PREFIX = "true:"
 
 
 @dataclass(frozen=True, eq=False)
-class TrainingMaterial:
+class TrainingInputs:
     """Where the training part of a request comes from."""
 
     #: Indices of the training frames.
@@ -67,14 +67,18 @@ class TrainingMaterial:
     hands: dict[str, HandParameters]
 
 
-def frames_with(truths: Iterable[str]) -> str:
+def frame_choice(truths: Iterable[str]) -> str:
     """The choice of frames in which the truth replaces some estimates."""
     asked = set(truths)
-    return _PREFIX + ",".join(name for name in TRUTHS if name in asked) if asked else "perturbed"
+    return (
+        _PREFIX + ",".join(name for name in ORACLE_INPUTS if name in asked)
+        if asked
+        else "perturbed"
+    )
 
 
-def known_truths(capture: Capture) -> tuple[str, ...]:
-    """The estimates of a capture whose truth is stored with it, in the order of `TRUTHS`."""
+def known_oracle_inputs(capture: Capture) -> tuple[str, ...]:
+    """The estimates of a capture whose truth is stored with it, in the order of `ORACLE_INPUTS`."""
     known = set()
     if capture.true_hands is not None:
         known |= {"poses", "test-poses", "betas"}
@@ -84,10 +88,10 @@ def known_truths(capture: Capture) -> tuple[str, ...]:
         known.add("mesh")
     if all((capture.root / IMAGE_FOLDERS[kind]).is_dir() for kind in ("clean", "clean_masks")):
         known.add("pixels")
-    return tuple(name for name in TRUTHS if name in known)
+    return tuple(name for name in ORACLE_INPUTS if name in known)
 
 
-def training_material(capture: Capture, split: Split, choice: str) -> TrainingMaterial:
+def choose_training_inputs(capture: Capture, split: Split, choice: str) -> TrainingInputs:
     """Return the training part that a method is given of a capture."""
     if choice.startswith(_PREFIX):
         return _with_truths(capture, split, _replaced_by(choice))
@@ -95,25 +99,25 @@ def training_material(capture: Capture, split: Split, choice: str) -> TrainingMa
         raise UsageError(f"{choice!r} is not one of {', '.join(FRAME_CHOICES)}", field="frames")
     hands = dict(capture.hands)
     if choice == "perturbed":
-        return TrainingMaterial(split.train, "frames", "masks", hands)
+        return TrainingInputs(split.train, "frames", "masks", hands)
     perturbed = _perturbed(capture)
     if choice == "unperturbed-only":
         train = split.train[~perturbed[split.train]]
         if not len(train):
             raise UsageError("has no unperturbed training frame", where=capture.root)
-        return TrainingMaterial(train, "frames", "masks", hands)
+        return TrainingInputs(train, "frames", "masks", hands)
     truth = capture.true_hands
-    if truth is None or "pixels" not in known_truths(capture):
+    if truth is None or "pixels" not in known_oracle_inputs(capture):
         raise UsageError(
             "does not know its clean frames",
             where=capture.root,
             remedy="Only simulated captures do; use --frames perturbed.",
         )
     repaired = {side: _replaced(hand, truth[side], perturbed) for side, hand in hands.items()}
-    return TrainingMaterial(split.train, "clean", "clean_masks", repaired)
+    return TrainingInputs(split.train, "clean", "clean_masks", repaired)
 
 
-def free_view_hands(clip: Capture, choice: str) -> dict[str, HandParameters]:
+def choose_free_view_hands(clip: Capture, choice: str) -> dict[str, HandParameters]:
     """Return the hand parameters of a free-view clip that a method is given."""
     truth = clip.true_hands
     # The subject's mesh has the true shape in it, and so belongs in the places of that shape.
@@ -121,7 +125,7 @@ def free_view_hands(clip: Capture, choice: str) -> dict[str, HandParameters]:
     return dict(truth if exact and truth is not None else clip.hands)
 
 
-def gives_mesh(choice: str) -> bool:
+def replaces_mesh(choice: str) -> bool:
     """Whether a choice of frames replaces the template by the subject's own mesh."""
     return "mesh" in _replaced_by(choice)
 
@@ -131,12 +135,12 @@ def _replaced_by(choice: str) -> list[str]:
     return choice.removeprefix(_PREFIX).split(",") if choice.startswith(_PREFIX) else []
 
 
-def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingMaterial:
+def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingInputs:
     """The capture as it is, but for some estimates."""
-    known = known_truths(capture)
+    known = known_oracle_inputs(capture)
     for name in names:
-        if name not in TRUTHS:
-            raise UsageError(f"{name!r} is not one of {', '.join(TRUTHS)}", field="frames")
+        if name not in ORACLE_INPUTS:
+            raise UsageError(f"{name!r} is not one of {', '.join(ORACLE_INPUTS)}", field="frames")
         if name not in known:
             raise UsageError(
                 f"does not know its true {name}",
@@ -156,7 +160,7 @@ def _with_truths(capture: Capture, split: Split, names: list[str]) -> TrainingMa
         hands[side] = _replaced(hands[side], truth, rows)
         if "betas" in names:
             hands[side] = replace(hands[side], betas=truth.betas)
-    return TrainingMaterial(split.train, frames, masks, hands)
+    return TrainingInputs(split.train, frames, masks, hands)
 
 
 def _perturbed(capture: Capture) -> np.ndarray:
@@ -197,7 +201,7 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
         UsageError: the capture does not know what `run.frames` asks for.
     """
     info = capture.info
-    material = training_material(capture, split, run.frames)
+    material = choose_training_inputs(capture, split, run.frames)
     with atomic_folder(path, overwrite=True) as root:
         for frame in [*material.train.tolist(), *split.validation.tolist()]:
             for kind, source_kind, read in (
@@ -212,14 +216,14 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
                 shutil.copyfile(source, target)
         write_hands(root / HANDS, material.hands)
         write_cameras(root / CAMERAS, capture.cameras)
-        mesh = gives_mesh(run.frames)
+        mesh = replaces_mesh(run.frames)
         if mesh:
             own = {side: capture.true_template(side) for side in info.sides}
             write_subject_mesh(root / TEMPLATE, own)
         clip = capture.free_view
         if clip is not None:
             (root / FREE_VIEW).mkdir()
-            write_hands(root / FREE_VIEW / HANDS, free_view_hands(clip, run.frames))
+            write_hands(root / FREE_VIEW / HANDS, choose_free_view_hands(clip, run.frames))
             write_cameras(root / FREE_VIEW / CAMERAS, clip.cameras)
         description = {
             "schema": SCHEMA,

@@ -315,12 +315,12 @@ def differing_settings(results: Sequence[Results]) -> list[str]:
 
 
 #: What `CaptureResult.isolation` says of a run inside the walls.
-WALLED = "namespaces"
+ISOLATED = "namespaces"
 #: What `Results.environment` says under `caches`: a run finds nothing that a method wrote before.
 NEW_CACHES = "new for each run"
 
 
-def without_walls(results: Results) -> dict[str, list[str]]:
+def unisolated_captures(results: Results) -> dict[str, list[str]]:
     """Return the ids of the captures that a method ran on without walls, by the reason.
 
     The reason is empty where a person asked for none. Predictions that came as files, and results
@@ -328,18 +328,18 @@ def without_walls(results: Results) -> dict[str, list[str]]:
     """
     found: dict[str, list[str]] = {}
     for capture in results.captures:
-        if capture.isolation is not None and capture.isolation != WALLED:
+        if capture.isolation is not None and capture.isolation != ISOLATED:
             _, _, reason = capture.isolation.partition(" ")
             found.setdefault(reason.strip("()"), []).append(capture.id)
     return found
 
 
-def walls_text(results: Results, head: str = "") -> str:
+def isolation_text(results: Results, head: str = "") -> str:
     """Say how the method's process was isolated; empty where nothing is known of it."""
-    open_runs = without_walls(results)
+    open_runs = unisolated_captures(results)
     if not open_runs:
-        walled = any(capture.isolation == WALLED for capture in results.captures)
-        return f"isolation: {head}{WALLED}" if walled else ""
+        walled = any(capture.isolation == ISOLATED for capture in results.captures)
+        return f"isolation: {head}{ISOLATED}" if walled else ""
     parts = [
         ", ".join(ids) + (f" (the system refuses them: {reason})" if reason else "")
         for reason, ids in open_runs.items()
@@ -351,16 +351,16 @@ def walls_text(results: Results, head: str = "") -> str:
     )
 
 
-def walls_note(results: Sequence[Results]) -> str:
+def isolation_note(results: Sequence[Results]) -> str:
     """Return a line under a table that names methods which ran without walls; empty if none did."""
-    titles = [one.method.title for one in results if without_walls(one)]
+    titles = [one.method.title for one in results if unisolated_captures(one)]
     names = ", ".join(dict.fromkeys(titles))
     return f"Run without walls, where test frames can be read: {names}." if names else ""
 
 
-def noted(table: Table, results: Sequence[Results]) -> Table:
-    """Return a table with `walls_note` below it, once."""
-    note = walls_note(results)
+def add_isolation_note(table: Table, results: Sequence[Results]) -> Table:
+    """Return a table with `isolation_note` below it, once."""
+    note = isolation_note(results)
     if not note or note in table.notes:
         return table
     return replace(table, notes=(*table.notes, note))

@@ -24,7 +24,7 @@ from hwp_bench.base.text import one_line, shown
 from hwp_bench.base.trees import remove_tree
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import MethodManifest
-from hwp_bench.results.schema import WALLED
+from hwp_bench.results.schema import ISOLATED
 from hwp_bench.run import START
 from hwp_bench.run.sandbox.confinement import (
     CACHE,
@@ -302,7 +302,7 @@ def _run(
         walled = Program(command, output, environment, places, output / LOG, memory_files)
         outcome = run_confined(walled, limits, poll)
         if outcome.refused is None:
-            return outcome, WALLED
+            return outcome, ISOLATED
         if confinement.mode == "required":
             raise MethodFailed(
                 f"namespaces are required, but the system refuses them ({outcome.refused})",

@@ -223,7 +223,9 @@ def render_free_views(avatar: Avatar, training: TrainingCapture, folder: Path) -
         assert views is not None
         camera = views.cameras.camera(frame, training.width, training.height)
         try:
-            pixels = drawn(avatar, views.hand_poses(frame), camera, f"free-view frame {frame}")
+            pixels = render_checked(
+                avatar, views.hand_poses(frame), camera, f"free-view frame {frame}"
+            )
         except Exception:
             traceback.print_exc()
             continue
@@ -238,10 +240,12 @@ def checkpoint_frames(validation: np.ndarray) -> list[int]:
 def render(avatar: Avatar, training: TrainingCapture, frame: int) -> np.ndarray:
     """Render one frame of the capture; see `drawn`."""
     hands, camera = training.hand_poses(frame), training.camera(frame)
-    return drawn(avatar, hands, camera, f"frame {frame}")
+    return render_checked(avatar, hands, camera, f"frame {frame}")
 
 
-def drawn(avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: str) -> np.ndarray:
+def render_checked(
+    avatar: Avatar, hands: Mapping[str, HandPose], camera: Camera, name: str
+) -> np.ndarray:
     """Render hands and bring the image to 8 bits: clipped, rounded half to even.
 
     A fourth channel is dropped: the data set owns the mask.
@@ -266,7 +270,7 @@ def device_name(avatar: Avatar) -> str:
     return str(getattr(avatar, "device", "cpu"))[:100]
 
 
-def schedule(budget: Budget) -> list[float]:
+def checkpoint_times(budget: Budget) -> list[float]:
     """Return the seconds at which checkpoints are due: dense at the start, then regular.
 
     1, 2, 4, 8, ... s, and every tenth of a budget in seconds. (`ReportClock` adds the first offer
@@ -285,7 +289,7 @@ class ReportClock:
     def __init__(
         self, budget: Budget, record: Callable[[int, Avatar], None], progress_file: Path
     ) -> None:
-        self._due = schedule(budget)
+        self._due = checkpoint_times(budget)
         self._due_steps = [budget.steps * tenth / 10 for tenth in range(1, 10) if budget.steps]
         self._record = record
         self._progress_file = progress_file

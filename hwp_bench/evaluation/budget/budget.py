@@ -21,7 +21,7 @@ from hwp_bench.evaluation.budget.surface import TEXT as CEILING_TEXT
 from hwp_bench.evaluation.budget.surface import Ceiling, Pair, error_of, pairs_of
 from hwp_bench.evaluation.evaluate import EvaluationSettings, OnCapture, evaluate
 from hwp_bench.methods.contract import FRAME_CHOICES
-from hwp_bench.methods.request import TRUTHS, frames_with, known_truths
+from hwp_bench.methods.request import ORACLE_INPUTS, frame_choice, known_oracle_inputs
 from hwp_bench.metrics.protocol import PSNR_CAP
 from hwp_bench.metrics.psnr_ssim import decibels
 from hwp_bench.results import CaptureResult, Results
@@ -38,7 +38,7 @@ class BudgetRuns:
 
     #: The captures, in order.
     captures: tuple[Capture, ...]
-    #: Results by what the truth replaced: `GIVEN`, names in `TRUTHS`, `ALL`.
+    #: Results by what the truth replaced: `GIVEN`, names in `ORACLE_INPUTS`, `ALL`.
     results: Mapping[str, Results]
     #: Their folders by the same names.
     folders: Mapping[str, Path]
@@ -49,7 +49,7 @@ def run_budget(
     captures: Sequence[Path],
     out: Path,
     settings: EvaluationSettings,
-    truths: Sequence[str] = tuple(TRUTHS),
+    truths: Sequence[str] = tuple(ORACLE_INPUTS),
     *,
     splits: Mapping[str, Split] | None = None,
     on_run: Callable[[int, int, str], OnCapture | None] | None = None,
@@ -62,13 +62,13 @@ def run_budget(
 
     What is on disk from an earlier start is taken as it is.
     """
-    check_truths(truths, settings)
+    check_oracle_inputs(truths, settings)
     opened = tuple(open_capture(path) for path in captures)
     if "mesh" in truths:
         # Captures that were rendered before it was stored get it from their scene.
         for capture in opened:
             add_subject_mesh(capture)
-    variants = variants_of([known_truths(capture) for capture in opened], truths)
+    variants = plan_variants([known_oracle_inputs(capture) for capture in opened], truths)
     results, folders = {}, {}
     for index, (name, replaced) in enumerate(variants.items()):
         folders[name] = out / "runs" / name.replace(" ", "-")
@@ -76,7 +76,7 @@ def run_budget(
             method,
             captures,
             folders[name],
-            replace(settings, run=replace(settings.run, frames=frames_with(replaced))),
+            replace(settings, run=replace(settings.run, frames=frame_choice(replaced))),
             splits=splits,
             on_capture=on_run(index, len(variants), name) if on_run else None,
             engine=engine,
@@ -87,27 +87,29 @@ def run_budget(
     return BudgetRuns(opened, results, folders)
 
 
-def check_truths(truths: Sequence[str], settings: EvaluationSettings) -> None:
+def check_oracle_inputs(truths: Sequence[str], settings: EvaluationSettings) -> None:
     """Refuse what no error budget is made of."""
     if settings.run.frames != FRAME_CHOICES[0]:
         raise UsageError(
             f"{settings.run.frames!r} is an oracle itself", field="--frames", remedy="Leave it out."
         )
-    unknown = sorted(set(truths) - set(TRUTHS))
+    unknown = sorted(set(truths) - set(ORACLE_INPUTS))
     if unknown:
         raise UsageError(
             f"{unknown[0]!r} is not an estimate",
             field="--truths",
-            remedy=f"Known: {', '.join(TRUTHS)}.",
+            remedy=f"Known: {', '.join(ORACLE_INPUTS)}.",
         )
 
 
-def variants_of(
+def plan_variants(
     known: Sequence[Sequence[str]], truths: Sequence[str]
 ) -> dict[str, tuple[str, ...]]:
     """The estimates that the truth replaces in each evaluation, by its name."""
     common = [
-        name for name in TRUTHS if name in truths and all(name in capture for capture in known)
+        name
+        for name in ORACLE_INPUTS
+        if name in truths and all(name in capture for capture in known)
     ]
     variants: dict[str, tuple[str, ...]] = {GIVEN: ()}
     variants |= {name: (name,) for name in common}
@@ -143,7 +145,7 @@ class BudgetRow:
 
 
 @dataclass(frozen=True)
-class Budget:
+class ErrorBudget:
     """An error budget."""
 
     #: Title of the method.
@@ -160,7 +162,7 @@ class Budget:
         return {"schema": SCHEMA, **asdict(self)}
 
 
-def make_budget(runs: BudgetRuns) -> Budget:
+def make_budget(runs: BudgetRuns) -> ErrorBudget:
     """Compute the budget of finished evaluations.
 
     Frames that the method left out keep the protocol's penalty in every row.
@@ -171,7 +173,9 @@ def make_budget(runs: BudgetRuns) -> Budget:
     for name, result in runs.results.items():
         if name != GIVEN:
             psnr = {capture.id: _psnr(capture) for capture in result.captures}
-            rows.append(_row("truth", name, TRUTHS.get(name, "all truths above"), psnr, base))
+            rows.append(
+                _row("truth", name, ORACLE_INPUTS.get(name, "all truths above"), psnr, base)
+            )
     corrected: dict[str, dict[str, float]] = {name: {} for name in CORRECTIONS}
     shown, ceilings = {}, {}
     for capture, found in zip(runs.captures, given.captures, strict=True):
@@ -181,7 +185,7 @@ def make_budget(runs: BudgetRuns) -> Budget:
         ceiling, most = Ceiling.of(capture), []
         for frame, pair in pairs_of(capture, folder, list(scores)):
             for name, (correct, _) in CORRECTIONS.items():
-                better = 0.0 if pair is None else gained(correct(pair), pair)
+                better = 0.0 if pair is None else measure_gain(correct(pair), pair)
                 gains[name].append(scores[frame] + better)
             if ceiling is not None:
                 most.append(ceiling.psnr(frame, pair, scores[frame]))
@@ -197,15 +201,15 @@ def make_budget(runs: BudgetRuns) -> Budget:
     ]
     if len(ceilings) == len(base):
         rows.append(_row("ceiling", CEILING, CEILING_TEXT, ceilings, base))
-    return Budget(given.method.title, base, tuple(rows), shown)
+    return ErrorBudget(given.method.title, base, tuple(rows), shown)
 
 
-def gained(image: np.ndarray, pair: Pair) -> float:
+def measure_gain(image: np.ndarray, pair: Pair) -> float:
     """Gain of an image (H, W, 3) in place of the prediction, dB; 0 where it is not better."""
     return max(0.0, decibels(error_of(image, pair)) - decibels(pair.error))
 
 
-def next_work(budget: Budget) -> str:
+def next_work(budget: ErrorBudget) -> str:
     """One sentence for people: the truth and the correction that would gain most."""
     parts = []
     for kind, text in (("truth", "before fitting"), ("correction", "in the rendered frames")):
@@ -220,7 +224,7 @@ def next_work(budget: Budget) -> str:
 _SUMS = (ALL, "motion+light", "gain map")
 
 
-def budget_tables(budget: Budget) -> dict[str, Table]:
+def budget_tables(budget: ErrorBudget) -> dict[str, Table]:
     """The tables `budget` (means over captures) and `captures` (gain on each)."""
     count = len(budget.psnr)
     columns = [
@@ -283,7 +287,7 @@ def _psnr(capture: CaptureResult) -> float:
 _EDGE, _MARGIN = 176, 4
 
 
-def budget_sheet(runs: BudgetRuns, budget: Budget) -> np.ndarray:
+def budget_sheet(runs: BudgetRuns, budget: ErrorBudget) -> np.ndarray:
     """Draw two rows for each capture, with PSNR over the tiles.
 
     The first has the truth, the method as it is, and the method with each truth; the second the

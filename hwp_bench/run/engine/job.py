@@ -97,11 +97,11 @@ class LocalEngine:
         """Run jobs; see `Engine.run`."""
         for index, job in enumerate(jobs):
             on_progress = on_start(index, len(jobs), job.text) if on_start else None
-            job.here(on_progress or ignore)
+            job.here(on_progress or ignore_progress)
             on_done(index)
 
 
-def ignore(done: int, total: int) -> None:
+def ignore_progress(done: int, total: int) -> None:
     """Be told the steps of a job that nobody watches."""
 
 
@@ -130,7 +130,7 @@ class Failures:
         ) from first
 
 
-def lost(text: str, retries: int, reason: str) -> HwpError:
+def worker_lost_error(text: str, retries: int, reason: str) -> HwpError:
     """Return the error of a job that lost its worker too often."""
     return HwpError(
         f"the worker of the job {text!r} was lost {retries + 1} times ({reason})",

@@ -38,7 +38,7 @@ from hwp_bench.run.engine.job import (
     OnProgress,
     OnStart,
     Work,
-    lost,
+    worker_lost_error,
 )
 
 #: Variables that say how many threads a library starts.
@@ -277,7 +277,7 @@ class ParallelEngine:
         visible = visible_gpus()
         needs = max((job.needs for job in jobs), key=lambda item: item.gpus, default=Needs())
         places: queue.SimpleQueue[tuple[int, dict[str, str]]] = queue.SimpleQueue()
-        for place in enumerate(shares(self._at_once, needs, visible), start=1):
+        for place in enumerate(divide_gpus(self._at_once, needs, visible), start=1):
             places.put(place)
         ended: queue.SimpleQueue[tuple[int, BaseException | None]] = queue.SimpleQueue()
         stop = threading.Event()
@@ -332,7 +332,7 @@ class ParallelEngine:
                 return
             except WorkerLost as error:
                 if attempt == self._retries:
-                    raise lost(job.text, self._retries, str(error)) from error
+                    raise worker_lost_error(job.text, self._retries, str(error)) from error
 
 
 def _next(
@@ -355,7 +355,7 @@ def visible_gpus() -> list[str]:
     return [str(number) for number, _ in enumerate(cards.iterdir())] if cards.is_dir() else []
 
 
-def shares(jobs: int, needs: Needs, gpus: list[str]) -> list[dict[str, str]]:
+def divide_gpus(jobs: int, needs: Needs, gpus: list[str]) -> list[dict[str, str]]:
     """Divide GPUs among jobs that run at once."""
     if needs.gpus == 0:
         return [{} for _ in range(jobs)]

@@ -36,7 +36,7 @@ from hwp_bench.run.engine.job import (
     OnDone,
     OnStart,
     Work,
-    lost,
+    worker_lost_error,
 )
 from hwp_bench.run.engine.processes import (
     VISIBLE_GPUS,
@@ -70,36 +70,47 @@ class Parcel:
 
 
 def folder_digest(root: Path, skip: Sequence[str] = ()) -> str:
-    """Return the SHA-256 (hex) of a folder: names, content, and which files can be executed."""
+    """Return the SHA-256 (hex) of a folder: names, content, and which files can be executed.
+
+    `skip` are names directly inside it that do not count.
+    """
+    return _pack(root, skip, None)
+
+
+def pack(root: Path, skip: Sequence[str] = ()) -> Parcel:
+    """Pack a folder; the digest is that of the bytes that are sent."""
+    buffer = io.BytesIO()
+    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
+        digest = _pack(root, skip, archive)
+    return Parcel(digest, buffer.getvalue())
+
+
+def _pack(root: Path, skip: Sequence[str], archive: zipfile.ZipFile | None) -> str:
+    """Read a folder in one order, into an archive if there is one; returns its digest."""
     total = hashlib.sha256()
     for name, path in _entries(root, skip):
         if path.is_dir():
             total.update(f"d\0{name}\0".encode())
-            continue
-        with _open(path) as stream:
-            content = hashlib.file_digest(stream, "sha256").digest()
-        total.update(f"{_letter(path)}\0{name}\0".encode() + content)
-    return total.hexdigest()
-
-
-def pack(root: Path, skip: Sequence[str] = ()) -> Parcel:
-    """Pack a folder."""
-    total = hashlib.sha256()
-    buffer = io.BytesIO()
-    with zipfile.ZipFile(buffer, "w", zipfile.ZIP_STORED) as archive:
-        for name, path in _entries(root, skip):
-            if path.is_dir():
-                total.update(f"d\0{name}\0".encode())
+            if archive is not None:
                 archive.writestr(zipfile.ZipInfo(f"{name}/", _EPOCH), b"")
-                continue
-            with _open(path) as stream:
-                content = stream.read()
-            letter = _letter(path)
-            total.update(f"{letter}\0{name}\0".encode() + hashlib.sha256(content).digest())
+            continue
+        executable = path.stat().st_mode & stat.S_IXUSR
+        try:
+            with open(path, "rb") as stream:
+                content = None if archive is None else stream.read()
+                digest = (
+                    hashlib.file_digest(stream, "sha256")
+                    if content is None
+                    else hashlib.sha256(content)
+                )
+        except OSError as error:
+            raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
+        total.update(f"{'x' if executable else 'f'}\0{name}\0".encode() + digest.digest())
+        if archive is not None and content is not None:
             info = zipfile.ZipInfo(name, _EPOCH)
-            info.external_attr = (0o755 if letter == "x" else 0o644) << 16
+            info.external_attr = (0o755 if executable else 0o644) << 16
             archive.writestr(info, content)
-    return Parcel(total.hexdigest(), buffer.getvalue())
+    return total.hexdigest()
 
 
 def unpack(parcel: Parcel, target: Path, *, replace: bool = False) -> None:
@@ -193,17 +204,6 @@ def _entries(root: Path, skip: Sequence[str]) -> Iterator[tuple[str, Path]]:
 
 def _refuse(error: OSError) -> None:
     raise BadInput(f"cannot be read ({error.strerror})", where=error.filename) from error
-
-
-def _open(path: Path) -> io.BufferedReader:
-    try:
-        return open(path, "rb")
-    except OSError as error:
-        raise BadInput(f"cannot be read ({error.strerror})", where=path) from error
-
-
-def _letter(path: Path) -> str:
-    return "x" if path.stat().st_mode & stat.S_IXUSR else "f"
 
 
 #: Seconds that the head may take to accept a connection.
@@ -581,7 +581,7 @@ class _Run:
                 remedy="Install the same version of the toolkit on every node.",
             ) from error
         except self._ray.exceptions.RayError as error:
-            raise lost(job.text, self._retries, type(error).__name__) from error
+            raise worker_lost_error(job.text, self._retries, type(error).__name__) from error
         if reply.missing:
             self._places.pop(index, None)
             self._view.drop(index)
@@ -644,7 +644,7 @@ class _Run:
     def _start_board(self) -> Any:
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-        # On the node that orders the jobs, so that no lost node takes it along.
+        # On the node that orders the jobs, so that no worker_lost_error node takes it along.
         here = self._ray.get_runtime_context().get_node_id()
         place = NodeAffinitySchedulingStrategy(here, soft=True)
         return self._ray.remote(Board).options(num_cpus=0, scheduling_strategy=place).remote()

@@ -29,15 +29,15 @@ _PROJECT_MARKS = ("pyproject.toml", "setup.py", "setup.cfg", ".git")
 def python_places() -> list[str]:
     """Return the folders of this interpreter, its packages and the toolkit."""
     sites = _sites()
-    linked = [path for folder in _linked(sites) for path in of_packages(folder)]
-    return [sys.prefix, sys.base_prefix, *of_packages(os.fspath(PACKAGES)), *sites, *linked]
+    linked = [path for folder in _linked(sites) for path in package_paths(folder)]
+    return [sys.prefix, sys.base_prefix, *package_paths(os.fspath(PACKAGES)), *sites, *linked]
 
 
 def _sites() -> list[str]:
     return [*site.getsitepackages(), site.getusersitepackages()]
 
 
-def of_packages(folder: str) -> list[str]:
+def package_paths(folder: str) -> list[str]:
     """Return what is shown of a folder on the path: of a project, its packages and modules.
 
     Methods need nothing else of it, such as tests, runs, history and files with secrets.
@@ -50,7 +50,7 @@ def of_packages(folder: str) -> list[str]:
     return packages if _is_checkout(real) else [*packages, *modules]
 
 
-def checkout() -> list[str]:
+def toolkit_checkout() -> list[str]:
     """Return the toolkit's checkout, to be hidden where it lies in a folder that is shown."""
     root = os.path.realpath(PACKAGES)
     return [root] if _is_checkout(root) else []
@@ -70,7 +70,7 @@ def _linked(sites: Iterable[str]) -> list[str]:
 
 #: Parts of `hwp_bench` that a method may import: all that methods which ship are built from. Any
 #: other stays out of sight; those render, seal, score or rank test frames.
-SHOWN_ROOMS = frozenset(
+VISIBLE_PACKAGES = frozenset(
     {"_data", "analysis", "base", "capture", "cli", "hands", "importers", "methods", "metrics"}
     | {"report", "results", "run", "taxonomy", "tracking"}
 )
@@ -79,7 +79,7 @@ SHOWN_ROOMS = frozenset(
 MAX_FOLDERS = 20_000
 
 
-def secluded_rooms(folders: Iterable[str]) -> list[str]:
+def hidden_packages(folders: Iterable[str]) -> list[str]:
     """Return the parts of every installed `hwp_bench` that methods do not see."""
     found = []
     for folder in folders:
@@ -103,7 +103,7 @@ def _parts(package: str) -> list[str]:
             for entry in entries
             # A link would have another place hidden.
             if entry.is_dir(follow_symlinks=False)
-            and entry.name not in SHOWN_ROOMS | {"__pycache__"}
+            and entry.name not in VISIBLE_PACKAGES | {"__pycache__"}
         ]
 
 
@@ -304,7 +304,7 @@ def _libraries() -> list[Path]:
     """Folders of `PYTHONPATH`."""
     entries = os.environ.get("PYTHONPATH", "").split(os.pathsep)
     absolute = [entry for entry in entries if os.path.isabs(entry)]
-    return [Path(path) for entry in absolute for path in of_packages(entry)]
+    return [Path(path) for entry in absolute for path in package_paths(entry)]
 
 
 def _torch_home() -> Path:
@@ -356,10 +356,10 @@ def visible_places(
     }
     chosen |= dict.fromkeys(SCRATCH, ("scratch", str(scratch)))
     shown = [*_system(), *python_places(), *map(os.fspath, read)]
-    rooms = secluded_rooms([*shown, "/usr/local", *glob("/opt/*")])
+    rooms = hidden_packages([*shown, "/usr/local", *glob("/opt/*")])
     groups: Sequence[tuple[str, Iterable[str | Path]]] = (
         ("read", shown),
-        ("hidden", [*checkout(), *rooms, *hidden]),
+        ("hidden", [*toolkit_checkout(), *rooms, *hidden]),
         ("write", write),
     )
     for kind, paths in groups:
