@@ -13,15 +13,13 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed
+from hwp_bench.base.errors import BadMethod, HwpError, MethodFailed, bounded, one_line, shown
 from hwp_bench.base.files import disc_errors, read_json, sha256_json, write_json
+from hwp_bench.base.folders import remove_tree, scratch_folder
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import MAX_TEXT, parse_record
-from hwp_bench.base.scratch import scratch_folder
-from hwp_bench.base.text import bounded, one_line, shown
-from hwp_bench.base.trees import remove_tree
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.capture.content import refuse_changed
+from hwp_bench.capture.check import refuse_changed
 from hwp_bench.capture.schema import EXTRA, IMAGE_FOLDERS
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.artifacts import keep_artifacts
@@ -38,7 +36,7 @@ from hwp_bench.methods.contract import FRAME_CHOICES, RunSettings
 from hwp_bench.methods.manifest import MethodManifest, read_manifest, ships
 from hwp_bench.methods.request import write_request
 from hwp_bench.metrics import METRICS, PROTOCOLS
-from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, CurvePoint, FreeViewResult, Results
 from hwp_bench.results.schema import ISOLATED

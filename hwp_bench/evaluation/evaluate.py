@@ -11,13 +11,12 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 
-from hwp_bench.base.errors import BadCapture, BadMethod, HwpError, UsageError
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadCapture, BadMethod, HwpError, UsageError, one_line
 from hwp_bench.base.files import Places, canonical_json, check_places, inside
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.progress import notice
+from hwp_bench.base.folders import exclusive
+from hwp_bench.base.packages import __version__
 from hwp_bench.base.records import check_json_values, merged, parse_record
-from hwp_bench.base.text import one_line
-from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, split_for
 from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation
@@ -39,7 +38,7 @@ from hwp_bench.methods.manifest import (
     read_manifest,
 )
 from hwp_bench.metrics import PROTOCOLS
-from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.score import Network
 from hwp_bench.results import CaptureResult, MethodId, Results, write_results
 from hwp_bench.results.schema import environment

@@ -16,12 +16,12 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import BadSplit, HwpError
-from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import inside, read_json, sha256_json
 from hwp_bench.base.images import as_float
+from hwp_bench.base.packages import __version__
 from hwp_bench.base.tables import FORMATS, format_table
-from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import Split, split_for
@@ -30,7 +30,7 @@ from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
 from hwp_bench.evaluation.scoring import ScoredFrames, Target, read_targets, score_frames_of
 from hwp_bench.evaluation.sentences import find_missing, find_other_captures, is_of_suite
 from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
-from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.protocol import HWP_V1, Protocol
 from hwp_bench.metrics.score import Network
 from hwp_bench.report.evaluation_tables import all_tables

@@ -12,13 +12,18 @@ from typing import Annotated, Any
 
 from msgspec import Meta
 
-from hwp_bench.base.errors import BadMethod, UsageError
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadMethod, UsageError, nearest
 from hwp_bench.base.files import inside
 from hwp_bench.base.packages import PACKAGES, data_folder
-from hwp_bench.base.progress import notice
-from hwp_bench.base.records import Line, check_json_values, flattened, parse_record, without_schema
-from hwp_bench.base.text import nearest
-from hwp_bench.base.toml_text import parse_toml
+from hwp_bench.base.records import (
+    Line,
+    check_json_values,
+    flattened,
+    parse_record,
+    parse_toml,
+    without_schema,
+)
 from hwp_bench.methods.contents import method_digest
 from hwp_bench.methods.settings import class_settings
 from hwp_bench.taxonomy import SIZED_LIKE

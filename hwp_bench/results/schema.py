@@ -19,7 +19,7 @@ from hwp_bench.base.files import canonical_json, files_digest
 from hwp_bench.base.records import Count, Line, Message, Seconds, Seed
 from hwp_bench.base.tables import Table
 from hwp_bench.metrics import METRICS
-from hwp_bench.metrics.aggregate import CaptureScores, Scores, aggregate
+from hwp_bench.metrics.score import CaptureScores, Scores, aggregate
 
 #: Largest result file that is read, bytes; one of 10,000 frames stays far below it.
 MAX_BYTES = 64 << 20
@@ -270,7 +270,7 @@ class Results:
 
 
 def score_rows(results: Results) -> list[CaptureScores]:
-    """Return the captures as `hwp_bench.metrics.aggregate` takes them."""
+    """Return the captures as `hwp_bench.metrics.score` takes them."""
     return [
         CaptureScores(
             id=capture.id,

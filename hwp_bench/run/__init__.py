@@ -19,8 +19,7 @@ def start() -> int:
     start (those of NumPy's BLAS are the first) flush them too. How many those are is said before
     as well.
     """
-    from hwp_bench.base.denormals import flushed_process
-    from hwp_bench.base.threads import share_processors
+    from hwp_bench.base.numerics import flushed_process, share_processors
 
     del sys.argv[0]
     share_processors()

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.analysis.statistics.pairing import MethodRuns
-from hwp_bench.base.errors import UsageError
-from hwp_bench.base.text import did_you_mean
+from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.evaluate import (
     EvaluationSettings,
@@ -21,7 +20,7 @@ from hwp_bench.evaluation.evaluate import (
     with_setting_files,
 )
 from hwp_bench.methods.manifest import MANIFEST, MethodManifest, Switch
-from hwp_bench.metrics.lpips_weights import load_available
+from hwp_bench.metrics.lpips import load_available
 from hwp_bench.results import Results
 from hwp_bench.run.engine import Engine, Needs
 

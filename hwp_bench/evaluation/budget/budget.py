@@ -22,8 +22,8 @@ from hwp_bench.evaluation.budget.surface import Ceiling, Pair, error_of, pairs_o
 from hwp_bench.evaluation.evaluate import EvaluationSettings, OnCapture, evaluate
 from hwp_bench.methods.contract import FRAME_CHOICES
 from hwp_bench.methods.request import ORACLE_INPUTS, frame_choice, known_oracle_inputs
+from hwp_bench.metrics.pixels import decibels
 from hwp_bench.metrics.protocol import PSNR_CAP
-from hwp_bench.metrics.psnr_ssim import decibels
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.run.engine import Engine, Needs
 from hwp_bench.sim.produce.subject_mesh import add_subject_mesh

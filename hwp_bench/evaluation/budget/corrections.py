@@ -9,8 +9,7 @@ from types import MappingProxyType
 import cv2
 import numpy as np
 
-from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
-from hwp_bench.base.harmonics import harmonics
+from hwp_bench.base.colors import harmonics, linear_to_srgb, srgb_to_linear
 from hwp_bench.evaluation.budget.surface import Pair, error_of
 
 # Steps of Gauss-Newton; all corrections have come to rest by then.

@@ -14,18 +14,16 @@ from scipy.ndimage import distance_transform_edt
 from scipy.spatial.transform import Rotation
 
 from hwp_bench.capture import Capture
-from hwp_bench.capture.schema import TRUE_TEMPLATE
-from hwp_bench.capture.subject_mesh import read_subject_mesh
+from hwp_bench.capture.schema import TRUE_TEMPLATE, read_subject_mesh
 from hwp_bench.evaluation.scoring import read_prediction
-from hwp_bench.hands.footprint import HandSurfaces
-from hwp_bench.hands.parameters import Camera, HandPose
+from hwp_bench.hands.anchors import HandSurfaces
+from hwp_bench.hands.articulation import axis_angle_to_matrix, matrix_to_axis_angle
 from hwp_bench.hands.raster import draw_faces, mix_corners
-from hwp_bench.hands.rotations import axis_angle_to_matrix, matrix_to_axis_angle
+from hwp_bench.hands.skeleton import JOINT_COUNT, Camera, HandPose
 from hwp_bench.hands.skinning import pose_hand, project
-from hwp_bench.hands.template import JOINT_COUNT, HandTemplate, TemplateTensors
-from hwp_bench.metrics.pixels import scored_pixels
+from hwp_bench.hands.template import HandTemplate, TemplateTensors
+from hwp_bench.metrics.pixels import decibels, scored_pixels, squared_error
 from hwp_bench.metrics.protocol import HWP_V1
-from hwp_bench.metrics.psnr_ssim import decibels, squared_error
 
 # Numbers of each hand: the turn of every joint, then the translation.
 _TURNS = 3 * JOINT_COUNT

@@ -65,12 +65,12 @@ def engine_for(args: argparse.Namespace) -> Engine:
         from hwp_bench.run.engine.ray import import_ray
 
         import_ray()
-        from hwp_bench.base.progress import JobsView
+        from hwp_bench.base.console import JobsView
         from hwp_bench.run.engine.ray import RayEngine
 
         return RayEngine(address or None, JobsView())
     if args.jobs > 1:
-        from hwp_bench.base.progress import JobsView
+        from hwp_bench.base.console import JobsView
         from hwp_bench.run.engine.processes import ParallelEngine
 
         return ParallelEngine(args.jobs, JobsView())

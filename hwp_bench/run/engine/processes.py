@@ -24,10 +24,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from hwp_bench.base import errors
+from hwp_bench.base.console import JobsView
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.packages import PACKAGES
-from hwp_bench.base.progress import JobsView
 from hwp_bench.run import START
 from hwp_bench.run.engine.job import (
     RETRIES,

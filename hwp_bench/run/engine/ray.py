@@ -22,11 +22,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.denormals import flushed
+from hwp_bench.base.console import JobsView
 from hwp_bench.base.errors import BadInput, HwpError, MissingDependency, UsageError
 from hwp_bench.base.files import cache_root, files_digest, inside, temporary_name
+from hwp_bench.base.numerics import flushed
 from hwp_bench.base.packages import PACKAGES
-from hwp_bench.base.progress import JobsView
 from hwp_bench.run.engine.job import (
     RETRIES,
     Failures,

@@ -15,8 +15,8 @@ from hwp_bench.evaluation.budget.budget import measure_gain
 from hwp_bench.evaluation.budget.corrections import motion, pose
 from hwp_bench.evaluation.budget.surface import MovingSurface, Pair
 from hwp_bench.hands import load_template
-from hwp_bench.hands.parameters import Camera, HandPose
 from hwp_bench.hands.raster import draw_faces, mix_corners
+from hwp_bench.hands.skeleton import Camera, HandPose
 from hwp_bench.hands.skinning import pose_hand, project
 
 SIZE = 64
