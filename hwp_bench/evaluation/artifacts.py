@@ -172,7 +172,9 @@ def write_side_by_side(
         found = [next(one for one in s.results.captures if one.id == name) for s in sources]
         frame = _typical_frame(found)
         [target] = read_targets(capture, [frame])
-        images = [(target.pixels, f"truth: {name}, frame {frame}")]
+        images: list[tuple[np.ndarray | None, str]] = [
+            (target.pixels, f"truth: {name}, frame {frame}")
+        ]
         for source, result in zip(sources, found, strict=True):
             folder = source.place(result.id, "predictions")
             pixels = read_prediction(folder, frame, capture.size).pixels if folder else None

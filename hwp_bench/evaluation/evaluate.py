@@ -269,16 +269,22 @@ def make_plan(
     settings = replace(settings, preset=preset, run=replace(settings.run, settings=chosen))
     refuse_links_out(manifest.root, settings.confinement.exposed)
     files = method_files(manifest.root)
-    common = {
-        "run": settings.run,
-        "time_limit": settings.time_limit,
-        "confinement": settings.confinement,
-        "networks": load_available() if networks is None else networks,
-        "method_files": files,
-    }
-    evaluations = (CaptureEvaluation(manifest, *data, **common) for data in captures)
+    known = load_available() if networks is None else networks
+    evaluations = tuple(
+        CaptureEvaluation(
+            manifest,
+            capture,
+            split,
+            settings.run,
+            settings.time_limit,
+            settings.confinement,
+            known,
+            files,
+        )
+        for capture, split in captures
+    )
     started = datetime.datetime.now(datetime.UTC).isoformat(timespec="seconds")
-    plan = Plan(manifest, settings, tuple(evaluations), started, digest_of(files), title)
+    plan = Plan(manifest, settings, evaluations, started, digest_of(files), title)
     # Before anything runs: what is to be written will have to be read.
     head = asdict(plan.results([]))
     parse_record(Results, head, where=manifest.name, error=BadMethod)

@@ -329,7 +329,9 @@ def read_manifest(path: str | os.PathLike[str]) -> MethodManifest:
     if table.entry.predictions is not None:
         inside(root, table.entry.predictions)
     manifest.check_setting_names(manifest.files, "files")
-    tables = {f"presets.{name}": preset for name, preset in manifest.presets.items()}
+    tables: dict[str, Mapping[str, Any]] = {
+        f"presets.{name}": preset for name, preset in manifest.presets.items()
+    }
     for name, switch in manifest.switches.items():
         kind = "settings_on" if switch.alternative else "settings_off"
         tables[f"switches.{name}.{kind}"] = switch.settings
