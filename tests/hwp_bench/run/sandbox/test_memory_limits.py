@@ -197,7 +197,7 @@ def test_a_kill_in_a_control_group_is_the_limit(attack, monkeypatch, tmp_path: P
     (tmp_path / "group").mkdir()
     (tmp_path / "group" / "memory.events").write_text("oom_kill 1\n")
     group = ControlGroup(tmp_path / "group")
-    monkeypatch.setattr(supervise.memory, "control_group", lambda limit: group)
+    monkeypatch.setattr(supervise, "control_group", lambda limit: group)
     with pytest.raises(MethodFailed, match=r"took more than 0\.2 GB of memory"):
         attack("os.kill(os.getpid(), 9)", "none", memory_limit=LIMIT)
     assert (tmp_path / "group" / "cgroup.procs").read_text() != str(os.getpid())
