@@ -91,10 +91,8 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings, look_ahead
-    from hwp_bench.evaluation.ablate.design import make_design
-    from hwp_bench.evaluation.ablate.runs import run_ablation
-    from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.methods.setting_files import check_settings
+    from hwp_bench.evaluation.ablate.runs import make_design, run_ablation
+    from hwp_bench.methods.manifest import check_settings, find_method, read_manifest
     from hwp_bench.run.engine.options import engine_for, needs_of
 
     if not 1 <= args.seeds <= 100:
@@ -134,22 +132,23 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.analysis.statistics.pairing import common_metrics
     from hwp_bench.base.console import notice
     from hwp_bench.base.tables import print_table, write_tables
-    from hwp_bench.evaluation.ablate.ablation_tables import (
+    from hwp_bench.evaluation.ablate.effects import (
         ablation_record,
         ablation_tables,
+        cost_effects,
+        score_effects,
         write_record,
     )
-    from hwp_bench.evaluation.ablate.effects import cost_effects, score_effects
     from hwp_bench.evaluation.ablate.runs import result_folder
-    from hwp_bench.evaluation.outcome import outcome_lines
+    from hwp_bench.evaluation.sentences import outcome_lines
     from hwp_bench.report.evaluation_tables import HEADLINE
-    from hwp_bench.results.walls import noted
+    from hwp_bench.results.schema import add_isolation_note
 
     metrics = common_metrics(list(ablation.runs.values()), HEADLINE)
     effects = score_effects(ablation, metrics)
     costs = cost_effects(ablation)
     found = ablation_tables(ablation, effects, costs)
-    tables = {name: noted(table, ablation.results) for name, table in found.items()}
+    tables = {name: add_isolation_note(table, ablation.results) for name, table in found.items()}
     record = ablation_record(ablation, effects, costs, tables)
     write_tables(out / "tables", tables)
     if print_json:

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING
 from hwp_bench.cli.evaluate import add_evaluation_arguments
 
 if TYPE_CHECKING:
-    from hwp_bench.evaluation.budget.runs import BudgetRuns
+    from hwp_bench.evaluation.budget.budget import BudgetRuns
     from hwp_bench.evaluation.evaluate import OnCapture
 
 _EXAMPLES = """examples:
@@ -51,15 +51,15 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.console import JobsView, notice
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.cli.evaluate import chosen_captures, evaluation_settings, look_ahead
-    from hwp_bench.evaluation.budget.runs import check_truths, run_budget
+    from hwp_bench.evaluation.budget.budget import check_oracle_inputs, run_budget
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.methods.material import TRUTHS
+    from hwp_bench.methods.request import ORACLE_INPUTS
     from hwp_bench.run.engine.options import engine_for, needs_of
 
     settings = evaluation_settings(args)
     manifest = read_manifest(find_method(args.method))
-    truths = tuple(TRUTHS) if args.truths is None else args.truths
-    check_truths(truths, settings)
+    truths = tuple(ORACLE_INPUTS) if args.truths is None else args.truths
+    check_oracle_inputs(truths, settings)
     out = Path(args.out or f"runs/budget-{manifest.name}-{settings.suite}")
     splits = read_splits(args.splits) if args.splits else None
     rehearse = look_ahead(args, manifest, settings, out, splits)
@@ -92,14 +92,21 @@ def _report(runs: BudgetRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.base.files import write_json
     from hwp_bench.base.images import write_image
     from hwp_bench.base.tables import print_table, write_tables
-    from hwp_bench.evaluation.budget.budget import budget_tables, make_budget, next_work
-    from hwp_bench.evaluation.budget.picture import budget_sheet
-    from hwp_bench.evaluation.outcome import outcome_lines
-    from hwp_bench.results.walls import noted
+    from hwp_bench.evaluation.budget.budget import (
+        budget_sheet,
+        budget_tables,
+        make_budget,
+        next_work,
+    )
+    from hwp_bench.evaluation.sentences import outcome_lines
+    from hwp_bench.results.schema import add_isolation_note
 
     budget = make_budget(runs)
     evaluations = list(runs.results.values())
-    tables = {name: noted(table, evaluations) for name, table in budget_tables(budget).items()}
+    tables = {
+        name: add_isolation_note(table, evaluations)
+        for name, table in budget_tables(budget).items()
+    }
     write_tables(out / "tables", tables)
     record = write_json(out / "budget.json", budget.to_json())
     picture = write_image(out / "budget.png", budget_sheet(runs, budget))

@@ -54,7 +54,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.tables import format_table, print_table
     from hwp_bench.report.evaluation_tables import HEADLINE
     from hwp_bench.results import read_all
-    from hwp_bench.results.walls import noted
+    from hwp_bench.results.schema import add_isolation_note
 
     results = read_all(args.results)
     comparison = compare_results(
@@ -69,7 +69,7 @@ def run(args: argparse.Namespace) -> int:
         print()
         return 0
     for plain in comparison.tables():
-        table = noted(plain, results)
+        table = add_isolation_note(plain, results)
         if args.format == "terminal":
             print_table(table)
         else:

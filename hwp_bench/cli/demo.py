@@ -42,9 +42,14 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.tables import Column, Table, print_table, write_tables
     from hwp_bench.capture import open_capture
     from hwp_bench.cli.evaluate import report_outcome
-    from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
-    from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
-    from hwp_bench.evaluation.side_by_side import write_side_by_side
+    from hwp_bench.evaluation.artifacts import write_side_by_side
+    from hwp_bench.evaluation.evaluate import (
+        EvaluationSettings,
+        check_call,
+        check_results_place,
+        check_suite,
+        evaluate,
+    )
     from hwp_bench.methods import find_method, read_manifest
     from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.report.sources import ResultsSource

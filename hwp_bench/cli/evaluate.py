@@ -196,7 +196,7 @@ def look_ahead(
     Raises:
         HwpError: as `check_results_place`, `check_call` and `check_suite`.
     """
-    from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
+    from hwp_bench.evaluation.evaluate import check_call, check_results_place, check_suite
 
     inputs = {
         "--capture": args.capture,
@@ -229,7 +229,7 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
 def report_outcome(out: Path, results: Results) -> int:
     """Print where the results are and which frames failed; returns the exit status."""
     from hwp_bench.base.console import notice
-    from hwp_bench.evaluation.outcome import outcome_lines
+    from hwp_bench.evaluation.sentences import outcome_lines
 
     for line in outcome_lines(out, results):
         notice(line)

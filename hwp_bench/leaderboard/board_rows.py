@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 from hwp_bench.analysis.statistics.pairing import same_but_seed
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.records import BADGES, LEVELS
 from hwp_bench.leaderboard.rules import current, source_of
@@ -41,8 +41,8 @@ class BoardRow:
 
     @property
     def whole(self) -> bool:
-        """Whether no capture or test frame of the suite is missing."""
-        return not missing(self.first)
+        """Whether no capture or test frame of the suite is find_missing."""
+        return not find_missing(self.first)
 
     @property
     def scores(self) -> Mapping[str, float]:
@@ -98,7 +98,7 @@ def board_rows(entries: Iterable[Entry]) -> list[BoardRow]:
     for entry in entries:
         key: object = (same_but_seed(entry.results), entry.submission.by, entry.level)
         seeds = {other.results.seed for other in groups.get(key, [])}
-        if missing(entry.results) or entry.results.seed in seeds:
+        if find_missing(entry.results) or entry.results.seed in seeds:
             key = entry.name
         groups.setdefault(key, []).append(entry)
     return [

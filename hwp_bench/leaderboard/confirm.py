@@ -14,7 +14,7 @@ from hwp_bench.leaderboard.records import Check
 from hwp_bench.leaderboard.rules import HEADLINE, current
 from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.results import Results, read_results
-from hwp_bench.results.environment import environment
+from hwp_bench.results.schema import environment
 
 #: Largest difference of the macro mean of PSNR with which a second run reproduces a row, dB.
 TOLERANCE = 0.1

@@ -13,8 +13,8 @@ import numpy as np
 from hwp_bench.base.drawing import error_map, fitted
 from hwp_bench.base.files import sha256_json
 from hwp_bench.capture import Capture
+from hwp_bench.evaluation.artifacts import square_around
 from hwp_bench.evaluation.scoring import read_prediction
-from hwp_bench.evaluation.side_by_side import square_around
 from hwp_bench.leaderboard.entries import Entry, digest
 from hwp_bench.leaderboard.rules import SUITES
 from hwp_bench.metrics import HWP_V1

@@ -6,7 +6,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.board_rows import BoardRow
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.records import LEVELS
@@ -119,7 +119,7 @@ def _older_run(entry: Entry, row: BoardRow, older: Sequence[Entry]) -> OlderRun:
         why = f"replaced: {corrections[0].submission.reason}"
     elif LEVELS.index(entry.level) < LEVELS.index(row.level):
         why = "checked less far than the row"
-    elif missing(entry.results):
+    elif find_missing(entry.results):
         why = "lacks a part of the suite"
     else:
         why = "older than the row"

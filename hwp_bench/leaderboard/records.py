@@ -11,7 +11,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import Count, Digest, Line, number
-from hwp_bench.results.bounds import MAX_CAPTURES, ScoreTable, check_scores
+from hwp_bench.results.schema import MAX_CAPTURES, ScoreTable, check_scores
 
 #: Version of the entry files. `submission` was added within it and may be missing.
 ENTRY_SCHEMA = "hwp-leaderboard-entry/1"

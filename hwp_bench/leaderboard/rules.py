@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from hwp_bench.base.errors import BadResult, UsageError
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.entries import Entry
 from hwp_bench.leaderboard.names import is_shipped
 from hwp_bench.leaderboard.records import LEVELS
@@ -31,7 +31,7 @@ def check_entries(entries: Iterable[Entry]) -> list[Entry]:
         UsageError: an entry is of no suite, of clean frames, of settings that are not its
             protocol's, or of other data, splits or test frames than the entries of the same
             suite and protocol; or a revision is of no entry that can be revised.
-        BadResult: scores are missing or impossible.
+        BadResult: scores are find_missing or impossible.
     """
     listed = list(entries)
     for entry in listed:
@@ -100,9 +100,9 @@ def check_complete(entry: Entry) -> None:
     """Refuse an entry that lacks a part of its suite.
 
     Raises:
-        BadResult: captures or test frames are missing, or are not the suite's.
+        BadResult: captures or test frames are find_missing, or are not the suite's.
     """
-    if problems := missing(entry.results):
+    if problems := find_missing(entry.results):
         raise BadResult(
             "; ".join(problems),
             where=entry.name,
@@ -181,7 +181,7 @@ def off_the_data(entries: Sequence[Entry]) -> list[tuple[Entry, str]]:
     whole suite; among these, of the most entries; among these, of the first. So an entry that
     nobody checked does not push out those that stand.
     """
-    whole = {entry.name: not missing(entry.results) for entry in entries}
+    whole = {entry.name: not find_missing(entry.results) for entry in entries}
     votes: dict[str, dict[tuple[Any, ...], list[Entry]]] = {}
     for entry in entries:
         for c in on_current_data(entry.results).captures:

@@ -12,7 +12,7 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.report.evaluation_tables import score_column
 from hwp_bench.results import FreeViewResult, Results
-from hwp_bench.results.walls import noted
+from hwp_bench.results.schema import add_isolation_note
 
 #: Name of the table.
 NAME = "free-view"
@@ -27,7 +27,7 @@ _RESAMPLES = 2000
 def free_view_tables(results: Sequence[Results]) -> dict[str, Table]:
     """Return the table by its name; empty where no result has scores of a clip."""
     scored = any(item.free_view for result in results for item in result.captures)
-    return {NAME: noted(free_view_table(results), results)} if scored else {}
+    return {NAME: add_isolation_note(free_view_table(results), results)} if scored else {}
 
 
 def free_view_table(results: Sequence[Results]) -> Table:

@@ -10,7 +10,7 @@ from hwp_bench.analysis.statistics.pairing import MethodRuns
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.results import CaptureResult, Results
-from hwp_bench.results.walls import walls_note
+from hwp_bench.results.schema import isolation_note
 
 #: The parts of a run, in the order of time, with what they hold.
 PARTS: Mapping[str, str] = {
@@ -161,7 +161,7 @@ def machine_notes(results: Sequence[Results]) -> list[str]:
     notes = [f"Machine: {'; '.join(sorted(machines))}."]
     if len(machines) > 1 or len(devices - {None}) > 1:
         notes.append("Taken on different machines or devices: the seconds do not compare.")
-    walls = walls_note(results)
+    walls = isolation_note(results)
     return [*notes, walls] if walls else notes
 
 

@@ -12,7 +12,7 @@ from hwp_bench.analysis.cost.curves import Curve, curve_of
 from hwp_bench.analysis.statistics.pairing import MethodRuns
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.results import CaptureResult
-from hwp_bench.results.bounds import per_second
+from hwp_bench.results.schema import per_second
 
 #: Fixed budgets, s.
 BUDGETS = (5.0, 15.0, 60.0, 300.0)

@@ -29,7 +29,7 @@ from hwp_bench.report.ranking_tables import rank_table
 from hwp_bench.report.sources import ResultsSource, find_captures, sound_temporal_weights
 from hwp_bench.report.study_tables import bias_table, robustness_table, seeds_table, severity_table
 from hwp_bench.results import Results
-from hwp_bench.results.walls import noted
+from hwp_bench.results.schema import add_isolation_note
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: The metric of the plots and of the summary sentence.
@@ -136,13 +136,15 @@ def gather_report(
     return ReportPage(
         summary=summary_sentence(runs),
         methods=list(order),
-        tables=[to_html(noted(table, results)) for table in shown if len(table.columns) > 1],
+        tables=[
+            to_html(add_isolation_note(table, results)) for table in shown if len(table.columns) > 1
+        ],
         pareto=_pareto(cost, order) if cost else None,
-        cost_tables=[to_html(noted(table, results)) for table in cost.tables.values()]
+        cost_tables=[to_html(add_isolation_note(table, results)) for table in cost.tables.values()]
         if cost
         else [],
         bars=_bars(runs),
-        differences=[to_html(noted(table, results)) for table in _differences(runs)],
+        differences=[to_html(add_isolation_note(table, results)) for table in _differences(runs)],
         captures=_captures(
             chosen, runs, infos, album, _by_label(avatar_pages or {}, sources, runs)
         ),
