@@ -165,7 +165,7 @@ def preload() -> dict[str, Callable[[Sequence[str]], int]]:
     torch.set_num_threads(1)  # a pool of threads does not live on in a fork
     for name in (
         "cv2", "OpenImageIO", "scipy.sparse", "scipy.spatial", "safetensors.torch", "psutil",
-        "hwp_bench.evaluation.evaluate", "hwp_bench.report.page.page", "hwp_bench.capture.check",
+        "hwp_bench.evaluation.evaluate", "hwp_bench.report.page", "hwp_bench.capture.check",
         "hwp_bench.leaderboard.entries", "hwp_bench.publish", "hwp_bench.sim",
         "hwp_bench.sim.produce.production", "wildghand.avatar.files", "wildghand.fitting",
         "wildghand.export.formats", "wildghand.from_video.api", "matplotlib",

@@ -131,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
 
 
 def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
-    from hwp_bench.analysis.statistics.pairing import common_metrics
+    from hwp_bench.analysis.pairing import common_metrics
     from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.evaluation.ablate.ablation_tables import (
@@ -142,7 +142,7 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
     from hwp_bench.evaluation.ablate.effects import cost_effects, score_effects
     from hwp_bench.evaluation.ablate.runs import result_folder
     from hwp_bench.evaluation.outcome import outcome_lines
-    from hwp_bench.report.evaluation_tables import HEADLINE
+    from hwp_bench.report.tables import HEADLINE
     from hwp_bench.results.walls import noted
 
     metrics = common_metrics(list(ablation.runs.values()), HEADLINE)
@@ -171,7 +171,7 @@ def _report(ablation: AblationRuns, out: Path, *, print_json: bool) -> int:
 
 
 def _draw(ablation: AblationRuns, out: Path) -> None:
-    from hwp_bench.analysis.cost.analysis import analyse_cost
+    from hwp_bench.analysis.cost import analyse_cost
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.progress import notice
     from hwp_bench.report.figures import write_cost

@@ -49,10 +49,10 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
 
 def run(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.analysis.statistics.comparison import compare_results
+    from hwp_bench.analysis.compare import compare_results
     from hwp_bench.base.console import print_document
     from hwp_bench.base.tables import format_table, print_table
-    from hwp_bench.report.evaluation_tables import HEADLINE
+    from hwp_bench.report.tables import HEADLINE
     from hwp_bench.results import read_all
     from hwp_bench.results.walls import noted
 

@@ -53,16 +53,21 @@ def run(args: argparse.Namespace) -> int:
     from dataclasses import replace
     from pathlib import Path
 
-    from hwp_bench.analysis.cost.analysis import CostAnalysis, analyse_cost
-    from hwp_bench.analysis.statistics.pairing import group_runs
+    from hwp_bench.analysis.cost import CostAnalysis, analyse_cost
+    from hwp_bench.analysis.pairing import group_runs
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
     from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table
     from hwp_bench.metrics import metric
-    from hwp_bench.report.data_groups import DataGroup, data_groups, data_key
     from hwp_bench.report.figures import write_cost
-    from hwp_bench.report.sources import read_sources, source_folders
+    from hwp_bench.report.sources import (
+        DataGroup,
+        data_groups,
+        data_key,
+        read_sources,
+        source_folders,
+    )
     from hwp_bench.results import read_all
 
     metric(args.metric)

@@ -46,8 +46,8 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
     from hwp_bench.evaluation.side_by_side import write_side_by_side
     from hwp_bench.methods import find_method, read_manifest
-    from hwp_bench.report.evaluation_tables import all_tables
     from hwp_bench.report.sources import ResultsSource
+    from hwp_bench.report.tables import all_tables
     from hwp_bench.sim import ensure_suite
 
     out = Path(args.out)

@@ -141,8 +141,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.capture.splits import read_splits
     from hwp_bench.evaluation.evaluate import default_folder, evaluate
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.report.evaluation_tables import all_tables
-    from hwp_bench.report.free_view_table import free_view_tables
+    from hwp_bench.report.tables import all_tables, free_view_tables
     from hwp_bench.run.engine.options import engine_for, needs_of
 
     settings = evaluation_settings(args)

@@ -9,8 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from hwp_bench.leaderboard.entries import Entry
-    from hwp_bench.leaderboard.records import Submission
+    from hwp_bench.leaderboard.entries import Entry, Submission
 
 _EXAMPLES = """examples:
   hwp-bench leaderboard submit runs/mine-mini -o submission --by "A. Person"
@@ -252,7 +251,7 @@ def _submit(args: argparse.Namespace, folder: Path) -> int:
 
 def _submission(args: argparse.Namespace) -> Submission:
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.leaderboard.records import Submission
+    from hwp_bench.leaderboard.entries import Submission
 
     given = [("--by", args.by), ("--reason", args.reason), ("--revises", args.revises or "")]
     for option, text in [*given, *(("--link", text) for text in args.link)]:
@@ -281,8 +280,13 @@ def _check_line(option: str, text: str) -> None:
 
 def _check(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.leaderboard.entries import read_entries
-    from hwp_bench.leaderboard.names import check_names, read_names
-    from hwp_bench.leaderboard.rules import check_complete, check_entries, check_unchanged
+    from hwp_bench.leaderboard.rules import (
+        check_complete,
+        check_entries,
+        check_names,
+        check_unchanged,
+        read_names,
+    )
     from hwp_bench.leaderboard.soundness import check_bound, check_dates
 
     _refuse_none(folder)
@@ -302,8 +306,8 @@ def _check(args: argparse.Namespace, folder: Path) -> int:
 def _show(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.tables import print_table, to_object
+    from hwp_bench.leaderboard.board import board_tables
     from hwp_bench.leaderboard.soundness import sound_entries
-    from hwp_bench.leaderboard.standings import board_tables
 
     _refuse_none(folder)
     entries = sound_entries(folder)
@@ -325,9 +329,9 @@ def _confirm(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.progress import notice
     from hwp_bench.cli.verify import captures_of
-    from hwp_bench.leaderboard.confirm import confirm, entry_of
     from hwp_bench.leaderboard.entries import refuse_installed, write_check
     from hwp_bench.leaderboard.soundness import readable_entries
+    from hwp_bench.leaderboard.submit import confirm, entry_of
     from hwp_bench.results import read_results, result_files
 
     _check_line("--by", args.by)
@@ -366,7 +370,7 @@ def _register(args: argparse.Namespace, folder: Path) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.progress import notice
     from hwp_bench.leaderboard.entries import refuse_installed
-    from hwp_bench.leaderboard.names import NAME, register
+    from hwp_bench.leaderboard.rules import NAME, register
     from hwp_bench.leaderboard.soundness import readable_entries
 
     refuse_installed(folder)

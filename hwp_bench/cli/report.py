@@ -56,7 +56,7 @@ def run(args: argparse.Namespace) -> int:
 
     from hwp_bench.base.files import check_places
     from hwp_bench.base.progress import notice
-    from hwp_bench.report.page.mixed import write_reports
+    from hwp_bench.report.page import write_reports
     from hwp_bench.report.sources import read_sources, source_folders
 
     sources = read_sources(args.results, repeats=False)

@@ -14,8 +14,7 @@ from hwp_bench.base.tables import FORMATS, Table, format_table
 from hwp_bench.capture import Capture
 from hwp_bench.evaluation.completeness import is_of_suite, missing, other_captures
 from hwp_bench.evaluation.evaluation_key import key_of
-from hwp_bench.report.evaluation_tables import all_tables
-from hwp_bench.report.free_view_table import free_view_tables
+from hwp_bench.report.tables import all_tables, free_view_tables
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.bounds import MAX_BYTES
 from hwp_bench.results.store import content_digest

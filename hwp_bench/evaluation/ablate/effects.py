@@ -8,9 +8,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hwp_bench.analysis.statistics.bootstrap import RESAMPLES, Estimate, bootstrap_mean
-from hwp_bench.analysis.statistics.compare import holm
-from hwp_bench.analysis.statistics.pairing import MethodRuns, scopes
+from hwp_bench.analysis.bootstrap import RESAMPLES, Estimate, bootstrap_mean
+from hwp_bench.analysis.compare import holm
+from hwp_bench.analysis.pairing import MethodRuns, scopes
 from hwp_bench.evaluation.ablate.design import AblationEffect
 from hwp_bench.evaluation.ablate.runs import AblationRuns
 from hwp_bench.metrics import metric as metric_facts

@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hwp_bench.analysis.statistics.pairing import MethodRuns
+from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.locks import exclusive
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.ablate.design import Design, Variant
