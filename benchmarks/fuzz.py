@@ -154,7 +154,7 @@ TARGETS = (
 def preload() -> dict[str, Callable[[Sequence[str]], int]]:
     """Load every module that a command loads, so that a fork has them; return the programs."""
     from hwp_bench.cli.main import command_tree, main
-    from hwp_bench.cli.whole_parser import whole_parser
+    from hwp_bench.cli.program import whole_parser
     from wildghand.cli.main import command_tree as hand_tree
     from wildghand.cli.main import main as hand_main
 

@@ -101,7 +101,7 @@ def template_environment(package: str) -> Environment:
         lstrip_blocks=True,
     )
     environment.filters["unbroken"] = _unbroken
-    environment.globals |= {"series_classes": series_classes, "column_groups": _column_groups}
+    environment.globals.update({"series_classes": series_classes, "column_groups": _column_groups})
     return environment
 
 

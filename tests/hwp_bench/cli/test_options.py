@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.cli.overrides import overrides
+from hwp_bench.cli.options import overrides
 
 
 @pytest.mark.parametrize(
