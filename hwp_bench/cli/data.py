@@ -20,7 +20,7 @@ from hwp_bench.cli.options import (
 
 if TYPE_CHECKING:
     from hwp_bench.capture.check import CheckReport
-    from hwp_bench.capture.splits.audit import AuditReport
+    from hwp_bench.capture.splits import AuditReport
     from hwp_bench.tracking import TrackedVideo
 
 _CHECK = """examples:
@@ -40,7 +40,7 @@ def add_check(parser: argparse.ArgumentParser) -> None:
 
 def do_check(args: argparse.Namespace) -> int:
     """Run `data check`."""
-    from hwp_bench.base.progress import track
+    from hwp_bench.base.console import track
     from hwp_bench.capture.check import check_capture
 
     reports = [check_capture(path) for path in track(args.captures, "checking captures")]
@@ -53,8 +53,8 @@ def do_check(args: argparse.Namespace) -> int:
 
 
 def _print_check(report: CheckReport) -> None:
+    from hwp_bench.base.errors import shown
     from hwp_bench.base.tables import Column, Table, print_table
-    from hwp_bench.base.text import shown
 
     title = shown(report.path)
     verdict = "sound" if report.ok else "NOT SOUND"
@@ -109,7 +109,7 @@ def do_show(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from hwp_bench.base.images import write_image
     from hwp_bench.capture import open_capture
-    from hwp_bench.capture.sheet import contact_sheet
+    from hwp_bench.capture.check import contact_sheet
 
     if args.count < 1 or not 16 <= args.edge <= 2048:
         raise UsageError("at least one frame, of 16 to 2048 px, is drawn", field="--count, --edge")
@@ -143,8 +143,8 @@ def add_audit(parser: argparse.ArgumentParser) -> None:
 
 def do_audit(args: argparse.Namespace) -> int:
     """Run `data audit`."""
+    from hwp_bench.base.console import track
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import track
     from hwp_bench.capture import open_capture
     from hwp_bench.capture.splits import audit_split, contiguous_split, split_for
 
@@ -231,8 +231,8 @@ def add_get(parser: argparse.ArgumentParser) -> None:
 
 def do_get(args: argparse.Namespace) -> int:
     """Run `data get`."""
+    from hwp_bench.base.console import JobsView, notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import JobsView, notice
     from hwp_bench.importers.official.download import HuggingFaceHub, download_release
 
     check_places({"--out": args.out}, {})
@@ -527,7 +527,7 @@ def do_export(args: argparse.Namespace) -> int:
     """Run `hands export`."""
     from hwp_bench.base.files import check_places
     from hwp_bench.capture import open_capture
-    from hwp_bench.capture.meshes import hand_meshes, write_meshes
+    from hwp_bench.capture.convert import hand_meshes, write_meshes
 
     check_places({"FILE": args.out}, {"CAPTURE": args.capture})
     meshes = hand_meshes(open_capture(args.capture), args.frame, truth=args.truth)

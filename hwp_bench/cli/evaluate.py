@@ -21,7 +21,7 @@ from hwp_bench.run.engine.options import add_engine_arguments
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
-    from hwp_bench.base.progress import JobsView
+    from hwp_bench.base.console import JobsView
     from hwp_bench.capture.splits import Split
     from hwp_bench.evaluation.ablate.runs import AblationRuns
     from hwp_bench.evaluation.budget.runs import BudgetRuns
@@ -179,7 +179,7 @@ def _running(
     Raises:
         HwpError: as `check_results_place`, `check_call` and `check_suite`.
     """
-    from hwp_bench.base.progress import JobsView
+    from hwp_bench.base.console import JobsView
     from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
     from hwp_bench.run.engine.options import engine_for, needs_of
     from hwp_bench.sim import ensure_suite
@@ -215,8 +215,8 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
     """Open the sealed part that is asked for, and print its commitment."""
     if args.sealed is None:
         return None
+    from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import notice
     from hwp_bench.publish import open_sealed
 
     if args.capture or args.splits:
@@ -228,7 +228,7 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
 
 def report_outcome(out: Path, results: Results) -> int:
     """Print where the results are and which frames failed; returns the exit status."""
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.console import notice
     from hwp_bench.evaluation.outcome import outcome_lines
 
     for line in outcome_lines(out, results):
@@ -344,8 +344,8 @@ def add_ablate(parser: argparse.ArgumentParser) -> None:
 
 def do_ablate(args: argparse.Namespace) -> int:
     """Run `ablate`."""
+    from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import notice
     from hwp_bench.evaluation.ablate.design import make_design
     from hwp_bench.evaluation.ablate.runs import run_ablation
     from hwp_bench.methods.manifest import find_method, read_manifest
@@ -379,7 +379,7 @@ def do_ablate(args: argparse.Namespace) -> int:
 
 def _report_ablate(ablation: AblationRuns, out: Path, *, as_json: bool) -> int:
     from hwp_bench.analysis.pairing import common_metrics
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.console import notice
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.evaluation.ablate.ablation_tables import (
         ablation_record,
@@ -418,8 +418,8 @@ def _report_ablate(ablation: AblationRuns, out: Path, *, as_json: bool) -> int:
 
 def _draw_ablate(ablation: AblationRuns, out: Path) -> None:
     from hwp_bench.analysis.cost import analyse_cost
+    from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.base.progress import notice
     from hwp_bench.report.figures import write_cost
 
     try:
@@ -464,7 +464,7 @@ def add_budget(parser: argparse.ArgumentParser) -> None:
 
 def do_budget(args: argparse.Namespace) -> int:
     """Run `budget`."""
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.console import notice
     from hwp_bench.evaluation.budget.runs import check_truths, run_budget
     from hwp_bench.methods.manifest import find_method, read_manifest
     from hwp_bench.methods.material import TRUTHS
@@ -486,9 +486,9 @@ def do_budget(args: argparse.Namespace) -> int:
 
 
 def _report_budget(runs: BudgetRuns, out: Path, *, as_json: bool) -> int:
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import write_json
     from hwp_bench.base.images import write_image
-    from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table, write_tables
     from hwp_bench.evaluation.budget.budget import budget_tables, make_budget, next_work
     from hwp_bench.evaluation.budget.picture import budget_sheet
@@ -547,7 +547,7 @@ def add_demo(parser: argparse.ArgumentParser) -> None:
 
 def do_demo(args: argparse.Namespace) -> int:
     """Run `demo`."""
-    from hwp_bench.base.progress import JobsView, notice
+    from hwp_bench.base.console import JobsView, notice
     from hwp_bench.base.tables import Column, Table, print_table, write_tables
     from hwp_bench.capture import open_capture
     from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate

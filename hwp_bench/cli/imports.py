@@ -89,8 +89,8 @@ def add_video(parser: argparse.ArgumentParser) -> None:
 
 def do_video(args: argparse.Namespace) -> int:
     """Run `import video`."""
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.importers.video import (
         VideoImport,
         finished_import,
@@ -217,8 +217,8 @@ def add_wildghand(parser: argparse.ArgumentParser) -> None:
 
 def do_wildghand(args: argparse.Namespace) -> int:
     """Run `import wildghand`."""
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.importers.official import OfficialImport, import_official
     from hwp_bench.importers.official.folders import find_folders
 

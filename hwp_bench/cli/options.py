@@ -9,9 +9,8 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hwp_bench.base.errors import UsageError
-from hwp_bench.base.text import has_odd_characters, shown
-from hwp_bench.base.toml_text import parse_toml
+from hwp_bench.base.errors import UsageError, has_odd_characters, shown
+from hwp_bench.base.records import parse_toml
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:

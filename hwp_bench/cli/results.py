@@ -221,9 +221,9 @@ def do_cost(args: argparse.Namespace) -> int:
 
     from hwp_bench.analysis.cost import CostAnalysis, analyse_cost
     from hwp_bench.analysis.pairing import group_runs
+    from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.base.tables import print_table
     from hwp_bench.metrics import metric
     from hwp_bench.report.figures import write_cost
@@ -319,8 +319,8 @@ def add_report(parser: argparse.ArgumentParser) -> None:
 def do_report(args: argparse.Namespace) -> int:
     """Run `report`."""
 
+    from hwp_bench.base.console import notice
     from hwp_bench.base.files import check_places
-    from hwp_bench.base.progress import notice
     from hwp_bench.report.page import write_reports
     from hwp_bench.report.sources import read_sources, source_folders
 
@@ -372,7 +372,7 @@ def do_verify(args: argparse.Namespace) -> int:
     """Run `verify`."""
     from dataclasses import asdict
 
-    from hwp_bench.base.progress import track
+    from hwp_bench.base.console import track
     from hwp_bench.evaluation.verify import verify_results
     from hwp_bench.results import result_files
 

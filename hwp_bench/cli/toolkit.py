@@ -183,7 +183,7 @@ def add_stability(parser: argparse.ArgumentParser) -> None:
 
 def do_stability(args: argparse.Namespace) -> int:
     """Run `stability`; 1 if anything that must hold does not."""
-    from hwp_bench.base.progress import notice
+    from hwp_bench.base.console import notice
     from hwp_bench.stability import find_cases, run_cases
 
     cases = find_cases(args.group, args.provider)

@@ -21,7 +21,7 @@ from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of,
 from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
-from hwp_bench.metrics.aggregate import CaptureScores, aggregate
+from hwp_bench.metrics.score import CaptureScores, aggregate
 from hwp_bench.report.figures import draw_pareto, inline_svg
 from hwp_bench.report.study_tables import METRIC
 from hwp_bench.report.tables import score_column

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import atomic_folder, files_digest, sha256_of
-from hwp_bench.base.version import __version__
+from hwp_bench.base.packages import __version__
 from hwp_bench.evaluation.scoring import predictions_digest, read_predictions
 from hwp_bench.evaluation.verify import verify_results
 from hwp_bench.leaderboard.entries import (

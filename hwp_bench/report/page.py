@@ -26,9 +26,9 @@ from hwp_bench.analysis.compare import (
 )
 from hwp_bench.analysis.cost import CostAnalysis, analyse_cost
 from hwp_bench.analysis.pairing import MethodRuns, group_runs, refuse_unlike, scopes
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.drawing import fitted, labelled, sheet
 from hwp_bench.base.errors import BadResult, HwpError, UsageError
-from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import read_rgb
 from hwp_bench.base.tables import Table

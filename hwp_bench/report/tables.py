@@ -12,7 +12,7 @@ from hwp_bench.analysis.pairing import MethodRuns, group_runs
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
-from hwp_bench.metrics.aggregate import Aggregate, Scores, Summary, aggregate
+from hwp_bench.metrics.score import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import CaptureResult, FreeViewResult, Results
 from hwp_bench.results.bounds import per_second
 from hwp_bench.results.schema import differing_makers, differing_settings, score_rows

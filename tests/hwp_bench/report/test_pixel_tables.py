@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.hands.rotations import axis_angle_to_matrix
+from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.metrics.protocol import PSNR_CAP
 from hwp_bench.metrics.score import score_frame
 from hwp_bench.report.pixel_tables import (
