@@ -79,7 +79,7 @@ def add_force(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--force", action="store_true", help="replace an existing capture")
 
 
-def splits_of(args: argparse.Namespace) -> dict[str, Split] | None:
+def splits_of(args: argparse.Namespace) -> Mapping[str, Split] | None:
     """Return the splits of the file that was named; None takes the rule."""
     from hwp_bench.capture.splits import read_splits
 
