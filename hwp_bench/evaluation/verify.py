@@ -33,8 +33,7 @@ from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.protocol import HWP_V1, Protocol
 from hwp_bench.metrics.score import Network
-from hwp_bench.report.evaluation_tables import all_tables
-from hwp_bench.report.free_view_table import free_view_tables
+from hwp_bench.report.tables import all_tables, free_view_tables
 from hwp_bench.results import (
     CaptureResult,
     FrameResult,
