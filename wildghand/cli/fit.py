@@ -233,7 +233,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
     """The overrides; a prior's path is the caller's, not the method's."""
-    from hwp_bench.cli.overrides import overrides
+    from hwp_bench.cli.options import overrides
 
     settings = overrides(args.set)
     if args.prior is not None:
@@ -279,7 +279,7 @@ def do_pretrain(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
-    from hwp_bench.cli.overrides import overrides
+    from hwp_bench.cli.options import overrides
     from wildghand.pretrain.session import pretrain
     from wildghand.prior.files import WEIGHTS
 

@@ -9,7 +9,7 @@ import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from hwp_bench.cli.completion import add_shell_argument
+from hwp_bench.cli.program import add_shell_argument
 
 if TYPE_CHECKING:
     import numpy as np
@@ -203,7 +203,7 @@ def do_info(args: argparse.Namespace) -> int:
         _print_network(args.network, args.json)
         return 0
     from hwp_bench.base.tables import Column, Table, print_table
-    from hwp_bench.results.environment import environment
+    from hwp_bench.results.schema import environment
 
     facts = environment()
     backends = [_check(name) for name in ("numba", "gsplat")]
@@ -296,7 +296,7 @@ def add_completion(parser: argparse.ArgumentParser) -> None:
 
 def do_completion(args: argparse.Namespace) -> int:
     """Run the command."""
-    from hwp_bench.cli.whole_parser import completion_script
+    from hwp_bench.cli.program import completion_script
     from wildghand.cli.main import command_tree
 
     print(completion_script("wildghand", command_tree(), args.shell))
