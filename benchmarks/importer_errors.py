@@ -29,7 +29,7 @@ from hwp_bench.hands import HandTemplate, PosedHand, load_template, pose_hand
 from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.hands.skeleton import FINGERS, finger_joints
 from hwp_bench.importers.video import FitSettings
-from hwp_bench.importers.video.from_video import fit_video
+from hwp_bench.importers.video.api import fit_video
 from hwp_bench.methods.settings import settings_from
 
 #: Seeds and kinds of the harder clips.

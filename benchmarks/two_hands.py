@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hwp_bench.importers.shared.hand_tracks import HandTracks, write_hand_tracks
-from hwp_bench.importers.shared.landmarks import read_landmarks
+from hwp_bench.importers.shared.landmarks import HandTracks, read_landmarks, write_hand_tracks
 from hwp_bench.importers.video import FitSettings, ImportedClip, VideoImport, import_video
 
 #: Shift of the mirror image to the left when it is apart, and to the right when it is nearest, px.

@@ -13,14 +13,12 @@ from synthetic_clip import FOCAL, FPS, HEIGHT, WIDTH, SyntheticClip, make_clip
 
 from hwp_bench.hands.anchors import vertex_normals
 from hwp_bench.hands.raster import draw_faces, mix_corners
+from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hands
-from hwp_bench.importers.video.clip_model import posed_vertices
-from hwp_bench.importers.video.fit_clip import FittedClip, Footage, fit_landmarks
-from hwp_bench.importers.video.hand_pictures import HandPictures
-from hwp_bench.importers.video.picture_energy import PictureEnergy
-from hwp_bench.importers.video.texture_energy import TextureEnergy
-from hwp_bench.importers.video.video_settings import FitSettings
+from hwp_bench.importers.video.model import posed_vertices
+from hwp_bench.importers.video.pictures import HandPictures, PictureEnergy, TextureEnergy
+from hwp_bench.importers.video.residuals import FitSettings
+from hwp_bench.importers.video.solve import FittedClip, Footage, fit_landmarks
 
 SETTINGS = FitSettings(
     start_steps=40, landmark_steps=80, contour_steps=50, picture_rounds=3, picture_steps=40

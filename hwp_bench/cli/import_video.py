@@ -131,7 +131,7 @@ def run(args: argparse.Namespace) -> int:
 def _print(clip: ImportedClip, args: argparse.Namespace) -> None:
     import numpy as np
 
-    from hwp_bench.importers.shared.writing import SHEET_NAME
+    from hwp_bench.importers.shared.output import SHEET_NAME
 
     facts = clip.facts()
     video = clip.source.video

@@ -59,7 +59,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from hwp_bench.base.progress import notice
     from hwp_bench.importers.official import OfficialImport, import_official
-    from hwp_bench.importers.official.folders import find_folders
+    from hwp_bench.importers.official.records import find_folders
 
     check_places(
         {"--out": args.out},

@@ -24,8 +24,8 @@ import numpy as np
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import read_gray, read_rgb
 from hwp_bench.base.progress import progress
-from hwp_bench.importers.official.release_records import OfficialRecords
-from hwp_bench.importers.shared.windows import cut, resample
+from hwp_bench.importers.official.records import OfficialRecords
+from hwp_bench.importers.shared.frames import cut, resample
 
 #: A mask pixel above this is hand, as in the released loader.
 MASK_THRESHOLD = 100

@@ -1,4 +1,4 @@
-"""The frames of a video: decoding them, and cutting the hand's window out of each."""
+"""Frame range."""
 
 from __future__ import annotations
 
@@ -18,10 +18,58 @@ from hwp_bench.base.files import check_is_file
 from hwp_bench.base.images import MAX_PIXELS, read_gray
 from hwp_bench.base.progress import notice
 from hwp_bench.base.text import bounded, check_name
-from hwp_bench.importers.shared.windows import CropWindows, cut, resample
-from hwp_bench.importers.video.contour import FIELD_SIZE
-from hwp_bench.importers.video.video_colours import Colours, colours_of, to_srgb
-from hwp_bench.importers.video.video_settings import FrameRange
+from hwp_bench.importers.shared.frames import CropWindows, cut, resample
+from hwp_bench.importers.video.colours import Colours, colours_of, to_srgb
+from hwp_bench.importers.video.residuals import FIELD_SIZE
+
+
+@dataclass(frozen=True)
+class FrameRange:
+    """The frames of a video that are used: start, start + stride, ... below stop.
+
+    Attributes:
+        start: first frame, counted from 0.
+        stop: end, not included; None = to the end.
+        stride: step.
+    """
+
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or self.stride < 1 or (self.stop is not None and self.stop <= self.start):
+            raise UsageError(
+                f"{self.start}:{'' if self.stop is None else self.stop} with stride {self.stride} "
+                "selects no frames",
+                field="--frames",
+                remedy="Use A:B with 0 <= A < B, and a stride of at least 1.",
+            )
+
+    def indices(self, frame_count: int) -> np.ndarray:
+        """Return the selected indices of a video of `frame_count` frames, (F,) int64."""
+        stop = frame_count if self.stop is None else min(self.stop, frame_count)
+        return np.arange(self.start, stop, self.stride)
+
+
+def parse_frame_range(text: str | None, stride: int) -> FrameRange:
+    """Read `A:B`, `A:` or `:B`.
+
+    Raises:
+        UsageError: not of that form, or it selects nothing.
+    """
+    if text is None:
+        return FrameRange(stride=stride)
+    head, colon, tail = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return FrameRange(int(head or 0), int(tail) if tail else None, stride)
+    except ValueError as error:
+        raise UsageError(
+            f"{text!r} is not a range", field="--frames", remedy="Use A:B, A: or :B."
+        ) from error
+
 
 #: Containers that are read, each with FFmpeg's name of its reader and how its files begin.
 CONTAINERS = {

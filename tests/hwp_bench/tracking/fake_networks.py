@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from hwp_bench.tracking.hand_landmarks import HAND_EDGE, HandReading
-from hwp_bench.tracking.palms import PALM_EDGE, anchors
+from hwp_bench.tracking.detection import HAND_EDGE, PALM_EDGE, HandReading, anchors
 
 #: Size of the pictures, (width, height), and the discs' radius, px.
 SIZE, RADIUS = (160, 120), 9

@@ -13,8 +13,8 @@ from typing import IO
 import pytest
 
 from hwp_bench.base.errors import BadInput, HwpError
-from hwp_bench.tracking import model_files
-from hwp_bench.tracking.model_files import (
+from hwp_bench.tracking import networks as model_files
+from hwp_bench.tracking.networks import (
     HAND,
     PALM,
     TASK_MEMBERS,

@@ -13,10 +13,15 @@ import numpy as np
 import pytest
 
 from hwp_bench.base.errors import BadInput, MissingDependency
-from hwp_bench.importers.video.decode import probe, read_frames
-from hwp_bench.importers.video.video_settings import FrameRange
-from hwp_bench.tracking.model_files import HAND, PALM, HandModels, load_models, models_folder
-from hwp_bench.tracking.networks import LiteRtNetworks
+from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
+from hwp_bench.tracking.networks import (
+    HAND,
+    PALM,
+    HandModels,
+    LiteRtNetworks,
+    load_models,
+    models_folder,
+)
 from hwp_bench.tracking.track_video import track_frames
 from hwp_bench.tracking.tracker import TrackerSettings
 

@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from hwp_bench.tracking.palms import Palm, anchors, decode, palm_input, place_in_image, suppress
+from hwp_bench.tracking.detection import Palm, anchors, decode, palm_input, place_in_image, suppress
 
 
 def test_anchors_are_those_of_the_published_options() -> None:

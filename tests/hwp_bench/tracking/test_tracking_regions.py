@@ -10,8 +10,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.tracking.hand_landmarks import HandReading, SeenHand, place_reading
-from hwp_bench.tracking.regions import Region, angle_of, cut_region, overlap, to_image
+from hwp_bench.tracking.detection import (
+    HandReading,
+    Region,
+    SeenHand,
+    angle_of,
+    cut_region,
+    overlap,
+    place_reading,
+    to_image,
+)
 
 ANGLES = st.floats(-math.pi, math.pi - 1e-6)
 REGIONS = st.builds(

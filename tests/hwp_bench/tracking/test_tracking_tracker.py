@@ -7,7 +7,7 @@ import pytest
 from fake_networks import LAYOUT, RADIUS, FakeNetworks, picture
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.importers.shared.hand_tracks import HandTracks
+from hwp_bench.importers.shared.landmarks import HandTracks
 from hwp_bench.tracking.track_video import track_frames
 from hwp_bench.tracking.tracker import TrackerSettings
 

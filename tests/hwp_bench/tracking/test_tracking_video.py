@@ -16,9 +16,12 @@ from fake_networks import LAYOUT, RADIUS, SIZE, FakeNetworks, picture
 from hwp_bench.base.arrays import write_npz
 from hwp_bench.base.errors import BadInput
 from hwp_bench.cli.main import main
-from hwp_bench.importers.shared.association import tracked_sides, tracked_votes
-from hwp_bench.importers.shared.hand_tracks import read_hand_tracks
-from hwp_bench.importers.shared.landmarks import read_landmarks
+from hwp_bench.importers.shared.landmarks import (
+    read_hand_tracks,
+    read_landmarks,
+    tracked_sides,
+    tracked_votes,
+)
 from hwp_bench.tracking import track_video
 
 

@@ -24,7 +24,7 @@ from hwp_bench.importers.interhand import (
     find_sequence,
     import_interhand,
 )
-from hwp_bench.importers.shared.overlay import project_hand
+from hwp_bench.importers.shared.output import project_hand
 
 SEQUENCE = PAPER_SEQUENCES["touchrom-15"]
 

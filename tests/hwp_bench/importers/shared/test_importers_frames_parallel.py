@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from hwp_bench.importers.shared.frames_parallel import MOST_THREADS, each_frame
+from hwp_bench.importers.shared.frames import MOST_THREADS, each_frame
 
 
 @pytest.mark.parametrize("cores", [1, 2, 64])

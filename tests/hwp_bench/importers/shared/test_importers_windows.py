@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip
 
+from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands, resample
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hands, resample
 
 
 def test_the_cropped_camera_sees_what_the_crop_shows() -> None:

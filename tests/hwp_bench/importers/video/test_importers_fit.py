@@ -13,19 +13,22 @@ from synthetic_clip import FOCAL, FPS, HEIGHT, WIDTH, SyntheticClip, make_clip
 from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.hands import pose_hand
 from hwp_bench.hands.template import rebuilt
+from hwp_bench.importers.shared.frames import cut, follow_hands
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.windows import cut, follow_hands
-from hwp_bench.importers.video.clip_model import continuous_rotation_vectors, posed_vertices
-from hwp_bench.importers.video.contour import ContourEnergy, signed_distance
-from hwp_bench.importers.video.fit_clip import (
+from hwp_bench.importers.video.model import (
+    continuous_rotation_vectors,
+    interpolate,
+    posed_vertices,
+    rigid_start,
+)
+from hwp_bench.importers.video.residuals import ContourEnergy, FitSettings, signed_distance
+from hwp_bench.importers.video.solve import (
     FittedClip,
     Footage,
     fit_landmarks,
     fit_outline,
     reprojection_error,
 )
-from hwp_bench.importers.video.rigid_start import interpolate, rigid_start
-from hwp_bench.importers.video.video_settings import FitSettings
 
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])
 SETTINGS = FitSettings(start_steps=80, landmark_steps=200)

@@ -14,12 +14,16 @@ from synthetic_clip import HEIGHT, WIDTH, SyntheticClip, make_clip, write_landma
 from hwp_bench.base.errors import BadInput
 from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
-from hwp_bench.importers.shared.hand_tracks import HandTracks, write_hand_tracks
+from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
 from hwp_bench.importers.video import VideoImport, import_video
-from hwp_bench.importers.video import from_video as pipeline
-from hwp_bench.importers.video.landmark_check import landmark_doubts, refuse_other_units
-from hwp_bench.importers.video.source import VideoSource, read_source
-from hwp_bench.importers.video.video_settings import FitSettings
+from hwp_bench.importers.video import api as pipeline
+from hwp_bench.importers.video.residuals import FitSettings
+from hwp_bench.importers.video.source import (
+    VideoSource,
+    landmark_doubts,
+    read_source,
+    refuse_other_units,
+)
 
 FRAMES = 24
 #: A fit without outlines, textures and pictures.

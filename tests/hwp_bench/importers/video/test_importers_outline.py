@@ -7,8 +7,8 @@ import pytest
 from synthetic_clip import make_clip
 
 from hwp_bench.hands.topology import boundary_vertices
-from hwp_bench.importers.video.clip_masks import beyond_wrist
-from hwp_bench.importers.video.contour import FIELD_SIZE, match_outline, signed_distance
+from hwp_bench.importers.video.masks import beyond_wrist
+from hwp_bench.importers.video.residuals import FIELD_SIZE, match_outline, signed_distance
 
 
 def disc(centre: np.ndarray, radius: float, corners: int = 120) -> tuple[np.ndarray, np.ndarray]:

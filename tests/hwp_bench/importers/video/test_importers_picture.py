@@ -24,15 +24,11 @@ from painted_clip import (
 )
 
 from hwp_bench.hands.raster import draw_faces, mix_corners
-from hwp_bench.importers.video.atlas import Atlas, sample
-from hwp_bench.importers.video.clip_model import ClipModel, posed_vertices
-from hwp_bench.importers.video.contour import ContourEnergy, signed_distance
-from hwp_bench.importers.video.fit_clip import FittedClip, fit_outline, fit_picture
-from hwp_bench.importers.video.frame_quadratic import Differences, linearised
-from hwp_bench.importers.video.lit_texture import DARK, LitTexture, SeenTexels
-from hwp_bench.importers.video.picture_energy import PictureEnergy
-from hwp_bench.importers.video.surface_motion import SurfaceMotion
-from hwp_bench.importers.video.texture_energy import TextureEnergy
+from hwp_bench.importers.video.model import ClipModel, SurfaceMotion, posed_vertices
+from hwp_bench.importers.video.pictures import Differences, PictureEnergy, TextureEnergy, linearised
+from hwp_bench.importers.video.residuals import ContourEnergy, signed_distance
+from hwp_bench.importers.video.solve import FittedClip, fit_outline, fit_picture
+from hwp_bench.importers.video.texture import DARK, Atlas, LitTexture, SeenTexels, sample
 
 
 def picture_of(fitted: FittedClip) -> PictureEnergy:

@@ -11,9 +11,17 @@ from synthetic_clip import CUP, HEIGHT, WIDTH, SyntheticClip, make_clip
 
 from hwp_bench.hands.raster import draw_silhouette, overlap
 from hwp_bench.hands.topology import boundary_vertices
-from hwp_bench.importers.video.clip_masks import beyond_wrist
-from hwp_bench.importers.video.colour_model import ColourModel, evidence, learn_colours
-from hwp_bench.importers.video.segmentation import WIDE, Prompt, Segmentation, segment_clip, to_lab
+from hwp_bench.importers.video.masks import (
+    WIDE,
+    ColourModel,
+    Prompt,
+    Segmentation,
+    beyond_wrist,
+    evidence,
+    learn_colours,
+    segment_clip,
+    to_lab,
+)
 
 HAND = 150.0
 

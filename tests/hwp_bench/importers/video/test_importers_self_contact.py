@@ -8,9 +8,8 @@ import torch
 from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip, template
 
 from hwp_bench.hands.articulation import joint_axes
-from hwp_bench.importers.video.clip_model import ClipModel
-from hwp_bench.importers.video.fit_terms import ContactEnergy, template_spheres, touching_pairs
-from hwp_bench.importers.video.rigid_start import RigidStart
+from hwp_bench.importers.video.model import ClipModel, RigidStart
+from hwp_bench.importers.video.residuals import ContactEnergy, template_spheres, touching_pairs
 
 
 def model(side: str, fingers: np.ndarray) -> ClipModel:

@@ -17,15 +17,15 @@ from synthetic_clip import (
 )
 
 from hwp_bench.importers.shared.landmarks import Landmarks, read_landmarks
-from hwp_bench.importers.video.fit_clip import Footage
-from hwp_bench.importers.video.from_video import import_video
-from hwp_bench.importers.video.side_check import (
+from hwp_bench.importers.video.api import import_video
+from hwp_bench.importers.video.solve import (
     CLEAR,
+    Footage,
     SideScores,
     side_scores,
     warn_of_contradiction,
 )
-from hwp_bench.importers.video.video_settings import VideoImport
+from hwp_bench.importers.video.source import VideoImport
 
 REAL = Path(__file__).resolve().parents[5] / "shared" / "data" / "real_hand"
 FOOTAGE = Footage(WIDTH, HEIGHT, FPS, None)

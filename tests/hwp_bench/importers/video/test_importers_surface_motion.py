@@ -8,12 +8,13 @@ import torch
 from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip
 
 from hwp_bench.hands.template import rebuilt
-from hwp_bench.importers.video.clip_model import ClipModel, posed_vertices
-from hwp_bench.importers.video.rigid_start import rigid_start
-from hwp_bench.importers.video.surface_motion import (
+from hwp_bench.importers.video.model import (
     FRAME_VARIABLES,
+    ClipModel,
     SurfaceMotion,
     frame_variables,
+    posed_vertices,
+    rigid_start,
 )
 
 CENTRE = np.array([WIDTH / 2, HEIGHT / 2])

@@ -18,12 +18,11 @@ from painted_clip import (
     true_pixels,
 )
 
-from hwp_bench.importers.video.contour import ContourEnergy, signed_distance
-from hwp_bench.importers.video.fit_clip import FittedClip, fit_outline
-from hwp_bench.importers.video.skin_texture import SkinTexture
-from hwp_bench.importers.video.surface_motion import frame_variables
-from hwp_bench.importers.video.texture_energy import TextureEnergy
-from hwp_bench.importers.video.within import smooth_within
+from hwp_bench.importers.video.model import frame_variables
+from hwp_bench.importers.video.pictures import TextureEnergy
+from hwp_bench.importers.video.residuals import ContourEnergy, signed_distance
+from hwp_bench.importers.video.solve import FittedClip, fit_outline
+from hwp_bench.importers.video.texture import SkinTexture, smooth_within
 
 
 def texture_of(fitted: FittedClip) -> TextureEnergy:

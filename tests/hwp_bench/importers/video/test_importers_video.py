@@ -27,11 +27,11 @@ from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import overlap
-from hwp_bench.importers.video.decode import probe, read_frames
-from hwp_bench.importers.video.from_video import import_video, without_blank_frames
-from hwp_bench.importers.video.imported_clip import IMPORTER_VERSION
-from hwp_bench.importers.video.source import read_source
-from hwp_bench.importers.video.video_settings import FitSettings, FrameRange, VideoImport
+from hwp_bench.importers.video.api import import_video, without_blank_frames
+from hwp_bench.importers.video.clip import IMPORTER_VERSION
+from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
+from hwp_bench.importers.video.residuals import FitSettings
+from hwp_bench.importers.video.source import VideoImport, read_source
 
 FRAMES = 16
 QUICK = FitSettings(
@@ -263,7 +263,7 @@ def test_arguments_are_checked_before_any_work(
     message: str,
 ) -> None:
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("hwp_bench.importers.video.from_video.read_source", None)
+    monkeypatch.setattr("hwp_bench.importers.video.api.read_source", None)
     given = ["data", "import-video", "hand.avi", "out", "--landmarks", "hand.npz"]
     assert main([*given, *words]) in (1, 2)
     said = capsys.readouterr().err

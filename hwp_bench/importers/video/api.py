@@ -19,10 +19,22 @@ from hwp_bench.base.text import bounded
 from hwp_bench.capture.schema import EXTRA, METADATA, check_id
 from hwp_bench.hands import load_template
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.writing import REPORT_NAME, SHEET_NAME, refuse_existing
-from hwp_bench.importers.video.clip_masks import ClipMasks, Masking, ProjectedClip, project_clip
-from hwp_bench.importers.video.contour import FIELD_SIZE, ContourEnergy
-from hwp_bench.importers.video.fit_clip import (
+from hwp_bench.importers.shared.output import REPORT_NAME, SHEET_NAME, refuse_existing
+from hwp_bench.importers.video.clip import ImportedClip, ImportedHand, store_clip
+from hwp_bench.importers.video.masks import (
+    NARROW,
+    WIDE,
+    ClipMasks,
+    Masking,
+    MaskSettings,
+    ProjectedClip,
+    ProjectedHands,
+    project_clip,
+    project_hands,
+)
+from hwp_bench.importers.video.pictures import HandPictures, PictureEnergy, TextureEnergy
+from hwp_bench.importers.video.residuals import FIELD_SIZE, ContourEnergy, hand_size
+from hwp_bench.importers.video.solve import (
     FittedClip,
     Footage,
     ReprojectionError,
@@ -32,20 +44,14 @@ from hwp_bench.importers.video.fit_clip import (
     reprojection_error,
     share_camera,
 )
-from hwp_bench.importers.video.fit_terms import hand_size
-from hwp_bench.importers.video.hand_pictures import HandPictures
-from hwp_bench.importers.video.imported_clip import ImportedClip, ImportedHand, store_clip
-from hwp_bench.importers.video.landmark_check import (
+from hwp_bench.importers.video.source import (
+    VideoImport,
+    VideoSource,
     landmark_doubts,
+    read_source,
     refuse_other_units,
     refuse_unfitted,
 )
-from hwp_bench.importers.video.picture_energy import PictureEnergy
-from hwp_bench.importers.video.segmentation import NARROW, WIDE, MaskSettings
-from hwp_bench.importers.video.source import VideoSource, read_source
-from hwp_bench.importers.video.texture_energy import TextureEnergy
-from hwp_bench.importers.video.two_hands import ProjectedHands, project_hands
-from hwp_bench.importers.video.video_settings import VideoImport
 from hwp_bench.taxonomy import perturbation
 
 #: Endings of the names of images that a sheet can be written to.

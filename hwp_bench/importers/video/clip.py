@@ -13,13 +13,21 @@ from hwp_bench.base.images import write_image
 from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.hands import HandParameters
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.overlay import OverlayFrame, overlay_sheet, sheet_frames
-from hwp_bench.importers.shared.writing import write_capture
-from hwp_bench.importers.video.clip_masks import ClipMasks, ProjectedClip
-from hwp_bench.importers.video.fit_clip import FittedClip, ReprojectionError
-from hwp_bench.importers.video.landmark_check import fit_warnings, overlap_warning
-from hwp_bench.importers.video.source import BOTH, VideoSource
-from hwp_bench.importers.video.video_settings import VideoImport
+from hwp_bench.importers.shared.output import (
+    OverlayFrame,
+    overlay_sheet,
+    sheet_frames,
+    write_capture,
+)
+from hwp_bench.importers.video.masks import ClipMasks, ProjectedClip
+from hwp_bench.importers.video.solve import FittedClip, ReprojectionError
+from hwp_bench.importers.video.source import (
+    BOTH,
+    VideoImport,
+    VideoSource,
+    fit_warnings,
+    overlap_warning,
+)
 
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
 #: because scores on captures of two versions do not compare.
