@@ -144,7 +144,7 @@ def main(arguments: list[str] | None = None) -> int:
             landmark_steps=90,
             contour_steps=20,
             contour_rounds=1,
-            texture_weight=0.0,
+            texture=False,
         )
     options = VideoImport(fit=fit, overwrite=True, sheet=args.folder / "sheet.png")
     clip = import_video(composed.video, composed.landmarks, args.folder / "capture", options)

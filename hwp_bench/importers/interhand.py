@@ -28,7 +28,7 @@ from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands, re
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.output import (
     ProjectedHand,
-    posed_sheet,
+    overlay_sheet,
     project_hand,
     refuse_existing,
     sheet_frames,
@@ -494,7 +494,7 @@ def import_interhand(
             yield image, mask
 
     def sheet() -> np.ndarray:
-        return posed_sheet(clips, images, masks)
+        return overlay_sheet(list(clips.values()), images, masks)
 
     write_capture(out, info, hands, cameras, frames(), sheet, facts, overwrite=options.overwrite)
     return facts

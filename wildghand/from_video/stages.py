@@ -16,7 +16,7 @@ from hwp_bench.base.errors import BadInput, HwpError, reason_of
 from hwp_bench.base.files import canonical_json, check_is_file, sha256_of
 from hwp_bench.base.progress import notice
 from hwp_bench.capture import open_capture
-from hwp_bench.importers.shared.landmarks import read_landmarks, tracked_sides
+from hwp_bench.importers.shared.landmarks import read_association, read_landmarks
 from hwp_bench.importers.video import FrameRange, VideoImport, import_video
 from hwp_bench.importers.video.clip import IMPORTER_VERSION
 from hwp_bench.importers.video.decode import probe
@@ -124,7 +124,8 @@ def import_options(job: Job) -> VideoImport:
     sides: tuple[str | None, ...] = (job.options.side,)
     if job.options.side not in ("right", "left"):
         # Where the landmarks do not say, only the import's own fit can tell.
-        sides = tracked_sides(job.landmarks) or (None,)
+        tracked = read_association(job.landmarks)
+        sides = (None,) if tracked is None else tracked.sides
     hands = {
         side: read_landmarks(job.landmarks, min_score=choices.min_score, side=side)
         for side in sides

@@ -41,7 +41,7 @@ from hwp_bench.importers.official.records import (
 )
 from hwp_bench.importers.shared.output import (
     ProjectedHand,
-    posed_sheet,
+    overlay_sheet,
     project_hand,
     refuse_existing,
     sheet_frames,
@@ -407,7 +407,8 @@ def import_official(
     def sheet() -> np.ndarray:
         images = {frame: crops[frame].image for frame in shown}
         masks = {frame: crops[frame].mask for frame in shown}
-        return posed_sheet(clips, images, masks, tracked)
+        dots = {frame: tracked[frame] for frame in shown}
+        return overlay_sheet(list(clips.values()), images, masks, dots)
 
     write_capture(
         out,

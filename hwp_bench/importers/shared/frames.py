@@ -1,4 +1,4 @@
-"""The square window that follows a hand through a video, and the camera that belongs to it."""
+"""Frames of a clip: the square window that follows its hands, and work in several threads."""
 
 from __future__ import annotations
 
@@ -18,6 +18,13 @@ MARGIN = 0.22
 #: The window's centre is smoothed over this time (standard deviation, s): a window that
 #: trembles with the landmarks would make a still background move.
 CENTRE_SECONDS = 0.3
+#: Most threads; each frame's work is mostly OpenCV and compiled code, which let others run.
+MOST_THREADS = 4
+# Frames that are worked on ahead of the one that is asked for, for each thread.
+_AHEAD = 4
+
+Frame = TypeVar("Frame")
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -26,15 +33,13 @@ class CropWindows:
 
     Whole pixels and one size mean that all frames are resampled alike: no frame is sharper than
     another, and the focal length of the cropped camera is constant.
-
-    Attributes:
-        corners: (F, 2) int64, x and y of the top left corner; may lie outside the image.
-        side: pixels of the whole frame.
-        size: pixels of the resampled crop.
     """
 
+    #: (F, 2) int64, x and y of the top left corner; may lie outside the image.
     corners: np.ndarray
+    #: Pixels of the whole frame.
     side: int
+    #: Pixels of the resampled crop.
     size: int
 
     @property
@@ -42,23 +47,15 @@ class CropWindows:
         """Pixels of the crop for each pixel of the whole frame."""
         return self.size / self.side
 
-    def intrinsics(self, focal: float, width: int, height: int) -> np.ndarray:
-        """Camera matrices of the cropped frames.
+    def intrinsics(self, K: np.ndarray) -> np.ndarray:
+        """Camera matrices of the cropped frames, (F, 3, 3), of that of the whole frame, (3, 3) px.
 
-        Args:
-            focal: focal length in pixels of the whole frame.
-            width: whole frame, px; the principal point is its centre.
-            height: px.
-
-        Returns:
-            (F, 3, 3) float64. Pixel centres are at +0.5 in both images, so cropping is a
-            shift and resampling a scale, with no half-pixel term.
+        Pixel centres are at +0.5 in both images, so cropping is a shift and resampling a scale,
+        with no half-pixel term.
         """
-        matrices = np.zeros((len(self.corners), 3, 3))
-        matrices[:, 0, 0] = matrices[:, 1, 1] = focal * self.scale
-        centre = np.array([width / 2.0, height / 2.0])
-        matrices[:, :2, 2] = (centre - self.corners) * self.scale
-        matrices[:, 2, 2] = 1.0
+        matrices = np.tile(K, (len(self.corners), 1, 1))
+        matrices[:, :2, 2] -= self.corners
+        matrices[:, :2] *= self.scale
         return matrices
 
 
@@ -101,16 +98,7 @@ def _boxes(hand: Landmarks, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]
 
 
 def cut(image: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
-    """Cut a square out of an image; pixels outside the image are black.
-
-    Args:
-        image: (H, W) or (H, W, C).
-        corner: (2,) integer x and y.
-        side: px.
-
-    Returns:
-        (side, side) or (side, side, C), a copy.
-    """
+    """Copy a square of `side` px, whose corner is x, y, out of an image; outside it is black."""
     height, width = image.shape[:2]
     x, y = int(corner[0]), int(corner[1])
     square = np.zeros((side, side, *image.shape[2:]), dtype=image.dtype)
@@ -122,15 +110,7 @@ def cut(image: np.ndarray, corner: np.ndarray, side: int) -> np.ndarray:
 
 
 def resample(square: np.ndarray, size: int) -> np.ndarray:
-    """Resample a square image: by area where it shrinks (no aliasing), linearly where it grows.
-
-    Args:
-        square: (S, S) or (S, S, C) uint8.
-        size: px.
-
-    Returns:
-        (size, size) or (size, size, C) uint8.
-    """
+    """Resample a square uint8 image: by area where it shrinks (no aliasing), else linearly."""
     import cv2
 
     if square.shape[0] == size:
@@ -139,13 +119,16 @@ def resample(square: np.ndarray, size: int) -> np.ndarray:
     return cv2.resize(square, (size, size), interpolation=method)
 
 
-Frame = TypeVar("Frame")
-Result = TypeVar("Result")
+def cells(places: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The pixels that places (P, 2) px lie in: rows, columns, and whether the image has them.
 
-#: Most threads; each frame's work is mostly OpenCV and compiled code, which let others run.
-MOST_THREADS = 4
-#: Frames that are worked on ahead of the one that is asked for, for each thread.
-_AHEAD = 4
+    Rows and columns of places outside of an image of this shape are those of its border.
+    """
+    size = np.array([shape[1], shape[0]])
+    cell = np.floor(places)
+    inside = ((cell >= 0) & (cell < size)).all(axis=1)
+    columns, rows = np.clip(cell, 0, size - 1).astype(np.int64).T
+    return rows, columns, inside
 
 
 def each_frame(work: Callable[[Frame], Result], frames: Iterable[Frame]) -> Iterator[Result]:

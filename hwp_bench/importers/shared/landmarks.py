@@ -1,7 +1,14 @@
-"""The file of tracked hands: one or two hands over all frames of a video, and which side they are.
+"""Tracked hands: the file, which hand is which in it, and the landmarks that an import reads.
 
-An `.npz` of version 2. It contains what version 1 contains (`image`, `world` and `score` of one
-hand), for the hand that is seen most, so that every reader of version 1 reads it.
+The file is an `.npz` of version 2: one or two hands over all frames of a video, and which side they
+are. It contains what version 1 contains (`image`, `world` and `score` of one hand), for the hand
+that is seen most, so that every reader of version 1 reads it.
+
+A tracker may change its mind where hands cross or one comes back from behind the other. Every
+frame has two possible assignments of its hands to the sides. The cheapest sequence of them is
+found by dynamic programming (Viterbi, 1967): a hand is expected where it was, moved on with its
+speed, and costs what the network's vote for the other side says. Where hands lie on each other the
+votes decide, and where single votes err the motion does.
 """
 
 from __future__ import annotations
@@ -20,6 +27,20 @@ from hwp_bench.base.errors import BadInput
 VERSION = 2
 #: Sides in the order of `votes`.
 SIDES = ("right", "left")
+#: MediaPipe (= OpenPose) order, the order of every landmark array in this package.
+LANDMARK_NAMES = (
+    "wrist",
+    *(f"{finger}_{k}" for finger in ("thumb", "index", "middle", "ring", "little") for k in "1234"),
+)
+#: Pairs of landmarks that a drawing connects.
+LANDMARK_EDGES = (
+    *((0, 4 * finger + 1) for finger in range(5)),
+    *((4 * finger + k, 4 * finger + k + 1) for finger in range(5) for k in (1, 2, 3)),
+)
+#: Landmarks that move with the palm: wrist, thumb base, and the four knuckles.
+PALM = (0, 1, 5, 9, 13, 17)
+#: Range of a hand's extent, m: from a small child's fist to a large open hand, with a margin.
+HAND_METRES = (0.02, 0.5)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,19 +111,13 @@ def write_hand_tracks(path: str | os.PathLike[str], tracks: HandTracks) -> Path:
 
 
 def read_hand_tracks(path: str | os.PathLike[str]) -> HandTracks | None:
-    """Read the hands of a file of version 2.
-
-    Returns:
-        The hands; None for a file of version 1, which says nothing of sides.
-
-    Raises:
-        BadInput: the file is damaged, of a newer version, or its arrays do not fit together.
-    """
-    return tracks_of(read_npz(path), path)
+    """Read the hands of a file of version 2; None for one of version 1, without sides."""
+    return _tracks_of(read_npz(path), path)
 
 
-def tracks_of(arrays: Mapping[str, np.ndarray], where: str | os.PathLike[str]) -> HandTracks | None:
-    """Check the arrays of a file; `read_hand_tracks` says how."""
+def _tracks_of(
+    arrays: Mapping[str, np.ndarray], where: str | os.PathLike[str]
+) -> HandTracks | None:
     if "version" not in arrays:
         return None
     version = int(take(arrays, "version", (1,), where=where, dtype=np.int64)[0])
@@ -131,40 +146,57 @@ def tracks_of(arrays: Mapping[str, np.ndarray], where: str | os.PathLike[str]) -
     return HandTracks(image, world, score, right, track, (int(width), int(height)))
 
 
-#: Landmarks that move with the palm; fingers move too fast to be expected anywhere.
-_PALM = (0, 1, 5, 9, 13, 17)
-#: Error of a place that is expected one frame ahead, as a share of the hand's size.
+# --- Which hand is which, frame by frame: swaps and doubles of a tracker are repaired
+
+# Error of a place that is expected one frame ahead, as a share of the hand's size. Of landmarks
+# that move with the palm; fingers move too fast to be expected anywhere.
 _MOTION = 0.1
-#: Most that a jump costs: a hand that comes back may be anywhere.
+# Most that a jump costs: a hand that comes back may be anywhere.
 _MOST_MOTION = 10.0
-#: Cost of a hand that was never seen before. Without it, one that is seen alone with a wrong vote
-#: would become the other hand, and be seen for the first time in the next frame.
+# Cost of a hand that was never seen before. Without it, one that is seen alone with a wrong vote
+# would become the other hand, and be seen for the first time in the next frame.
 _FIRST_SEEN = 5.0
-#: The speed of a hand is known for this many frames after it was seen.
+# The speed of a hand is known for this many frames after it was seen.
 _MEMORY = 3
-#: Weight of a vote: those of frames next to each other err together.
-_VOTE = 0.3
-#: No single vote is surer than this.
-_SUREST = 0.95
-#: A second hand is seen in at least this share of the frames that show the first.
+# Weight of a vote: those of frames next to each other err together. No single one is surer than
+# `_SUREST`.
+_VOTE, _SUREST = 0.3, 0.95
+# A second hand is seen in at least this share of the frames that show the first.
 _SECOND_HAND = 0.1
-#: Two hands are one that is seen twice if their landmarks are nearer than this share of its size.
+# Two hands are one that is seen twice if their landmarks are nearer than this share of its size.
 _SAME_HAND = 0.15
 
 
 @dataclass(frozen=True, eq=False)
 class Association:
-    """Hands that are the same in all frames.
+    """Hands that are the same in all frames."""
 
-    Attributes:
-        tracks: the right hand first, then the left one; one hand as it was given.
-        swaps: how often the tracker had exchanged the hands from one frame to the next.
-        doubles: number of frames in which it had put both on one hand.
-    """
-
+    #: The right hand first, then the left one; one hand as it was given.
     tracks: HandTracks
+    #: How often the tracker had exchanged the hands from one frame to the next.
     swaps: int
+    #: Number of frames in which it had put both on one hand.
     doubles: int
+
+    @property
+    def sides(self) -> tuple[str, ...]:
+        """Sides of the hands, seen most first; without a second one that is hardly ever seen."""
+        counts = [int(self.tracks.seen(hand).sum()) for hand in range(len(self.tracks.score))]
+        if len(counts) == 1:
+            return (self.tracks.side(0),)
+        first = int(counts[1] > counts[0])
+        if counts[1 - first] < _SECOND_HAND * counts[first]:
+            return (SIDES[first],)
+        return SIDES[first], SIDES[1 - first]
+
+    def row(self, side: str) -> int | None:
+        """The row of a side, None where no hand is of it."""
+        two = len(self.tracks.score) == 2
+        return SIDES.index(side) if two else self.tracks.hand_of(side)
+
+    def votes(self, side: str) -> dict[str, float]:
+        """The votes of the hand that `read_landmarks` reads for a side."""
+        return self.tracks.votes(self.row(side) or 0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -180,11 +212,7 @@ class _Path:
 
 
 def associate(tracks: HandTracks) -> Association:
-    """Assign the two hands of every frame to the right and the left hand.
-
-    Args:
-        tracks: one or two hands; what is in a row may change from frame to frame.
-    """
+    """Assign one or two hands, whose rows may change from frame to frame, to right and left."""
     if len(tracks.score) == 1:
         return Association(tracks, 0, 0)
     seen = (tracks.score > 0) & np.isfinite(tracks.image).all(axis=(2, 3))
@@ -215,12 +243,12 @@ def _doubles(tracks: HandTracks, seen: np.ndarray, size: float) -> np.ndarray:
 
 def _crossed(tracks: HandTracks, seen: np.ndarray, size: float) -> np.ndarray:
     """Return (F,) bool: frames whose first row is the left hand."""
-    places = tracks.image[:, :, list(_PALM), :2].astype(np.float64)
+    places = tracks.image[:, :, list(PALM), :2].astype(np.float64)
     right = np.clip(tracks.right.astype(np.float64), 1.0 - _SUREST, _SUREST)
     # Cost of calling the hand of each row a right one, and a left one.
     votes = -_VOTE * np.log(np.stack([right, 1.0 - right], axis=-1))
     count = seen.shape[1]
-    nothing = np.zeros((2, len(_PALM), 2))
+    nothing = np.zeros((2, len(PALM), 2))
     paths = [_Path(0.0, nothing, nothing, (-1, -1))] * 2
     back = np.tile(np.arange(2), (count, 1))
     for frame in range(count):
@@ -291,62 +319,13 @@ def _exchanged(tracks: HandTracks, crossed: np.ndarray) -> HandTracks:
     )
 
 
-def hand_of(tracks: HandTracks, side: str) -> int | None:
-    """Return the row of a side in associated hands, None where none is of it."""
-    return SIDES.index(side) if len(tracks.score) == 2 else tracks.hand_of(side)
-
-
 def read_association(path: str | os.PathLike[str]) -> Association | None:
-    """Read the hands of a file and associate them; None for a file that says nothing of sides.
-
-    Raises:
-        BadInput: as `read_hand_tracks` does.
-    """
+    """Read the hands of a file and associate them; None for a file that says nothing of sides."""
     tracks = read_hand_tracks(path)
     return None if tracks is None else associate(tracks)
 
 
-def sides_of(tracks: HandTracks) -> tuple[str, ...]:
-    """Return the sides of associated hands, the one that is seen most first.
-
-    A second hand that is hardly ever seen is left out.
-    """
-    counts = [int(tracks.seen(hand).sum()) for hand in range(len(tracks.score))]
-    if len(counts) == 1:
-        return (tracks.side(0),)
-    first = int(counts[1] > counts[0])
-    if counts[1 - first] < _SECOND_HAND * counts[first]:
-        return (SIDES[first],)
-    return SIDES[first], SIDES[1 - first]
-
-
-def tracked_sides(path: str | os.PathLike[str]) -> tuple[str, ...]:
-    """Return the sides of a file's hands as `sides_of` does; none if it says nothing of sides."""
-    found = read_association(path)
-    return () if found is None else sides_of(found.tracks)
-
-
-def tracked_votes(path: str | os.PathLike[str], side: str) -> dict[str, float] | None:
-    """Return the votes of the hand that `read_landmarks` reads for a side.
-
-    None for a file that says nothing of sides.
-    """
-    found = read_association(path)
-    return None if found is None else found.tracks.votes(hand_of(found.tracks, side) or 0)
-
-
-#: MediaPipe (= OpenPose) order, the order of every landmark array in this package.
-LANDMARK_NAMES = (
-    "wrist",
-    *(f"{finger}_{k}" for finger in ("thumb", "index", "middle", "ring", "little") for k in "1234"),
-)
-#: Range of a hand's extent, m: from a small child's fist to a large open hand, with a margin.
-HAND_METRES = (0.02, 0.5)
-#: Pairs of landmarks that a drawing connects.
-LANDMARK_EDGES = (
-    *((0, 4 * finger + 1) for finger in range(5)),
-    *((4 * finger + k, 4 * finger + k + 1) for finger in range(5) for k in (1, 2, 3)),
-)
+# --- The landmarks of one hand
 
 
 @dataclass(frozen=True)
@@ -365,6 +344,12 @@ class Landmarks:
     world: np.ndarray
     score: np.ndarray
     detected: np.ndarray
+
+    @property
+    def hand_size(self) -> float:
+        """Median over the frames of the larger side of the landmarks' box, px."""
+        pixels = self.image[self.detected]
+        return float(np.median((pixels.max(axis=1) - pixels.min(axis=1)).max(axis=1)))
 
     def select(self, frames: np.ndarray) -> Landmarks:
         """Return the landmarks of some frames."""
@@ -450,14 +435,10 @@ def _check_metres(path: Path, world: np.ndarray) -> None:
 def check_against_video(
     landmarks: Landmarks, frame_count: int, width: int, height: int, where: str | os.PathLike[str]
 ) -> Landmarks:
-    """Check the landmarks against the video that they were tracked in.
+    """Check the landmarks against the video that they were tracked in, and return them.
 
-    Returns:
-        The landmarks; frames are marked as not detected whose hand lies completely outside
-        the image, leaves it by more than the image's size, or is smaller than 8 pixels.
-
-    Raises:
-        BadInput: the number of frames differs, or no frame is left.
+    Frames are marked as not detected whose hand lies completely outside the image, leaves it by
+    more than the image's size, or is smaller than 8 pixels.
     """
     if len(landmarks.score) != frame_count:
         raise BadInput(
@@ -483,15 +464,13 @@ def check_against_video(
 
 def _load(path: Path, side: str | None) -> dict[str, np.ndarray]:
     arrays = read_npz(path)
-    tracks = None if side is None else tracks_of(arrays, path)
-    tracks = None if tracks is None else associate(tracks).tracks
-    hand = None if tracks is None or side is None else hand_of(tracks, side)
-    if tracks is not None and hand is not None:
-        return {
-            "image": tracks.image[hand],
-            "world": tracks.world[hand],
-            "score": tracks.score[hand],
-        }
+    tracks = None if side is None else _tracks_of(arrays, path)
+    if tracks is not None and side is not None:
+        found = associate(tracks)
+        hand = found.row(side)
+        if hand is not None:
+            names = ("image", "world", "score")
+            return {name: getattr(found.tracks, name)[hand] for name in names}
     missing = [name for name in ("image", "world", "score") if name not in arrays]
     if missing:
         raise BadInput(f"lacks the arrays {', '.join(missing)}", where=path)

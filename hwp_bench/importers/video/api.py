@@ -1,11 +1,10 @@
-"""From a video and its tracked landmarks to a capture."""
+"""From a video and its tracked landmarks to a capture, in turns of fitting and cutting masks."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
-from functools import cached_property
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,16 +24,15 @@ from hwp_bench.importers.video.masks import (
     NARROW,
     WIDE,
     ClipMasks,
-    Masking,
     MaskSettings,
-    ProjectedClip,
     ProjectedHands,
+    cut_masks,
     project_clip,
-    project_hands,
 )
-from hwp_bench.importers.video.pictures import HandPictures, PictureEnergy, TextureEnergy
-from hwp_bench.importers.video.residuals import FIELD_SIZE, ContourEnergy, hand_size
+from hwp_bench.importers.video.pictures import HandPictures, PictureResidual, TextureResidual
+from hwp_bench.importers.video.residuals import FIELD_SIZE, REACH, OutlineResidual
 from hwp_bench.importers.video.solve import (
+    PICTURE_STEPS,
     FittedClip,
     Footage,
     ReprojectionError,
@@ -105,13 +103,7 @@ def finished_import(
     """Return the numbers of an import that the same call has finished; None where it has not.
 
     A process may be killed after its capture was whole, and before its sheet was written, which is
-    made up for. Code and hand model do not count.
-
-    Args:
-        video, landmarks, out, options: as `import_video`.
-
-    Raises:
-        BadInput: one of the files cannot be read.
+    made up for. Code and hand model do not count. Arguments as of `import_video`.
     """
     report = Path(out) / EXTRA / REPORT_NAME
     if options.overwrite or not report.is_file() or not (Path(out) / METADATA).is_file():
@@ -171,7 +163,6 @@ def fit_video(
     Landmarks, masks, outline, masks, outline and texture, masks, whole pictures, masks. Two hands
     are fitted one after the other and share their camera and their masks.
     """
-    settings = options.fit
     hands = list(source.hands.values())
     fits = _fit_hands(source, options)
     first_errors = [
@@ -179,108 +170,33 @@ def fit_video(
     ]
     good = map(followed, first_errors, hands)
     refuse_unfitted(dict(zip(source.hands, good, strict=True)), source, doubts)
-    size = sum(hand_size(hand) for hand in hands) / len(hands)
-    scale = source.images.working.shape[1] / source.windows.side
-    masking = Masking(source.images, source.detected, size * scale, source.own_masks)
-    pictures = settings.picture_weight > 0 and settings.picture_rounds > 0
-    turns = 4 if pictures else 3
-
-    def cut(turn: int, trust: MaskSettings, reduction: int = 1) -> _Cut:
-        with progress(f"cutting masks ({turn} of {turns})", len(source.indices)) as update:
-            clips = [project_clip(fitted.model, source.windows) for fitted in fits]
-            pair = project_hands(clips, hands) if len(clips) == 2 else None
-            masks = masking.masks(pair or clips[0], trust, reduction=reduction, update=update)
-        return _Cut(masks, clips, pair)
-
-    found = cut(1, WIDE, reduction=2)
-    overlap_landmarks_only = float(found.masks.overlap[source.detected].mean())
-    if found.pair is not None:
+    turns = _Turns(source, options, fits)
+    projected, masks = turns.cut(WIDE, reduction=2)
+    overlap_landmarks_only = float(masks.overlap[source.detected].mean())
+    if len(fits) == 2:
         for hand, fitted in enumerate(fits):
-            fitted.energy.trust(found.pair.trust(hand))
-    _fit_outlines(source, options, fits, found, turn=1)
-    _fit_outlines(source, options, fits, cut(2, NARROW), turn=2)
-    if pictures:
-        _fit_pictures(source, options, fits, cut(3, NARROW))
-    last = cut(turns, NARROW)
+            fitted.landmarks.weaken(projected.trust(hand))
+    turns.fit_outlines(projected, masks)
+    turns.fit_outlines(*turns.cut(NARROW), texture=options.fit.texture)
+    if options.fit.picture_rounds > 0:
+        turns.fit_pictures(*turns.cut(NARROW))
+    projected, masks = turns.cut(NARROW)
     imported = {}
-    for (side, landmarks), fitted, projected, first in zip(
-        source.hands.items(), fits, last.clips, first_errors, strict=True
+    for (side, landmarks), fitted, clip, first in zip(
+        source.hands.items(), fits, projected.hands, first_errors, strict=True
     ):
         error = reprojection_error(fitted, landmarks)
-        imported[side] = ImportedHand(
-            landmarks=landmarks,
-            parameters=fitted.model.parameters(followed(error, landmarks)),
-            fitted=fitted,
-            projected=projected,
-            error=error,
-            error_landmarks_only=first,
-        )
+        parameters = fitted.model.parameters(followed(error, landmarks))
+        imported[side] = ImportedHand(landmarks, parameters, fitted, clip, error, first)
     valid = {side: hand.parameters.valid for side, hand in imported.items()}
     refuse_unfitted(valid, source, doubts)
-    return ImportedClip(source, imported, last.masks, overlap_landmarks_only, tuple(doubts))
+    return ImportedClip(source, imported, masks, overlap_landmarks_only, tuple(doubts))
 
 
 def followed(error: ReprojectionError, landmarks: Landmarks) -> np.ndarray:
     """(F,) bool, the frames in which a fit follows the landmarks."""
-    missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * hand_size(landmarks)
+    missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * landmarks.hand_size
     return np.asarray(landmarks.detected & ~missed)
-
-
-@dataclass(frozen=True, eq=False)
-class _Cut:
-    """Masks of all hands, each hand projected, and both together where there are two."""
-
-    masks: ClipMasks
-    clips: list[ProjectedClip]
-    pair: ProjectedHands | None
-
-    @cached_property
-    def coverages(self) -> list[np.ndarray]:
-        """The visible part of each hand, (F, S, S) uint8."""
-        if self.pair is None:
-            return [self.masks.coverage]
-        return list(self.pair.coverage(self.masks.coverage))
-
-
-def _fit_outlines(
-    source: VideoSource, options: VideoImport, fits: list[FittedClip], found: _Cut, turn: int
-) -> None:
-    """Refine the hands by their outlines; in the second turn by their textures too."""
-    settings = options.fit
-    steps = settings.contour_rounds * settings.contour_steps
-    with progress(f"fitting outlines ({turn} of 2)", steps * len(fits)) as update:
-        for hand, fitted in enumerate(fits):
-            contour = _contour(source, options, hand, found.masks, found.pair)
-            texture = None
-            if turn == 2 and settings.texture_weight > 0:
-                pictures = _pictures(source, hand, found)
-                texture = TextureEnergy(pictures, settings, fitted.model)
-            fit_outline(fitted, contour, _after(update, hand * steps), texture)
-
-
-def _fit_pictures(
-    source: VideoSource, options: VideoImport, fits: list[FittedClip], found: _Cut
-) -> None:
-    """Refine the hands' poses by whole pictures."""
-    settings = options.fit
-    steps = settings.picture_rounds * settings.picture_steps
-    with progress("fitting pictures", steps * len(fits)) as update:
-        for hand, fitted in enumerate(fits):
-            picture = PictureEnergy(_pictures(source, hand, found), settings, fitted.model)
-            fit_picture(fitted, picture, _after(update, hand * steps))
-
-
-def _pictures(source: VideoSource, hand: int, found: _Cut) -> HandPictures:
-    """The frames as the fit of one hand sees them."""
-    landmarks: Landmarks = list(source.hands.values())[hand]
-    return HandPictures(
-        images=source.images.frames,
-        masks=found.coverages[hand],
-        usable=landmarks.detected,
-        windows=source.windows,
-        hand_size=hand_size(landmarks),
-        other=found.coverages[1 - hand] if len(found.coverages) == 2 else None,
-    )
 
 
 def _fit_hands(source: VideoSource, options: VideoImport) -> list[FittedClip]:
@@ -292,33 +208,95 @@ def _fit_hands(source: VideoSource, options: VideoImport) -> list[FittedClip]:
     with progress("fitting landmarks", steps * len(source.hands)) as update:
         for side, landmarks in source.hands.items():
             template = load_template(options.hand_model, side)
-            later = _after(update, steps * len(fits))
+            later = _counting_on(update, steps * len(fits))
             fits.append(fit_landmarks(landmarks, template, footage, settings, later))
     if len(fits) == 2 and options.focal is None:
         share_camera(fits, steps=settings.landmark_steps // 3)
     return fits
 
 
-def _contour(
-    source: VideoSource,
-    options: VideoImport,
-    hand: int,
-    masks: ClipMasks,
-    pair: ProjectedHands | None,
-) -> ContourEnergy:
-    """The outline of one hand; where the other one is, the masks' outline is not this one's."""
-    landmarks: Landmarks = list(source.hands.values())[hand]
-    size, settings = hand_size(landmarks), options.fit
-    ignored = None
-    if pair is not None:
-        reach = settings.contour_reach * size * FIELD_SIZE / source.windows.side
-        ignored = pair.covered(hand, reach)
-    return ContourEnergy(masks.fields, landmarks.detected, source.windows, settings, size, ignored)
-
-
-def _after(update: Callable[[int], None], done: int) -> Callable[[int], None]:
-    """A report of progress that counts on."""
+def _counting_on(update: Callable[[int], None], done: int) -> Callable[[int], None]:
     return lambda more: update(done + more)
+
+
+class _Turns:
+    """The turns of masks and fits of one clip."""
+
+    def __init__(
+        self, source: VideoSource, options: VideoImport, fits: Sequence[FittedClip]
+    ) -> None:
+        self._source, self._fits, self._settings = source, fits, options.fit
+        self._landmarks = list(source.hands.values())
+        self._outlines = self._masks = 0
+        self._turns = 4 if options.fit.picture_rounds > 0 else 3
+
+    def cut(self, trust: MaskSettings, reduction: int = 1) -> tuple[ProjectedHands, ClipMasks]:
+        """Cut the masks of all hands, prompted by the fits as they are now."""
+        source, images = self._source, self._source.images
+        size = sum(hand.hand_size for hand in self._landmarks) / len(self._landmarks)
+        size *= images.working.shape[1] / source.windows.side
+        self._masks += 1
+        title = f"cutting masks ({self._masks} of {self._turns})"
+        with progress(title, len(source.indices)) as update:
+            clips = [project_clip(fitted.model, source.windows) for fitted in self._fits]
+            projected = ProjectedHands(clips, self._landmarks)
+            masks = cut_masks(
+                images,
+                projected,
+                source.detected,
+                size,
+                trust,
+                own=source.own_masks,
+                reduction=reduction,
+                update=update,
+            )
+        return projected, masks
+
+    def fit_outlines(
+        self, projected: ProjectedHands, masks: ClipMasks, *, texture: bool = False
+    ) -> None:
+        """Refine the hands by their outlines, and by their textures too."""
+        windows = self._source.windows
+        steps = self._settings.contour_rounds * self._settings.contour_steps
+        self._outlines += 1
+        with progress(
+            f"fitting outlines ({self._outlines} of 2)", steps * len(self._fits)
+        ) as update:
+            pictures = self._pictures(projected, masks) if texture else None
+            for hand, (fitted, landmarks) in enumerate(
+                zip(self._fits, self._landmarks, strict=True)
+            ):
+                size = landmarks.hand_size
+                # Where the other hand is, the masks' outline is not this one's.
+                ignored = projected.covered(hand, REACH * size * FIELD_SIZE / windows.side)
+                outline = OutlineResidual(masks.fields, landmarks.detected, windows, size, ignored)
+                more = [] if pictures is None else [TextureResidual(pictures[hand], fitted.model)]
+                later = _counting_on(update, hand * steps)
+                fit_outline(fitted, outline, *more, update=later)
+
+    def fit_pictures(self, projected: ProjectedHands, masks: ClipMasks) -> None:
+        """Refine the hands' poses by whole pictures."""
+        steps = self._settings.picture_rounds * PICTURE_STEPS
+        with progress("fitting pictures", steps * len(self._fits)) as update:
+            pictures = self._pictures(projected, masks)
+            for hand, fitted in enumerate(self._fits):
+                residual = PictureResidual(pictures[hand], fitted.model)
+                fit_picture(fitted, residual, _counting_on(update, hand * steps))
+
+    def _pictures(self, projected: ProjectedHands, masks: ClipMasks) -> list[HandPictures]:
+        """The frames as the fit of each hand sees them."""
+        visible = projected.coverage(masks.coverage)
+        return [
+            HandPictures(
+                images=self._source.images.frames,
+                masks=visible[hand],
+                usable=landmarks.detected,
+                windows=self._source.windows,
+                hand_size=landmarks.hand_size,
+                other=visible[1 - hand] if len(visible) == 2 else None,
+            )
+            for hand, landmarks in enumerate(self._landmarks)
+        ]
 
 
 def _check_output(out: Path, options: VideoImport) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 
 import numpy as np
@@ -14,7 +14,7 @@ from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.hands import HandParameters
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.output import (
-    OverlayFrame,
+    ProjectedHand,
     overlay_sheet,
     sheet_frames,
     write_capture,
@@ -23,10 +23,10 @@ from hwp_bench.importers.video.masks import ClipMasks, ProjectedClip
 from hwp_bench.importers.video.solve import FittedClip, ReprojectionError
 from hwp_bench.importers.video.source import (
     BOTH,
+    LOW_OVERLAP,
     VideoImport,
     VideoSource,
     fit_warnings,
-    overlap_warning,
 )
 
 #: Version of the fit and the masks. It is raised when they come out otherwise for the same input,
@@ -38,21 +38,16 @@ SHEET_FRAMES = 24
 
 @dataclass(frozen=True, eq=False)
 class ImportedHand:
-    """One hand of an import.
+    """One hand of an import."""
 
-    Attributes:
-        landmarks: the tracker's.
-        parameters: pose, shape and place.
-        fitted: the fit.
-        projected: the fit in the images.
-        error: reprojection error of the final fit.
-        error_landmarks_only: the same before the outline was fitted.
-    """
-
+    #: The tracker's.
     landmarks: Landmarks
+    #: Pose, shape and place.
     parameters: HandParameters
+    #: The fit, and the fit in the images.
     fitted: FittedClip
     projected: ProjectedClip
+    #: Reprojection error of the final fit, and before the outline was fitted.
     error: ReprojectionError
     error_landmarks_only: ReprojectionError
 
@@ -104,8 +99,12 @@ class ImportedClip:
         """Things to know before the capture is used; empty for a sound clip."""
         fitted = {side: hand.parameters.valid for side, hand in self.hands.items()}
         seen = {side: hand.landmarks.detected for side, hand in self.hands.items()}
-        few = fit_warnings(fitted, seen)
-        return (*self.doubts, *few, *overlap_warning(self.overlap))
+        said = [*self.doubts, *fit_warnings(fitted, seen)]
+        if self.overlap < LOW_OVERLAP:
+            said.append(
+                f"the overlap of mesh and mask is {self.overlap:.2f}, of a sound clip 0.9 and more"
+            )
+        return tuple(said)
 
     @property
     def first(self) -> ImportedHand:
@@ -150,16 +149,18 @@ def store_clip(
 ) -> None:
     """Write the capture, whole or not at all, and the separate sheet where one is asked for.
 
-    Args:
-        clip: the clip.
-        out: the capture folder to make.
-        options: choices.
-        call: digest of the call that makes it, by which a second one knows that it is complete.
+    `call` is the digest of the call that makes it, by which a second one knows that it is complete.
     """
     source = clip.source
     frames = len(source.indices)
-    Ks = source.windows.intrinsics(clip.focal, source.video.width, source.video.height)
-    cameras = Cameras(Ks, np.tile(np.eye(4), (frames, 1, 1)))
+    K = np.array(
+        [
+            [clip.focal, 0, source.video.width / 2],
+            [0, clip.focal, source.video.height / 2],
+            [0, 0, 1.0],
+        ]
+    )
+    cameras = Cameras(source.windows.intrinsics(K), np.tile(np.eye(4), (frames, 1, 1)))
     drawn = draw_sheet(clip)
     write_capture(
         out,
@@ -223,53 +224,35 @@ def capture_info(
 
 
 def draw_sheet(clip: ImportedClip) -> np.ndarray:
-    """Draw evenly spaced frames with masks, mesh and joints, (H, W, 3) uint8."""
+    """Draw evenly spaced frames with masks, meshes and joints, (H, W, 3) uint8."""
     source, hands = clip.source, list(clip.hands.values())
-    count = len(source.indices)
-    size = source.windows.size
-    faces, offset = [], 0
-    for hand in hands:
-        faces.append(hand.projected.faces + offset)
-        offset += hand.projected.vertices.shape[1]
-    frames = []
+    count, size = len(source.indices), source.windows.size
+    images, masks, tracked, captions = {}, {}, {}, {}
     for frame in sheet_frames(count, SHEET_FRAMES):
         number = f"{source.indices[frame]}"
         if source.reading is not None and source.reading.ends_early and frame == count - 1:
             # At the front: long captions are cut.
             number += f" (video ends early: {source.reading.counted()})"
-        caption = f"frame {number}: overlap {clip.masks.overlap[frame]:.2f}"
-        caption += "".join(_said(hand, frame) for hand in hands)
-        tracked = [
-            hand.projected.in_crop(hand.landmarks.image[frame], frame, size)
-            for hand in hands
-            if hand.landmarks.detected[frame]
-        ]
-        drawn = [hand.projected for hand in hands]
-        frames.append(
-            OverlayFrame(
-                caption=caption,
-                image=source.images.frames[frame],
-                mask=clip.masks.coverage[frame],
-                vertices=np.concatenate([one.vertices[frame] for one in drawn]),
-                pixels=_in_crop(drawn, [one.pixels for one in drawn], frame, size),
-                fitted=_in_crop(drawn, [one.landmarks for one in drawn], frame, size),
-                tracked=np.concatenate(tracked) if tracked else None,
-            )
+        captions[frame] = f"frame {number}: overlap {clip.masks.overlap[frame]:.2f}"
+        dots = [np.zeros((0, 2))]
+        for hand in hands:
+            if not hand.landmarks.detected[frame]:
+                captions[frame] += ", not detected"
+                continue
+            valid = "" if hand.parameters.valid[frame] else ", not valid"
+            captions[frame] += f", {hand.error.by_frame[frame]:.1f} px{valid}"
+            dots.append(hand.projected.in_crop(hand.landmarks.image[frame], frame, size))
+        images[frame], masks[frame] = source.images.frames[frame], clip.masks.coverage[frame]
+        tracked[frame] = np.concatenate(dots)
+    corners, scale = source.windows.corners[:, None], source.windows.scale
+    drawn = [
+        ProjectedHand(
+            hand.projected.vertices,
+            (hand.projected.pixels - corners) * scale,
+            (hand.projected.landmarks - corners) * scale,
+            hand.projected.faces,
+            np.ones(count, dtype=bool),
         )
-    return overlay_sheet(frames, np.concatenate(faces))
-
-
-def _in_crop(
-    clips: Sequence[ProjectedClip], pixels: Sequence[np.ndarray], frame: int, size: int
-) -> np.ndarray:
-    """Pixels of all hands in a frame's crop."""
-    moved = [clip.in_crop(one[frame], frame, size) for clip, one in zip(clips, pixels, strict=True)]
-    return np.concatenate(moved)
-
-
-def _said(hand: ImportedHand, frame: int) -> str:
-    """The end of a caption that one hand has."""
-    if not hand.landmarks.detected[frame]:
-        return ", not detected"
-    error = f", {hand.error.by_frame[frame]:.1f} px"
-    return error if hand.parameters.valid[frame] else f"{error}, not valid"
+        for hand in hands
+    ]
+    return overlay_sheet(drawn, images, masks, tracked, captions)

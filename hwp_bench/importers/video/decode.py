@@ -20,7 +20,6 @@ from hwp_bench.base.progress import notice
 from hwp_bench.base.text import bounded, check_name
 from hwp_bench.importers.shared.frames import CropWindows, cut, resample
 from hwp_bench.importers.video.colours import Colours, colours_of, to_srgb
-from hwp_bench.importers.video.residuals import FIELD_SIZE
 
 
 @dataclass(frozen=True)
@@ -204,27 +203,6 @@ class ClipImages:
 def working_size(windows: CropWindows) -> int:
     """Edge of the working images, px."""
     return min(windows.side, 2 * windows.size)
-
-
-def check_memory(windows: CropWindows) -> None:
-    """Refuse a clip that would not fit into memory, before minutes of work.
-
-    Raises:
-        UsageError: the images would take more than the free memory.
-    """
-    import psutil
-
-    edge = working_size(windows)
-    # Colours at both resolutions, the mask, the distance field, and the posed vertices.
-    each = 3 * edge**2 + 4 * windows.size**2 + 2 * FIELD_SIZE**2 + 200_000
-    needed, free = len(windows.corners) * each, psutil.virtual_memory().available
-    if needed > free:
-        raise UsageError(
-            f"{len(windows.corners)} frames need about {needed / 1e9:.1f} GB of memory, "
-            f"{free / 1e9:.1f} GB are free",
-            field="--frames",
-            remedy="Take fewer frames with --frames or --stride, or a smaller --size.",
-        )
 
 
 def read_images(

@@ -11,10 +11,7 @@ from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
 from hwp_bench.hands.rotations import axis_angle_to_matrix, cross_matrix, right_jacobian
 from hwp_bench.hands.skeleton import moved_joints
 from hwp_bench.hands.skinning import only_fingertips
-from hwp_bench.importers.shared.landmarks import Landmarks
-
-#: Landmarks that move with the palm: wrist, thumb base, and the four knuckles.
-PALM = (0, 1, 5, 9, 13, 17)
+from hwp_bench.importers.shared.landmarks import PALM, Landmarks
 
 
 @dataclass(frozen=True)

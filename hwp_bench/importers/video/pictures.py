@@ -1,9 +1,11 @@
-"""The frames of a clip as the fit of one hand sees them."""
+"""The residuals of whole frames: the clip's own mean texture, and the hand drawn in its light."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import cv2
 import numpy as np
@@ -20,36 +22,40 @@ from hwp_bench.importers.video.model import (
     frame_variables,
     posed_vertices,
 )
-from hwp_bench.importers.video.residuals import FitSettings
 from hwp_bench.importers.video.texture import (
-    DARK,
     LitTexture,
+    MeanTexture,
     SeenTexels,
-    SkinTexture,
-    View,
     row_products,
     sample,
+    smooth_within,
 )
+
+#: Pixels of a frame below which it says nothing.
+_LEAST_PIXELS = 50
+# m, how much deeper than the nearest surface a texel may lie and still be seen.
+_SEEN = 0.004
+# Cosine of the angle to the viewer from which a surface counts.
+_LEAST_FACING = 0.25
+# Rows in a product of matrices.
+_BLOCK = 24
 
 
 @dataclass(frozen=True, eq=False)
 class HandPictures:
-    """Images of a clip, and what is this hand's in them; S is the edge of the images.
+    """The frames of a clip as the fit of one hand sees them; S is the edge of the images."""
 
-    Attributes:
-        images: (F, S, S, 3) uint8 RGB.
-        masks: (F, S, S) uint8 coverage of the hand.
-        usable: (F,) bool, frames that count.
-        windows: where the images lie in the whole frame.
-        hand_size: size of the hand in the whole frame, px.
-        other: (F, S, S) uint8 coverage of another hand, or None.
-    """
-
+    #: (F, S, S, 3) uint8 RGB.
     images: np.ndarray
+    #: (F, S, S) uint8 coverage of the hand.
     masks: np.ndarray
+    #: (F,) bool, frames that count.
     usable: np.ndarray
+    #: Where the images lie in the whole frame.
     windows: CropWindows
+    #: Size of the hand in the whole frame, px.
     hand_size: float
+    #: (F, S, S) uint8 coverage of another hand, or None.
     other: np.ndarray | None = None
 
     @property
@@ -71,43 +77,127 @@ class HandPictures:
         return vertices, inside.astype(np.float32)
 
 
-# Rows in a product of matrices.
-_BLOCK = 24
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """The mesh of one frame: vertices (V, 3) m, their (V, 2) px, and what each pixel shows."""
+
+    vertices: np.ndarray
+    pixels: np.ndarray
+    faces: np.ndarray
+    #: (S, S) int32 nearest face, -1 where there is none.
+    face: np.ndarray
+    #: (S, S, 2) float32 barycentric coordinates.
+    mix: np.ndarray
+
+    @property
+    def inside(self) -> np.ndarray:
+        """(S, S) bool, where the mesh is."""
+        return np.asarray(self.face >= 0)
+
+    def mixed(self, values: np.ndarray) -> np.ndarray:
+        """Values of the vertices (V, C) at the pixels inside."""
+        inside = self.inside
+        return mix_corners(values, self.faces, self.face[inside], self.mix[inside])
+
+    def depth(self, outside: float) -> np.ndarray:
+        """(S, S) float32 m."""
+        depth = np.full(self.face.shape, outside, np.float32)
+        depth[self.inside] = self.mixed(self.vertices[:, 2:])[:, 0]
+        return depth
 
 
 @dataclass(frozen=True, eq=False)
 class Differences:
-    """A frame compared with what is expected of it, at P pixels; C channels.
+    """A frame compared with what is expected of it, at P pixels; C channels."""
 
-    Attributes:
-        face: (P,) the face that each pixel shows, or that is nearest to it.
-        mix: (P, 2) barycentric coordinates as `draw_faces` returns them.
-        error: (P, C) the frame less what is expected.
-        across: (P, C) how the picture changes to the right, by px of the images.
-        down: (P, C) the same downwards.
-        trust: (P,) weights.
-    """
-
+    #: (P,) the face that each pixel shows, or that is nearest to it.
     face: np.ndarray
+    #: (P, 2) barycentric coordinates as `draw_faces` returns them.
     mix: np.ndarray
+    #: (P, C) the frame less what is expected.
     error: np.ndarray
+    #: (P, C) how the picture changes to the right and downwards, by px of the images.
     across: np.ndarray
     down: np.ndarray
+    #: (P,) weights.
     trust: np.ndarray
 
 
-#: Curvature (51, 51) and slope (51,) of one frame.
-Quadratic = tuple[np.ndarray, np.ndarray]
+class SurfaceResidual(ABC):
+    """Difference of every frame from what its hand's surface should look like, in second order.
 
+    `rematch` collects the surface with the model as it is and linearises the difference of each
+    pixel. Within a round of descent the energy is then a quadratic function of the variables of
+    each frame, zero where it was linearised, which costs next to nothing.
 
-def no_quadratic() -> Quadratic:
-    """Return that of a frame that says nothing."""
-    return np.zeros((FRAME_VARIABLES,) * 2), np.zeros(FRAME_VARIABLES)
+    Args:
+        pictures: of the clip.
+        model: the clip.
+        weight: of the energy of as many pixels as the hand's size squared.
+    """
+
+    def __init__(self, pictures: HandPictures, model: ClipModel, weight: float) -> None:
+        self.pictures = pictures
+        self._faces = model.template.faces
+        #: Px of the images.
+        self._size = pictures.hand_size * pictures.ratio
+        # The energy of a whole hand is the same in images of any size.
+        self._weight = weight / self._size**2
+
+    @abstractmethod
+    def seen(self, frame: int, drawn: Drawn) -> Any:
+        """What a frame shows of the surface."""
+
+    @abstractmethod
+    def collect(self, frames: list[int], seen: Iterable[Any]) -> None:
+        """Join what the frames show."""
+
+    @abstractmethod
+    def differences(self, frame: int, drawn: Drawn) -> Differences | None:
+        """Compare a frame with what was collected; None if it says nothing."""
+
+    def draw(self, vertices: np.ndarray, pixels: np.ndarray) -> Drawn:
+        """Draw the mesh of a frame in its image."""
+        size = self.pictures.images.shape[1:3]
+        face, mix = draw_faces(pixels, vertices[:, 2], self._faces, (size[0], size[1]))
+        return Drawn(vertices, pixels, self._faces, face, mix)
+
+    def rematch(self, model: ClipModel) -> None:
+        """Collect the surface and linearise the differences, with the model as it is now."""
+        usable = self.pictures.frames
+        vertices, pixels = self.pictures.placed(model)
+        motion = SurfaceMotion(model)
+
+        # Each frame is drawn twice: all drawings together would need 1 MB for each frame.
+        def seen(frame: int) -> Any:
+            return self.seen(frame, self.draw(vertices[frame], pixels[frame]))
+
+        def linear(frame: int) -> tuple[np.ndarray, np.ndarray] | None:
+            found = self.differences(frame, self.draw(vertices[frame], pixels[frame]))
+            if found is None:
+                return None
+            return linearised(motion, frame, self._faces, found, self.pictures.ratio)
+
+        self.collect(usable, each_frame(seen, usable))
+        self._start = frame_variables(model.variables).detach().clone()
+        curvature = np.zeros((len(self._start), FRAME_VARIABLES, FRAME_VARIABLES))
+        slope = np.zeros((len(self._start), FRAME_VARIABLES))
+        for frame, found in zip(usable, each_frame(linear, usable), strict=True):
+            if found is not None:
+                curvature[frame], slope[frame] = found
+        self._curvature = torch.as_tensor(curvature, dtype=torch.float32)
+        self._slope = torch.as_tensor(slope, dtype=torch.float32)
+
+    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        """Return the energy, a scalar; zero where it was linearised."""
+        step = frame_variables(model.variables) - self._start
+        bent = (self._curvature @ step[..., None])[..., 0]
+        return self._weight * (step * (0.5 * bent + self._slope)).sum()
 
 
 def linearised(
     motion: SurfaceMotion, frame: int, faces: np.ndarray, found: Differences, ratio: float
-) -> Quadratic:
+) -> tuple[np.ndarray, np.ndarray]:
     """Differentiate half the weighed squared differences by the variables of their frame.
 
     A surface that moves by u takes its picture with it, so that a pixel gets less of what is
@@ -119,6 +209,9 @@ def linearised(
         faces: (T, 3) of the hand.
         found: the differences.
         ratio: px of the images to one px of the whole frame.
+
+    Returns:
+        Curvature (51, 51) and slope (51,).
     """
     shares = np.stack([1.0 - found.mix.sum(axis=1), found.mix[:, 0], found.mix[:, 1]], axis=1)
     corners = faces[found.face].ravel()
@@ -139,36 +232,6 @@ def linearised(
     return _summed(rates, weighed), np.einsum("pak,pa->k", rates, pull)
 
 
-class FrameQuadratic:
-    """An energy that is quadratic in the variables of each frame; zero where it was linearised.
-
-    Args:
-        model: the clip, as it is now.
-        usable: frames that count.
-        found: their curvatures and slopes, in this order.
-        weight: of the energy.
-    """
-
-    def __init__(
-        self, model: ClipModel, usable: Sequence[int], found: Iterable[Quadratic], weight: float
-    ) -> None:
-        self._weight = weight
-        self._start = frame_variables(model.variables).detach().clone()
-        frames = len(self._start)
-        curvature = np.zeros((frames, FRAME_VARIABLES, FRAME_VARIABLES))
-        slope = np.zeros((frames, FRAME_VARIABLES))
-        for frame, (bent, steep) in zip(usable, found, strict=True):
-            curvature[frame], slope[frame] = bent, steep
-        self._curvature = torch.as_tensor(curvature, dtype=torch.float32)
-        self._slope = torch.as_tensor(slope, dtype=torch.float32)
-
-    def __call__(self, model: ClipModel) -> torch.Tensor:
-        """Return the energy, a scalar."""
-        step = frame_variables(model.variables) - self._start
-        bent = (self._curvature @ step[..., None])[..., 0]
-        return self._weight * (step * (0.5 * bent + self._slope)).sum()
-
-
 def _summed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     """Sum over P and 2 of the products of (P, 2, K) and (P, 2, K): (K, K).
 
@@ -182,172 +245,139 @@ def _summed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
     return np.asarray((left.transpose(0, 2, 1) @ right).sum(axis=0))
 
 
-#: Pixels of a frame below which its texture says nothing.
-LEAST_PIXELS = 50
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame without its light, as the mesh lies in it."""
+
+    #: (S, S) bool, mesh and hand.
+    region: np.ndarray
+    #: (S, S) bool, region away from its border and from edges in depth.
+    core: np.ndarray
+    #: (S, S) float32 log grey, light and noise removed; zero outside of the region.
+    detail: np.ndarray
+    #: (S, S) float32 m; zero where no mesh is.
+    depth: np.ndarray
+    #: (T,) cosine of each face's angle to the viewer, 0 where it looks away.
+    facing: np.ndarray
 
 
-class TextureEnergy:
-    """Difference of each frame from the mean texture of all frames, to second order in the poses.
+class TextureResidual(SurfaceResidual):
+    """Difference of each frame from the mean texture of all frames.
 
-    `rematch` collects the texture with the model as it is and linearises the difference of each
-    pixel; within a round of descent the energy is then a quadratic function of the frame's
-    variables, which costs next to nothing. An outline cannot tell how a finger is turned about
-    its axis, or a palm about an axis in the image; wrinkles, nails and veins can.
-
-    Args:
-        pictures: of the clip.
-        settings: weights and scales.
-        model: the clip.
+    An outline cannot tell how a finger is turned about its axis, or a palm about an axis in the
+    image; wrinkles, nails and veins can.
     """
 
-    def __init__(self, pictures: HandPictures, settings: FitSettings, model: ClipModel) -> None:
-        self._pictures = pictures
-        size = pictures.hand_size * pictures.ratio
-        self._scale = settings.texture_scale
-        self._faces = model.template.faces
-        # The energy of a whole hand is the same in images of any size.
-        self._weight = settings.texture_weight / size**2
-        self.texture = SkinTexture(model.template, settings.light_breadth * size)
+    #: Weight, and difference of a pixel that is still normal, log grey.
+    WEIGHT, SCALE = 770.0, 0.06
+    # Changes wider than this share of the hand's size count as light, not as texture.
+    _LIGHT_BREADTH = 0.05
+    # Grey level added before the logarithm: noise of the dark pixels counts less.
+    _DARK = 8.0
+    # Pixels next to an outline, or next to an edge in depth, m, mix two surfaces.
+    _BORDER = np.ones((5, 5), np.uint8)
+    _DEPTH_EDGE = 0.012
 
-    def rematch(self, model: ClipModel) -> None:
-        """Collect the texture and linearise the differences, with the model as it is now."""
-        images, masks, usable = self._pictures.images, self._pictures.masks, self._pictures.frames
-        vertices, pixels = self._pictures.placed(model)
-        motion = SurfaceMotion(model)
+    def __init__(self, pictures: HandPictures, model: ClipModel) -> None:
+        super().__init__(pictures, model, self.WEIGHT)
+        self.texture = MeanTexture(model.template)
 
-        def view(frame: int) -> View:
-            return self.texture.view(images[frame], masks[frame], vertices[frame], pixels[frame])
+    def view(self, frame: int, drawn: Drawn) -> View:
+        """Take the light off a frame."""
+        inside, depth = drawn.inside, drawn.depth(0.0)
+        region = inside & (self.pictures.masks[frame] > 127)
+        nearest = cv2.erode(np.where(inside, depth, np.inf).astype(np.float32), self._BORDER)
+        core = cv2.erode(region.astype(np.uint8), self._BORDER) > 0
+        core &= cv2.dilate(depth, self._BORDER) - nearest <= self._DEPTH_EDGE
+        grey = cv2.cvtColor(self.pictures.images[frame], cv2.COLOR_RGB2GRAY)
+        logs = np.log(grey.astype(np.float32) + self._DARK)
+        detail = smooth_within(self._without_light(logs, region), region, 1.0)
+        return View(region, core, detail, depth, _facing(drawn.vertices, drawn.faces))
 
-        def seen(frame: int) -> tuple[np.ndarray, np.ndarray]:
-            return self.texture.seen(view(frame), vertices[frame], pixels[frame])
+    def seen(self, frame: int, drawn: Drawn) -> tuple[np.ndarray, np.ndarray]:
+        """Read a frame at each texel: (K,) log grey, and (K,) weights, zero where it is hidden."""
+        view, atlas = self.view(frame, drawn), self.texture.atlas
+        places = atlas.on_surface(drawn.pixels)
+        depths = atlas.on_surface(drawn.vertices[:, 2:])
+        facing = view.facing[atlas.face]
+        here = np.abs(sample(view.depth, places, cv2.INTER_NEAREST) - depths[:, 0]) < _SEEN
+        here &= (sample(view.core.astype(np.float32), places, cv2.INTER_NEAREST) > 0) & (
+            facing > _LEAST_FACING
+        )
+        return sample(view.detail, places), np.where(here, facing**2, 0.0)
 
-        for values, weights in each_frame(seen, usable):
+    def collect(self, frames: list[int], seen: Iterable[tuple[np.ndarray, np.ndarray]]) -> None:
+        """Form the mean texture."""
+        for values, weights in seen:
             self.texture.add(values, weights)
         self.texture.finish()
 
-        def linear(frame: int) -> Quadratic:
-            return self._linearised(motion, frame, view(frame))
+    def expected(self, view: View, drawn: Drawn) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the mean texture in a frame: (S, S) log grey, and (S, S) bool, whether it counts."""
+        inside = view.region
+        face = drawn.face[inside]
+        mean, known = np.zeros(inside.shape, np.float32), np.zeros(inside.shape, bool)
+        mean[inside], known[inside] = self.texture.expected(face, drawn.mix[inside])
+        known[inside] &= view.facing[face] > _LEAST_FACING
+        return mean, known & view.core
 
-        found = each_frame(linear, usable)
-        self._energy = FrameQuadratic(model, usable, found, self._weight)
-
-    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        """Return the energy, a scalar; zero where it was linearised."""
-        return self._energy(model)
-
-    def _linearised(self, motion: SurfaceMotion, frame: int, view: View) -> Quadratic:
-        """Curvature and slope of one frame, before the weight."""
-        expected, core = self.texture.expected(view)
-        if np.count_nonzero(core) < LEAST_PIXELS:
-            return no_quadratic()
-        error = self.texture.without_light(view.detail - expected, core)[core]
+    def differences(self, frame: int, drawn: Drawn) -> Differences | None:
+        """Compare a frame with the mean texture, light taken off both."""
+        view = self.view(frame, drawn)
+        expected, core = self.expected(view, drawn)
+        if np.count_nonzero(core) < _LEAST_PIXELS:
+            return None
+        error = self._without_light(view.detail - expected, core)[core]
         # The mean of both images' gradients makes the step of second order.
         # Benhimane and Malis, "Homography-based 2D visual tracking and servoing", 2007.
         both = view.detail + expected
         across, down = (
             cv2.Scharr(both, cv2.CV_32F, *axis)[core] / 64.0 for axis in ((1, 0), (0, 1))
         )
-        trust = 1.0 / (1.0 + (error / (2.0 * self._scale)) ** 2) ** 2 / self._scale**2
-        found = Differences(
-            face=view.face[core],
-            mix=view.mix[core],
-            error=error[:, None],
-            across=across[:, None],
-            down=down[:, None],
-            trust=trust,
-        )
-        return linearised(motion, frame, self._faces, found, self._pictures.ratio)
+        trust = 1.0 / (1.0 + (error / (2.0 * self.SCALE)) ** 2) ** 2 / self.SCALE**2
+        columns = (error[:, None], across[:, None], down[:, None])
+        return Differences(drawn.face[core], drawn.mix[core], *columns, trust)
+
+    def _without_light(self, values: np.ndarray, region: np.ndarray) -> np.ndarray:
+        """Subtract what changes over the breadth of light; zero outside of the region."""
+        light = smooth_within(values, region, self._LIGHT_BREADTH * self._size)
+        return np.where(region, values - light, 0.0).astype(np.float32)
 
 
-# Pixels next to a border mix two surfaces.
-_BORDER = np.ones((3, 3), np.uint8)
-# Both pictures are compared this far off hand and mask, too: their borders say where a hand ends.
-_REACH = np.ones((5, 5), np.uint8)
-# px, deviation of the Gaussian that both are smoothed by: a drawn border is a step.
-_SMOOTH = 1.0
-# m, how much deeper than the nearest surface a texel may lie and still be seen.
-_SEEN = 0.004
-# Cosine of the angle to the viewer from which a surface counts.
-_LEAST_FACING = 0.25
+class PictureResidual(SurfaceResidual):
+    """Difference of each frame from the hand drawn in its colours and light.
 
-
-@dataclass(frozen=True, eq=False)
-class _Drawn:
-    """A frame's mesh: nearest face (S, S), mix (S, S, 2), vertices' places, px, and normals."""
-
-    vertices: np.ndarray
-    pixels: np.ndarray
-    normals: np.ndarray
-    face: np.ndarray
-    mix: np.ndarray
-
-
-class PictureEnergy:
-    """Difference of each frame from the hand drawn in its colours and light, in second order.
-
-    `rematch` fits the colours with the model as it is, draws each frame with them, and linearises
-    the difference of each pixel. Unlike the texture's term it compares whole pictures: with what
-    is as broad as light, the borders of fingers before a palm, and the hand's own border, beyond
-    which both are black.
-
-    Args:
-        pictures: of the clip; around another hand nothing is compared.
-        settings: weight and scale.
-        model: the clip.
+    Unlike the texture it compares whole pictures: with what is as broad as light, the borders of
+    fingers before a palm, and the hand's own border, beyond which both are black. Around another
+    hand nothing is compared.
     """
 
-    def __init__(self, pictures: HandPictures, settings: FitSettings, model: ClipModel) -> None:
-        self._pictures = pictures
-        self._scale = settings.picture_scale
-        # The energy of a whole hand is the same in images of any size.
-        self._weight = settings.picture_weight / (pictures.hand_size * pictures.ratio) ** 2
-        self._faces = model.template.faces
+    #: Weight, and difference of a pixel that is still normal, sRGB in [0, 1].
+    WEIGHT, SCALE = 1000.0, 0.06
+    # Pixels next to a border mix two surfaces.
+    _BORDER = np.ones((3, 3), np.uint8)
+    # Both pictures are compared this far off hand and mask: their borders say where a hand ends.
+    _REACH = np.ones((5, 5), np.uint8)
+    # px, deviation of the Gaussian that both are smoothed by: a drawn border is a step.
+    _SMOOTH = 1.0
+
+    def __init__(self, pictures: HandPictures, model: ClipModel) -> None:
+        super().__init__(pictures, model, self.WEIGHT)
         self.texture = LitTexture(model.template, len(pictures.images))
 
-    def rematch(self, model: ClipModel) -> None:
-        """Fit the colours and linearise the differences, with the model as it is now."""
-        usable = self._pictures.frames
-        vertices, pixels = self._pictures.placed(model)
-        motion = SurfaceMotion(model)
-
-        # Each frame is drawn twice: all drawings together would need 1 MB for each frame.
-        def seen(frame: int) -> SeenTexels:
-            return self._seen(frame, self._draw(vertices[frame], pixels[frame]))
-
-        def linear(frame: int) -> Quadratic:
-            found = self._differences(frame, self._draw(vertices[frame], pixels[frame]))
-            if found is None:
-                return no_quadratic()
-            return linearised(motion, frame, self._faces, found, self._pictures.ratio)
-
-        if usable:
-            self.texture.fit(dict(zip(usable, each_frame(seen, usable), strict=True)))
-        self._energy = FrameQuadratic(model, usable, each_frame(linear, usable), self._weight)
-
-    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        """Return the energy, a scalar; zero where it was linearised."""
-        return self._energy(model)
-
-    def _draw(self, vertices: np.ndarray, pixels: np.ndarray) -> _Drawn:
-        size = self._pictures.images.shape[1:3]
-        face, mix = draw_faces(pixels, vertices[:, 2], self._faces, (size[0], size[1]))
-        faces = torch.as_tensor(self._faces, dtype=torch.int64)
-        normals = vertex_normals(torch.as_tensor(vertices), faces).numpy()
-        return _Drawn(vertices, pixels, normals, face, mix)
-
-    def _seen(self, frame: int, drawn: _Drawn) -> SeenTexels:
-        inside = drawn.face >= 0
-        depth = np.full(inside.shape, np.inf, np.float32)
-        depth[inside] = self._mixed(drawn.vertices[:, 2:], drawn, inside)[:, 0]
-        core = cv2.erode((inside & (self._pictures.masks[frame] > 127)).astype(np.float32), _BORDER)
+    def seen(self, frame: int, drawn: Drawn) -> SeenTexels:
+        """The texels that a frame shows from the front, away from borders."""
+        depth = drawn.depth(np.inf)
+        hand = drawn.inside & (self.pictures.masks[frame] > 127)
+        core = cv2.erode(hand.astype(np.float32), self._BORDER)
         atlas = self.texture.atlas
         places, points = atlas.on_surface(drawn.pixels), atlas.on_surface(drawn.vertices)
-        normals = _unit(atlas.on_surface(drawn.normals))
+        normals = _unit(atlas.on_surface(_normals(drawn)))
         facing = -row_products(normals, _unit(points))
-        nearest = sample(cv2.erode(depth, _BORDER), places, cv2.INTER_NEAREST)
+        nearest = sample(cv2.erode(depth, self._BORDER), places, cv2.INTER_NEAREST)
         here = (facing > _LEAST_FACING) & (np.abs(nearest - points[:, 2]) < _SEEN)
         shown = np.flatnonzero(here & (sample(core, places, cv2.INTER_NEAREST) > 0))
-        logs = np.log(self._pictures.images[frame].astype(np.float32) / 255.0 + DARK)
+        logs = np.log(self.pictures.images[frame].astype(np.float32) / 255.0 + LitTexture.DARK)
         return SeenTexels(
             texels=shown.astype(np.int32),
             logs=sample(logs, places[shown]),
@@ -355,43 +385,51 @@ class PictureEnergy:
             weights=facing[shown] ** 2,
         )
 
-    def _differences(self, frame: int, drawn: _Drawn) -> Differences | None:
-        inside = drawn.face >= 0
-        if np.count_nonzero(inside) < LEAST_PIXELS or not self._pictures.masks[frame].any():
+    def collect(self, frames: list[int], seen: Iterable[SeenTexels]) -> None:
+        """Fit colours and light."""
+        if frames:
+            self.texture.fit(dict(zip(frames, seen, strict=True)))
+
+    def differences(self, frame: int, drawn: Drawn) -> Differences | None:
+        """Compare a frame with the lit hand, both before black."""
+        inside, mask = drawn.inside, self.pictures.masks[frame]
+        if np.count_nonzero(inside) < _LEAST_PIXELS or not mask.any():
             return None
         expected = np.zeros((*inside.shape, 3), np.float32)
         known = np.zeros(inside.shape, np.float32)
+        normals = _unit(drawn.mixed(_normals(drawn)))
         expected[inside], known[inside] = self.texture.expected(
-            frame,
-            drawn.face[inside],
-            drawn.mix[inside],
-            _unit(self._mixed(drawn.normals, drawn, inside)),
+            frame, drawn.face[inside], drawn.mix[inside], normals
         )
-        coverage = self._pictures.masks[frame].astype(np.float32) / 255.0
-        image = self._pictures.images[frame].astype(np.float32) / 255.0 * coverage[..., None]
-        expected, image = (cv2.GaussianBlur(each, (0, 0), _SMOOTH) for each in (expected, image))
-        near = cv2.dilate((inside | (coverage > 0.5)).astype(np.uint8), _REACH) > 0
-        if self._pictures.other is not None:
-            near &= cv2.dilate(self._pictures.other[frame], _REACH) == 0
+        coverage = mask.astype(np.float32) / 255.0
+        image = self.pictures.images[frame].astype(np.float32) / 255.0 * coverage[..., None]
+        expected, image = (cv2.GaussianBlur(one, (0, 0), self._SMOOTH) for one in (expected, image))
+        near = cv2.dilate((inside | (coverage > 0.5)).astype(np.uint8), self._REACH) > 0
+        if self.pictures.other is not None:
+            near &= cv2.dilate(self.pictures.other[frame], self._REACH) == 0
         error = (image - expected)[near]
-        squared = row_products(error, error) / (3.0 * (2.0 * self._scale) ** 2)
+        squared = row_products(error, error) / (3.0 * (2.0 * self.SCALE) ** 2)
         # Pixels off the hand move as the nearest pixel on it: its border moves with it.
         nearest = _nearest(inside)[near]
-        trust = known.ravel()[nearest] / (1.0 + squared) ** 2 / self._scale**2
-        # The mean of both pictures' slopes, as in the texture's term.
+        trust = known.ravel()[nearest] / (1.0 + squared) ** 2 / self.SCALE**2
+        # The mean of both pictures' slopes, as for the texture.
         both = 0.5 * (image + expected)
         across, down = (cv2.Scharr(both, cv2.CV_32F, *axis) / 32.0 for axis in ((1, 0), (0, 1)))
-        return Differences(
-            face=drawn.face.ravel()[nearest],
-            mix=drawn.mix.reshape(-1, 2)[nearest],
-            error=error,
-            across=across[near],
-            down=down[near],
-            trust=trust,
-        )
+        place = (drawn.face.ravel()[nearest], drawn.mix.reshape(-1, 2)[nearest])
+        return Differences(*place, error, across[near], down[near], trust)
 
-    def _mixed(self, values: np.ndarray, drawn: _Drawn, inside: np.ndarray) -> np.ndarray:
-        return mix_corners(values, self._faces, drawn.face[inside], drawn.mix[inside])
+
+def _facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    normal = np.cross(second - first, third - first)
+    middle = first + second + third
+    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(middle, axis=1)
+    return np.asarray(np.maximum(-(normal * middle).sum(axis=1) / np.maximum(length, 1e-12), 0.0))
+
+
+def _normals(drawn: Drawn) -> np.ndarray:
+    faces = torch.as_tensor(drawn.faces, dtype=torch.int64)
+    return np.asarray(vertex_normals(torch.as_tensor(drawn.vertices), faces).numpy())
 
 
 def _nearest(inside: np.ndarray) -> np.ndarray:

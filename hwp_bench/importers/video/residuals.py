@@ -1,11 +1,15 @@
-"""Fit settings."""
+"""The residuals of the fit that need no pictures: landmarks, motion, anatomy, touch, and outlines.
+
+Each is a sum over frames of a robust function of an error over its scale, so that a scale is the
+size of an error that is still normal. The numbers stand at the residual that they belong to.
+"""
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import torch
 
@@ -14,101 +18,46 @@ from hwp_bench.hands.articulation import anatomical_limits, joint_limit_penalty
 from hwp_bench.hands.raster import draw_silhouette
 from hwp_bench.hands.skeleton import FINGERS, finger_joints, palm_directions, unit
 from hwp_bench.hands.topology import boundary_vertices
-from hwp_bench.importers.shared.frames import CropWindows, each_frame
+from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video.model import ClipModel, PosedClip, posed_vertices
+from hwp_bench.importers.video.texture import sample
+
+# --- Landmarks, motion, and what is known of hands
+
+#: Landmark error in the image, as a share of the hand's size in the image.
+IMAGE_SCALE = 0.012
+#: Error of centred world landmarks, m; the tracker's bones change by 5 mm between frames.
+WORLD_SCALE = 0.015
+# Weight of the world landmarks; they guide depth, the image decides the rest.
+_WORLD_WEIGHT = 0.5
+# Weight of the image landmarks in the first steps, relative to 1 of the world landmarks.
+_START_IMAGE_WEIGHT = 0.05
+# Acceleration of landmarks in space, m per (1/30 s)^2, and of joint angles, rad per (1/30 s)^2.
+_MOTION_SCALE, _TURNING_SCALE = 0.003, 0.06
+# Weight of both.
+_MOTION_WEIGHT = 0.3
+# Weight of the joint-limit penalty (rad^2 beyond the anatomical range).
+_LIMIT_WEIGHT = 300.0
+# Weight of the finger angles squared: it keeps undetermined angles near the rest pose.
+_POSE_WEIGHT = 0.02
+# Constant distance between the tracker's landmark and the model's joint, m.
+_OFFSET_SCALE = 0.004
+# Share of the frames that shape, offsets, scale and focal length priors weigh as much as: the
+# tracker's errors repeat from frame to frame, so a clip is worth far fewer views.
+_PRIOR_SHARE = 0.1
+# Uncertainty of the metres in the world landmarks, and of the default focal length (logs).
+_SIZE_SCALE, _FOCAL_SCALE = 0.05, 0.15
 
 
-@dataclass(frozen=True)
-class FitSettings:
-    """Weights and scales of the energy that `fit_clip` minimises.
-
-    Every term is a sum over frames of a robust function of residual / scale, so a scale is the
-    size of an error that is still normal.
-    """
-
-    #: Steps of Adam from the rigid start, with the world landmarks dominant.
-    start_steps: int = 150
-    #: Steps of Adam after that, on all landmarks, robust against outliers.
-    landmark_steps: int = 450
-    #: Steps of Adam in each round against the masks.
-    contour_steps: int = 120
-    #: Rounds after each cutting of masks: find the mesh's outline, pull it to the mask's outline.
-    contour_rounds: int = 3
-    #: Factor on the learning rates in those rounds: only corrections are left.
-    contour_rate: float = 0.3
-    #: Landmark error in the image, as a share of the hand's size in the image.
-    image_scale: float = 0.012
-    #: Error of centred world landmarks, m; the tracker's bones change by 5 mm between frames.
-    world_scale: float = 0.015
-    #: Weight of the world landmarks; they guide depth, the image decides the rest.
-    world_weight: float = 0.5
-    #: Weight of the image landmarks in the first steps, relative to 1 of the world landmarks.
-    start_image_weight: float = 0.05
-    #: Acceleration of landmarks in space, m per (1/30 s)^2.
-    motion_scale: float = 0.003
-    #: Acceleration of joint angles, rad per (1/30 s)^2.
-    turning_scale: float = 0.06
-    #: Weight of both smoothness terms.
-    motion_weight: float = 0.3
-    #: Weight of the joint-limit penalty (rad^2 beyond the anatomical range).
-    limit_weight: float = 300.0
-    #: Overlap of fingers with each other or the palm, m.
-    contact_scale: float = 0.003
-    #: Weight of that overlap.
-    contact_weight: float = 0.5
-    #: Weight of the finger angles squared: it keeps undetermined angles near the rest pose.
-    pose_weight: float = 0.02
-    #: Constant distance between the tracker's landmark and the model's joint, m.
-    offset_scale: float = 0.004
-    #: Share of the frames that shape, offsets, scale and focal length priors weigh as much as:
-    #: the tracker's errors repeat from frame to frame, so a clip is worth far fewer views.
-    prior_share: float = 0.1
-    #: Uncertainty of the metres in the world landmarks (log).
-    size_scale: float = 0.05
-    #: Uncertainty of the default focal length (log).
-    focal_scale: float = 0.15
-    #: Outline error in the image, as a share of the hand's size in the image.
-    contour_scale: float = 0.007
-    #: How far an outline vertex looks for the mask's outline, as a share of the hand's size.
-    contour_reach: float = 0.06
-    #: Weight of one outline vertex; neighbours agree, so each counts little.
-    contour_weight: float = 0.2
-    #: Weight of the texture, shared among as many pixels as the hand's size squared; 0 leaves it
-    #: out. It joins when the outline fits.
-    texture_weight: float = 770.0
-    #: Difference of a pixel from the clip's mean texture, log grey.
-    texture_scale: float = 0.06
-    #: Changes wider than this count as light, not as texture, as a share of the hand's size.
-    light_breadth: float = 0.05
-    #: Rounds after the outline's: draw the lit hand, lay it onto the frames.
-    picture_rounds: int = 6
-    #: Steps of Adam in each of them, at the rates of `contour_rate`.
-    picture_steps: int = 40
-    #: Weight of the whole picture, shared among as many pixels as the hand's size squared; 0
-    #: leaves it out.
-    picture_weight: float = 1000.0
-    #: Difference of a pixel from the drawn hand, sRGB in [0, 1].
-    picture_scale: float = 0.06
-
-
-#: Share of the radii that counts: skin and flesh give way.
-FIRMNESS = 0.85
-# Slices along each finger segment and along each metacarpal.
-_FINGER_SLICES = 2
-_PALM_SLICES = 3
-# A sphere of fewer vertices does not measure thickness.
-_LEAST_VERTICES = 4
-
-
-class LandmarkEnergy:
+class LandmarkResidual:
     """Everything that does not need the images: landmarks, smoothness, anatomy, priors.
 
     Args:
         landmarks: of the clip; frames without a detection count only in the other terms.
         model: the clip.
-        settings: weights and scales.
-        fps: frames per second; the smoothness scales are per (1/30 s)^2.
+        fps: frames per second; None where the frames are far apart, so that motion between them
+            is not smooth.
         default_focal: px, the focal length that the prior favours; None = it is known.
     """
 
@@ -116,28 +65,25 @@ class LandmarkEnergy:
         self,
         landmarks: Landmarks,
         model: ClipModel,
-        settings: FitSettings,
-        fps: float,
+        fps: float | None,
         default_focal: float | None,
     ) -> None:
-        self.settings = settings
         self.default_focal = default_focal
         self.image = torch.as_tensor(landmarks.image, dtype=torch.float32)
         self.weight = torch.as_tensor(
             np.where(landmarks.detected, landmarks.score, 0.0), dtype=torch.float32
         )[:, None]
         self.world = model.world - model.world.mean(dim=1, keepdim=True)
-        self.hand_size = hand_size(landmarks)
+        self.image_scale = IMAGE_SCALE * landmarks.hand_size
         self.limits = anatomical_limits(model.template)
-        self.contact = ContactEnergy(model.template, settings.contact_scale)
-        self.pace = (30.0 / fps) ** 2
-        self.prior = settings.prior_share * float(landmarks.detected.sum())
+        self.contact = ContactResidual(model.template)
+        self.pace = None if fps is None else (30.0 / fps) ** 2
+        self.prior = _PRIOR_SHARE * float(landmarks.detected.sum())
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy, a scalar."""
-        image = geman_mcclure(self._image_error(model, posed))
-        data = (self.weight * image).sum() + self.settings.world_weight * self._world(model, posed)
-        return data + self._rest(model, posed)
+        image = (self.weight * geman_mcclure(self._image_error(model, posed))).sum()
+        return image + _WORLD_WEIGHT * self._world(model, posed) + self._rest(model, posed)
 
     def from_afar(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy for the first steps, when most fingers are bent wrongly.
@@ -145,60 +91,51 @@ class LandmarkEnergy:
         The world landmarks dominate, because only they show in which direction a finger bends. The
         image landmarks only place the hand.
         """
-        settings = self.settings
         image = (self.weight * charbonnier(self._image_error(model, posed))).sum()
-        data = settings.start_image_weight * image + self._world(model, posed)
-        return data + self._rest(model, posed)
+        return _START_IMAGE_WEIGHT * image + self._world(model, posed) + self._rest(model, posed)
 
-    def trust(self, weights: np.ndarray) -> None:
+    def weaken(self, weights: np.ndarray) -> None:
         """Multiply the weights of landmarks by (F, 21) numbers: some are hidden."""
         self.weight = self.weight * torch.as_tensor(weights, dtype=torch.float32)
 
     def _image_error(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        scale = self.settings.image_scale * self.hand_size
-        return (((model.pixels(posed.landmarks) - self.image) / scale) ** 2).sum(dim=-1)
+        return (((model.pixels(posed.landmarks) - self.image) / self.image_scale) ** 2).sum(dim=-1)
 
     def _world(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         # Compared at the tracker's own scale: measured at the hand's, a hand that shrinks to
         # nothing would fit best.
         centred = posed.landmarks - posed.landmarks.mean(dim=1, keepdim=True)
         error = centred * torch.exp(-model.variables.log_size) - self.world
-        squared = ((error / self.settings.world_scale) ** 2).sum(dim=-1)
+        squared = ((error / WORLD_SCALE) ** 2).sum(dim=-1)
         return (self.weight * charbonnier(squared)).sum()
 
     def _rest(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         return self._motion(model, posed) + self._priors(model, posed)
 
     def _motion(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        settings = self.settings
         energy = posed.landmarks.new_zeros(())
+        if self.pace is None:
+            return energy
         for track, scale in (
-            (posed.landmarks, settings.motion_scale),
-            (model.variables.fingers, settings.turning_scale),
+            (posed.landmarks, _MOTION_SCALE),
+            (model.variables.fingers, _TURNING_SCALE),
         ):
             if len(track) > 2:
                 bend = (track[2:] - 2.0 * track[1:-1] + track[:-2]) / (scale * self.pace)
                 energy = energy + charbonnier((bend**2).sum(dim=-1)).sum()
-        return settings.motion_weight * energy
+        return _MOTION_WEIGHT * energy
 
     def _priors(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
-        settings, free = self.settings, model.variables
-        anatomy = settings.limit_weight * joint_limit_penalty(posed.pose, self.limits).sum()
-        anatomy = anatomy + settings.contact_weight * self.contact(model, posed)
-        anatomy = anatomy + settings.pose_weight * (free.fingers**2).sum()
-        constant = (free.betas**2).sum()
-        constant = constant + ((free.offsets / settings.offset_scale) ** 2).sum()
-        constant = constant + (free.log_size / settings.size_scale) ** 2
+        free = model.variables
+        anatomy = _LIMIT_WEIGHT * joint_limit_penalty(posed.pose, self.limits).sum()
+        anatomy = anatomy + self.contact(model, posed)
+        anatomy = anatomy + _POSE_WEIGHT * (free.fingers**2).sum()
+        constant = (free.betas**2).sum() + ((free.offsets / _OFFSET_SCALE) ** 2).sum()
+        constant = constant + (free.log_size / _SIZE_SCALE) ** 2
         if self.default_focal is not None:
-            focal = (free.log_focal - float(np.log(self.default_focal))) / settings.focal_scale
+            focal = (free.log_focal - float(np.log(self.default_focal))) / _FOCAL_SCALE
             constant = constant + focal**2
         return anatomy + 0.5 * self.prior * constant
-
-
-def hand_size(landmarks: Landmarks) -> float:
-    """Median over the frames of the larger side of the landmarks' box, px."""
-    pixels = landmarks.image[landmarks.detected]
-    return float(np.median((pixels.max(axis=1) - pixels.min(axis=1)).max(axis=1)))
 
 
 def geman_mcclure(squared: torch.Tensor, turn: float = 2.0) -> torch.Tensor:
@@ -218,15 +155,22 @@ def charbonnier(squared: torch.Tensor) -> torch.Tensor:
     return 2.0 * (torch.sqrt(1.0 + squared) - 1.0)
 
 
-class ContactEnergy:
-    """Squared overlap of the spheres of one hand.
+# --- Fingers in fingers
 
-    Args:
-        template: the hand.
-        scale: m, an overlap that is still ordinary.
-    """
+#: Share of the radii that counts: skin and flesh give way.
+FIRMNESS = 0.85
+# Overlap of fingers with each other or the palm that is still ordinary, m; and its weight.
+_CONTACT_SCALE, _CONTACT_WEIGHT = 0.003, 0.5
+# Slices along each finger segment and along each metacarpal.
+_FINGER_SLICES, _PALM_SLICES = 2, 3
+# A sphere of fewer vertices does not measure thickness.
+_LEAST_VERTICES = 4
 
-    def __init__(self, template: HandTemplate, scale: float) -> None:
+
+class ContactResidual:
+    """Squared overlap of spheres in a hand."""
+
+    def __init__(self, template: HandTemplate) -> None:
         spheres = template_spheres(template)
         pairs, distance = touching_pairs(spheres)
         self.centres = torch.as_tensor(spheres.centres, dtype=torch.float32)
@@ -235,7 +179,6 @@ class ContactEnergy:
         least = np.zeros((len(spheres.radii),) * 2)
         least[tuple(pairs.T)] = distance
         self.least = torch.as_tensor(least, dtype=torch.float32)
-        self.scale = scale
 
     def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
         """Return the energy, a scalar."""
@@ -250,28 +193,25 @@ class ContactEnergy:
         apart = places[frame, first] - places[frame, second]
         # A tiny length keeps the root's gradient finite for centres that meet.
         length = torch.sqrt((apart**2).sum(dim=-1) + 1e-10)
-        overlap = (self.least[first, second] - length).clamp(min=0.0) / self.scale
-        return (overlap**2).sum()
+        overlap = (self.least[first, second] - length).clamp(min=0.0) / _CONTACT_SCALE
+        return _CONTACT_WEIGHT * (overlap**2).sum()
 
 
 @dataclass(frozen=True, eq=False)
 class Spheres:
-    """Spheres inside a template, each moving with one joint.
+    """Spheres inside a template, each moving with one joint."""
 
-    Attributes:
-        centres: (K, 3) m, rest place; the mean of the vertices around it.
-        basis: (K, 3, 10) m per unit of shape.
-        radii: (K,) m.
-        joints: (K,) int64.
-        fingers: (K,) int64, index into `FINGERS`, or -1 in the palm.
-        segments: (K,) int64, 0 to 2 from a finger's base; 0 in the palm.
-    """
-
+    #: (K, 3) m, rest place; the mean of the vertices around it.
     centres: np.ndarray
+    #: (K, 3, 10) m per unit of shape.
     basis: np.ndarray
+    #: (K,) m.
     radii: np.ndarray
+    #: (K,) int64.
     joints: np.ndarray
+    #: (K,) int64, index into `FINGERS`, or -1 in the palm.
     fingers: np.ndarray
+    #: (K,) int64, 0 to 2 from a finger's base; 0 in the palm.
     segments: np.ndarray
 
 
@@ -291,27 +231,21 @@ def template_spheres(template: HandTemplate) -> Spheres:
                 radial = radial - np.outer(radial @ axis, axis)
                 radius = float(np.linalg.norm(radial, axis=1).mean())
                 found.append((part, radius, joint, finger, segment))
-    found += _palm_spheres(template, np.flatnonzero(owner == 0))
-    parts = [part for part, *_ in found]
+    found += [(*sphere, 0, -1, 0) for sphere in _palm_spheres(template, owner == 0)]
+    parts, radii, joints, fingers, segments = zip(*found, strict=True)
     return Spheres(
-        centres=np.stack([template.vertices[part].mean(axis=0) for part in parts]),
-        basis=np.stack([template.shape_basis[part].mean(axis=0) for part in parts]),
-        radii=np.array([radius for _, radius, *_ in found]),
-        joints=np.array([joint for _, _, joint, _, _ in found]),
-        fingers=np.array([finger for *_, finger, _ in found]),
-        segments=np.array([segment for *_, segment in found]),
+        np.stack([template.vertices[part].mean(axis=0) for part in parts]),
+        np.stack([template.shape_basis[part].mean(axis=0) for part in parts]),
+        *(np.array(column) for column in (radii, joints, fingers, segments)),
     )
 
 
 def touching_pairs(spheres: Spheres) -> tuple[np.ndarray, np.ndarray]:
-    """Choose the pairs that must not overlap.
+    """Choose the pairs that must not overlap: (P, 2) int64, and (P,) m, their least distance.
 
     Left out are neighbours: spheres of one finger, a finger's first segment with the palm, and
-    the first segments of two fingers.
-
-    Returns:
-        (P, 2) int64 pairs, and (P,) m, the least distance: the firm part of both radii, or the
-        distance at rest where that is smaller.
+    the first segments of two fingers. The least distance is the firm part of both radii, or the
+    distance at rest where that is smaller.
     """
     first, second = np.triu_indices(len(spheres.radii), k=1)
     base = spheres.segments == 0
@@ -322,10 +256,9 @@ def touching_pairs(spheres: Spheres) -> tuple[np.ndarray, np.ndarray]:
     return np.stack([first, second], axis=1), np.minimum(firm, rest)
 
 
-def _palm_spheres(
-    template: HandTemplate, members: np.ndarray
-) -> list[tuple[np.ndarray, float, int, int, int]]:
+def _palm_spheres(template: HandTemplate, palm: np.ndarray) -> list[tuple[np.ndarray, float]]:
     """Slices along the four metacarpals; the radius is half the palm's thickness there."""
+    members = np.flatnonzero(palm)
     wrist = template.joints[0]
     knuckles = template.joints[[finger_joints(name)[0] for name in FINGERS[1:]]]
     across = palm_directions(template.joints, template.side).palmar
@@ -340,8 +273,7 @@ def _palm_spheres(
         mine = (nearest == ray) & (along > 0.2)
         for part in _slices(members[mine], along[mine], _PALM_SLICES):
             height = template.vertices[part] @ across
-            radius = float(np.abs(height - height.mean()).mean())
-            found.append((part, radius, 0, -1, 0))
+            found.append((part, float(np.abs(height - height.mean()).mean())))
     return found
 
 
@@ -354,18 +286,26 @@ def _slices(members: np.ndarray, along: np.ndarray, count: int) -> list[np.ndarr
     return [part for part in parts if len(part) >= _LEAST_VERTICES]
 
 
+# --- Outlines
+
 #: Edge of the images in which outlines are compared, px; distances interpolate well, so less
 #: than the crop's resolution is enough.
 FIELD_SIZE = 192
-#: Outline vertices of each frame.
-OUTLINE_COUNT = 200
-#: Vertices of the outline lie at most this far inside the silhouette, px of the field.
-OUTLINE_WITHIN = 1.6
+#: How far an outline vertex looks for the mask's outline, as a share of the hand's size.
+REACH = 0.06
+# Outline error in the image, as a share of the hand's size in the image.
+_OUTLINE_SCALE = 0.007
+# Weight of one outline vertex; neighbours agree, so each counts little.
+_OUTLINE_WEIGHT = 0.2
+# Outline vertices of each frame.
+_OUTLINE_COUNT = 200
+# Vertices of the outline lie at most this far inside the silhouette, px of the field.
+_OUTLINE_WITHIN = 1.6
 # Step of the search along a normal, px of the field.
 _STEP = 0.5
 
 
-class ContourEnergy:
+class OutlineResidual:
     """Robust distance of outline vertices from the mask's outline, along their normals.
 
     The vertices and their targets are chosen by `rematch` between rounds of descent
@@ -377,7 +317,6 @@ class ContourEnergy:
             `signed_distance`; zero fields have no effect.
         usable: (F,) bool, frames that count.
         windows: where the fields lie in the whole frame.
-        settings: weights and scales.
         hand_size: size of the hand in the whole frame, px.
         ignored: (F, FIELD_SIZE, FIELD_SIZE) bool, where the mask's outline is not this hand's: skin
             meets skin there; None where nothing is.
@@ -388,7 +327,6 @@ class ContourEnergy:
         fields: np.ndarray,
         usable: np.ndarray,
         windows: CropWindows,
-        settings: FitSettings,
         hand_size: float,
         ignored: np.ndarray | None = None,
     ) -> None:
@@ -397,11 +335,10 @@ class ContourEnergy:
         self.usable = np.asarray(usable) & (np.abs(fields).max(axis=(1, 2)) > 0)
         self.ratio = FIELD_SIZE / windows.side
         self.corners = torch.as_tensor(windows.corners, dtype=torch.float32)[:, None]
-        self.scale = settings.contour_scale * hand_size * self.ratio
-        self.reach = settings.contour_reach * hand_size * self.ratio
-        self.weight = settings.contour_weight
+        self.scale = _OUTLINE_SCALE * hand_size * self.ratio
+        self.reach = REACH * hand_size * self.ratio
 
-    def rematch(self, model: ClipModel, update: Callable[[int], None] | None = None) -> None:
+    def rematch(self, model: ClipModel) -> None:
         """Choose the outline vertices of the model as it is now, and their targets."""
         faces = model.template.faces
         candidates = np.setdiff1d(np.arange(len(model.template.vertices)), boundary_vertices(faces))
@@ -414,14 +351,11 @@ class ContourEnergy:
                 return Outline.nothing()
             usable = candidates
             if self.ignored is not None:
-                usable = candidates[~_marked(self.ignored[frame], pixels[frame][candidates])]
+                rows, columns, inside = cells(pixels[frame][candidates], self.ignored[frame].shape)
+                usable = candidates[~(inside & self.ignored[frame][rows, columns])]
             return match_outline(pixels[frame], faces, usable, self.fields[frame], self.reach)
 
-        matches = []
-        for found in each_frame(match, range(len(self.usable))):
-            matches.append(found)
-            if update is not None:
-                update(len(matches))
+        matches = list(each_frame(match, range(len(self.usable))))
         self.normal = torch.as_tensor(np.stack([match.normal for match in matches]))
         self.target = torch.as_tensor(np.stack([match.target for match in matches]))
         self.outline = model.choose(torch.as_tensor(np.stack([match.index for match in matches])))
@@ -431,7 +365,7 @@ class ContourEnergy:
         pixels = self._in_field(model.pixels(model.vertices(posed, self.outline)))
         # A vertex without a match has a zero normal and a zero target.
         distance = (pixels * self.normal).sum(dim=-1) - self.target
-        return self.weight * geman_mcclure((distance / self.scale) ** 2, turn=4.0).sum()
+        return _OUTLINE_WEIGHT * geman_mcclure((distance / self.scale) ** 2, turn=4.0).sum()
 
     def _in_field(self, pixels: torch.Tensor) -> torch.Tensor:
         return (pixels - self.corners) * self.ratio
@@ -439,39 +373,33 @@ class ContourEnergy:
 
 @dataclass(frozen=True, eq=False)
 class Outline:
-    """Outline vertices of one frame and the line that each is pulled to: normal . pixel = target.
+    """N outline vertices of one frame and the line that each is pulled to: normal . pixel = target.
 
-    Attributes:
-        index: (OUTLINE_COUNT,) int64 vertices.
-        normal: (OUTLINE_COUNT, 2) float32, outward unit normals; zero where nothing matched.
-        target: (OUTLINE_COUNT,) float32, px of the field; zero where nothing matched.
+    Where nothing matched, normal and target are zero.
     """
 
+    #: (N,) int64 vertices.
     index: np.ndarray
+    #: (N, 2) float32, outward unit normals.
     normal: np.ndarray
+    #: (N,) float32, px of the field.
     target: np.ndarray
 
     @classmethod
     def nothing(cls) -> Outline:
         """Return an outline that pulls nothing."""
         return cls(
-            np.zeros(OUTLINE_COUNT, dtype=np.int64),
-            np.zeros((OUTLINE_COUNT, 2), dtype=np.float32),
-            np.zeros(OUTLINE_COUNT, dtype=np.float32),
+            np.zeros(_OUTLINE_COUNT, dtype=np.int64),
+            np.zeros((_OUTLINE_COUNT, 2), dtype=np.float32),
+            np.zeros(_OUTLINE_COUNT, dtype=np.float32),
         )
 
 
 def signed_distance(mask: np.ndarray) -> np.ndarray:
-    """Distance to the outline of a mask, positive outside.
+    """Distance to the outline of a mask (S, S) uint8, positive outside.
 
-    Args:
-        mask: (S, S) uint8, 255 inside.
-
-    Returns:
-        (FIELD_SIZE, FIELD_SIZE) float16 in px of the field; zeros where the mask has no outline.
+    (FIELD_SIZE, FIELD_SIZE) float16 in px of the field; zeros where the mask has no outline.
     """
-    import cv2
-
     small = cv2.resize(mask, (FIELD_SIZE, FIELD_SIZE), interpolation=cv2.INTER_AREA)
     inside = (small >= 128).astype(np.uint8)
     if inside.all() or not inside.any():
@@ -498,7 +426,9 @@ def match_outline(
         field: (FIELD_SIZE, FIELD_SIZE) signed distance of the mask.
         reach: how far to look, px of the field.
     """
-    import cv2
+
+    def read(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+        return sample(image, at, border=cv2.BORDER_REPLICATE)
 
     own = signed_distance(draw_silhouette(pixels, faces, FIELD_SIZE)).astype(np.float32)
     if not own.any():
@@ -507,13 +437,13 @@ def match_outline(
     places = pixels[chosen].astype(np.float32)
     smooth = cv2.GaussianBlur(own, (0, 0), 1.0)
     gradient = np.stack(
-        [_sample(cv2.Sobel(smooth, cv2.CV_32F, *axis), places) for axis in ((1, 0), (0, 1))], axis=1
+        [read(cv2.Sobel(smooth, cv2.CV_32F, *axis), places) for axis in ((1, 0), (0, 1))], axis=1
     )
     length = np.linalg.norm(gradient, axis=1, keepdims=True)
     normals = gradient / np.maximum(length, 1e-6)
     steps = np.arange(-reach, reach + _STEP, _STEP, dtype=np.float32)
     along = places[:, None] + normals[:, None] * steps[:, None]
-    values = _sample(field.astype(np.float32), along.reshape(-1, 2)).reshape(len(chosen), -1)
+    values = read(field.astype(np.float32), along.reshape(-1, 2)).reshape(len(chosen), -1)
     leaves = (values[:, :-1] <= 0) & (values[:, 1:] > 0)
     middle = np.abs(steps[:-1] + 0.5 * _STEP)
     best = np.where(leaves, middle, np.inf).argmin(axis=1)
@@ -522,7 +452,7 @@ def match_outline(
     before, after = values[rows, best], values[rows, best + 1]
     crossing = steps[best] + _STEP * before / np.minimum(before - after, -1e-6)
     # A vertex that lies inside the mesh's own outline is to stay as far inside the mask's.
-    offset = crossing + _sample(own, places)
+    offset = crossing + read(own, places)
     outline = Outline.nothing()
     count = len(chosen)
     outline.index[:count] = chosen
@@ -531,28 +461,10 @@ def match_outline(
     return outline
 
 
-def _marked(area: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Whether places (P, 2) px lie in a (S, S) bool area; outside of the image none does."""
-    cell = np.floor(places)
-    inside = ((cell >= 0) & (cell < len(area))).all(axis=1)
-    column, row = np.clip(cell, 0, len(area) - 1).astype(np.int64).T
-    return np.asarray(inside & area[row, column])
-
-
 def _on_outline(pixels: np.ndarray, own: np.ndarray, candidates: np.ndarray) -> np.ndarray:
-    """Candidates near the outline, at most OUTLINE_COUNT, evenly thinned."""
-    cell = np.floor(pixels[candidates])
-    inside = ((cell >= 0) & (cell < FIELD_SIZE)).all(axis=1)
-    column, row = np.clip(cell, 0, FIELD_SIZE - 1).astype(np.int64).T
-    chosen = candidates[inside & (own[row, column] >= -OUTLINE_WITHIN)]
-    if len(chosen) > OUTLINE_COUNT:
-        chosen = chosen[np.linspace(0, len(chosen) - 1, OUTLINE_COUNT).astype(np.int64)]
+    """Candidates near the outline, at most _OUTLINE_COUNT, evenly thinned."""
+    rows, columns, inside = cells(pixels[candidates], own.shape)
+    chosen = candidates[inside & (own[rows, columns] >= -_OUTLINE_WITHIN)]
+    if len(chosen) > _OUTLINE_COUNT:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, _OUTLINE_COUNT).astype(np.int64)]
     return chosen
-
-
-def _sample(image: np.ndarray, places: np.ndarray) -> np.ndarray:
-    """Bilinear samples (P,) at (P, 2) px, pixel centres at +0.5, the border repeated."""
-    import cv2
-
-    x, y = (places[:, axis, None].astype(np.float32) - 0.5 for axis in (0, 1))
-    return cv2.remap(image, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[:, 0]

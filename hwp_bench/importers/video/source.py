@@ -1,4 +1,11 @@
-"""Import choices."""
+"""The inputs of a video import: what a person chooses, what is read, and whether it fits together.
+
+Landmarks of another convention are numbers like all others: a fit to them runs for minutes and
+follows no frame. Three things tell beforehand. The joints of a hand are near each other along its
+fingers, in one order only. Its landmarks in the image look like its landmarks in space, seen from
+the front. And skin has other colours than what is around it, so that landmarks that lie on a hand
+separate the colours on them from those around them better than any that lie elsewhere.
+"""
 
 from __future__ import annotations
 
@@ -7,6 +14,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from hwp_bench.base.errors import BadInput, UsageError
@@ -15,31 +23,38 @@ from hwp_bench.base.progress import notice, progress
 from hwp_bench.base.records import MAX_TEXT
 from hwp_bench.base.text import has_odd_characters
 from hwp_bench.capture.schema import MAX_FRAMES
-from hwp_bench.importers.shared.frames import CropWindows, follow_hands
+from hwp_bench.importers.shared.frames import CropWindows, cells, follow_hands
 from hwp_bench.importers.shared.landmarks import (
     LANDMARK_EDGES,
+    Association,
     Landmarks,
     check_against_video,
     read_association,
     read_hand_tracks,
     read_landmarks,
-    tracked_sides,
-    tracked_votes,
 )
 from hwp_bench.importers.video.decode import (
     ClipImages,
     FrameRange,
     Reading,
     VideoInfo,
-    check_memory,
     probe,
     read_frames,
     read_images,
     read_masks,
     warn_of_damage,
+    working_size,
 )
-from hwp_bench.importers.video.residuals import FitSettings
-from hwp_bench.importers.video.solve import Footage, side_scores, warn_of_contradiction
+from hwp_bench.importers.video.residuals import FIELD_SIZE
+from hwp_bench.importers.video.solve import (
+    FitSettings,
+    Footage,
+    side_scores,
+    warn_of_contradiction,
+)
+
+#: Sides of two hands, in the order in which a capture has them.
+BOTH = ("right", "left")
 
 #: The hands that can be asked for, as the person sees them; `auto` is what the landmarks show.
 CHOICES = ("auto", "right", "left", "both")
@@ -109,36 +124,27 @@ class VideoImport:
         return self.id or Path(out).absolute().name
 
 
-#: Sides of two hands, in the order in which a capture has them.
-BOTH = ("right", "left")
-
-
 @dataclass(frozen=True, eq=False)
 class VideoSource:
-    """The inputs of an import.
-
-    Attributes:
-        video: the probed video.
-        landmarks_path: the tracker's file.
-        indices: (F,) frame numbers in the video.
-        hands: landmarks of those frames by side, the hand that is detected most first.
-        windows: where the hands are.
-        images: the frames.
-        own_masks: (F, S, S) uint8 or None.
-        swaps: how often the tracker had exchanged two hands, over the whole video.
-        doubles: number of frames in which it had put both on one hand.
-        reading: what came of reading the video to its end; None where a part was read.
-    """
+    """The inputs of an import."""
 
     video: VideoInfo
+    #: The tracker's file.
     landmarks_path: Path
+    #: (F,) frame numbers in the video.
     indices: np.ndarray
+    #: Landmarks of those frames by side, the hand that is detected most first.
     hands: Mapping[str, Landmarks]
+    #: Where the hands are.
     windows: CropWindows
     images: ClipImages
+    #: (F, S, S) uint8 or None.
     own_masks: np.ndarray | None
+    #: How often the tracker had exchanged two hands, over the whole video.
     swaps: int = 0
+    #: Number of frames in which it had put both on one hand.
     doubles: int = 0
+    #: What came of reading the video to its end; None where a part was read.
     reading: Reading | None = None
 
     @property
@@ -155,20 +161,16 @@ class VideoSource:
 def read_source(
     video: str | os.PathLike[str], landmarks: str | os.PathLike[str], options: VideoImport
 ) -> VideoSource:
-    """Read and check everything that the import needs from outside.
-
-    Raises:
-        BadInput: one of the files is unusable; file and field are named.
-        UsageError: an option makes no sense for these files.
-    """
+    """Read and check everything that the import needs from outside."""
     info = probe(video)
-    every = _read_hands(landmarks, options)
+    tracked = read_association(landmarks)
+    every = _read_hands(landmarks, tracked, options)
     # Containers may state a wrong number of frames. A whole video is counted as it is decoded.
     # The end of a part is never read, so the header is trusted.
     part = options.frames.stop is not None
     count = len(next(iter(every.values())).score)
     total = info.stated_frames if part and info.stated_frames else count
-    tracked = {
+    checked = {
         side: check_against_video(hand, total, info.width, info.height, landmarks)
         for side, hand in every.items()
     }
@@ -178,16 +180,23 @@ def read_source(
             f"{len(indices)} of {total} frames are selected, a capture has 3 to {MAX_FRAMES}",
             field="--frames",
         )
-    selected = {side: hand.select(indices) for side, hand in tracked.items()}
+    selected = {side: hand.select(indices) for side, hand in checked.items()}
     seen = {side: hand for side, hand in selected.items() if hand.detected.any()}
     if not seen:
         raise UsageError("no hand is detected in the selected frames", field="--frames")
     for side in selected.keys() - seen.keys():
         notice(f"The {side} hand is in none of the selected frames and is left out.")
     footage = Footage(info.width, info.height, info.fps / options.frames.stride, options.focal)
-    hands = _checked_sides(seen, landmarks, options, footage)
+    # The pictures are asked which hands they show, before minutes of work.
+    hands = {}
+    for given, hand in seen.items():
+        scores = side_scores(hand, options.hand_model, footage)
+        if given is not None:
+            votes = None if tracked is None else tracked.votes(given)
+            warn_of_contradiction(given, scores, votes, stated=options.side in BOTH)
+        hands[given or scores.better] = hand
     windows = follow_hands(list(hands.values()), footage.fps, options.size)
-    check_memory(windows)
+    _check_memory(windows)
     own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
     endings: list[Reading] = []
     with progress("reading frames", len(indices)) as update:
@@ -195,20 +204,22 @@ def read_source(
     reading = endings[0] if endings else None
     if reading is not None:
         warn_of_damage(info, reading)
-    found = read_association(landmarks) if len(hands) == 2 else None
-    repaired = (0, 0) if found is None else (found.swaps, found.doubles)
+    two = tracked is not None and len(hands) == 2
+    repaired = (tracked.swaps, tracked.doubles) if tracked is not None and two else (0, 0)
     return VideoSource(
         info, Path(landmarks), indices, hands, windows, images, own, *repaired, reading
     )
 
 
-def _read_hands(path: str | os.PathLike[str], options: VideoImport) -> dict[str | None, Landmarks]:
+def _read_hands(
+    path: str | os.PathLike[str], tracked: Association | None, options: VideoImport
+) -> dict[str | None, Landmarks]:
     """Landmarks by side; the key is None where the file says nothing of it and nobody else."""
     sides: tuple[str | None, ...]
     if options.side in BOTH:
         sides = (options.side,)
     else:
-        sides = tracked_sides(path) or (None,)
+        sides = (None,) if tracked is None else tracked.sides
         if options.side == "both" and len(sides) < 2:
             raise BadInput(
                 "has landmarks of one hand",
@@ -219,22 +230,24 @@ def _read_hands(path: str | os.PathLike[str], options: VideoImport) -> dict[str 
     return {side: read_landmarks(path, min_score=options.min_score, side=side) for side in sides}
 
 
-def _checked_sides(
-    hands: Mapping[str | None, Landmarks],
-    path: str | os.PathLike[str],
-    options: VideoImport,
-    footage: Footage,
-) -> dict[str, Landmarks]:
-    """Ask the pictures which hands they show, before minutes of work."""
-    checked = {}
-    for side, hand in hands.items():
-        scores = side_scores(hand, options.hand_model, footage)
-        if side is not None:
-            votes = tracked_votes(path, side)
-            warn_of_contradiction(side, scores, votes, stated=options.side in BOTH)
-        checked[side or scores.better] = hand
-    return checked
+def _check_memory(windows: CropWindows) -> None:
+    """Refuse a clip that would not fit into memory, before minutes of work."""
+    import psutil
 
+    edge = working_size(windows)
+    # Colours at both resolutions, the mask, the distance field, and the posed vertices.
+    each = 3 * edge**2 + 4 * windows.size**2 + 2 * FIELD_SIZE**2 + 200_000
+    needed, free = len(windows.corners) * each, psutil.virtual_memory().available
+    if needed > free:
+        raise UsageError(
+            f"{len(windows.corners)} frames need about {needed / 1e9:.1f} GB of memory, "
+            f"{free / 1e9:.1f} GB are free",
+            field="--frames",
+            remedy="Take fewer frames with --frames or --stride, or a smaller --size.",
+        )
+
+
+# --- Whether the landmarks follow the convention that they are read by, and belong to the video
 
 #: A fit that follows the landmarks in a smaller share of the frames than this has failed.
 LEAST_FITTED = 0.1
@@ -292,12 +305,7 @@ _Move = Callable[[np.ndarray], np.ndarray]
 
 
 def refuse_other_units(source: VideoSource) -> None:
-    """Refuse landmarks that are of another size of this video, or not in space at all.
-
-    Raises:
-        BadInput: the tracker saw frames of another size; or `world` holds the landmarks in the
-            image, divided by its size.
-    """
+    """Refuse landmarks that are of another size of this video, or not in space at all."""
     width, height = source.video.width, source.video.height
     tracks = read_hand_tracks(source.landmarks_path)
     if tracks is not None and tracks.size != (width, height):
@@ -409,8 +417,6 @@ def _clearly(better: float, as_given: float, least: float) -> bool:
 
 def _pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[int], list[np.ndarray]]:
     """Some frames in which a hand is seen, reduced, as (rows, pictures of floats in Lab)."""
-    import cv2
-
     seen = np.flatnonzero(landmarks.detected)
     chosen = [int(row) for row in seen[evenly(len(seen), _LOOKED_AT)]]
     numbers = {int(source.indices[row]): row for row in chosen}
@@ -440,15 +446,10 @@ def _separation_of_frames(
 
 
 def _separation(pictures: Sequence[np.ndarray], points: np.ndarray) -> float:
-    """How well a line through colours tells those on the landmarks from those around them.
+    """How well a line through colours tells those on (F, 21, 2) px from those around them.
 
-    Args:
-        pictures: (H, W, 3) uint8 each.
-        points: (F, 21, 2) px.
-
-    Returns:
-        Mean probability over the frames that a colour on the hand lies on its side of one around
-        it: 0.5 by chance, 1 where all do.
+    Mean probability over the frames that a colour on the hand lies on its side of one around it:
+    0.5 by chance, 1 where all do.
     """
     found = []
     for picture, hand in zip(pictures, points, strict=True):
@@ -475,10 +476,9 @@ def _separation(pictures: Sequence[np.ndarray], points: np.ndarray) -> float:
 
 def _colors(picture: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float]:
     """Colours at points inside of a picture, and the share of points that are."""
-    height, width = picture.shape[:2]
-    x, y = np.floor(points).clip(-1, 1e6).astype(np.int64).T
-    inside = (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    return picture[y[inside], x[inside]].astype(np.float64), inside.sum() / max(len(inside), 1)
+    rows, columns, inside = cells(points, picture.shape)
+    found = picture[rows[inside], columns[inside]].astype(np.float64)
+    return found, inside.sum() / max(len(inside), 1)
 
 
 def _length(points: np.ndarray) -> float:
@@ -495,15 +495,10 @@ def _centred(points: np.ndarray) -> np.ndarray:
 def refuse_unfitted(
     fitted: Mapping[str, np.ndarray], source: VideoSource, doubts: Sequence[str]
 ) -> None:
-    """Refuse a fit that follows (nearly) no frame of a hand.
+    """Refuse a fit that follows (nearly) no frame of a hand, with what is likely wrong.
 
-    Args:
-        fitted: (F,) bool by side, frames in which the hand model follows the landmarks.
-        source: the inputs.
-        doubts: what tells against the landmarks.
-
-    Raises:
-        BadInput: nothing or nearly nothing of a hand is fitted; with what is likely wrong.
+    `fitted` are (F,) bool by side, frames in which the hand model follows the landmarks; `doubts`
+    what tells against them.
     """
     for side, good in fitted.items():
         seen = source.hands[side].detected
@@ -522,22 +517,10 @@ def refuse_unfitted(
 
 
 def fit_warnings(fitted: Mapping[str, np.ndarray], seen: Mapping[str, np.ndarray]) -> list[str]:
-    """Say of which hands few frames are fitted.
-
-    Args:
-        fitted: (F,) bool by side, frames in which the hand model follows the landmarks.
-        seen: (F,) bool by side, frames in which the hand is detected.
-    """
+    """Say of which hands few frames are fitted, of those in which they are seen: (F,) bool each."""
     return [
         f"the {side} hand is fitted in {int(good.sum())} of the {int(seen[side].sum())} frames "
         "that show it"
         for side, good in fitted.items()
         if good.sum() < FEW_FITTED * seen[side].sum()
     ]
-
-
-def overlap_warning(overlap: float) -> list[str]:
-    """Say that meshes and masks do not lie on each other, where that is so."""
-    if overlap >= LOW_OVERLAP:
-        return []
-    return [f"the overlap of mesh and mask is {overlap:.2f}, of a sound clip 0.9 and more"]

@@ -1,4 +1,8 @@
-"""Scalar products of many short rows."""
+"""What a clip shows of the surface of a hand: its mean texture, and its colours in their light.
+
+Both lie on the texels of the hand's texture map. The texture is what is left of the frames without
+the light; the colours come with a light for each frame.
+"""
 
 from __future__ import annotations
 
@@ -12,34 +16,45 @@ from hwp_bench.base.harmonics import COUNT, harmonics
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.raster import draw_faces, mix_corners
 
+# Texels beyond a chart that go on as its border, so that interpolation reads nothing else.
+_MARGIN = 1.5
+# OpenCV takes at most 32,767 places in a row.
+_ROW = 1024
+
 
 def row_products(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """Return the (P,) scalar products of the rows of (P, C) and (P, C), for small C."""
+    """The (P,) scalar products of the rows of (P, C) and (P, C), for small C."""
     # NumPy's sum over a short last axis takes several times as long.
     return np.asarray((first * second) @ np.ones(first.shape[1], first.dtype))
 
 
+def sample(
+    image: np.ndarray,
+    places: np.ndarray,
+    how: int = cv2.INTER_LINEAR,
+    border: int = cv2.BORDER_CONSTANT,
+) -> np.ndarray:
+    """Read an image (H, W) or (H, W, C) float32 at (P, 2) px, pixel centres at +0.5; C at most 4.
+
+    `how` and `border` are OpenCV's; outside of the image it is zero if nothing else is said.
+    """
+    padded = np.zeros((-(-max(len(places), 1) // _ROW) * _ROW, 2), np.float32)
+    padded[: len(places)] = places - 0.5
+    x, y = (np.ascontiguousarray(part.reshape(-1, _ROW)) for part in padded.T)
+    found = cv2.remap(image, x, y, how, borderMode=border)
+    return np.asarray(found.reshape(-1, *image.shape[2:])[: len(places)])
+
+
 def smooth_within(values: np.ndarray, region: np.ndarray, breadth: float) -> np.ndarray:
-    """Gaussian mean over the pixels of a region alone.
+    """Gaussian mean of values (H, W) or (H, W, C) over the pixels of a region (H, W) bool alone.
 
-    Args:
-        values: (H, W) or (H, W, C).
-        region: (H, W) bool.
-        breadth: deviation of the Gaussian, px.
-
-    Returns:
-        float32 of the values' shape, next to the region too; towards zero far from it.
+    `breadth` is the Gaussian's deviation, px. The mean, float32, is also next to the region, and
+    falls towards zero far from it.
     """
     inside = region.reshape(*region.shape, *(1,) * (values.ndim - 2))
     weight = cv2.GaussianBlur(region.astype(np.float32), (0, 0), breadth)
     total = cv2.GaussianBlur(np.where(inside, values, 0.0).astype(np.float32), (0, 0), breadth)
     return np.asarray(total / np.maximum(weight.reshape(inside.shape), 1e-3))
-
-
-# Texels beyond a chart that go on as its border, so that interpolation reads nothing else.
-_MARGIN = 1.5
-# OpenCV takes at most 32,767 places in a row.
-_ROW = 1024
 
 
 class Atlas:
@@ -71,12 +86,7 @@ class Atlas:
         return mix_corners(values, self._faces, self.face, self._mix)
 
     def places(self, face: np.ndarray, mix: np.ndarray) -> np.ndarray:
-        """Return where points of the surface lie in the map: (P, 2) texels.
-
-        Args:
-            face: (P,) which face each point is on.
-            mix: (P, 2) barycentric coordinates as `draw_faces` returns them.
-        """
+        """Where points of faces (P,) with mixes (P, 2) of `draw_faces` lie: (P, 2) texels."""
         return mix_corners(self._corners, self._corner_faces, face, mix)
 
     def drawn(self, values: np.ndarray) -> np.ndarray:
@@ -98,126 +108,25 @@ class Atlas:
         return image
 
 
-def sample(image: np.ndarray, places: np.ndarray, how: int = cv2.INTER_LINEAR) -> np.ndarray:
-    """Read an image at places.
+class MeanTexture:
+    """The mean of what the frames of a clip show at each texel, log grey without the light."""
 
-    Args:
-        image: (H, W) or (H, W, C) float32, C at most 4.
-        places: (P, 2) px, pixel centres at +0.5.
-        how: OpenCV's name of an interpolation.
+    #: Edge of the map, texels.
+    EDGE = 384
+    # Frames that a texel must have been seen in, each weighed by its facing squared.
+    _LEAST_WEIGHT = 5.0
+    # Log grey: a frame that differs from the mean by more counts less in the next mean.
+    _ODD = 0.06
 
-    Returns:
-        (P,) or (P, C); zero outside of the image.
-    """
-    padded = np.zeros((-(-max(len(places), 1) // _ROW) * _ROW, 2), np.float32)
-    padded[: len(places)] = places - 0.5
-    x, y = (np.ascontiguousarray(part.reshape(-1, _ROW)) for part in padded.T)
-    found = cv2.remap(image, x, y, how)
-    return np.asarray(found.reshape(-1, *image.shape[2:])[: len(places)])
-
-
-#: Edge of the atlas, texels.
-ATLAS = 384
-#: Grey level added before the logarithm: noise of the dark pixels counts less.
-_DARK = 8.0
-# Pixels next to an outline, or next to an edge in depth, mix two surfaces.
-_BORDER = np.ones((5, 5), np.uint8)
-_DEPTH_EDGE = 0.012
-# m, how much deeper than the nearest surface a texel may lie and still be seen.
-_SEEN = 0.004
-# Cosine of the angle to the viewer from which a surface counts.
-_LEAST_FACING = 0.25
-# Frames that a texel must have been seen in, each weighed by its facing squared.
-_LEAST_WEIGHT = 5.0
-# Log grey: a frame that differs from the mean by more counts less in the next mean.
-_ODD_DETAIL = 0.06
-
-
-@dataclass(frozen=True, eq=False)
-class View:
-    """A frame as the mesh lies in it; S is the edge of the image.
-
-    Attributes:
-        face: (S, S) int32 nearest face, -1 where there is none.
-        mix: (S, S, 2) float32 barycentric coordinates.
-        depth: (S, S) float32 m.
-        region: (S, S) bool, mesh and hand.
-        core: (S, S) bool, region away from its border and from edges in depth.
-        detail: (S, S) float32 log grey, light and noise removed; zero outside of the region.
-        facing: (T,) cosine of each face's angle to the viewer, 0 where it looks away.
-    """
-
-    face: np.ndarray
-    mix: np.ndarray
-    depth: np.ndarray
-    region: np.ndarray
-    core: np.ndarray
-    detail: np.ndarray
-    facing: np.ndarray
-
-
-class SkinTexture:
-    """Collects the texture of a clip: the mean of what the frames show at each texel.
-
-    Args:
-        template: the hand, with its texture coordinates.
-        breadth: px, deviation of the Gaussian whose wider changes count as light.
-    """
-
-    def __init__(self, template: HandTemplate, breadth: float) -> None:
-        self._faces = template.faces
-        self._breadth = breadth
-        self._atlas = Atlas(template, ATLAS)
+    def __init__(self, template: HandTemplate) -> None:
+        self.atlas = Atlas(template, self.EDGE)
         self._mean: np.ndarray | None = None
-        self._sum, self._weight = (np.zeros(len(self._atlas)) for _ in range(2))
-
-    def view(
-        self, image: np.ndarray, mask: np.ndarray, vertices: np.ndarray, pixels: np.ndarray
-    ) -> View:
-        """Look at a frame.
-
-        Args:
-            image: (S, S, 3) uint8 RGB.
-            mask: (S, S) uint8 coverage of the hand.
-            vertices: (V, 3) m, camera axes.
-            pixels: (V, 2) px of the image.
-        """
-        size = image.shape[:2]
-        face, mix = draw_faces(pixels, vertices[:, 2], self._faces, (size[0], size[1]))
-        inside = face >= 0
-        depth = np.zeros(size, np.float32)
-        depth[inside] = mix_corners(vertices[:, 2:], self._faces, face[inside], mix[inside])[:, 0]
-        region = inside & (mask > 127)
-        nearest = cv2.erode(np.where(inside, depth, np.inf).astype(np.float32), _BORDER)
-        core = cv2.erode(region.astype(np.uint8), _BORDER) > 0
-        core &= cv2.dilate(depth, _BORDER) - nearest <= _DEPTH_EDGE
-        grey = np.log(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY).astype(np.float32) + _DARK)
-        detail = smooth_within(self.without_light(grey, region), region, 1.0)
-        return View(face, mix, depth, region, core, detail, _facing(vertices, self._faces))
-
-    def without_light(self, values: np.ndarray, region: np.ndarray) -> np.ndarray:
-        """Subtract what changes over the breadth of light; zero outside of the region."""
-        return np.where(region, values - smooth_within(values, region, self._breadth), 0.0).astype(
-            np.float32
-        )
-
-    def seen(
-        self, view: View, vertices: np.ndarray, pixels: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Read a frame at each texel: (K,) log grey, and (K,) weights, zero where it is hidden."""
-        places = self._atlas.on_surface(pixels)
-        depths = self._atlas.on_surface(vertices[:, 2:])
-        facing = view.facing[self._atlas.face]
-        here = np.abs(sample(view.depth, places, cv2.INTER_NEAREST) - depths[:, 0]) < _SEEN
-        here &= (sample(view.core.astype(np.float32), places, cv2.INTER_NEAREST) > 0) & (
-            facing > _LEAST_FACING
-        )
-        return sample(view.detail, places), np.where(here, facing**2, 0.0)
+        self._sum, self._weight = (np.zeros(len(self.atlas)) for _ in range(2))
 
     def add(self, values: np.ndarray, weights: np.ndarray) -> None:
-        """Count a frame's texels; those far from the last mean count less."""
+        """Count a frame's texels (K,) with weights (K,); those far from the last mean less."""
         if self._mean is not None:
-            weights = weights / (1.0 + ((values - self._mean) / _ODD_DETAIL) ** 2)
+            weights = weights / (1.0 + ((values - self._mean) / self._ODD) ** 2)
         self._sum += weights * values
         self._weight += weights
 
@@ -225,61 +134,27 @@ class SkinTexture:
         """Form the mean of the frames added, and start again without any."""
         mean = self._sum / (self._weight + 1.0)
         self._mean = mean.astype(np.float32)
-        self._drawn = self._atlas.drawn(self._mean)
-        self._known = self._atlas.drawn_weights(self._weight)
-        self._sum, self._weight = (np.zeros(len(self._atlas)) for _ in range(2))
+        self._drawn = self.atlas.drawn(self._mean)
+        self._known = self.atlas.drawn_weights(self._weight)
+        self._sum, self._weight = (np.zeros(len(self.atlas)) for _ in range(2))
 
-    def expected(self, view: View) -> tuple[np.ndarray, np.ndarray]:
-        """Draw the mean texture as a frame sees it: (S, S) log grey, and (S, S) bool, is known."""
-        inside = view.region
-        face = view.face[inside]
-        places = self._atlas.places(face, view.mix[inside])
-        drawn, known = np.zeros(inside.shape, np.float32), np.zeros(inside.shape, bool)
-        drawn[inside] = sample(self._drawn, places)
-        known[inside] = (sample(self._known, places) > _LEAST_WEIGHT) & (
-            view.facing[face] > _LEAST_FACING
-        )
-        return drawn, known & view.core
-
-
-def _facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
-    normal = np.cross(second - first, third - first)
-    middle = first + second + third
-    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(middle, axis=1)
-    return np.asarray(np.maximum(-(normal * middle).sum(axis=1) / np.maximum(length, 1e-12), 0.0))
-
-
-# Edge of the map, texels; twice as many change nothing.
-_EDGE = 256
-#: Added to colours before the logarithm: noise of dark pixels counts less.
-DARK = 0.04
-# Logarithm of a colour: a frame that differs by more counts less.
-_ODD = 0.1
-# Weight of no light of its own, as a share of the frame's texels.
-_RIDGE = 0.02
-# Weight of the mean colour at each texel, in frames that show it from the front.
-_COMMON = 0.5
-# Frames from the front that a texel must have been seen in to count fully.
-_ENOUGH = 2.0
-# Turns of light and colours, at first and each time after that.
-_FIRST_TURNS, _LATER_TURNS = 4, 2
+    def expected(self, face: np.ndarray, mix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The mean at P points of the surface, and whether it is known there."""
+        places = self.atlas.places(face, mix)
+        return sample(self._drawn, places), sample(self._known, places) > self._LEAST_WEIGHT
 
 
 @dataclass(frozen=True, eq=False)
 class SeenTexels:
-    """The texels that a frame shows, T of them.
+    """The texels that a frame shows, T of them."""
 
-    Attributes:
-        texels: (T,) int32, their numbers.
-        logs: (T, 3) logarithms of colours in [0, 1], with `DARK` added before.
-        normals: (T, 3) unit, camera axes.
-        weights: (T,) in [0, 1].
-    """
-
+    #: (T,) int32, their numbers.
     texels: np.ndarray
+    #: (T, 3) logarithms of colours in [0, 1], with `LitTexture.DARK` added before.
     logs: np.ndarray
+    #: (T, 3) unit, camera axes.
     normals: np.ndarray
+    #: (T,) in [0, 1].
     weights: np.ndarray
 
 
@@ -288,51 +163,51 @@ class LitTexture:
 
     In logarithms of sRGB both are sums, and each follows from the other by weighted means and
     small least squares. A shadow that the hand casts on itself is in neither.
-
-    Args:
-        template: the hand, with its texture coordinates.
-        frames: of the clip.
     """
 
+    #: Edge of the map, texels; twice as many change nothing.
+    EDGE = 256
+    #: Added to colours before the logarithm: noise of dark pixels counts less.
+    DARK = 0.04
+    # Logarithm of a colour: a frame that differs by more counts less.
+    _ODD = 0.1
+    # Weight of no light of its own, as a share of the frame's texels.
+    _RIDGE = 0.02
+    # Weight of the mean colour at each texel, in frames that show it from the front.
+    _COMMON = 0.5
+    # Frames from the front that a texel must have been seen in to count fully.
+    _ENOUGH = 2.0
+    # Turns of light and colours, at first and each time after that.
+    _FIRST_TURNS, _LATER_TURNS = 4, 2
+
     def __init__(self, template: HandTemplate, frames: int) -> None:
-        self.atlas = Atlas(template, _EDGE)
+        self.atlas = Atlas(template, self.EDGE)
         self._light = np.zeros((frames, COUNT, 3))
         self._colors: np.ndarray | None = None
 
     def fit(self, seen: Mapping[int, SeenTexels]) -> None:
-        """Fit colours and light to frames; what an earlier call found is the start.
-
-        Args:
-            seen: by frame, at least one.
-        """
-        turns = _LATER_TURNS
+        """Fit colours and light to one frame or more; what an earlier call found is the start."""
+        turns = self._LATER_TURNS
         if self._colors is None:
-            turns = _FIRST_TURNS
+            turns = self._FIRST_TURNS
             total = sum(float(frame.weights.sum()) for frame in seen.values())
             common = sum(frame.weights @ frame.logs for frame in seen.values()) / max(total, 1e-9)
             self._colors = np.tile(common, (len(self.atlas), 1))
         for _ in range(turns):
             self._turn(seen)
         self._map = self.atlas.drawn(self._colors)
-        self._known = self.atlas.drawn_weights(np.minimum(self._count / _ENOUGH, 1.0))
+        self._known = self.atlas.drawn_weights(np.minimum(self._count / self._ENOUGH, 1.0))
 
     def expected(
         self, frame: int, face: np.ndarray, mix: np.ndarray, normals: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Colours of points of the surface in the light of a frame.
+        """Colours of P points of the surface in the light of a frame, and how well they are known.
 
-        Args:
-            frame: which frame.
-            face: (P,) which face each point is on.
-            mix: (P, 2) barycentric coordinates as `draw_faces` returns them.
-            normals: (P, 3) unit, camera axes.
-
-        Returns:
-            (P, 3) sRGB in [0, 1], and (P,) how well the colours are known, in [0, 1].
+        With unit normals (P, 3), camera axes: (P, 3) sRGB in [0, 1], and (P,) in [0, 1].
         """
         places = self.atlas.places(face, mix)
         logs = sample(self._map, places) + harmonics(normals) @ self._light[frame]
-        return np.clip(np.exp(logs) - DARK, 0.0, 1.0), sample(self._known, places)
+        return np.clip(np.exp(logs) - self.DARK, 0.0, 1.0), sample(self._known, places)
 
     def _turn(self, seen: Mapping[int, SeenTexels]) -> None:
         """Fit the light of each frame to the colours, and then the colours to all frames."""
@@ -341,20 +216,19 @@ class LitTexture:
         total, weight = np.zeros((count, 3)), np.zeros(count)
         for frame, shown in seen.items():
             basis, colors = harmonics(shown.normals), self._colors[shown.texels]
-            trust = _trust(shown, shown.logs - colors - basis @ self._light[frame])
+            trust = self._trust(shown, shown.logs - colors - basis @ self._light[frame])
             moment = (basis * trust[:, None]).T
-            normal = moment @ basis + (_RIDGE * trust.sum() + 1e-9) * np.eye(COUNT)
+            normal = moment @ basis + (self._RIDGE * trust.sum() + 1e-9) * np.eye(COUNT)
             self._light[frame] = np.linalg.solve(normal, moment @ (shown.logs - colors))
             unlit = shown.logs - basis @ self._light[frame]
-            trust = _trust(shown, unlit - colors)
+            trust = self._trust(shown, unlit - colors)
             weight += np.bincount(shown.texels, trust, minlength=count)
             for channel in range(3):
                 part = trust * unlit[:, channel]
                 total[:, channel] += np.bincount(shown.texels, part, minlength=count)
         common = total.sum(axis=0) / max(float(weight.sum()), 1e-9)
-        self._colors = (total + _COMMON * common) / (weight + _COMMON)[:, None]
+        self._colors = (total + self._COMMON * common) / (weight + self._COMMON)[:, None]
         self._count = weight
 
-
-def _trust(shown: SeenTexels, error: np.ndarray) -> np.ndarray:
-    return np.asarray(shown.weights / (1.0 + row_products(error, error) / (3.0 * _ODD**2)))
+    def _trust(self, shown: SeenTexels, error: np.ndarray) -> np.ndarray:
+        return np.asarray(shown.weights / (1.0 + row_products(error, error) / (3.0 * self._ODD**2)))

@@ -14,7 +14,7 @@ from hwp_bench.importers.shared.landmarks import Landmarks
 def test_the_cropped_camera_sees_what_the_crop_shows() -> None:
     clip = make_clip(8)
     windows = follow_hands([clip.landmarks], 30.0, 100)
-    Ks = windows.intrinsics(FOCAL, WIDTH, HEIGHT)
+    Ks = windows.intrinsics(np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1]]))
     for frame in range(8):
         rays = clip.joints[frame] / clip.joints[frame, :, 2:]
         pixels = (rays @ Ks[frame].T)[:, :2]

@@ -9,7 +9,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from synthetic_clip import HEIGHT, WIDTH, SyntheticClip, make_clip, write_landmarks, write_video
+from synthetic_clip import (
+    HEIGHT,
+    WIDTH,
+    SyntheticClip,
+    landmark_import,
+    make_clip,
+    write_landmarks,
+    write_video,
+)
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.capture.check import check_capture
@@ -17,7 +25,6 @@ from hwp_bench.cli.main import main
 from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
 from hwp_bench.importers.video import VideoImport, import_video
 from hwp_bench.importers.video import api as pipeline
-from hwp_bench.importers.video.residuals import FitSettings
 from hwp_bench.importers.video.source import (
     VideoSource,
     landmark_doubts,
@@ -27,10 +34,7 @@ from hwp_bench.importers.video.source import (
 
 FRAMES = 24
 #: A fit without outlines, textures and pictures.
-FIT = FitSettings(
-    start_steps=40, landmark_steps=40, contour_steps=1, contour_rounds=1, texture_weight=0.0
-)
-FIT = replace(FIT, picture_weight=0.0)
+FIT = landmark_import(40, outline_steps=1)
 #: Our joints in the order of MANO's model and its tips, and of InterHand2.6M's annotations.
 MANO = [0, 5, 6, 7, 9, 10, 11, 17, 18, 19, 13, 14, 15, 1, 2, 3, 4, 8, 12, 16, 20]
 INTERHAND = [4, 3, 2, 1, 8, 7, 6, 5, 12, 11, 10, 9, 16, 15, 14, 13, 20, 19, 18, 17, 0]

@@ -11,7 +11,6 @@ import torch
 from painted_clip import (
     FRAMES,
     HAND,
-    SETTINGS,
     TINT,
     assert_says_nothing,
     assert_slopes_lead_down,
@@ -25,23 +24,28 @@ from painted_clip import (
 
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.importers.video.model import ClipModel, SurfaceMotion, posed_vertices
-from hwp_bench.importers.video.pictures import Differences, PictureEnergy, TextureEnergy, linearised
-from hwp_bench.importers.video.residuals import ContourEnergy, signed_distance
+from hwp_bench.importers.video.pictures import (
+    Differences,
+    PictureResidual,
+    TextureResidual,
+    linearised,
+)
+from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
 from hwp_bench.importers.video.solve import FittedClip, fit_outline, fit_picture
-from hwp_bench.importers.video.texture import DARK, Atlas, LitTexture, SeenTexels, sample
+from hwp_bench.importers.video.texture import Atlas, LitTexture, SeenTexels, sample
 
 
-def picture_of(fitted: FittedClip) -> PictureEnergy:
-    return PictureEnergy(pictures(lit=True), SETTINGS, fitted.model)
+def picture_of(fitted: FittedClip) -> PictureResidual:
+    return PictureResidual(pictures(lit=True), fitted.model)
 
 
 def test_a_lit_hand_comes_nearer_to_its_truth_than_by_outline_and_texture() -> None:
     clip, windows, _, masks = footage(lit=True)
     fields = np.stack([signed_distance(mask) for mask in masks])
     fitted = fit_to_errors()
-    contour = ContourEnergy(fields, clip.landmarks.detected, windows, SETTINGS, HAND)
-    texture = TextureEnergy(pictures(lit=True), SETTINGS, fitted.model)
-    fit_outline(fitted, contour, texture=texture)
+    contour = OutlineResidual(fields, clip.landmarks.detected, windows, HAND)
+    texture = TextureResidual(pictures(lit=True), fitted.model)
+    fit_outline(fitted, contour, texture)
     before, free = pixel_error(fitted), fitted.model.variables
     held = {name: getattr(free, name).detach().clone() for name in ("betas", "log_depth")}
     done: list[int] = []
@@ -66,7 +70,7 @@ def test_where_nothing_can_be_compared_nothing_is(case: str) -> None:
         "no mask": replace(given, masks=np.zeros_like(given.masks)),
         "no detection": replace(given, usable=np.zeros(FRAMES, bool)),
     }
-    assert_says_nothing(fitted, PictureEnergy(changed[case], SETTINGS, fitted.model))
+    assert_says_nothing(fitted, PictureResidual(changed[case], fitted.model))
 
 
 def seen_texels(texture: LitTexture, frame: int, colors: np.ndarray) -> SeenTexels:
@@ -98,7 +102,7 @@ def test_colours_and_light_are_told_apart() -> None:
         found, known = texture.expected(frame, face, mix, normals)
         wanted = (0.2 + 2.0 * point) * TINT * np.exp(normals @ lamp(frame))[:, None]
         assert np.median(known) == pytest.approx(1.0)
-        error = np.abs(found - np.clip(wanted - DARK, 0.0, 1.0))[known > 0.99]
+        error = np.abs(found - np.clip(wanted - LitTexture.DARK, 0.0, 1.0))[known > 0.99]
         assert np.median(error) < 0.02
 
 
@@ -165,9 +169,9 @@ def test_a_true_hand_is_drawn_as_it_was_pictured() -> None:
     clip, _, _, masks = footage(lit=True)
     energy = picture_of(fit_to_errors())
     vertices, pixels = clip.vertices.astype(np.float32), true_pixels()
-    drawn = [energy._draw(*parts) for parts in zip(vertices, pixels, strict=True)]
-    energy.texture.fit({frame: energy._seen(frame, one) for frame, one in enumerate(drawn)})
-    found = energy._differences(5, drawn[5])
+    drawn = [energy.draw(*parts) for parts in zip(vertices, pixels, strict=True)]
+    energy.collect(list(range(FRAMES)), map(energy.seen, range(FRAMES), drawn))
+    found = energy.differences(5, drawn[5])
     assert found is not None
     face, _ = draw_faces(pixels[5], vertices[5, :, 2], clip.template.faces, masks[5].shape)
     assert len(found.face) > np.count_nonzero(face >= 0)

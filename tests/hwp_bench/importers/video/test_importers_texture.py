@@ -8,7 +8,6 @@ import numpy as np
 from painted_clip import (
     FRAMES,
     HAND,
-    SETTINGS,
     assert_says_nothing,
     assert_slopes_lead_down,
     fit_to_errors,
@@ -19,14 +18,14 @@ from painted_clip import (
 )
 
 from hwp_bench.importers.video.model import frame_variables
-from hwp_bench.importers.video.pictures import TextureEnergy
-from hwp_bench.importers.video.residuals import ContourEnergy, signed_distance
+from hwp_bench.importers.video.pictures import TextureResidual
+from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
 from hwp_bench.importers.video.solve import FittedClip, fit_outline
-from hwp_bench.importers.video.texture import SkinTexture, smooth_within
+from hwp_bench.importers.video.texture import smooth_within
 
 
-def texture_of(fitted: FittedClip) -> TextureEnergy:
-    return TextureEnergy(pictures(), SETTINGS, fitted.model)
+def texture_of(fitted: FittedClip) -> TextureResidual:
+    return TextureResidual(pictures(), fitted.model)
 
 
 def test_a_painted_hand_comes_nearer_to_its_truth_than_by_its_outline() -> None:
@@ -35,8 +34,8 @@ def test_a_painted_hand_comes_nearer_to_its_truth_than_by_its_outline() -> None:
     errors = []
     for painted in (False, True):
         fitted = fit_to_errors()
-        contour = ContourEnergy(fields, clip.landmarks.detected, windows, SETTINGS, HAND)
-        fit_outline(fitted, contour, texture=texture_of(fitted) if painted else None)
+        contour = OutlineResidual(fields, clip.landmarks.detected, windows, HAND)
+        fit_outline(fitted, contour, *([texture_of(fitted)] if painted else []))
         errors.append(pixel_error(fitted))
     # 0.78 and 0.93 px when this was written.
     assert errors[1] < 0.92 * errors[0]
@@ -51,17 +50,15 @@ def test_the_energy_and_its_slope_are_those_of_the_linearisation() -> None:
 
 def test_the_mean_texture_is_what_was_painted() -> None:
     # True poses: light removed from both, picture and mean agree to a correlation of 0.9.
-    clip, _, images, masks = footage()
-    texture = SkinTexture(clip.template, 8.0)
-    pixels = true_pixels()
+    clip = footage()[0]
+    residual = texture_of(fit_to_errors())
     vertices = clip.vertices.astype(np.float32)
-    views = [texture.view(*parts) for parts in zip(images, masks, vertices, pixels, strict=True)]
+    drawn = [residual.draw(*parts) for parts in zip(vertices, true_pixels(), strict=True)]
     for _ in range(2):
-        for view, *hand in zip(views, vertices, pixels, strict=True):
-            texture.add(*texture.seen(view, *hand))
-        texture.finish()
-    for view in views[::6]:
-        expected, core = texture.expected(view)
+        residual.collect([], (residual.seen(frame, one) for frame, one in enumerate(drawn)))
+    for frame in range(0, len(drawn), 6):
+        view = residual.view(frame, drawn[frame])
+        expected, core = residual.expected(view, drawn[frame])
         assert core.sum() > 0.3 * view.region.sum()
         assert np.corrcoef(expected[core], view.detail[core])[0, 1] > 0.9
 
@@ -69,7 +66,7 @@ def test_the_mean_texture_is_what_was_painted() -> None:
 def test_a_frame_without_a_hand_has_no_energy() -> None:
     fitted = fit_to_errors()
     nothing = replace(pictures(), masks=np.zeros_like(pictures().masks))
-    assert_says_nothing(fitted, TextureEnergy(nothing, SETTINGS, fitted.model))
+    assert_says_nothing(fitted, TextureResidual(nothing, fitted.model))
 
 
 def test_smoothing_within_a_region_keeps_a_constant_and_reads_nothing_outside() -> None:

@@ -31,7 +31,7 @@ QUICK = FitSettings(
     landmark_steps=90,
     contour_steps=20,
     contour_rounds=1,
-    texture_weight=0.0,
+    texture=False,
     picture_rounds=2,
 )
 

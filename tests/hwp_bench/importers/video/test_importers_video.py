@@ -30,7 +30,7 @@ from hwp_bench.hands.raster import overlap
 from hwp_bench.importers.video.api import import_video, without_blank_frames
 from hwp_bench.importers.video.clip import IMPORTER_VERSION
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
-from hwp_bench.importers.video.residuals import FitSettings
+from hwp_bench.importers.video.solve import FitSettings
 from hwp_bench.importers.video.source import VideoImport, read_source
 
 FRAMES = 16
