@@ -1,4 +1,8 @@
-"""Names of sequences of InterHand2.6M, among them the three of the paper."""
+"""Captures of InterHand2.6M: the annotations of one camera of one sequence, and its images.
+
+Masks are silhouettes of the annotated hands: the data set has none. Parts of a hand that the other
+hand hides are inside the one mask of a capture. Sleeves and marks on the skin are in it too.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +15,6 @@ from types import MappingProxyType
 from typing import Any
 
 import numpy as np
-import torch
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import check_is_file, inside, read_json
@@ -21,7 +24,7 @@ from hwp_bench.base.text import bounded
 from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.capture.convert import with_one_shape
 from hwp_bench.capture.schema import MAX_FRAMES
-from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand
+from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.hands.fitting import FitTargets, fit_hand
 from hwp_bench.hands.raster import draw_silhouette
 from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands, resample
@@ -29,14 +32,30 @@ from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.shared.output import (
     ProjectedHand,
     overlay_sheet,
+    pose_parameters,
     project_hand,
     refuse_existing,
     sheet_frames,
     write_capture,
 )
 
+#: The hands that can be asked for.
+CHOICES = ("auto", "right", "left", "both")
+#: Fewest frames of a capture.
+FEWEST = 3
+#: Terms of the data set.
+LICENCE = "CC BY-NC 4.0 (InterHand2.6M)"
 #: Parts of the data set.
 SPLITS = ("train", "val", "test")
+#: Largest annotation file; the training part's `data` file has about 1 GB.
+MAX_BYTES = 3 * 1024 * 1024 * 1024
+#: The data set's joints of one hand in the order of our 21 landmarks (wrist, then each finger
+#: from its base to its tip): it lists thumb to little finger from tip to base, the wrist last.
+LANDMARK_ROWS = (20, 3, 2, 1, 0, 7, 6, 5, 4, 11, 10, 9, 8, 15, 14, 13, 12, 19, 18, 17, 16)
+# The file of MANO parameters, which comes apart from the others.
+_MANO = "MANO_NeuralAnnot"
+# First joint of each hand.
+_FIRST_JOINT = {"right": 0, "left": 21}
 _PATH = re.compile(r"(?:(train|val|test)/)?Capture(\d{1,4})/([A-Za-z0-9_.-]{1,80})/cam(\d{1,9})")
 
 
@@ -57,6 +76,11 @@ class InterHandSequence:
     def id(self) -> str:
         """Id of the HWP capture that is made of it."""
         return f"interhand-{self.capture}-{self.name}-{self.camera}"
+
+    @property
+    def folder(self) -> str:
+        """Its folder in a part of the data set, without the camera."""
+        return f"Capture{self.capture}/{self.name}"
 
 
 #: The three sequences of the paper.
@@ -89,315 +113,6 @@ def find_sequence(name: str) -> InterHandSequence:
             remedy=f"Use {', '.join(PAPER_SEQUENCES)}, or CaptureN/SEQUENCE/camID.",
         )
     return InterHandSequence(int(match.group(2)), match.group(3), match.group(4), match.group(1))
-
-
-#: Largest annotation file; the training part's `data` file has about 1 GB.
-MAX_BYTES = 3 * 1024 * 1024 * 1024
-#: The data set's joints of one hand in the order of our 21 landmarks (wrist, then each finger
-#: from its base to its tip): it lists thumb to little finger from tip to base, the wrist last.
-LANDMARK_ROWS = (20, 3, 2, 1, 0, 7, 6, 5, 4, 11, 10, 9, 8, 15, 14, 13, 12, 19, 18, 17, 16)
-#: The file of MANO parameters, which comes apart from the others.
-MANO = "MANO_NeuralAnnot"
-#: First joint of each hand.
-FIRST_JOINT = {"right": 0, "left": 21}
-
-
-@dataclass(frozen=True, eq=False)
-class ManoAnnotation:
-    """MANO parameters of one hand in every frame, world frame.
-
-    Attributes:
-        pose: (F, 16, 3) axis-angle rad, relative to MANO's mean pose.
-        shape: (F, 10).
-        transl: (F, 3) m.
-        valid: (F,) bool, false where the data set has none.
-    """
-
-    pose: np.ndarray
-    shape: np.ndarray
-    transl: np.ndarray
-    valid: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
-class InterHandRecords:
-    """The annotations of one camera of one sequence.
-
-    Attributes:
-        split: part of the data set.
-        frames: (F,) frame numbers, ascending.
-        images: F image files.
-        size: (width, height) px.
-        sides: the hands that some frame shows.
-        K: (3, 3) px.
-        viewmat: (4, 4) world to camera, m.
-        joints: (F, 21, 3) m, world, OpenPose order, by side; NaN where not valid.
-        mano: MANO parameters by side.
-    """
-
-    split: str
-    frames: np.ndarray
-    images: tuple[Path, ...]
-    size: tuple[int, int]
-    sides: tuple[str, ...]
-    K: np.ndarray
-    viewmat: np.ndarray
-    joints: Mapping[str, np.ndarray]
-    mano: Mapping[str, ManoAnnotation]
-
-    def select(self, kept: np.ndarray) -> InterHandRecords:
-        """The annotations of some frames, (F,) bool."""
-        mano = {
-            side: ManoAnnotation(
-                hand.pose[kept], hand.shape[kept], hand.transl[kept], hand.valid[kept]
-            )
-            for side, hand in self.mano.items()
-        }
-        return replace(
-            self,
-            frames=self.frames[kept],
-            images=tuple(image for image, one in zip(self.images, kept, strict=True) if one),
-            joints={side: joints[kept] for side, joints in self.joints.items()},
-            mano=mano,
-        )
-
-
-def read_annotations(
-    root: str | os.PathLike[str],
-    sequence: InterHandSequence,
-    side: str = "auto",
-    *,
-    mano: bool = True,
-) -> InterHandRecords:
-    """Read the annotations of one camera of one sequence.
-
-    Args:
-        root: the folder with `images/` and `annotations/`.
-        sequence: which one.
-        side: `right`, `left` or `both`; `auto`: the hands that the sequence is said to show.
-        mano: whether MANO parameters are needed. If not, they are read where they are.
-
-    Raises:
-        BadInput: a file or field is missing or damaged, or no frame of the sequence is listed or
-            shows that hand.
-    """
-    base = Path(root)
-    split, data = _data(base, sequence)
-    rows = _frames(data, sequence, base / "annotations" / split)
-    folder = base / "images" / split
-    images = tuple(_image(folder, row["file_name"]) for row in rows)
-    frames = np.array([row["frame_idx"] for row in rows])
-    types = {row["hand_type"] for row in rows}
-    shown = {"right", "left"} if "interacting" in types else types & {"right", "left"}
-    wanted = ("right", "left") if side in ("auto", "both") else (side,)
-    if side != "auto" and not shown >= set(wanted):
-        raise BadInput(
-            f"shows the {' and the '.join(sorted(shown)) or 'no'} hand only",
-            where=folder / f"Capture{sequence.capture}" / sequence.name,
-            field="--side",
-        )
-    sides = tuple(side for side in wanted if side in shown)
-    sizes = {(row["width"], row["height"]) for row in rows}
-    if len(sizes) != 1 or not sides:
-        raise BadInput(
-            f"has frames of sizes {sorted(sizes)} and hands {sorted(types)}", where=folder
-        )
-    K, viewmat = _camera(base, split, sequence)
-    keys = [str(frame) for frame in frames]
-    return InterHandRecords(
-        split=split,
-        frames=frames,
-        images=images,
-        size=sizes.pop(),
-        sides=sides,
-        K=K,
-        viewmat=viewmat,
-        joints=_joints(base, split, sequence, keys, sides),
-        mano=_mano(base, split, sequence, keys, sides, needed=mano),
-    )
-
-
-def _annotation(base: Path, split: str, kind: str) -> Path:
-    return base / "annotations" / split / f"InterHand2.6M_{split}_{kind}.json"
-
-
-def _data(base: Path, sequence: InterHandSequence) -> tuple[str, dict[str, Any]]:
-    splits = (sequence.split,) if sequence.split else SPLITS
-    for split in splits:
-        folder = base / "images" / split / f"Capture{sequence.capture}" / sequence.name
-        if not folder.is_dir():
-            continue
-        path = _annotation(base, split, "data")
-        value = read_json(path, max_bytes=MAX_BYTES)
-        if not isinstance(value, dict):
-            raise BadInput("is not a JSON object", where=path)
-        return split, value
-    raise BadInput(
-        f"does not contain images/*/Capture{sequence.capture}/{sequence.name}",
-        where=base,
-        remedy="Give the folder with images/ and annotations/ of InterHand2.6M.",
-    )
-
-
-def _frames(data: dict[str, Any], sequence: InterHandSequence, where: Path) -> list[dict[str, Any]]:
-    chosen = {}
-    for image in _list(data, "images", where):
-        if (
-            str(image.get("capture")) == str(sequence.capture)
-            and image.get("seq_name") == sequence.name
-            and str(image.get("camera")) == sequence.camera
-        ):
-            chosen[image.get("id")] = image
-    types = {
-        item.get("image_id"): item.get("hand_type")
-        for item in _list(data, "annotations", where)
-        if item.get("image_id") in chosen
-    }
-    rows = []
-    for key, image in chosen.items():
-        row = {**image, "hand_type": types.get(key)}
-        for name in ("frame_idx", "width", "height"):
-            try:
-                row[name] = int(row[name])
-            except (KeyError, TypeError, ValueError) as error:
-                raise BadInput(f"image {key} does not have it", where=where, field=name) from error
-        if not isinstance(row.get("file_name"), str):
-            raise BadInput(f"image {key} does not have it", where=where, field="file_name")
-        if row["hand_type"] in ("right", "left", "interacting"):
-            rows.append(row)
-    if not 1 <= len(rows) <= MAX_FRAMES:
-        raise BadInput(
-            f"{len(rows)} annotated frames of {sequence.name}, camera {sequence.camera}",
-            where=where,
-            remedy="Is the sequence in this part of the data set?",
-        )
-    rows.sort(key=lambda row: row["frame_idx"])
-    if len({row["frame_idx"] for row in rows}) < len(rows):
-        raise BadInput(f"lists a frame of {sequence.name} twice", where=where, field="frame_idx")
-    return rows
-
-
-def _list(data: dict[str, Any], name: str, where: Path) -> list[dict[str, Any]]:
-    value = data.get(name)
-    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
-        raise BadInput("is not a list of objects", where=where, field=name)
-    return value
-
-
-def _image(folder: Path, name: str) -> Path:
-    path = inside(folder, re.sub(r"^/+", "", name))
-    check_is_file(path, remedy="Unpack the images of the sequence.")
-    return path
-
-
-def _of_capture(
-    base: Path, split: str, kind: str, sequence: InterHandSequence
-) -> tuple[Path, dict]:
-    path = _annotation(base, split, kind)
-    value = read_json(path, max_bytes=MAX_BYTES)
-    found = value.get(str(sequence.capture)) if isinstance(value, dict) else None
-    if not isinstance(found, dict):
-        raise BadInput("is missing", where=path, field=str(sequence.capture))
-    return path, found
-
-
-def _camera(base: Path, split: str, sequence: InterHandSequence) -> tuple[np.ndarray, np.ndarray]:
-    path, capture = _of_capture(base, split, "camera", sequence)
-
-    def numbers(name: str, *shape: int) -> np.ndarray:
-        table = capture.get(name)
-        value = table.get(sequence.camera) if isinstance(table, dict) else None
-        return _numbers(value, shape, path, f"{sequence.capture}.{name}.{sequence.camera}")
-
-    position, rotation = numbers("campos", 3) / 1000.0, numbers("camrot", 3, 3)
-    focal, centre = numbers("focal", 2), numbers("princpt", 2)
-    if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or focal.min() <= 0:
-        raise BadInput("is not a rotation, or a focal length is not above 0", where=path)
-    # Written with six digits, it is a rotation only to about 1e-6: take the nearest one.
-    left, _, right = np.linalg.svd(rotation)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = left @ right
-    viewmat[:3, 3] = -viewmat[:3, :3] @ position
-    K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1.0]])
-    return K, viewmat
-
-
-def _joints(
-    base: Path, split: str, sequence: InterHandSequence, keys: list[str], sides: tuple[str, ...]
-) -> dict[str, np.ndarray]:
-    path, capture = _of_capture(base, split, "joint_3d", sequence)
-    found = {side: np.full((len(keys), 21, 3), np.nan) for side in sides}
-    for index, key in enumerate(keys):
-        frame = capture.get(key)
-        if not isinstance(frame, dict):
-            continue
-        field = f"{sequence.capture}.{key}"
-        world = _numbers(frame.get("world_coord"), (42, 3), path, f"{field}.world_coord") / 1000.0
-        flags = _numbers(frame.get("joint_valid"), (42,), path, f"{field}.joint_valid", flat=True)
-        for side in sides:
-            rows = FIRST_JOINT[side] + np.array(LANDMARK_ROWS)
-            # Joints that are not valid are filled with ones.
-            found[side][index] = np.where(flags[rows, None] > 0, world[rows], np.nan)
-    return found
-
-
-def _mano(
-    base: Path,
-    split: str,
-    sequence: InterHandSequence,
-    keys: list[str],
-    sides: tuple[str, ...],
-    *,
-    needed: bool,
-) -> dict[str, ManoAnnotation]:
-    if not needed and not _annotation(base, split, MANO).exists():
-        nothing = {side: np.zeros((len(keys), 16, 3)) for side in sides}
-        return {
-            side: ManoAnnotation(
-                pose, np.zeros((len(keys), 10)), pose[:, 0], np.zeros(len(keys), dtype=bool)
-            )
-            for side, pose in nothing.items()
-        }
-    path, capture = _of_capture(base, split, MANO, sequence)
-    made = {}
-    for side in sides:
-        pose, shape, transl = (np.zeros((len(keys), n)) for n in (48, 10, 3))
-        valid = np.zeros(len(keys), dtype=bool)
-        for index, key in enumerate(keys):
-            frame = capture.get(key)
-            hand = frame.get(side) if isinstance(frame, dict) else None
-            if hand is None:
-                continue
-            field = f"{sequence.capture}.{key}.{side}"
-            if not isinstance(hand, dict):
-                raise BadInput("is not a JSON object", where=path, field=field)
-            for name, target in (("pose", pose), ("shape", shape), ("trans", transl)):
-                length = (target.shape[1],)
-                target[index] = _numbers(hand.get(name), length, path, f"{field}.{name}", flat=True)
-            valid[index] = True
-        made[side] = ManoAnnotation(pose.reshape(-1, 16, 3), shape, transl, valid)
-    return made
-
-
-def _numbers(
-    value: Any, shape: tuple[int, ...], where: Path, field: str, *, flat: bool = False
-) -> np.ndarray:
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        raise BadInput("is not a list of numbers", where=where, field=field) from error
-    array = array.reshape(-1) if flat else array
-    if array.shape != shape or not np.isfinite(array).all():
-        raise BadInput(f"is not a finite array of shape {shape}", where=where, field=field)
-    return array
-
-
-#: The hands that can be asked for.
-CHOICES = ("auto", "right", "left", "both")
-#: Fewest frames of a capture.
-FEWEST = 3
-#: Terms of the data set.
-LICENCE = "CC BY-NC 4.0 (InterHand2.6M)"
 
 
 @dataclass(frozen=True)
@@ -434,6 +149,275 @@ class InterHandImport:
         return "anny" if self.mano is None else f"mano:{Path(self.mano).absolute()}"
 
 
+# --- Annotations
+
+
+@dataclass(frozen=True, eq=False)
+class ManoAnnotation:
+    """MANO parameters of one hand in every frame, world frame."""
+
+    #: (F, 16, 3) axis-angle rad, relative to MANO's mean pose.
+    pose: np.ndarray
+    #: (F, 10).
+    shape: np.ndarray
+    #: (F, 3) m.
+    transl: np.ndarray
+    #: (F,) bool, false where the data set has none.
+    valid: np.ndarray
+
+    def select(self, kept: np.ndarray) -> ManoAnnotation:
+        """Those of some frames, (F,) bool."""
+        return ManoAnnotation(
+            self.pose[kept], self.shape[kept], self.transl[kept], self.valid[kept]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class InterHandRecords:
+    """The annotations of one camera of one sequence."""
+
+    #: Part of the data set.
+    split: str
+    #: (F,) frame numbers, ascending.
+    frames: np.ndarray
+    #: F image files.
+    images: tuple[Path, ...]
+    #: (width, height) px.
+    size: tuple[int, int]
+    #: The hands that some frame shows.
+    sides: tuple[str, ...]
+    #: (3, 3) px.
+    K: np.ndarray
+    #: (4, 4) world to camera, m.
+    viewmat: np.ndarray
+    #: (F, 21, 3) m, world, OpenPose order, by side; NaN where not valid.
+    joints: Mapping[str, np.ndarray]
+    #: MANO parameters by side.
+    mano: Mapping[str, ManoAnnotation]
+
+    def select(self, kept: np.ndarray) -> InterHandRecords:
+        """The annotations of some frames, (F,) bool."""
+        return replace(
+            self,
+            frames=self.frames[kept],
+            images=tuple(image for image, one in zip(self.images, kept, strict=True) if one),
+            joints={side: joints[kept] for side, joints in self.joints.items()},
+            mano={side: hand.select(kept) for side, hand in self.mano.items()},
+        )
+
+
+class _Annotations:
+    """The annotation files of the part of the data set that has a sequence."""
+
+    def __init__(self, root: str | os.PathLike[str], sequence: InterHandSequence) -> None:
+        self.root, self.sequence = Path(root), sequence
+        splits = (sequence.split,) if sequence.split else SPLITS
+        found = [one for one in splits if (self.root / "images" / one / sequence.folder).is_dir()]
+        if not found:
+            raise BadInput(
+                f"does not contain images/*/{sequence.folder}",
+                where=self.root,
+                remedy="Give the folder with images/ and annotations/ of InterHand2.6M.",
+            )
+        self.split = found[0]
+        self.images = self.root / "images" / self.split
+
+    def path(self, kind: str) -> Path:
+        """The file of a kind of annotations."""
+        name = f"InterHand2.6M_{self.split}_{kind}.json"
+        return self.root / "annotations" / self.split / name
+
+    def of_capture(self, kind: str) -> tuple[Path, dict[str, Any]]:
+        """The file of a kind, and what it says of the sequence's capture."""
+        path, capture = self.path(kind), str(self.sequence.capture)
+        value = read_json(path, max_bytes=MAX_BYTES)
+        found = value.get(capture) if isinstance(value, dict) else None
+        if not isinstance(found, dict):
+            raise BadInput("is missing", where=path, field=capture)
+        return path, found
+
+    def frames(self) -> list[dict[str, Any]]:
+        """The records of the annotated frames of the camera, by frame number."""
+        sequence, path = self.sequence, self.path("data")
+        data, where = read_json(path, max_bytes=MAX_BYTES), path.parent
+        if not isinstance(data, dict):
+            raise BadInput("is not a JSON object", where=path)
+        wanted = (str(sequence.capture), sequence.name, sequence.camera)
+        chosen = {
+            image.get("id"): image
+            for image in _objects(data, "images", where)
+            if (str(image.get("capture")), image.get("seq_name"), str(image.get("camera")))
+            == wanted
+        }
+        types = {
+            item.get("image_id"): item.get("hand_type")
+            for item in _objects(data, "annotations", where)
+            if item.get("image_id") in chosen
+        }
+        rows = []
+        for key, image in chosen.items():
+            row = {**image, "hand_type": types.get(key)}
+            for name in ("frame_idx", "width", "height"):
+                try:
+                    row[name] = int(row[name])
+                except (KeyError, TypeError, ValueError) as error:
+                    problem = f"image {key} does not have it"
+                    raise BadInput(problem, where=where, field=name) from error
+            if not isinstance(row.get("file_name"), str):
+                raise BadInput(f"image {key} does not have it", where=where, field="file_name")
+            if row["hand_type"] in ("right", "left", "interacting"):
+                rows.append(row)
+        if not 1 <= len(rows) <= MAX_FRAMES:
+            raise BadInput(
+                f"{len(rows)} annotated frames of {sequence.name}, camera {sequence.camera}",
+                where=where,
+                remedy="Is the sequence in this part of the data set?",
+            )
+        rows.sort(key=lambda row: row["frame_idx"])
+        if len({row["frame_idx"] for row in rows}) < len(rows):
+            raise BadInput(
+                f"lists a frame of {sequence.name} twice", where=where, field="frame_idx"
+            )
+        return rows
+
+    def camera(self) -> tuple[np.ndarray, np.ndarray]:
+        """Intrinsics (3, 3) px, and (4, 4) world to camera, m."""
+        path, capture = self.of_capture("camera")
+        sequence = self.sequence
+
+        def numbers(name: str, *shape: int) -> np.ndarray:
+            table = capture.get(name)
+            value = table.get(sequence.camera) if isinstance(table, dict) else None
+            return _numbers(value, shape, path, f"{sequence.capture}.{name}.{sequence.camera}")
+
+        position, rotation = numbers("campos", 3) / 1000.0, numbers("camrot", 3, 3)
+        focal, centre = numbers("focal", 2), numbers("princpt", 2)
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or focal.min() <= 0:
+            raise BadInput("is not a rotation, or a focal length is not above 0", where=path)
+        # Written with six digits, it is a rotation only to about 1e-6: take the nearest one.
+        left, _, right = np.linalg.svd(rotation)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = left @ right
+        viewmat[:3, 3] = -viewmat[:3, :3] @ position
+        K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1.0]])
+        return K, viewmat
+
+    def joints(self, keys: list[str], sides: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """(F, 21, 3) m by side."""
+        path, capture = self.of_capture("joint_3d")
+        found = {side: np.full((len(keys), 21, 3), np.nan) for side in sides}
+        for index, key in enumerate(keys):
+            frame = capture.get(key)
+            if not isinstance(frame, dict):
+                continue
+            field = f"{self.sequence.capture}.{key}"
+            coords, valid = frame.get("world_coord"), frame.get("joint_valid")
+            world = _numbers(coords, (42, 3), path, f"{field}.world_coord") / 1000.0
+            flags = _numbers(valid, (42,), path, f"{field}.joint_valid", flat=True)
+            for side in sides:
+                rows = _FIRST_JOINT[side] + np.array(LANDMARK_ROWS)
+                # Joints that are not valid are filled with ones.
+                found[side][index] = np.where(flags[rows, None] > 0, world[rows], np.nan)
+        return found
+
+    def mano(
+        self, keys: list[str], sides: tuple[str, ...], *, needed: bool
+    ) -> dict[str, ManoAnnotation]:
+        """MANO parameters by side; none valid if they are not needed and not there."""
+        path, capture = self.path(_MANO), {}
+        if needed or path.exists():
+            path, capture = self.of_capture(_MANO)
+        made = {}
+        for side in sides:
+            pose, shape, transl = (np.zeros((len(keys), n)) for n in (48, 10, 3))
+            valid = np.zeros(len(keys), dtype=bool)
+            for index, key in enumerate(keys):
+                frame = capture.get(key)
+                hand = frame.get(side) if isinstance(frame, dict) else None
+                if hand is None:
+                    continue
+                field = f"{self.sequence.capture}.{key}.{side}"
+                if not isinstance(hand, dict):
+                    raise BadInput("is not a JSON object", where=path, field=field)
+                for name, target in (("pose", pose), ("shape", shape), ("trans", transl)):
+                    value, length = hand.get(name), (target.shape[1],)
+                    target[index] = _numbers(value, length, path, f"{field}.{name}", flat=True)
+                valid[index] = True
+            made[side] = ManoAnnotation(pose.reshape(-1, 16, 3), shape, transl, valid)
+        return made
+
+
+def _objects(data: dict[str, Any], name: str, where: Path) -> list[dict[str, Any]]:
+    value = data.get(name)
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise BadInput("is not a list of objects", where=where, field=name)
+    return value
+
+
+def _numbers(
+    value: Any, shape: tuple[int, ...], where: Path, field: str, *, flat: bool = False
+) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadInput("is not a list of numbers", where=where, field=field) from error
+    array = array.reshape(-1) if flat else array
+    if array.shape != shape or not np.isfinite(array).all():
+        raise BadInput(f"is not a finite array of shape {shape}", where=where, field=field)
+    return array
+
+
+def read_annotations(
+    root: str | os.PathLike[str],
+    sequence: InterHandSequence,
+    side: str = "auto",
+    *,
+    mano: bool = True,
+) -> InterHandRecords:
+    """Read the annotations of one camera of one sequence.
+
+    `side` is `right`, `left` or `both`; `auto`: the hands that the sequence is said to show. MANO
+    parameters that are not needed (`mano`) are read where they are.
+    """
+    files = _Annotations(root, sequence)
+    rows = files.frames()
+    images = tuple(inside(files.images, re.sub(r"^/+", "", row["file_name"])) for row in rows)
+    for image in images:
+        check_is_file(image, remedy="Unpack the images of the sequence.")
+    types = {row["hand_type"] for row in rows}
+    shown = {"right", "left"} if "interacting" in types else types & {"right", "left"}
+    wanted = ("right", "left") if side in ("auto", "both") else (side,)
+    if side != "auto" and not shown >= set(wanted):
+        raise BadInput(
+            f"shows the {' and the '.join(sorted(shown)) or 'no'} hand only",
+            where=files.images / sequence.folder,
+            field="--side",
+        )
+    sides = tuple(side for side in wanted if side in shown)
+    sizes = {(row["width"], row["height"]) for row in rows}
+    if len(sizes) != 1 or not sides:
+        raise BadInput(
+            f"has frames of sizes {sorted(sizes)} and hands {sorted(types)}", where=files.images
+        )
+    K, viewmat = files.camera()
+    frames = np.array([row["frame_idx"] for row in rows])
+    keys = [str(frame) for frame in frames]
+    return InterHandRecords(
+        split=files.split,
+        frames=frames,
+        images=images,
+        size=sizes.pop(),
+        sides=sides,
+        K=K,
+        viewmat=viewmat,
+        joints=files.joints(keys, sides),
+        mano=files.mano(keys, sides, needed=mano),
+    )
+
+
+# --- The import
+
+
 def import_interhand(
     root: str | os.PathLike[str],
     sequence: InterHandSequence,
@@ -460,27 +444,30 @@ def import_interhand(
     refuse_existing(out, overwrite=options.overwrite)
     records = read_annotations(root, sequence, options.side, mano=options.mano is not None)
     records, black = _without_black_frames(records, root)
-    templates = {side: load_template(options.model, side) for side in records.sides}
-    hands, facts = {}, {"frames": len(records.frames), "hands": list(records.sides)}
+    count = len(records.frames)
+    facts: dict[str, Any] = {"frames": count, "hands": list(records.sides)}
     if black:
         facts["black_frames"] = black
-    errors: dict[str, Any] = {}
+    templates = {side: load_template(options.model, side) for side in records.sides}
+    hands, errors = {}, {}
     for side, template in templates.items():
+        errors[side] = {}
         if options.mano is not None:
             hands[side], one_shape = _mano_hand(records.mano[side], template, side, root)
             errors[side] = {"one_shape_mm": round(float(np.nanmean(one_shape)), 3)}
         else:
             hands[side] = _free_hand(records, template, side, root)
-            errors[side] = {}
         distance = _joint_distance(records.joints[side], template, hands[side])
         errors[side] |= {"joints_mm": distance, "frames_valid": int(hands[side].valid.sum())}
-    windows = _windows(records, templates, hands, options)
-    count = len(records.frames)
-    Ks = np.stack([_shifted(records.K, windows, frame) for frame in range(count)])
-    cameras = Cameras(Ks, np.tile(records.viewmat, (count, 1, 1)))
-    clips = {
-        side: project_hand(template, hands[side], cameras) for side, template in templates.items()
-    }
+    viewmats = np.tile(records.viewmat, (count, 1, 1))
+
+    def projected(Ks: np.ndarray) -> list[ProjectedHand]:
+        cameras = Cameras(Ks, viewmats)
+        return [project_hand(templates[side], hands[side], cameras) for side in hands]
+
+    windows = _windows(projected(np.tile(records.K, (count, 1, 1))), options)
+    cameras = Cameras(windows.intrinsics(records.K), viewmats)
+    clips = projected(cameras.Ks)
     facts |= {"errors": errors, "crop_px": windows.side, "split": records.split}
     info = _info(records, sequence, facts, options)
     shown = set(sheet_frames(count))
@@ -494,7 +481,7 @@ def import_interhand(
             yield image, mask
 
     def sheet() -> np.ndarray:
-        return overlay_sheet(list(clips.values()), images, masks)
+        return overlay_sheet(clips, images, masks)
 
     write_capture(out, info, hands, cameras, frames(), sheet, facts, overwrite=options.overwrite)
     return facts
@@ -551,61 +538,31 @@ def _free_hand(
         raise _no_annotation("joints", side, root)
     mano = records.mano[side]
     pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
-    zeros = np.zeros((len(pose), 3))
-    posed = pose_hand(
-        template.to_torch(torch.float64),
-        torch.from_numpy(pose),
-        torch.zeros(10, dtype=torch.float64),
-        torch.from_numpy(zeros),
-    )
-    shift = np.where(valid[:, None], joints[:, 9] - posed.landmarks[:, 9].numpy(), 0.0)
-    start = HandParameters(pose, np.zeros(10), shift, valid)
+    unplaced = HandParameters(pose, np.zeros(10), np.zeros((len(pose), 3)), valid)
+    shift = joints[:, 9] - pose_parameters(template, unplaced).landmarks[:, 9].numpy()
+    start = replace(unplaced, transl=np.where(valid[:, None], shift, 0.0))
     return fit_hand(template, FitTargets(joints), start).parameters
 
 
 def _joint_distance(
     joints: np.ndarray, template: HandTemplate, hand: HandParameters
 ) -> float | None:
-    posed = pose_hand(
-        template.to_torch(torch.float64),
-        torch.from_numpy(hand.pose),
-        torch.from_numpy(hand.betas),
-        torch.from_numpy(hand.transl),
-    )
-    gaps = np.linalg.norm(posed.landmarks.numpy() - joints, axis=-1)[hand.valid]
+    posed = pose_parameters(template, hand).landmarks.numpy()
+    gaps = np.linalg.norm(posed - joints, axis=-1)[hand.valid]
     return round(1000.0 * float(np.nanmean(gaps)), 3) if np.isfinite(gaps).any() else None
 
 
-def _windows(
-    records: InterHandRecords,
-    templates: Mapping[str, HandTemplate],
-    hands: Mapping[str, HandParameters],
-    options: InterHandImport,
-) -> CropWindows:
-    """One square of constant size that follows both hands, as for a video."""
-    count = len(records.frames)
-    whole = Cameras(np.tile(records.K, (count, 1, 1)), np.tile(records.viewmat, (count, 1, 1)))
-    clips = {side: project_hand(templates[side], hand, whole) for side, hand in hands.items()}
-    seen = np.any([hand.valid for hand in hands.values()], axis=0)
+def _windows(clips: list[ProjectedHand], options: InterHandImport) -> CropWindows:
+    """One square of constant size that follows all hands in whole frames, as for a video."""
+    seen = np.any([clip.valid for clip in clips], axis=0)
     points = []
-    for side, clip in clips.items():
-        valid = hands[side].valid[:, None, None]
+    for index, clip in enumerate(clips):
         # A hand that is missing must not draw the window: the other one stands in for it.
-        others = [clips[other].pixels[:, :1] for other in clips if other != side] or [
-            clip.pixels[:, :1]
-        ]
-        points.append(np.where(valid, clip.pixels, others[0]))
+        other = clips[index - 1].pixels[:, :1]
+        points.append(np.where(clip.valid[:, None, None], clip.pixels, other))
     image = np.concatenate(points, axis=1)
-    world = np.zeros((count, 21, 3))
-    hand = Landmarks(image, world, seen.astype(float), seen)
+    hand = Landmarks(image, np.zeros((len(image), 21, 3)), seen.astype(float), seen)
     return follow_hands([hand], options.fps, options.size)
-
-
-def _shifted(K: np.ndarray, windows: CropWindows, frame: int) -> np.ndarray:
-    cropped = K.copy()
-    cropped[:2, 2] -= windows.corners[frame]
-    cropped[:2] *= windows.scale
-    return cropped
 
 
 def _info(
@@ -628,7 +585,7 @@ def _info(
         perturbations={},
         source={
             "kind": "InterHand2.6M",
-            "sequence": f"{records.split}/Capture{sequence.capture}/{sequence.name}",
+            "sequence": f"{records.split}/{sequence.folder}",
             "camera": sequence.camera,
             "frames": records.frames.tolist(),
             "masks": "silhouette of the annotated hands",
@@ -639,7 +596,7 @@ def _info(
 
 
 def _cropped_frames(
-    records: InterHandRecords, clips: Mapping[str, ProjectedHand], windows: CropWindows
+    records: InterHandRecords, clips: list[ProjectedHand], windows: CropWindows
 ) -> Iterator[tuple[np.ndarray, np.ndarray]]:
     """Yield the cropped image and mask of every frame."""
     width, height = records.size
@@ -648,10 +605,10 @@ def _cropped_frames(
         corner = windows.corners[frame]
         whole = read_rgb(path, (height, width))
         mask = np.zeros((windows.size, windows.size), dtype=np.uint8)
-        for clip in clips.values():
+        for clip in clips:
             if clip.valid[frame]:
                 mask |= draw_silhouette(clip.pixels[frame], clip.faces, windows.size)
         # Outside the camera's frame no hand is visible.
-        inside = resample(cut(whole_frame, corner, windows.side), windows.size)
-        mask[inside < 255] = 0
+        in_frame = resample(cut(whole_frame, corner, windows.side), windows.size)
+        mask[in_frame < 255] = 0
         yield resample(cut(whole, corner, windows.side), windows.size), mask

@@ -1,4 +1,8 @@
-"""Rotated rectangles in an image: the networks see the image through them."""
+"""What MediaPipe's networks see: rotated regions of an image, palms in it, and hands in regions.
+
+Source: the graphs `palm_detection_cpu`, `palm_detection_detection_to_roi`, `hand_landmark_cpu` and
+`hand_landmark_landmarks_to_roi` of MediaPipe 0.10.21.
+"""
 
 from __future__ import annotations
 
@@ -10,20 +14,17 @@ import numpy as np
 
 @dataclass(frozen=True)
 class Region:
-    """A rectangle in an image, turned about its centre.
+    """A rectangle in an image, turned about its centre."""
 
-    Attributes:
-        x: centre, px from the left edge of the image.
-        y: centre, px from its upper edge.
-        width: px, along the rectangle's own first axis.
-        height: px, along its second axis.
-        rotation: rad, clockwise as the image is seen; 0 = upright.
-    """
-
+    #: Centre, px from the left edge of the image.
     x: float
+    #: Centre, px from its upper edge.
     y: float
+    #: Px, along the rectangle's own first axis.
     width: float
+    #: Px, along its second axis.
     height: float
+    #: Rad, clockwise as the image is seen; 0 = upright.
     rotation: float = 0.0
 
     def matrix(self) -> np.ndarray:
@@ -37,11 +38,8 @@ class Region:
     def grown(self, scale: float, shift: float) -> Region:
         """Return the square around this rectangle, moved and then scaled.
 
-        Args:
-            scale: edge of the square, as a multiple of the rectangle's longer side.
-            shift: along the second axis, as a share of the rectangle's height.
-
-        Source: MediaPipe's RectTransformationCalculator with `square_long`.
+        Its edge is `scale` times the longer side; it is moved along the second axis by `shift`
+        times the height. Source: MediaPipe's RectTransformationCalculator with `square_long`.
         """
         step = shift * self.height
         edge = scale * max(self.width, self.height)
@@ -61,14 +59,9 @@ def full_square(width: int, height: int) -> Region:
 
 
 def angle_of(start: np.ndarray, end: np.ndarray) -> float:
-    """Return the rotation of a region whose upward direction is that from `start` to `end`.
+    """The rotation of a region whose upward direction is from `start` to `end`, (2,) px.
 
-    Args:
-        start: (2,) px.
-        end: (2,) px.
-
-    Returns:
-        rad in [-pi, pi), clockwise; 0 where `end` is straight above `start`.
+    rad in [-pi, pi), clockwise; 0 where `end` is straight above `start`.
     """
     dx, dy = float(end[0] - start[0]), float(end[1] - start[1])
     angle = math.pi / 2 - math.atan2(-dy, dx)
@@ -94,17 +87,11 @@ def _shared(centre: float, length: float, other: float, other_length: float) -> 
 
 
 def cut_region(image: np.ndarray, region: Region, edge: int, *, outside_black: bool) -> np.ndarray:
-    """Resample the content of a region into a square image.
+    """Resample a region, which may reach beyond its image, into a square: (edge, edge, 3) uint8.
 
-    Args:
-        image: (H, W, 3) uint8.
-        region: of the image; it may reach beyond it.
-        edge: px of the result.
-        outside_black: what lies outside the image is black; otherwise the image's edge goes on.
-
-    Returns:
-        (edge, edge, 3) uint8. Its position (0, 0) is the region's first corner, as in MediaPipe's
-        ImageToTensorCalculator, which samples bilinearly and does not smooth.
+    What lies outside the image is black, or the image's edge goes on. Position (0, 0) is the
+    region's first corner, as in MediaPipe's ImageToTensorCalculator, which samples bilinearly and
+    does not smooth.
     """
     import cv2
 
@@ -139,18 +126,15 @@ _PALM_GROWTH, _PALM_SHIFT = 2.6, -0.5
 
 @dataclass(frozen=True, eq=False)
 class Palm:
-    """A palm that was found.
+    """A palm that was found."""
 
-    Attributes:
-        low: (2,) upper left corner of its box, px of the image.
-        high: (2,) lower right corner.
-        keypoints: (7, 2) px; the wrist is the first, the base of the middle finger the third.
-        score: in [0, 1].
-    """
-
+    #: (2,) upper left corner of its box, px of the image.
     low: np.ndarray
+    #: (2,) lower right corner.
     high: np.ndarray
+    #: (7, 2) px; the wrist is the first, the base of the middle finger the third.
     keypoints: np.ndarray
+    #: In [0, 1].
     score: float
 
     def hand_region(self) -> Region:
@@ -175,16 +159,10 @@ def anchors() -> np.ndarray:
 
 
 def decode(values: np.ndarray, logits: np.ndarray, min_score: float) -> list[Palm]:
-    """Decode the detector's output.
+    """Decode the detector's output to palms in the unit square of its image, by anchor.
 
-    Args:
-        values: (2016, 18): centre, size and seven keypoints, px of the detector's image, centre
-            and keypoints relative to the anchor.
-        logits: (2016,) of the scores.
-        min_score: palms below it are left out.
-
-    Returns:
-        Palms in the unit square of the detector's image, in the order of the anchors.
+    `values` (2016, 18) are centre, size and seven keypoints, px of the detector's image, centre and
+    keypoints relative to the anchor; `logits` (2016,) those of the scores.
     """
     scores = 1 / (1 + np.exp(-np.clip(logits.astype(np.float64), -100, 100)))
     kept = np.flatnonzero(scores >= min_score)
@@ -199,12 +177,10 @@ def decode(values: np.ndarray, logits: np.ndarray, min_score: float) -> list[Pal
 
 
 def suppress(palms: list[Palm]) -> list[Palm]:
-    """Replace boxes of the same palm by their mean, weighted with their scores.
+    """Replace boxes of the same palm by their mean, weighted with their scores; best first.
 
-    Returns:
-        The palms, best first; each has the score of its best box.
-
-    Source: MediaPipe's NonMaxSuppressionCalculator, algorithm WEIGHTED.
+    Each has the score of its best box. Source: MediaPipe's NonMaxSuppressionCalculator, algorithm
+    WEIGHTED.
     """
     rest = sorted(palms, key=lambda palm: -palm.score)
     found = []
@@ -261,38 +237,18 @@ _DEPTH = 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class HandReading:
-    """The network's answer about one region.
-
-    Attributes:
-        points: (21, 3) px of the network's image: x, y, and depth in a scale of its own.
-        world: (21, 3) m, axes of the network's image.
-        presence: probability that the region shows a hand.
-        right: probability that it is a right hand, if the video is not mirrored.
-    """
-
-    points: np.ndarray
-    world: np.ndarray
-    presence: float
-    right: float
-
-
-@dataclass(frozen=True, eq=False)
 class SeenHand:
-    """One hand in one image.
+    """One hand in one image."""
 
-    Attributes:
-        image: (21, 3) float64, x, y in px of the image; z in the same unit, negative towards the
-            camera, relative to the wrist.
-        world: (21, 3) float64 m, x right, y down, z away from the camera; the origin is near the
-            hand's centre.
-        presence: probability that it is a hand.
-        right: probability that it is a right hand, if the video is not mirrored.
-    """
-
+    #: (21, 3) float64, x, y in px of the image; z in the same unit, negative towards the camera,
+    #: relative to the wrist.
     image: np.ndarray
+    #: (21, 3) float64 m, x right, y down, z away from the camera; the origin is near the hand's
+    #: centre.
     world: np.ndarray
+    #: Probability that it is a hand.
     presence: float
+    #: Probability that it is a right hand, if the video is not mirrored.
     right: float
 
     def next_region(self) -> Region:
@@ -313,23 +269,20 @@ class SeenHand:
         """Return the longer side of the box around all landmarks, px."""
         return float(np.ptp(self.image[:, :2], axis=0).max())
 
+    def placed(self, region: Region) -> SeenHand:
+        """Put what the network says of a region, a square, into the image.
 
-def place_reading(reading: HandReading, region: Region) -> SeenHand:
-    """Put the network's answer about a region into the image.
-
-    Args:
-        reading: the answer.
-        region: that the network saw; a square.
-    """
-    points = reading.points.astype(np.float64) / HAND_EDGE
-    flat = to_image(points[:, :2], region)
-    depth = points[:, 2:] / _DEPTH * region.width
-    cos, sin = math.cos(region.rotation), math.sin(region.rotation)
-    world = reading.world.astype(np.float64)
-    turned = world[:, :2] @ np.array([[cos, -sin], [sin, cos]]).T
-    return SeenHand(
-        np.concatenate([flat, depth], axis=1),
-        np.concatenate([turned, world[:, 2:]], axis=1),
-        reading.presence,
-        reading.right,
-    )
+        The network's points are px of its own image, and its axes those of the region.
+        """
+        points = self.image.astype(np.float64) / HAND_EDGE
+        flat = to_image(points[:, :2], region)
+        depth = points[:, 2:] / _DEPTH * region.width
+        cos, sin = math.cos(region.rotation), math.sin(region.rotation)
+        world = self.world.astype(np.float64)
+        turned = world[:, :2] @ np.array([[cos, -sin], [sin, cos]]).T
+        return SeenHand(
+            np.concatenate([flat, depth], axis=1),
+            np.concatenate([turned, world[:, 2:]], axis=1),
+            self.presence,
+            self.right,
+        )

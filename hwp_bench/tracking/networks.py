@@ -28,7 +28,7 @@ from hwp_bench.tracking.detection import (
     HAND_EDGE,
     PALM_EDGE,
     PALM_VALUES,
-    HandReading,
+    SeenHand,
 )
 
 #: Largest network that is read, bytes.
@@ -41,32 +41,24 @@ _MAGIC = b"TFL3"
 
 @dataclass(frozen=True)
 class Pinned:
-    """A file whose content is known.
+    """A file whose content is known."""
 
-    Attributes:
-        name: path inside the wheel, or address.
-        size: bytes.
-        sha256: hex.
-    """
-
+    #: Path inside the wheel, or address.
     name: str
+    #: Bytes.
     size: int
+    #: Hex.
     sha256: str
 
 
 @dataclass(frozen=True)
 class HandModels:
-    """The two networks.
+    """The two networks, TensorFlow Lite files."""
 
-    Attributes:
-        palm: the palm detector, a TensorFlow Lite file.
-        hand: the landmark network, the same.
-        source: where they come from, for messages.
-        digest: SHA-256 (hex) over both.
-    """
-
+    #: The palm detector, and the landmark network.
     palm: bytes
     hand: bytes
+    #: Where they come from, for messages.
     source: str
 
     @property
@@ -174,15 +166,9 @@ def fetch_models(*, opener: Opener | None = None, wheel: Pinned = WHEEL) -> Path
 def read_members(
     archive: Path | IO[bytes], names: list[str] | tuple[str, ...], *, where: str | None = None
 ) -> list[bytes]:
-    """Read members of a zip archive into memory; nothing is unpacked to a path.
+    """Read members of a zip archive into memory, by exact names; nothing is unpacked to a path.
 
-    Args:
-        archive: the file.
-        names: of the members, exactly.
-        where: the archive's name in messages.
-
-    Raises:
-        BadInput: it is not a zip archive, a member is missing, there twice, or above `MAX_NETWORK`.
+    `where` is the archive's name in messages.
     """
     where = where or os.fspath(archive)  # type: ignore[arg-type]
     try:
@@ -294,7 +280,7 @@ class HandNetworks(Protocol):
             Boxes and keypoints (2016, 18), and logits of scores (2016,).
         """
 
-    def hand(self, image: np.ndarray) -> HandReading:
+    def hand(self, image: np.ndarray) -> SeenHand:
         """Read the landmarks of the hand in an image, (224, 224, 3) uint8 RGB."""
 
 
@@ -304,10 +290,6 @@ class LiteRtNetworks:
     Args:
         models: the two networks.
         threads: of each network.
-
-    Raises:
-        MissingDependency: `ai-edge-litert` is not installed.
-        BadInput: a network cannot be loaded, or has other inputs and outputs than MediaPipe's.
     """
 
     def __init__(self, models: HandModels, *, threads: int = 1) -> None:
@@ -328,10 +310,10 @@ class LiteRtNetworks:
         values, logits = self._palm(image)
         return values[0], logits[0, :, 0]
 
-    def hand(self, image: np.ndarray) -> HandReading:
+    def hand(self, image: np.ndarray) -> SeenHand:
         """Read the landmarks of a hand; see `HandNetworks`."""
         points, presence, right, world = self._hand(image)
-        return HandReading(
+        return SeenHand(
             points.reshape(21, 3), world.reshape(21, 3), float(presence[0, 0]), float(right[0, 0])
         )
 

@@ -34,18 +34,15 @@ class NoHandSeen(HwpError):
 
 @dataclass(frozen=True, eq=False)
 class TrackedVideo:
-    """The hands of a video.
+    """The hands of a video."""
 
-    Attributes:
-        video: the file.
-        hands: in every frame.
-        seconds: of tracking.
-        reading: what came of reading the video.
-    """
-
+    #: The file.
     video: VideoInfo
+    #: In every frame.
     hands: HandTracks
+    #: Of tracking.
     seconds: float
+    #: What came of reading the video.
     reading: Reading
 
     def facts(self) -> dict[str, Any]:
@@ -150,15 +147,9 @@ _SHIFT = 4
 
 
 def landmark_sheet(tracked: TrackedVideo, *, count: int = 16, edge: int = 320) -> np.ndarray:
-    """Draw frames that are evenly spaced over a video.
+    """Draw `count` frames, evenly spaced over a video, with their hands: (H, W, 3) uint8.
 
-    Args:
-        tracked: the video and its hands.
-        count: number of frames.
-        edge: longer side of each frame, px.
-
-    Returns:
-        (H, W, 3) uint8.
+    `edge` is the longer side of each frame, px.
     """
     frames = tracked.hands.score.shape[1]
     stride = -(-frames // count)
@@ -189,17 +180,9 @@ def _window(hands: HandTracks) -> tuple[int, int, int, int]:
 def draw_landmarks(
     image: np.ndarray, hands: HandTracks, frame: int, corner: tuple[int, int], scale: float
 ) -> np.ndarray:
-    """Draw the hands of a frame.
+    """Draw the hands of a frame on a part of it, (H, W, 3) uint8, which is returned.
 
-    Args:
-        image: (H, W, 3) uint8, a part of the frame; it is drawn on.
-        hands: of the video.
-        frame: its number.
-        corner: the part's upper left corner in the frame, px.
-        scale: of the image, relative to the frame.
-
-    Returns:
-        `image`.
+    `corner` is the part's upper left corner in the frame, px; `scale` the image's, relative to it.
     """
     for hand in range(len(hands.score)):
         if not hands.seen(hand)[frame]:

@@ -24,7 +24,6 @@ from hwp_bench.tracking.detection import (
     overlap,
     palm_input,
     place_in_image,
-    place_reading,
     suppress,
 )
 from hwp_bench.tracking.networks import HandNetworks
@@ -57,14 +56,11 @@ class TrackerSettings:
 
 @dataclass(frozen=True, eq=False)
 class TrackedHand:
-    """A hand in a frame.
+    """A hand in a frame."""
 
-    Attributes:
-        track: number of the track, a stretch of frames without a gap; counts from 0.
-        hand: what was seen.
-    """
-
+    #: Number of the track, a stretch of frames without a gap; counts from 0.
     track: int
+    #: What was seen.
     hand: SeenHand
 
 
@@ -83,11 +79,7 @@ class HandTracker:
         self._tracks = 0
 
     def step(self, frame: np.ndarray) -> list[TrackedHand]:
-        """Find the hands of the next frame, (H, W, 3) uint8 RGB.
-
-        Returns:
-            At most `hands` of them. A hand that was seen in the last frame keeps its track.
-        """
+        """Find the hands of the next frame, (H, W, 3) uint8 RGB; one that was seen keeps its track."""
         seen: list[tuple[TrackedHand, float]] = []
         for region, before in self._regions(frame):
             image = cut_region(frame, region, HAND_EDGE, outside_black=False)
@@ -95,7 +87,7 @@ class HandTracker:
             values = (reading.presence, reading.right)
             if not np.isfinite(values).all() or reading.presence < self._settings.min_presence:
                 continue
-            hand = place_reading(reading, region)
+            hand = reading.placed(region)
             if not (np.isfinite(hand.image).all() and np.isfinite(hand.world).all()):
                 continue
             moved = np.inf if before is None else _distance(hand, before.hand)
@@ -203,15 +195,7 @@ class Collected:
         self.frames += 1
 
     def hands(self, size: tuple[int, int], most: int) -> HandTracks | None:
-        """Join the tracks to hands.
-
-        Args:
-            size: (width, height) of the video, px.
-            most: hands, 1 or 2.
-
-        Returns:
-            The hands; None where nothing was seen.
-        """
+        """Join the tracks to at most `most` hands, in a video of `size` px; None if nothing was seen."""
         if not self._frame:
             return None
         frame, track = np.array(self._frame), np.array(self._track, dtype=np.int32)

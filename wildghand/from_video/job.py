@@ -97,12 +97,7 @@ def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
 class Job:
     """One video, the folder of its avatar, the choices, and where everything lies.
 
-    Args:
-        video: the file.
-        folder: of the avatar.
-        options: the choices.
-        world: the processes that fit together.
-        watch: who is shown the fit while it runs.
+    `world` are the processes that fit together; `watch` is who is shown the fit while it runs.
     """
 
     def __init__(

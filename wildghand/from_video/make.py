@@ -29,18 +29,15 @@ from wildghand.model.settings import read_settings
 
 @dataclass(frozen=True, eq=False)
 class MadeAvatar:
-    """The avatar of a video, and how it was made.
+    """The avatar of a video, and how it was made."""
 
-    Attributes:
-        avatar: the avatar; `avatar.folder` is where it lies.
-        job: its files.
-        record: seconds of every stage, those of earlier runs included.
-        kept: names of the stages that earlier runs had done.
-    """
-
+    #: The avatar; `avatar.folder` is where it lies.
     avatar: WildGHandAvatar
+    #: Its files.
     job: Job
+    #: Seconds of every stage, those of earlier runs included.
     record: JobRecord
+    #: Names of the stages that earlier runs had done.
     kept: tuple[str, ...]
 
     def video_facts(self) -> dict[str, Any]:

@@ -104,9 +104,6 @@ def find_file(folder: Path, named: str, *, where: Path, field: str) -> Path:
 
     The paths in the release belong to its authors' machine. The last parts of the name are
     searched for below the folder, the bare file name first. No name can lead out of the folder.
-
-    Raises:
-        BadInput: the file does not exist.
     """
     parts = [part for part in _SEPARATORS.split(named) if part not in ("", ".", "..")]
     for count in range(1, len(parts) + 1):
@@ -144,61 +141,49 @@ FRAME_KEYS = (
 
 @dataclass(frozen=True, eq=False)
 class SideRecords:
-    """One hand in every frame, as the tracker wrote it.
+    """One hand in every frame, as the tracker wrote it."""
 
-    Attributes:
-        pose: (F, 16, 3) axis-angle rad, relative to MANO's mean pose; of a left hand in the
-            mirrored right-hand convention.
-        shape: (F, 10).
-        vertices: (F, 778, 3) m, in camera axes: `verts3d_world` + `cam_aligned`.
-        camera: (F, 3) m, `cam_aligned`.
-        landmarks: (F, 21, 2) px of the whole frame.
-        valid: (F,) bool, false where a value is not finite.
-    """
-
+    #: (F, 16, 3) axis-angle rad, relative to MANO's mean pose; of a left hand in the mirrored
+    #: right-hand convention.
     pose: np.ndarray
+    #: (F, 10).
     shape: np.ndarray
+    #: (F, 778, 3) m, in camera axes: `verts3d_world` + `cam_aligned`.
     vertices: np.ndarray
+    #: (F, 3) m, `cam_aligned`.
     camera: np.ndarray
+    #: (F, 21, 2) px of the whole frame.
     landmarks: np.ndarray
+    #: (F,) bool, false where a value is not finite.
     valid: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class OfficialRecords:
-    """All records of one capture of the release.
+    """All records of one capture of the release."""
 
-    Attributes:
-        numbers: (F,) the first integer in each image's name, ascending.
-        images: F image files.
-        masks: F mask files.
-        focal: (F,) px of the whole frame.
-        boxes: F boxes (4,) x1, y1, x2, y2 as stored, or None where there is none.
-        root_rel: (F, 3) m.
-        sides: the tracked hands.
-        unknown: keys that the format does not list.
-        reordered: whether the records were not in the order of their numbers.
-    """
-
+    #: (F,) the first integer in each image's name, ascending.
     numbers: np.ndarray
+    #: F image files.
     images: tuple[Path, ...]
+    #: F mask files.
     masks: tuple[Path, ...]
+    #: (F,) px of the whole frame.
     focal: np.ndarray
+    #: F boxes (4,) x1, y1, x2, y2 as stored, or None where there is none.
     boxes: tuple[np.ndarray | None, ...]
+    #: (F, 3) m.
     root_rel: np.ndarray
+    #: The tracked hands.
     sides: Mapping[str, SideRecords]
+    #: Keys that the format does not list.
     unknown: tuple[str, ...]
+    #: Whether the records were not in the order of their numbers.
     reordered: bool
 
 
 def read_records(folder: OfficialFolder) -> OfficialRecords:
-    """Read and check the pickles of one capture.
-
-    Raises:
-        UnsafePickle: a pickle asks for something that is not plain data; it is named.
-        BadInput: a pickle is not a list of records, a key is missing or has another shape, two
-            records have one number, or a file that is named does not exist.
-    """
+    """Read and check the pickles of one capture."""
     rows: list[tuple[int, dict[str, Any], Path]] = []
     for pickle in folder.pickles:
         content = load_pickle(pickle, max_bytes=MAX_PICKLE_BYTES)

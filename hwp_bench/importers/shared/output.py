@@ -17,7 +17,7 @@ from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import refuse_existing as refuse_folder
 from hwp_bench.base.progress import progress
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter
-from hwp_bench.hands import HandParameters, HandTemplate, pose_hand, project
+from hwp_bench.hands import HandParameters, HandTemplate, PosedHand, pose_hand, project
 from hwp_bench.importers.shared.frames import each_frame
 from hwp_bench.importers.shared.landmarks import LANDMARK_EDGES
 
@@ -97,16 +97,22 @@ class ProjectedHand:
     valid: np.ndarray
 
 
-def project_hand(template: HandTemplate, hand: HandParameters, cameras: Cameras) -> ProjectedHand:
-    """Pose a hand in every frame and project it."""
-    viewmats, Ks = torch.from_numpy(cameras.viewmats), torch.from_numpy(cameras.Ks)
+def pose_parameters(template: HandTemplate, hand: HandParameters) -> PosedHand:
+    """Pose a hand in every frame, in float64."""
     with torch.no_grad():
-        posed = pose_hand(
+        return pose_hand(
             template.to_torch(torch.float64),
             torch.from_numpy(hand.pose),
             torch.from_numpy(hand.betas),
             torch.from_numpy(hand.transl),
         )
+
+
+def project_hand(template: HandTemplate, hand: HandParameters, cameras: Cameras) -> ProjectedHand:
+    """Pose a hand in every frame and project it."""
+    viewmats, Ks = torch.from_numpy(cameras.viewmats), torch.from_numpy(cameras.Ks)
+    posed = pose_parameters(template, hand)
+    with torch.no_grad():
         pixels, _ = project(posed.vertices, viewmats, Ks)
         landmarks, _ = project(posed.landmarks, viewmats, Ks)
         vertices = posed.vertices @ viewmats[:, :3, :3].mT + viewmats[:, None, :3, 3]

@@ -73,20 +73,17 @@ class ImportedHand:
 
 @dataclass(frozen=True, eq=False)
 class ImportedClip:
-    """The results of an import.
+    """The results of an import."""
 
-    Attributes:
-        source: the inputs.
-        hands: by side, the hand that is detected most first.
-        masks: final masks, of all hands.
-        overlap_landmarks_only: mean overlap of mesh and mask before the outline was fitted.
-        doubts: what tells against the landmarks.
-    """
-
+    #: The inputs.
     source: VideoSource
+    #: By side, the hand that is detected most first.
     hands: Mapping[str, ImportedHand]
+    #: Final masks, of all hands.
     masks: ClipMasks
+    #: Mean overlap of mesh and mask before the outline was fitted.
     overlap_landmarks_only: float
+    #: What tells against the landmarks.
     doubts: tuple[str, ...] = ()
 
     @property

@@ -146,20 +146,17 @@ _CONVERT = (
 
 @dataclass(frozen=True)
 class Colours:
-    """How the samples of a frame are read.
+    """How the samples of a frame are read."""
 
-    Attributes:
-        matrix: number in H.273, a key of `_MATRICES`; 0 for samples of red, green and blue.
-        primaries: 1 for BT.709 or what is taken for it, 9 for BT.2020, 12 for Display P3.
-        transfer: 1 for ordinary video, 16 for PQ, 18 for HLG.
-        full: whether samples use the full range.
-        bits: of a sample.
-    """
-
+    #: Number in H.273, a key of `_MATRICES`; 0 for samples of red, green and blue.
     matrix: int
+    #: 1 for BT.709 or what is taken for it, 9 for BT.2020, 12 for Display P3.
     primaries: int
+    #: 1 for ordinary video, 16 for PQ, 18 for HLG.
     transfer: int
+    #: Whether samples use the full range.
     full: bool
+    #: Of a sample.
     bits: int
 
     @property
@@ -177,17 +174,7 @@ class Colours:
 
 
 def colours_of(frame: Any, tag: str, path: Path) -> Colours:
-    """Find out how the samples of a frame are to be read.
-
-    Args:
-        frame: PyAV's.
-        tag: the codec's tag in the container.
-        path: of the video, for messages.
-
-    Raises:
-        BadInput: they cannot be converted; the message names what the file states, and a command
-            that helps.
-    """
+    """Find out how the samples of a frame of PyAV's are to be read, by the codec's tag too."""
     bits = frame.format.components[0].bits
     matrix, primaries, transfer = frame.colorspace, frame.color_primaries, frame.color_trc
     full = frame.color_range == 2 or frame.format.name.startswith("yuvj")
@@ -252,16 +239,7 @@ def _refused(path: Path, what: str) -> BadInput:
 
 
 def to_srgb(frame: Any, colours: Colours, size: tuple[int, int]) -> np.ndarray:
-    """Convert a frame.
-
-    Args:
-        frame: PyAV's.
-        colours: of the frame.
-        size: width and height of the result, px.
-
-    Returns:
-        (height, width, 3) uint8 sRGB.
-    """
+    """Convert a frame of PyAV's to (height, width, 3) uint8 sRGB; `size` is width and height."""
     if colours.matrix:
         frame.colorspace = _MATRICES[colours.matrix][2]
         frame.color_range = 2 if colours.full else 1
@@ -358,11 +336,7 @@ def pq_signal(light: np.ndarray) -> np.ndarray:
 def rolled_off(light: np.ndarray) -> np.ndarray:
     """Bend light so that the peak becomes reference white (ITU-R BT.2390, EETF).
 
-    Args:
-        light: relative to reference white, 0 or more.
-
-    Returns:
-        In [0, 1], the same up to 0.43.
+    Light is relative to reference white, 0 or more; the result in [0, 1], the same up to 0.43.
     """
     peak = pq_signal(np.array(PEAK))
     given = np.minimum(pq_signal(np.asarray(light) * REFERENCE_WHITE) / peak, 1.0)

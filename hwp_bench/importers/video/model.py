@@ -16,16 +16,13 @@ from hwp_bench.importers.shared.landmarks import PALM, Landmarks
 
 @dataclass(frozen=True)
 class RigidStart:
-    """Rigid motion of a hand in F frames.
+    """Rigid motion of a hand in F frames."""
 
-    Attributes:
-        rotation: (F, 3, 3) template rest frame to camera.
-        wrist: (F, 3) m, the wrist joint in the camera frame.
-        world: (F, 21, 3) m, the tracker's world landmarks turned into the camera frame.
-    """
-
+    #: (F, 3, 3) template rest frame to camera.
     rotation: np.ndarray
+    #: (F, 3) m, the wrist joint in the camera frame.
     wrist: np.ndarray
+    #: (F, 21, 3) m, the tracker's world landmarks turned into the camera frame.
     world: np.ndarray
 
 
@@ -63,16 +60,7 @@ def rigid_start(
 
 
 def interpolate(values: np.ndarray, seen: np.ndarray, count: int) -> np.ndarray:
-    """Fill frames between those seen linearly, and those outside with the nearest.
-
-    Args:
-        values: (S, ...) at the frames `seen`.
-        seen: (S,) increasing frame numbers, at least one.
-        count: number of frames F.
-
-    Returns:
-        (F, ...).
-    """
+    """Fill values (S, ...) of frames `seen`, ascending, to (F, ...): linearly, ends held."""
     flat = values.reshape(len(seen), -1)
     columns = [np.interp(np.arange(count), seen, column) for column in flat.T]
     return np.stack(columns, axis=1).reshape(count, *values.shape[1:])
@@ -265,15 +253,7 @@ class ClipModel:
         )
 
     def vertices(self, posed: PosedClip, some: SomeVertices) -> torch.Tensor:
-        """Pose some vertices of each frame.
-
-        Args:
-            posed: this clip.
-            some: which.
-
-        Returns:
-            (F, P, 3) m, camera axes.
-        """
+        """Pose some vertices of each frame: (F, P, 3) m, camera axes."""
         shaped = some.rest + some.shape_basis @ self.variables.betas
         motion = posed.transforms[:, :, :3].flatten(start_dim=2)
         blended = (some.weights @ motion).unflatten(-1, (3, 4))

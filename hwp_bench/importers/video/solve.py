@@ -353,18 +353,10 @@ def side_scores(landmarks: Landmarks, hand_model: str, footage: Footage) -> Side
 def warn_of_contradiction(
     side: str, scores: SideScores, votes: Mapping[str, float] | None, *, stated: bool = True
 ) -> bool:
-    """Warn where a hand is imported as one of a side, and the pictures show the other one.
+    """Warn, and say so, where a hand is imported as one of a side and the pictures show the other.
 
-    The fit decides where it is clear, else the votes.
-
-    Args:
-        side: `right` or `left`.
-        scores: of the fits.
-        votes: the network's mean probability of each side, None where the landmarks have none.
-        stated: whether a person has stated the side; else it is what the votes say.
-
-    Returns:
-        Whether there was a warning.
+    The fit decides where it is clear, else the network's votes, where the landmarks have them.
+    `stated`: a person has stated the side; else it is what the votes say.
     """
     voted = None if votes is None else max(SIDES, key=lambda side: votes[side])
     shown = scores.better if scores.is_clear else voted

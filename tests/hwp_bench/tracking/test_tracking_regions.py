@@ -11,13 +11,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.tracking.detection import (
-    HandReading,
     Region,
     SeenHand,
     angle_of,
     cut_region,
     overlap,
-    place_reading,
     to_image,
 )
 
@@ -88,7 +86,7 @@ def test_landmarks_of_a_crop_return_to_the_image(region: Region, seed: int) -> N
     rng = np.random.default_rng(seed)
     points = rng.uniform(0, 224, (21, 3))
     world = rng.normal(0, 0.05, (21, 3))
-    hand = place_reading(HandReading(points, world, 0.9, 0.8), square)
+    hand = SeenHand(points, world, 0.9, 0.8).placed(square)
     turn = cmath.exp(1j * region.rotation)
     for k in range(21):
         local = complex(*(points[k, :2] / 224 - 0.5)) * square.width
