@@ -324,7 +324,8 @@ class _Annotations:
         self, keys: list[str], sides: tuple[str, ...], *, needed: bool
     ) -> dict[str, ManoAnnotation]:
         """MANO parameters by side; none valid if they are not needed and not there."""
-        path, capture = self.path(_MANO), {}
+        path = self.path(_MANO)
+        capture: dict[str, Any] = {}
         if needed or path.exists():
             path, capture = self.of_capture(_MANO)
         made = {}
@@ -449,7 +450,8 @@ def import_interhand(
     if black:
         facts["black_frames"] = black
     templates = {side: load_template(options.model, side) for side in records.sides}
-    hands, errors = {}, {}
+    hands: dict[str, HandParameters] = {}
+    errors: dict[str, dict[str, Any]] = {}
     for side, template in templates.items():
         errors[side] = {}
         if options.mano is not None:

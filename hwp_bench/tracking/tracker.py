@@ -79,7 +79,7 @@ class HandTracker:
         self._tracks = 0
 
     def step(self, frame: np.ndarray) -> list[TrackedHand]:
-        """Find the hands of the next frame, (H, W, 3) uint8 RGB; one that was seen keeps its track."""
+        """Find the hands of the next frame, (H, W, 3) uint8 RGB; known ones keep their tracks."""
         seen: list[tuple[TrackedHand, float]] = []
         for region, before in self._regions(frame):
             image = cut_region(frame, region, HAND_EDGE, outside_black=False)
@@ -195,7 +195,7 @@ class Collected:
         self.frames += 1
 
     def hands(self, size: tuple[int, int], most: int) -> HandTracks | None:
-        """Join the tracks to at most `most` hands, in a video of `size` px; None if nothing was seen."""
+        """Join the tracks to 1 or 2 (`most`) hands; None where nothing was seen. `size`: px."""
         if not self._frame:
             return None
         frame, track = np.array(self._frame), np.array(self._track, dtype=np.int32)
