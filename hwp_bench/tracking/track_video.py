@@ -1,4 +1,4 @@
-"""From a video to the landmarks of its hands."""
+"""From a video to the landmarks of its hands, and a sheet that shows them."""
 
 from __future__ import annotations
 
@@ -138,6 +138,8 @@ def track_frames(
             update(collected.frames)
     return collected
 
+
+# --- A contact sheet of a video with the landmarks that were tracked in it
 
 #: Colours of a right and a left hand.
 COLOURS = {"right": (255, 160, 0), "left": (60, 200, 255)}

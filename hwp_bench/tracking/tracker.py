@@ -156,6 +156,12 @@ def _is_sound(region: Region, frame: np.ndarray) -> bool:
     )
 
 
+# --- From tracks to hands: which stretches of frames belong to one hand, and which side it is
+#
+# A track ends where its hand is lost, and the next one has another number. The network says in
+# each frame whether it sees a right or a left hand. It errs in single frames, so that all frames
+# of a track vote together.
+
 #: A second hand is seen in at least this share of the frames that show the first; what is less is
 #: the first hand with a wrong side, or a mistake.
 _SECOND_HAND = 0.1

@@ -1,4 +1,4 @@
-"""Folders of the release: their captures, the subsampling, and where the files are."""
+"""Folders of the release, and the frame records of their pickles, checked key by key."""
 
 from __future__ import annotations
 
@@ -117,6 +117,8 @@ def find_file(folder: Path, named: str, *, where: Path, field: str) -> Path:
         remedy="Put the images and masks of the release next to its pickle.",
     )
 
+
+# --- Frame records
 
 #: Largest pickle that is read, bytes: each record holds a mask of the whole frame.
 MAX_PICKLE_BYTES = 4 * 1024 * 1024 * 1024

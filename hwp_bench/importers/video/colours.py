@@ -1,4 +1,22 @@
-"""The compiled loop of `video_colours`: from Y'CbCr samples of 16 bits to sRGB."""
+"""The colours of a video's frames: from the samples of any phone to sRGB in 8 bits.
+
+What a file states (matrix, range, primaries, transfer; ITU-T H.273) decides how its samples are
+read. Where it states nothing: BT.709 from 1280 columns or more than 576 rows on, BT.601 below, as
+players assume, and limited range.
+
+Ordinary video, in the primaries of BT.709 or of BT.601 (which differ little and are taken for
+those of BT.709, as browsers do), is converted by FFmpeg's swscale. Its values are shown as sRGB.
+
+HLG and PQ (ITU-R BT.2100) become light as a display of 1000 cd/m2 shows it, relative to 203 cd/m2,
+the reference white of HDR (ITU-R BT.2408). So that what is brighter does not burn out, the curve of
+ITU-R BT.2390 (EETF, from 1000 to 203 cd/m2) bends above 88 cd/m2, which is level 176 of 255:
+reference white becomes level 228, the peak 255. It is applied to the largest of red, green and
+blue, which keeps the hue. Then the primaries become those of BT.709, colours outside of them are
+clipped, and the rest is encoded as sRGB. Metadata of single scenes are not used.
+
+Ordinary video in wide primaries (BT.2020, Display P3) takes the same way without the curve, and so
+does the full range of more than 8 bits, which swscale misses by a level.
+"""
 
 from __future__ import annotations
 
@@ -12,82 +30,6 @@ import numpy as np
 from hwp_bench.base.colors import eight_bit_srgb, srgb_to_linear
 from hwp_bench.base.compiled import compiled, helper
 from hwp_bench.base.errors import BadInput
-
-
-@helper
-def _nearest(table: np.ndarray, place: float) -> float:
-    """A table's value at the nearest entry to a place in [0, 1]; outside, that of its ends."""
-    last = len(table) - 1
-    if not place > 0.0:
-        return table[0]
-    return table[last] if place >= 1.0 else table[int(place * last + 0.5)]
-
-
-@compiled(nogil=True)
-def convert(
-    luma: np.ndarray,
-    blue: np.ndarray,
-    red: np.ndarray,
-    black: float,
-    luma_span: float,
-    chroma_span: float,
-    weights: np.ndarray,
-    light: np.ndarray,
-    luminance: np.ndarray,
-    display: np.ndarray,
-    factors: np.ndarray,
-    top: float,
-    matrix: np.ndarray,
-    codes: np.ndarray,
-    out: np.ndarray,
-) -> None:
-    """Convert the samples of a frame.
-
-    Args:
-        luma, blue, red: (H, W) uint16, Y', Cb and Cr.
-        black: sample of black.
-        luma_span, chroma_span: samples from black to white, and from one end of a colour
-            difference to the other.
-        weights: (3,) of red, green and blue in Y'.
-        light: linear light for signals that are evenly spaced in [0, 1].
-        luminance: (3,) weights of linear light in luminance.
-        display: scales light, for square roots of luminance that are evenly spaced in [0, top];
-            one entry where nothing does.
-        factors: scales light, for largest components that are evenly spaced in [0, top].
-        top: light above it becomes white.
-        matrix: (3, 3) to the primaries of sRGB.
-        codes: sRGB of 8 bits for square roots of light that are evenly spaced in [0, 1].
-        out: (H, W, 3) uint8, written.
-    """
-    red_step = 2.0 * (1.0 - weights[0]) / chroma_span
-    blue_step = 2.0 * (1.0 - weights[2]) / chroma_span
-    luma_step, per_top = 1.0 / luma_span, 1.0 / top
-    red_share, blue_share = weights[0] / weights[1], weights[2] / weights[1]
-    luma_share = 1.0 / weights[1]
-    for row in range(luma.shape[0]):
-        for column in range(luma.shape[1]):
-            y = (luma[row, column] - black) * luma_step
-            b = y + (blue[row, column] - 32768.0) * blue_step
-            r = y + (red[row, column] - 32768.0) * red_step
-            g = luma_share * y - red_share * r - blue_share * b
-            r = _nearest(light, r)
-            g = _nearest(light, g)
-            b = _nearest(light, b)
-            scale = 1.0
-            if len(display) > 1:
-                bright = luminance[0] * r + luminance[1] * g + luminance[2] * b
-                # Light is in units of reference white, the display's in those of the peak.
-                scale = _nearest(display, np.sqrt(bright * per_top))
-            largest = scale * max(r, max(g, b)) * per_top
-            scale *= per_top / largest if largest > 1.0 else _nearest(factors, largest)
-            r *= scale
-            g *= scale
-            b *= scale
-            for channel in range(3):
-                linear = matrix[channel, 0] * r + matrix[channel, 1] * g + matrix[channel, 2] * b
-                root = np.sqrt(linear) if linear > 0.0 else 0.0
-                out[row, column, channel] = _nearest(codes, root)
-
 
 #: Reference white of HDR (ITU-R BT.2408), and the peak that curves end at, cd/m2.
 REFERENCE_WHITE, PEAK = 203.0, 1000.0
@@ -357,3 +299,78 @@ def _to_xyz(primaries: tuple[tuple[float, float], ...]) -> np.ndarray:
     x, y = _D65
     scale = np.linalg.solve(columns, [x / y, 1.0, (1.0 - x - y) / y])
     return np.asarray(columns * scale)
+
+
+@helper
+def _nearest(table: np.ndarray, place: float) -> float:
+    """A table's value at the nearest entry to a place in [0, 1]; outside, that of its ends."""
+    last = len(table) - 1
+    if not place > 0.0:
+        return table[0]
+    return table[last] if place >= 1.0 else table[int(place * last + 0.5)]
+
+
+@compiled(nogil=True)
+def convert(
+    luma: np.ndarray,
+    blue: np.ndarray,
+    red: np.ndarray,
+    black: float,
+    luma_span: float,
+    chroma_span: float,
+    weights: np.ndarray,
+    light: np.ndarray,
+    luminance: np.ndarray,
+    display: np.ndarray,
+    factors: np.ndarray,
+    top: float,
+    matrix: np.ndarray,
+    codes: np.ndarray,
+    out: np.ndarray,
+) -> None:
+    """Convert the samples of a frame.
+
+    Args:
+        luma, blue, red: (H, W) uint16, Y', Cb and Cr.
+        black: sample of black.
+        luma_span, chroma_span: samples from black to white, and from one end of a colour
+            difference to the other.
+        weights: (3,) of red, green and blue in Y'.
+        light: linear light for signals that are evenly spaced in [0, 1].
+        luminance: (3,) weights of linear light in luminance.
+        display: scales light, for square roots of luminance that are evenly spaced in [0, top];
+            one entry where nothing does.
+        factors: scales light, for largest components that are evenly spaced in [0, top].
+        top: light above it becomes white.
+        matrix: (3, 3) to the primaries of sRGB.
+        codes: sRGB of 8 bits for square roots of light that are evenly spaced in [0, 1].
+        out: (H, W, 3) uint8, written.
+    """
+    red_step = 2.0 * (1.0 - weights[0]) / chroma_span
+    blue_step = 2.0 * (1.0 - weights[2]) / chroma_span
+    luma_step, per_top = 1.0 / luma_span, 1.0 / top
+    red_share, blue_share = weights[0] / weights[1], weights[2] / weights[1]
+    luma_share = 1.0 / weights[1]
+    for row in range(luma.shape[0]):
+        for column in range(luma.shape[1]):
+            y = (luma[row, column] - black) * luma_step
+            b = y + (blue[row, column] - 32768.0) * blue_step
+            r = y + (red[row, column] - 32768.0) * red_step
+            g = luma_share * y - red_share * r - blue_share * b
+            r = _nearest(light, r)
+            g = _nearest(light, g)
+            b = _nearest(light, b)
+            scale = 1.0
+            if len(display) > 1:
+                bright = luminance[0] * r + luminance[1] * g + luminance[2] * b
+                # Light is in units of reference white, the display's in those of the peak.
+                scale = _nearest(display, np.sqrt(bright * per_top))
+            largest = scale * max(r, max(g, b)) * per_top
+            scale *= per_top / largest if largest > 1.0 else _nearest(factors, largest)
+            r *= scale
+            g *= scale
+            b *= scale
+            for channel in range(3):
+                linear = matrix[channel, 0] * r + matrix[channel, 1] * g + matrix[channel, 2] * b
+                root = np.sqrt(linear) if linear > 0.0 else 0.0
+                out[row, column, channel] = _nearest(codes, root)

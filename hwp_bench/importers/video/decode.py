@@ -1,4 +1,4 @@
-"""Frame range."""
+"""The frames of a video: decoding them, and cutting the hand's window out of each."""
 
 from __future__ import annotations
 
