@@ -1,4 +1,4 @@
-"""Residuals without pictures. Oracles: distances of circles; hands that plainly penetrate, or not."""
+"""Residuals without pictures. Oracles: distances of circles; hands that plainly penetrate."""
 
 from __future__ import annotations
 
