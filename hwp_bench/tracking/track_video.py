@@ -12,9 +12,9 @@ from typing import Any
 import cv2
 import numpy as np
 
+from hwp_bench.base.console import progress
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import HwpError, UsageError
-from hwp_bench.base.progress import progress
 from hwp_bench.importers.shared.landmarks import LANDMARK_EDGES, HandTracks, write_hand_tracks
 from hwp_bench.importers.video.decode import (
     FrameRange,

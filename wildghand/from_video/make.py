@@ -9,10 +9,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.arguments import of_type, place, real_number, whole_number
-from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.movies import check_encoder
+from hwp_bench.base.errors import BadInput, UsageError, of_type, place, real_number, whole_number
+from hwp_bench.base.folders import exclusive
+from hwp_bench.base.images import check_encoder
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.importers.video.decode import probe
 from hwp_bench.methods.contract import Budget

@@ -10,12 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.console import track
 from hwp_bench.base.drawing import fitted, labelled, sheet
-from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import sha256_of
-from hwp_bench.base.images import as_uint8, read_gray, write_image
-from hwp_bench.base.movies import write_movie
-from hwp_bench.base.progress import track
+from hwp_bench.base.images import as_uint8, read_gray, write_image, write_movie
 from hwp_bench.capture import Capture, open_capture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, MODEL, WEIGHTS, load_avatar

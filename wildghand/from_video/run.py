@@ -14,11 +14,10 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Literal
 
+from hwp_bench.base.console import StagesView, notice
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.files import read_json, write_json
-from hwp_bench.base.progress import notice
 from hwp_bench.base.records import Seconds, parse_record
-from hwp_bench.base.stages_view import StagesView
 from wildghand.from_video.job import Job
 
 #: Largest record that is read, bytes.

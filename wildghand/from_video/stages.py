@@ -12,9 +12,9 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadInput, HwpError, reason_of
 from hwp_bench.base.files import canonical_json, check_is_file, sha256_of
-from hwp_bench.base.progress import notice
 from hwp_bench.capture import open_capture
 from hwp_bench.importers.shared.landmarks import read_association, read_landmarks
 from hwp_bench.importers.video import FrameRange, VideoImport, import_video

@@ -17,15 +17,14 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.files import sha256_file
 from hwp_bench.base.images import is_blank, read_gray
-from hwp_bench.base.text import bounded
 from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.capture.schema import check_id
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
 from hwp_bench.hands.fitting import FitTargets, fit_hand
-from hwp_bench.hands.mano import FINGERTIPS
+from hwp_bench.hands.sources import FINGERTIPS
 from hwp_bench.importers.official.crop import (
     MASK_THRESHOLD,
     CroppedFrame,

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 import torch
 
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.console import progress
 from hwp_bench.base.drawing import labelled, outlined, sheet
-from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import refuse_existing as refuse_folder
-from hwp_bench.base.progress import progress
 from hwp_bench.capture import Cameras, CaptureInfo, CaptureWriter
 from hwp_bench.hands import HandParameters, HandTemplate, PosedHand, pose_hand, project
 from hwp_bench.importers.shared.frames import each_frame

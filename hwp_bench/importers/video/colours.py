@@ -28,8 +28,8 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.base.colors import eight_bit_srgb, srgb_to_linear
-from hwp_bench.base.compiled import compiled, helper
 from hwp_bench.base.errors import BadInput
+from hwp_bench.base.kernels import compiled, helper
 
 #: Reference white of HDR (ITU-R BT.2408), and the peak that curves end at, cd/m2.
 REFERENCE_WHITE, PEAK = 203.0, 1000.0

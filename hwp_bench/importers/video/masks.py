@@ -17,7 +17,7 @@ import numpy as np
 import torch
 
 from hwp_bench.hands.raster import draw_faces, draw_silhouette, overlap
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame, resample
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video.decode import ClipImages

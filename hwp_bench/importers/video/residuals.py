@@ -17,7 +17,7 @@ from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.articulation import anatomical_limits, joint_limit_penalty
 from hwp_bench.hands.raster import draw_silhouette
 from hwp_bench.hands.skeleton import FINGERS, finger_joints, palm_directions, unit
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video.model import ClipModel, PosedClip, posed_vertices

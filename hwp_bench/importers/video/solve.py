@@ -10,9 +10,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.console import notice
 from hwp_bench.base.errors import DidNotConverge
-from hwp_bench.base.evenly import evenly
-from hwp_bench.base.progress import notice
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, SIDES, Landmarks
 from hwp_bench.importers.video.model import ClipModel, PosedClip, rigid_start

@@ -17,11 +17,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.evenly import evenly
-from hwp_bench.base.progress import notice, progress
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.console import notice, progress
+from hwp_bench.base.errors import BadInput, UsageError, has_odd_characters
 from hwp_bench.base.records import MAX_TEXT
-from hwp_bench.base.text import has_odd_characters
 from hwp_bench.capture.schema import MAX_FRAMES
 from hwp_bench.importers.shared.frames import CropWindows, cells, follow_hands
 from hwp_bench.importers.shared.landmarks import (

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from hwp_bench.base.harmonics import COUNT, harmonics
+from hwp_bench.base.colors import COUNT, harmonics
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.raster import draw_faces, mix_corners
 

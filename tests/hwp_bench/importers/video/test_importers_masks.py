@@ -10,7 +10,7 @@ from scipy.stats import multivariate_normal
 from synthetic_clip import CUP, HEIGHT, WIDTH, SyntheticClip, make_clip
 
 from hwp_bench.hands.raster import draw_silhouette, overlap
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.video.masks import (
     WIDE,
     ColourModel,

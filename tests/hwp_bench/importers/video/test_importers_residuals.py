@@ -8,7 +8,7 @@ import torch
 from synthetic_clip import FOCAL, HEIGHT, WIDTH, make_clip, template
 
 from hwp_bench.hands.articulation import joint_axes
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.video.masks import beyond_wrist
 from hwp_bench.importers.video.model import ClipModel, RigidStart
 from hwp_bench.importers.video.residuals import (
