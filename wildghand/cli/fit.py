@@ -130,7 +130,7 @@ def do_fit(args: argparse.Namespace) -> int:
     """Run the command, in one process or in those that torchrun started."""
     from hwp_bench.base.files import check_places
     from wildghand.fitting.parallel import run_in_world
-    from wildghand.from_video.api import is_video
+    from wildghand.from_video.make import is_video
     from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings
 
@@ -189,7 +189,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.methods.contract import Budget
     from wildghand.fitting.session import fit_capture
-    from wildghand.from_video.settings import with_quick
+    from wildghand.from_video.job import with_quick
 
     for option in ("side", "landmarks", "model", "hand-model"):
         if getattr(args, option.replace("-", "_")) is not None:
