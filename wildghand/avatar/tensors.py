@@ -10,7 +10,7 @@ import torch
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.text import shown
 from wildghand.model.settings import WildGHandSettings
-from wildghand.network.weight_shapes import MAPS, shapes_of_settings
+from wildghand.network.network import MAPS, shapes_of_settings
 
 #: Largest model that is read, bytes.
 MAX_MODEL_BYTES = 4 << 30

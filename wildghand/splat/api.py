@@ -13,8 +13,7 @@ import torch
 
 from hwp_bench.base.errors import UsageError
 from wildghand.splat.conventions import MAX_COLOR
-from wildghand.splat.layout import check_options, flatten
-from wildghand.splat.scene import FlatScene, Options, unflattened
+from wildghand.splat.scene import FlatScene, Options, check_options, flatten, unflattened
 
 #: Values of `backend`.
 BACKENDS = ("auto", "numba", "gsplat", "reference")

@@ -13,8 +13,8 @@ from tiny_fits import TINY
 from hwp_bench.methods.contract import Budget
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import optimize
-from wildghand.gaussians import step_threads
-from wildghand.gaussians.step_threads import BLOCK, HELD, TURNS, StepThreads, candidates, fewest
+from wildghand.gaussians import fit_loop as step_threads
+from wildghand.gaussians.fit_loop import BLOCK, HELD, TURNS, StepThreads, candidates, fewest
 from wildghand.model.settings import read_settings
 from wildghand.splat import threads
 

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.hands import load_template
-from wildghand.gaussians.anchored import flat_gaussians
+from wildghand.gaussians.attributes import flat_gaussians
 from wildghand.gaussians.rig import make_rig
 from wildghand.network import (
     NetworkOutput,

@@ -18,9 +18,8 @@ import torch
 from hwp_bench.base.errors import MissingDependency
 from wildghand.gaussians.fit_loop import choose_device
 from wildghand.splat import gsplat_backend, rasterize
-from wildghand.splat.hard_scenes import difference, draw, hand_scene
-from wildghand.splat.layout import flatten
-from wildghand.splat.scene import Options
+from wildghand.splat.hard_cases import difference, draw, hand_scene
+from wildghand.splat.scene import Options, flatten
 
 HAS_GPU = choose_device("auto").type == "cuda"
 
