@@ -1,5 +1,8 @@
 """Compiled passes over many tensors: the squares of gradients, and the step of Adam."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math

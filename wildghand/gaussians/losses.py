@@ -1,5 +1,8 @@
 """Losses on images: SSIM with a closed-form gradient, and L1 + D-SSIM under pixel weights."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import functools

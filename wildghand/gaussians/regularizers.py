@@ -1,5 +1,8 @@
 """Weighted sums of rows of which index and weight never change, on the CPU."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math

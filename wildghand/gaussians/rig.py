@@ -1,5 +1,8 @@
 """Anchors on one hand, posed frame by frame; the Gaussians ride on them."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import functools

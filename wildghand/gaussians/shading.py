@@ -1,5 +1,8 @@
 """Shading of a posed surface by its normals: low-order spherical harmonics of the light."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math

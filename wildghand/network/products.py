@@ -4,6 +4,9 @@ All matrices are parts of flat float32 arrays, row after row. Columns of results
 vectors of 16 lanes and rows in groups of 8, so callers keep room for them.
 """
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 from typing import Any, NamedTuple

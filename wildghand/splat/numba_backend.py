@@ -1,6 +1,7 @@
-"""The stages of the CPU backend's forward pass, from arrays to arrays.
+"""CPU backend: the compiled kernels as two steps that autograd knows, project and blend.
 
-Each call owns what it makes; nothing here uses torch.
+They are two so that the means on the image plane and the depths are tensors of the graph: users of
+gsplat read the gradient of `info["means2d"]` to densify.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ from wildghand.splat.scene import (
     per_image,
     unflattened,
 )
-from wildghand.splat.threads import even_jobs, lease, run, thread_count, weighted_jobs
+from wildghand.splat.threads import lease, run, run_jobs, thread_count, weighted_jobs
 
 #: Numbers of channels for which the blending kernels are compiled unrolled.
 UNROLLED = (3,)
@@ -64,8 +65,13 @@ UNROLLED = (3,)
 _BYTES_PER_ENTRY = 12
 #: Bytes that are allocated without asking how much the machine has.
 _LITTLE = 1 << 30
-#: Most chunks: each has a counter for every tile.
+#: Most chunks of the sorted Gaussians: each has a counter for every tile.
 _MOST_CHUNKS = 32
+#: Pixels of the background's gradient that take as long as a (Gaussian, tile) pair.
+_PIXELS_LIKE_A_PAIR = 20
+
+_log = logging.getLogger("wildghand.splat")
+_lock = threading.Lock()
 
 
 @dataclass(frozen=True)
@@ -73,354 +79,9 @@ class Lists:
     """Which Gaussians each tile blends, in which order."""
 
     start: np.ndarray  # (tiles + 1,) int64
-    entries: np.ndarray  # (E,) uint64, see kernels.bins
+    entries: np.ndarray  # (E,) uint64, see kernels.lists
     first_entry: np.ndarray  # (I * N + 1,) int32
     visible: np.ndarray  # (I,) int64, Gaussians on screen
-
-
-@dataclass(frozen=True)
-class Drawn:
-    """The results of blending besides images and alphas."""
-
-    remaining: np.ndarray  # (I, H, W) float32, transmittance
-    stops: np.ndarray  # (tiles,) int64, where each list was left because of saturation
-    pairs: np.ndarray  # (tiles,) int64, blended (Gaussian, pixel) pairs if counted
-
-
-def repeat_of(shared: np.ndarray, images: int) -> int:
-    """How many images in a row read the same entry of an array."""
-    return images // max(1, len(shared))
-
-
-def camera_rows(viewmats: np.ndarray, Ks: np.ndarray, options: Options) -> np.ndarray:
-    """(I, CAMERA) numbers for the kernels; a camera that is not usable sees nothing.
-
-    Args:
-        viewmats: (I, 4, 4) float64, world to camera.
-        Ks: (I, 3, 3) float64, px.
-        options: for the image size.
-    """
-    rows = np.empty((len(viewmats), CAMERA))
-    prepare_cameras(viewmats, Ks, options.width, options.height, rows)
-    return rows
-
-
-def view_of(options: Options) -> View:
-    """The options that the projection reads."""
-    return View(
-        width=float(options.width),
-        height=float(options.height),
-        near=options.near_plane,
-        far=options.far_plane,
-        eps2d=options.eps2d,
-        antialiased=options.antialiased,
-    )
-
-
-def project_stage(
-    ellipsoids: Ellipsoids,
-    opacities: np.ndarray,
-    colors: np.ndarray,
-    cameras: np.ndarray,
-    options: Options,
-) -> Projected:
-    """Culls and projects.
-
-    Args:
-        ellipsoids: S entries of N Gaussians, N at least `rows.GROUP`.
-        opacities: (S, N) float32.
-        colors: (S, N, D) float32, to see which are finite.
-        cameras: (I, CAMERA) float64.
-        options: of the call.
-    """
-    images, gaussians = len(cameras), ellipsoids.means.shape[1]
-    projected = Projected(
-        geom=lease((images, gaussians, ROW), np.float32),
-        depths=lease((images, gaussians), np.float32),
-        rows=lease((images, gaussians), np.int32),
-        radii=lease((images, gaussians, 2), np.int32),
-        compensations=lease((images, gaussians if options.antialiased else 0), np.float32),
-    )
-    jobs = images * max(1, gaussians // PIECE)
-    run(
-        project,
-        even_jobs(jobs, thread_count(jobs, images * gaussians)),
-        ellipsoids,
-        opacities,
-        colors,
-        cameras,
-        view_of(options),
-        projected,
-    )
-    return projected
-
-
-def list_stage(projected: Projected, options: Options) -> Lists:
-    """Sorts by depth and lists the splats of each tile.
-
-    Raises:
-        HwpError: more (splat, tile) pairs than can be counted or held.
-    """
-    images, gaussians = projected.depths.shape
-    chunks = min(thread_count(_MOST_CHUNKS, gaussians), _MOST_CHUNKS)
-    order = lease((images, gaussians), np.int32)
-    spare = lease((images, gaussians), np.int32)
-    visible = np.empty(images, np.int64)
-    chunk_rows = np.empty((images, chunks + 1), np.int64)
-    run(
-        sort_by_depth,
-        even_jobs(images, thread_count(images, images * gaussians)),
-        projected.depths,
-        projected.rows,
-        order,
-        spare,
-        visible,
-        chunk_rows,
-    )
-    image_spans = np.zeros(images + 1, np.int64)
-    np.cumsum(chunk_rows[:, -1], out=image_spans[1:])
-    tiles_x = -(-options.width // TILE_WIDTH)
-    tiles = tiles_x * -(-options.height // TILE_HEIGHT)
-    spans = lease((int(image_spans[-1]),), np.uint32)
-    heads = lease((images, gaussians), np.uint32)
-    counts = lease((images, chunks, tiles), np.int32)
-    entry_count = lease((images, gaussians), np.int32)
-    entry_count[:] = 0
-    shares = even_jobs(images * chunks, thread_count(images * chunks, images * gaussians))
-    run(
-        count_tiles,
-        shares,
-        projected.geom.reshape(-1),
-        order,
-        visible,
-        chunk_rows,
-        image_spans,
-        tiles_x,
-        options.width,
-        spans,
-        heads,
-        counts,
-        entry_count,
-    )
-    start = np.empty(images * tiles + 1, np.int64)
-    first_entry = lease((images * gaussians + 1,), np.int32)
-    number = place_tiles(counts, entry_count, start, first_entry)
-    _check_room(number)
-    entries = lease((number,), np.uint64)
-    run(
-        fill_tiles,
-        shares,
-        order,
-        visible,
-        heads,
-        chunk_rows,
-        image_spans,
-        spans,
-        counts,
-        first_entry,
-        tiles_x,
-        entries,
-    )
-    return Lists(start, entries, first_entry, visible)
-
-
-def tile_jobs(start: np.ndarray) -> np.ndarray:
-    """Shares of the tiles for `run`, by the lengths of their lists.
-
-    Args:
-        start: where the list of each tile starts, and the end of the last.
-    """
-    tiles, entries = len(start) - 1, int(start[-1])
-    # A tile without splats is work, too: its background.
-    return weighted_jobs(start + np.arange(tiles + 1), thread_count(tiles, entries))
-
-
-def _check_room(entries: int) -> None:
-    """Refuses lists that cannot be held, before the system ends the process for them."""
-    needed = entries * _BYTES_PER_ENTRY
-    if 0 <= needed < _LITTLE or 0 <= needed < psutil.virtual_memory().available:
-        return
-    size = f"{needed / 2**30:.0f} GiB of memory" if entries >= 0 else "lists of more than 2^31"
-    raise HwpError(
-        f"the Gaussians cover so many pixels that drawing them needs {size}",
-        field="scales",
-        remedy="Draw fewer or smaller Gaussians, or a smaller image, at a time",
-    )
-
-
-def kernel_channels(size: int) -> int | tuple[int, ...]:
-    """How the blending kernels are told the number of channels, see kernels.channels."""
-    return (0,) * size if size in UNROLLED else size
-
-
-def blend_stage(
-    projected: Projected,
-    lists: Lists,
-    colors: np.ndarray,
-    backgrounds: np.ndarray,
-    options: Options,
-    images: np.ndarray,
-    alphas: np.ndarray,
-) -> Drawn:
-    """Draws into images (I, H, W, D) and alphas (I, H, W, 1).
-
-    Args:
-        projected, lists: from the stages before.
-        colors: (S, N, D) float32.
-        backgrounds: (I, D) float32.
-        options: of the call.
-        images, alphas: float32, overwritten.
-    """
-    tiles = len(lists.start) - 1
-    drawn = Drawn(
-        remaining=lease(images.shape[:3], np.float32),
-        stops=np.empty(tiles, np.int64),
-        pairs=np.empty(tiles, np.int64),
-    )
-    run(
-        blend,
-        tile_jobs(lists.start),
-        lists.start,
-        lists.entries,
-        projected.geom.reshape(-1),
-        colors.reshape(-1),
-        repeat_of(colors, len(images)),
-        backgrounds,
-        options.width,
-        options.height,
-        projected.depths.shape[1],
-        images.reshape(-1),
-        alphas.reshape(-1),
-        drawn.remaining.reshape(-1),
-        drawn.stops,
-        drawn.pairs,
-        kernel_channels(colors.shape[-1]),
-        options.count_pairs,
-    )
-    return drawn
-
-
-#: Pixels of the background's gradient that take as long as a (Gaussian, tile) pair.
-_PIXELS_LIKE_A_PAIR = 20
-
-
-def blend_backward_stage(
-    projected: Projected,
-    lists: Lists,
-    opacities: np.ndarray,
-    colors: np.ndarray,
-    drawn: Drawn,
-    images: np.ndarray,
-    v_images: np.ndarray,
-    v_alphas: np.ndarray,
-    options: Options,
-    gradients: BlendGradients,
-) -> None:
-    """Fills `gradients`.
-
-    Args:
-        projected, lists, drawn, images: as the forward pass left them.
-        opacities: (S, N) float32, as blended.
-        colors: (S, N, D) float32.
-        v_images, v_alphas: gradients of the loss, (I, H, W, D) and (I, H, W, 1) or (0,).
-        options: of the call.
-        gradients: overwritten.
-    """
-    count, gaussians = projected.depths.shape
-    size = colors.shape[-1]
-    looked_at = drawn.stops - lists.start[:-1]
-    first_slot = np.cumsum(looked_at) - looked_at
-    floats = slot_size(size, size in UNROLLED)
-    slots = lease((int(looked_at.sum()), floats), np.float32)
-    slot_of = lease((len(lists.entries),), np.int32)
-    pieces = max(1, gaussians // PIECE)
-    run(
-        blend_backward,
-        tile_jobs(np.append(first_slot, len(slots))),
-        lists.start,
-        drawn.stops,
-        first_slot,
-        lists.entries,
-        projected.geom.reshape(-1),
-        colors.reshape(-1),
-        repeat_of(colors, count),
-        options.width,
-        options.height,
-        gaussians,
-        images.reshape(-1),
-        drawn.remaining.reshape(-1),
-        v_images.reshape(-1),
-        v_alphas.reshape(-1),
-        slots.reshape(-1),
-        floats,
-        slot_of,
-        kernel_channels(size),
-    )
-    run(
-        reduce_slots,
-        even_jobs(pieces, thread_count(pieces, count * gaussians)),
-        projected.geom,
-        projected.depths,
-        opacities,
-        lists.first_entry,
-        slot_of,
-        slots,
-        gradients,
-    )
-
-
-def background_backward_stage(v_images: np.ndarray, remaining: np.ndarray) -> np.ndarray:
-    """Gradient of the backgrounds, (I, D) float64."""
-    count, height, width, size = v_images.shape
-    lines = np.empty((count, height, size))
-    work = count * height * width // _PIXELS_LIKE_A_PAIR
-    run(
-        background_backward,
-        even_jobs(count * height, thread_count(count * height, work)),
-        v_images,
-        remaining,
-        lines,
-    )
-    return lines.sum(1)
-
-
-def project_backward_stage(
-    ellipsoids: Ellipsoids,
-    cameras: np.ndarray,
-    projected: Projected,
-    upstream: PlaneGradients,
-    options: Options,
-    want_cameras: bool,
-    gradients: Ellipsoids,
-) -> np.ndarray:
-    """Fills `gradients`.
-
-    Args:
-        ellipsoids, cameras: as projected.
-        projected: from the forward pass.
-        upstream: gradients of the loss by the projected Gaussians.
-        options: of the call.
-        want_cameras: whether the result is needed.
-        gradients: overwritten.
-
-    Returns:
-        Gradients of the cameras, (I, 12) float64: rotation row by row, then translation.
-    """
-    count, gaussians = projected.depths.shape
-    pieces = max(1, gaussians // PIECE)
-    v_cameras = np.zeros((count, pieces if want_cameras else 0, 12))
-    run(
-        project_backward,
-        even_jobs(pieces, thread_count(pieces, count * gaussians)),
-        ellipsoids,
-        cameras,
-        projected.depths,
-        view_of(options),
-        upstream,
-        gradients,
-        v_cameras,
-    )
-    return v_cameras.sum(1)
 
 
 @dataclass
@@ -434,7 +95,69 @@ class Call:
     cameras: np.ndarray  # (I, CAMERA) float64
     projected: Projected = field(init=False)
     lists: Lists = field(init=False)
-    drawn: Drawn = field(init=False)
+    remaining: np.ndarray = field(init=False)  # (I, H, W) float32, transmittance
+    stops: np.ndarray = field(init=False)  # (tiles,) int64, where saturation ended each list
+    pairs: np.ndarray = field(init=False)  # (tiles,) int64, blended pairs if counted
+
+    @property
+    def view(self) -> View:
+        """The options that the projection reads."""
+        o = self.options
+        size = float(o.width), float(o.height)
+        return View(*size, o.near_plane, o.far_plane, o.eps2d, o.antialiased)
+
+
+def rasterize_numba(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    """Draws the scene, float32 on the CPU; see `wildghand.splat.rasterize`.
+
+    Returns:
+        channels (I, H, W, X), alphas (I, H, W, 1) and the backend's part of `info`.
+    """
+    warm_up(channel_count(scene))
+    return _draw(scene)
+
+
+def _draw(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    options = scene.options
+    cameras = np.empty((scene.images, CAMERA))
+    given = (m.detach().double().contiguous().numpy() for m in (scene.viewmats, scene.Ks))
+    prepare_cameras(*given, options.width, options.height, cameras)
+    call = Call(options, cameras)
+    means2d, shapes, depths, compensations = Project.apply(
+        scene.means.contiguous(),
+        scene.quats.contiguous(),
+        scene.scales.contiguous(),
+        scene.viewmats,
+        scene.opacities.contiguous(),
+        scene.colors.contiguous(),
+        call,
+    )
+    # The caller's tensor lies on the way, so that its gradient can be kept.
+    info_means2d = unflattened(means2d, scene)
+    opacities = scene.opacities
+    if options.antialiased:
+        opacities = per_image(opacities, scene.images) * compensations
+    channels, backgrounds = channels_with_depth(scene.colors, depths, scene)
+    if backgrounds is None:
+        backgrounds = torch.zeros(scene.images, channels.shape[-1])
+    images, alphas = Blend.apply(
+        info_means2d.reshape(means2d.shape),
+        shapes,
+        opacities.contiguous(),
+        channels.contiguous(),
+        backgrounds.contiguous(),
+        call,
+    )
+    info: dict[str, Any] = {
+        "means2d": info_means2d,
+        "depths": unflattened(depths, scene),
+        "radii": unflattened(torch.from_numpy(call.projected.radii)[:, : scene.gaussians], scene),
+        "visible": unflattened(torch.from_numpy(call.lists.visible), scene),
+    }
+    if options.count_pairs:
+        pairs = torch.from_numpy(call.pairs).reshape(scene.images, -1).sum(1)
+        info["pairs"] = unflattened(pairs, scene)
+    return expected_depth(images, alphas, options.render_mode), alphas, info
 
 
 class Project(torch.autograd.Function):
@@ -451,25 +174,38 @@ class Project(torch.autograd.Function):
         colors: torch.Tensor,
         call: Call,
     ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]:
-        """Flat contiguous float32 tensors of a `FlatScene`; `call` gets `projected`."""
+        """Culls and projects flat contiguous float32 tensors; `call` gets `projected`."""
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(means, quats, scales, viewmats)
         ctx.call = call
-        call.projected = project_stage(
-            Ellipsoids(_gaussians(means), _gaussians(quats), _gaussians(scales)),
+        ellipsoids = Ellipsoids(_gaussians(means), _gaussians(quats), _gaussians(scales))
+        images, gaussians = len(call.cameras), ellipsoids.means.shape[1]
+        call.projected = projected = Projected(
+            geom=lease((images, gaussians, ROW), np.float32),
+            depths=lease((images, gaussians), np.float32),
+            rows=lease((images, gaussians), np.int32),
+            radii=lease((images, gaussians, 2), np.int32),
+            compensations=lease((images, gaussians * call.options.antialiased), np.float32),
+        )
+        run_jobs(
+            project,
+            images * max(1, gaussians // PIECE),
+            images * gaussians,
+            ellipsoids,
             _gaussians(opacities),
             _gaussians(colors),
             call.cameras,
-            call.options,
+            call.view,
+            projected,
         )
         count = means.shape[1]
-        geom = torch.from_numpy(call.projected.geom)[:, :count]
+        geom = torch.from_numpy(projected.geom)[:, :count]
         # The values of `shapes` are never read: it is there for its gradient.
         return (
             geom[..., MEAN_X : MEAN_Y + 1],
             geom[..., SHEAR : SHEAR + 3],
-            torch.from_numpy(call.projected.depths)[:, :count],
-            torch.from_numpy(call.projected.compensations)[:, :count],
+            torch.from_numpy(projected.depths)[:, :count],
+            torch.from_numpy(projected.compensations)[:, :count],
         )
 
     @staticmethod
@@ -478,32 +214,37 @@ class Project(torch.autograd.Function):
         _refuse_second_order()
         call: Call = ctx.call
         means, quats, scales, viewmats = ctx.saved_tensors
-        shape = call.projected.depths.shape
-        v_means2d, v_shapes, v_depths, v_compensations = (
-            None if v is None else _gaussians(v.contiguous()) for v in upstream
+        images, gaussians = call.projected.depths.shape
+        # Without a gradient: zeros, but none at all for the depths, which are skipped then.
+        empty = ((images, gaussians, 2), (images, gaussians, 3), (0, 0), (images, gaussians))
+        given = PlaneGradients(
+            *(
+                np.zeros(shape, np.float32) if v is None else _gaussians(v.contiguous())
+                for v, shape in zip(upstream, empty, strict=True)
+            )
         )
         made = [_like_gaussians(tensor) for tensor in (means, quats, scales)]
-        rows = project_backward_stage(
+        pieces, with_cameras = max(1, gaussians // PIECE), ctx.needs_input_grad[3]
+        v_cameras = np.zeros((images, pieces if with_cameras else 0, 12))
+        run_jobs(
+            project_backward,
+            pieces,
+            images * gaussians,
             Ellipsoids(_gaussians(means), _gaussians(quats), _gaussians(scales)),
             call.cameras,
-            call.projected,
-            PlaneGradients(
-                np.zeros((*shape, 2), np.float32) if v_means2d is None else v_means2d,
-                np.zeros((*shape, 3), np.float32) if v_shapes is None else v_shapes,
-                np.zeros((0, 0), np.float32) if v_depths is None else v_depths,
-                np.zeros(shape, np.float32) if v_compensations is None else v_compensations,
-            ),
-            call.options,
-            ctx.needs_input_grad[3],
+            call.projected.depths,
+            call.view,
+            given,
             Ellipsoids(*(_array(tensor) for tensor in made)),
+            v_cameras,
         )
         v_viewmats = None
-        if ctx.needs_input_grad[3]:
+        if with_cameras:
+            rows = torch.from_numpy(v_cameras.sum(1))
             v_viewmats = torch.zeros_like(viewmats)
-            v_viewmats[:, :3, :3] = torch.from_numpy(rows[:, :9].reshape(-1, 3, 3))
-            v_viewmats[:, :3, 3] = torch.from_numpy(rows[:, 9:])
-        count = means.shape[1]
-        return (*(v[:, :count] for v in made), v_viewmats, None, None, None)
+            v_viewmats[:, :3, :3] = rows[:, :9].reshape(-1, 3, 3)
+            v_viewmats[:, :3, 3] = rows[:, 9:]
+        return (*(v[:, : means.shape[1]] for v in made), v_viewmats, None, None, None)
 
 
 class Blend(torch.autograd.Function):
@@ -524,15 +265,24 @@ class Blend(torch.autograd.Function):
         options = call.options
         shape = (len(backgrounds), options.height, options.width)
         images, alphas = torch.empty(*shape, colors.shape[-1]), torch.empty(*shape, 1)
-        call.lists = list_stage(call.projected, options)
-        call.drawn = blend_stage(
-            call.projected,
-            call.lists,
-            _gaussians(colors),
+        call.lists = _list_tiles(call.projected, options)
+        tiles = len(call.lists.start) - 1
+        call.remaining = lease(shape, np.float32)
+        call.stops, call.pairs = np.empty(tiles, np.int64), np.empty(tiles, np.int64)
+        run(
+            blend,
+            _tile_shares(call.lists.start),
+            call.lists.start,
+            call.lists.entries,
+            *_what_tiles_read(call, colors),
             _array(backgrounds),
-            options,
-            _array(images),
-            _array(alphas),
+            _array(images).reshape(-1),
+            _array(alphas).reshape(-1),
+            call.remaining.reshape(-1),
+            call.stops,
+            call.pairs,
+            _kernel_channels(colors.shape[-1]),
+            options.count_pairs,
         )
         ctx.save_for_backward(opacities, colors, images)
         ctx.call = call
@@ -551,28 +301,160 @@ class Blend(torch.autograd.Function):
         if v_alphas is None:
             v_alphas = torch.empty(0)
         upstream = _array(v_images.contiguous())
-        shape = call.projected.depths.shape
-        v_means2d, v_shapes = torch.empty(*shape, 2), torch.empty(*shape, 3)
-        v_opacities, v_colors = _like_gaussians(opacities), _like_gaussians(colors)
-        blend_backward_stage(
-            call.projected,
-            call.lists,
+        lists, projected = call.lists, call.projected
+        count, gaussians = projected.depths.shape
+        size = colors.shape[-1]
+        looked_at = call.stops - lists.start[:-1]
+        first_slot = np.cumsum(looked_at) - looked_at
+        floats = slot_size(size, size in UNROLLED)
+        slots = lease((int(looked_at.sum()), floats), np.float32)
+        slot_of = lease((len(lists.entries),), np.int32)
+        run(
+            blend_backward,
+            _tile_shares(np.append(first_slot, len(slots))),
+            lists.start,
+            call.stops,
+            first_slot,
+            lists.entries,
+            *_what_tiles_read(call, colors),
+            _array(images).reshape(-1),
+            call.remaining.reshape(-1),
+            upstream.reshape(-1),
+            _array(v_alphas.contiguous()).reshape(-1),
+            slots.reshape(-1),
+            floats,
+            slot_of,
+            _kernel_channels(size),
+        )
+        made = [
+            torch.empty(count, gaussians, 2),
+            torch.empty(count, gaussians, 3),
+            _like_gaussians(opacities),
+            _like_gaussians(colors),
+        ]
+        run_jobs(
+            reduce_slots,
+            max(1, gaussians // PIECE),
+            count * gaussians,
+            projected.geom,
+            projected.depths,
             _gaussians(opacities),
-            _gaussians(colors),
-            call.drawn,
-            _array(images),
-            upstream,
-            _array(v_alphas.contiguous()),
-            call.options,
-            BlendGradients(*(_array(v) for v in (v_means2d, v_shapes, v_opacities, v_colors))),
+            lists.first_entry,
+            slot_of,
+            slots,
+            BlendGradients(*(_array(v) for v in made)),
         )
         v_backgrounds = None
         if ctx.needs_input_grad[4]:
-            sums = background_backward_stage(upstream, call.drawn.remaining)
-            v_backgrounds = torch.from_numpy(sums).float()
-        count = opacities.shape[1]
-        gradients = (v[:, :count] for v in (v_means2d, v_shapes, v_opacities, v_colors))
-        return (*gradients, v_backgrounds, None)
+            lines = np.empty((*upstream.shape[:2], size))
+            work = images.shape[:3].numel() // _PIXELS_LIKE_A_PAIR
+            run_jobs(
+                background_backward,
+                images.shape[:2].numel(),
+                work,
+                upstream,
+                call.remaining,
+                lines,
+            )
+            v_backgrounds = torch.from_numpy(lines.sum(1)).float()
+        return (*(v[:, : opacities.shape[1]] for v in made), v_backgrounds, None)
+
+
+def _tile_shares(before: np.ndarray) -> np.ndarray:
+    """Shares of the tiles for `run`, by (tiles + 1,) entries before each, and of all."""
+    tiles, entries = len(before) - 1, int(before[-1])
+    # A tile without splats is work, too: its background.
+    return weighted_jobs(before + np.arange(tiles + 1), thread_count(tiles, entries))
+
+
+def _what_tiles_read(call: Call, colors: torch.Tensor) -> tuple[Any, ...]:
+    """What both passes over tiles read: rows, colours and their sharing, sizes."""
+    images, gaussians = call.projected.depths.shape
+    shared = _gaussians(colors)
+    repeat = images // max(1, len(shared))  # images in a row that read the same colours
+    options = call.options
+    size = (options.width, options.height, gaussians)
+    return (call.projected.geom.reshape(-1), shared.reshape(-1), repeat, *size)
+
+
+def _list_tiles(projected: Projected, options: Options) -> Lists:
+    """Sorts by depth and lists the splats of each tile.
+
+    Raises:
+        HwpError: more (splat, tile) pairs than can be counted or held.
+    """
+    images, gaussians = projected.depths.shape
+    work = images * gaussians
+    chunks = min(thread_count(_MOST_CHUNKS, gaussians), _MOST_CHUNKS)
+    order, spare = (lease((images, gaussians), np.int32) for _ in range(2))
+    visible = np.empty(images, np.int64)
+    chunk_rows = np.empty((images, chunks + 1), np.int64)
+    depths, rows = projected.depths, projected.rows
+    run_jobs(sort_by_depth, images, work, depths, rows, order, spare, visible, chunk_rows)
+    image_spans = np.zeros(images + 1, np.int64)
+    np.cumsum(chunk_rows[:, -1], out=image_spans[1:])
+    tiles_x = -(-options.width // TILE_WIDTH)
+    tiles = tiles_x * -(-options.height // TILE_HEIGHT)
+    spans = lease((int(image_spans[-1]),), np.uint32)
+    heads = lease((images, gaussians), np.uint32)
+    counts = lease((images, chunks, tiles), np.int32)
+    entry_count = lease((images, gaussians), np.int32)
+    entry_count[:] = 0
+    run_jobs(
+        count_tiles,
+        images * chunks,
+        work,
+        projected.geom.reshape(-1),
+        order,
+        visible,
+        chunk_rows,
+        image_spans,
+        tiles_x,
+        options.width,
+        spans,
+        heads,
+        counts,
+        entry_count,
+    )
+    start = np.empty(images * tiles + 1, np.int64)
+    first_entry = lease((work + 1,), np.int32)
+    number = place_tiles(counts, entry_count, start, first_entry)
+    _check_room(number)
+    entries = lease((number,), np.uint64)
+    run_jobs(
+        fill_tiles,
+        images * chunks,
+        work,
+        order,
+        visible,
+        heads,
+        chunk_rows,
+        image_spans,
+        spans,
+        counts,
+        first_entry,
+        tiles_x,
+        entries,
+    )
+    return Lists(start, entries, first_entry, visible)
+
+
+def _check_room(entries: int) -> None:
+    """Refuses lists that cannot be held, before the system ends the process for them."""
+    needed = entries * _BYTES_PER_ENTRY
+    if 0 <= needed < _LITTLE or 0 <= needed < psutil.virtual_memory().available:
+        return
+    size = f"{needed / 2**30:.0f} GiB of memory" if entries >= 0 else "lists of more than 2^31"
+    raise HwpError(
+        f"the Gaussians cover so many pixels that drawing them needs {size}",
+        field="scales",
+        remedy="Draw fewer or smaller Gaussians, or a smaller image, at a time",
+    )
+
+
+def _kernel_channels(size: int) -> int | tuple[int, ...]:
+    """How the blending kernels are told the number of channels, see kernels.tiles."""
+    return (0,) * size if size in UNROLLED else size
 
 
 def _array(tensor: torch.Tensor) -> np.ndarray:
@@ -610,63 +492,6 @@ def _refuse_second_order() -> None:
         )
 
 
-def rasterize_numba(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """Draws the scene, float32 on the CPU; see `wildghand.splat.rasterize`.
-
-    Returns:
-        channels (I, H, W, X), alphas (I, H, W, 1) and the backend's part of `info`.
-    """
-    options = scene.options
-    warm_up(channel_count(scene))
-    call = Call(
-        options,
-        camera_rows(
-            scene.viewmats.detach().double().contiguous().numpy(),
-            scene.Ks.detach().double().contiguous().numpy(),
-            options,
-        ),
-    )
-    means2d, shapes, depths, compensations = Project.apply(
-        scene.means.contiguous(),
-        scene.quats.contiguous(),
-        scene.scales.contiguous(),
-        scene.viewmats,
-        scene.opacities.contiguous(),
-        scene.colors.contiguous(),
-        call,
-    )
-    # The caller's tensor lies on the way, so that its gradient can be kept.
-    info_means2d = unflattened(means2d, scene)
-    opacities = scene.opacities
-    if options.antialiased:
-        opacities = per_image(opacities, scene.images) * compensations
-    channels, backgrounds = channels_with_depth(scene.colors, depths, scene)
-    if backgrounds is None:
-        backgrounds = torch.zeros(scene.images, channels.shape[-1])
-    images, alphas = Blend.apply(
-        info_means2d.reshape(means2d.shape),
-        shapes,
-        opacities.contiguous(),
-        channels.contiguous(),
-        backgrounds.contiguous(),
-        call,
-    )
-    info: dict[str, Any] = {
-        "means2d": info_means2d,
-        "depths": unflattened(depths, scene),
-        "radii": unflattened(torch.from_numpy(call.projected.radii)[:, : scene.gaussians], scene),
-        "visible": unflattened(torch.from_numpy(call.lists.visible), scene),
-    }
-    if options.count_pairs:
-        pairs = torch.from_numpy(call.drawn.pairs).reshape(scene.images, -1).sum(1)
-        info["pairs"] = unflattened(pairs, scene)
-    return expected_depth(images, alphas, options.render_mode), alphas, info
-
-
-_log = logging.getLogger("wildghand.splat")
-_lock = threading.Lock()
-
-
 def warm_up(channels: int = UNROLLED[0]) -> None:
     """Makes the kernels ready; costs nothing from the second call on.
 
@@ -678,11 +503,11 @@ def warm_up(channels: int = UNROLLED[0]) -> None:
             which few programs need.
     """
     with _lock:
-        _warm_up(channels if channels in UNROLLED else None)
+        _warm_up(channels if channels in UNROLLED else max(UNROLLED) + 1)
 
 
 @functools.cache
-def _warm_up(unrolled: int | None) -> None:
+def _warm_up(channels: int) -> None:
     kernels = all_kernels()
     before = sum(kernel.compiled_here() for kernel in kernels)
     if not all(kernel.on_disk() for kernel in kernels):
@@ -690,36 +515,33 @@ def _warm_up(unrolled: int | None) -> None:
             "compiling the CPU rasterizer, once on this machine; it takes some ten seconds"
         )
     start = time.perf_counter()
-    _draw_nothing(max(UNROLLED) + 1 if unrolled is None else unrolled)
+    _draw_nothing(channels)
     if sum(kernel.compiled_here() for kernel in kernels) > before:
         _log.warning("compiled the CPU rasterizer in %.1f s", time.perf_counter() - start)
 
 
 def all_kernels() -> list[Kernel]:
-    """Every kernel that the stages call."""
+    """Every kernel that a call runs."""
     return [value for value in globals().values() if isinstance(value, Kernel)]
 
 
 def _draw_nothing(channels: int) -> None:
-    """Runs every stage, forward and backward, on Gaussians that are all culled."""
-    options = Options(1, 1, 0.01, 1e10, 0.3, "RGB", antialiased=False, count_pairs=False)
+    """Draws Gaussians that are all culled, and takes every gradient."""
+    with torch.inference_mode(False), torch.enable_grad():
 
-    def zeros(*shape: int) -> np.ndarray:
-        return np.zeros(shape, np.float32)
+        def zeros(*shape: int) -> torch.Tensor:
+            return torch.from_numpy(np.zeros(shape, np.float32)).requires_grad_()
 
-    cameras = camera_rows(np.eye(4)[None], np.eye(3)[None], options)
-    opacities, colors = zeros(1, GROUP), zeros(1, GROUP, channels)
-    ellipsoids = Ellipsoids(zeros(1, GROUP, 3), zeros(1, GROUP, 4), zeros(1, GROUP, 3))
-    projected = project_stage(ellipsoids, opacities, colors, cameras, options)
-    lists = list_stage(projected, options)
-    image, alpha = zeros(1, 1, 1, channels), zeros(1, 1, 1, 1)
-    drawn = blend_stage(projected, lists, colors, zeros(1, channels), options, image, alpha)
-    background_backward_stage(image, drawn.remaining)
-    blended = BlendGradients(
-        zeros(1, GROUP, 2), zeros(1, GROUP, 3), opacities, zeros(1, GROUP, channels)
-    )
-    blend_backward_stage(
-        projected, lists, opacities, colors, drawn, image, image, alpha, options, blended
-    )
-    upstream = PlaneGradients(blended.means2d, blended.shapes, zeros(0, 0), zeros(1, GROUP))
-    project_backward_stage(ellipsoids, cameras, projected, upstream, options, True, ellipsoids)
+        gaussians = zeros(1, GROUP, 3), zeros(1, GROUP, 4), zeros(1, GROUP, 3), zeros(1, GROUP)
+        options = Options(1, 1, 0.01, 1e10, 0.3, "RGB", antialiased=False, count_pairs=False)
+        scene = FlatScene(
+            *gaussians,
+            zeros(1, GROUP, channels),
+            viewmats=zeros(1, 4, 4),
+            Ks=torch.from_numpy(np.eye(3, dtype=np.float32)[None]),
+            backgrounds=zeros(1, channels),
+            options=options,
+            image_dims=(1,),
+        )
+        images, _, _ = _draw(scene)
+        images.backward(torch.zeros_like(images))

@@ -1,4 +1,11 @@
-"""Forward pass: every tile blends its splats from front to back."""
+"""Every tile blends its splats from front to back; the backward pass does so once more.
+
+The gradients of each (splat, tile) have a slot of their own, so threads share nothing, and each
+Gaussian adds its slots in the order of its tiles: the sums are the same bits on every run.
+"""
+
+# Numba infers the types.
+# mypy: allow-untyped-defs
 
 from __future__ import annotations
 
@@ -52,6 +59,43 @@ from wildghand.splat.kernels.vectors import (
     store,
 )
 
+#: The entries of a tile that are being worked on: what `enter_batch` writes.
+BATCH_FLOATS = 2 * BLOCKS * BATCH
+
+
+@inline
+def meet(u_pixel, e_pixel, offsets, to, b, opacity, state, place):
+    """One splat over the pixels of block `b`, whose transmittance lies at `place`.
+
+    Takes from the transmittance what the splat leaves, which both passes must decide alike.
+
+    Returns:
+        u and e (see `tiles`), log2 of alpha before it is clamped, transmittance before, alpha, the
+        weight of the splat's colour, and in which pixels it is blended.
+    """
+    u = u_pixel + offsets[to + b]
+    e = e_pixel + offsets[to + BLOCKS + b]
+    power = log2_alpha(u, e, opacity)
+    seen = power >= LOG2_MIN_ALPHA
+    before = load_pixels(state, place)
+    alpha = clamped_alpha(power)
+    weight = alpha * before
+    after = before - weight
+    lives = after > MIN_TRANSMITTANCE
+    blended = seen & lives
+    stopped = negate(absolute(before))
+    store(state, place, select(seen, select(lives, after, stopped), before))
+    return u, e, power, before, alpha, select(blended, weight, ZERO), blended
+
+
+@inline
+def corner_of(tile, width, height):
+    """Image, left and top pixel of a tile."""
+    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
+    tiles_y = (height + TILE_HEIGHT - 1) // TILE_HEIGHT
+    left, top = tile % tiles_x * TILE_WIDTH, tile // tiles_x % tiles_y * TILE_HEIGHT
+    return tile // (tiles_x * tiles_y), left, top
+
 
 @inline
 def blend_tile(
@@ -83,64 +127,50 @@ def blend_tile(
             while inside != 0:
                 b = lowest_bit(inside)
                 inside &= inside - np.uint64(1)
-                u = u_pixel + offsets[2 * BLOCKS * i + b]
-                e = e_pixel + offsets[2 * BLOCKS * i + BLOCKS + b]
-                power = log2_alpha(u, e, opacity)
-                seen = power >= LOG2_MIN_ALPHA
                 place = b * stride
-                before = load_pixels(state, place)
-                weight = clamped_alpha(power) * before
-                after = before - weight
-                lives = after > MIN_TRANSMITTANCE
-                weight = select(seen & lives, weight, ZERO)
+                _, _, _, _, _, weight, blended = meet(
+                    u_pixel, e_pixel, offsets, 2 * BLOCKS * i, b, opacity, state, place
+                )
                 paint(state, place + LANES, weight, colors, color, channels)
-                stopped = negate(absolute(before))
-                store(state, place, select(seen, select(lives, after, stopped), before))
                 if counting:
-                    pairs += count_bits(bits(seen & lives))
+                    pairs += count_bits(bits(blended))
     return last, pairs
 
 
 @kernel
 def blend(
     worker, counters, ends,
-    start, entries, geom, colors, color_repeat, backgrounds, width, height, gaussians,
-    images, alphas, remaining, stops, pairs, channels, counting,
+    start, entries, geom, colors, color_repeat, width, height, gaussians,
+    backgrounds, images, alphas, remaining, stops, pairs, channels, counting,
 ):  # fmt: skip
     """Draws every image.
 
     Args:
         worker, counters, ends: see `next_job`; a job is a tile.
-        start, entries: the lists of all tiles of all images, see `bins`.
+        start, entries: the lists of all tiles of all images, see `lists`.
         geom: flat float32 (I, N, 16).
         colors: flat float32 (S, N, D).
         color_repeat: image i reads entry i // color_repeat of the S.
-        backgrounds: float32 (I, D).
         width, height, gaussians: pixels and N.
+        backgrounds: float32 (I, D).
         images: out, flat float32 (I, H, W, D).
         alphas: out, flat float32 (I, H, W).
         remaining: out, flat float32 (I, H, W); transmittance.
         stops: out, int64 (tiles,); end of the part of each list that was looked at.
         pairs: out, int64 (tiles,); blended (splat, pixel) pairs, if `counting`.
-        channels: D, or a tuple of D zeros (see `channels`).
+        channels: D, or a tuple of D zeros (see `tiles.count`).
         counting: whether to count pairs.
     """
     size = count(channels)
     stride = (1 + size) * LANES
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    tiles_y = (height + TILE_HEIGHT - 1) // TILE_HEIGHT
-    state = scratch(BLOCKS * stride)
-    offsets = scratch(2 * BLOCKS * BATCH)
-    blocks = np.empty(BATCH, np.uint64)
-    ids = np.empty(BATCH, np.int64)
+    state, offsets = scratch(BLOCKS * stride), scratch(BATCH_FLOATS)
+    blocks, ids = np.empty(BATCH, np.uint64), np.empty(BATCH, np.int64)
     slopes = np.empty(BATCH, np.float32)
     while True:
         tile = next_job(worker, counters, ends)
         if tile < 0:
             break
-        image = tile // (tiles_x * tiles_y)
-        left = tile % tiles_x * TILE_WIDTH
-        top = tile // tiles_x % tiles_y * TILE_HEIGHT
+        image, left, top = corner_of(tile, width, height)
         first, last = start[tile], start[tile + 1]
         stops[tile] = first
         pairs[tile] = 0
@@ -183,8 +213,19 @@ def tile_backward(
     geom, base, colors, color_base, entries, first, last, tile_x, tile_y,
     state, offsets, blocks, ids, slopes, sum_scratch, slots, slot, slot_size, channels,
 ):  # fmt: skip
-    """Gradients of the entries from `first` to `last`, written to consecutive slots."""
+    """Gradients of the entries from `first` to `last`, written to consecutive slots.
+
+    Front to back again, with one number for all that lies behind. For a pixel with upstream
+    gradient v, a splat of colour c, alpha a and transmittance T before it:
+
+        dL/dc = a T v,    dL/da = T (c . v) - R / (1 - a)
+
+    where R, what the pixel gets from behind the splat times v, starts as the whole pixel's and
+    loses a T (c . v) at every splat. So nothing but the image and its transmittance need be kept
+    from the forward pass.
+    """
     stride = (2 + count(channels)) * LANES
+    zero = fill_pixels(ZERO)
     for start in range(first, last, BATCH):
         stop = min(start + BATCH, last)
         enter_batch(
@@ -197,30 +238,15 @@ def tile_backward(
             opacity = geom[row + at.LOG2_OPACITY]
             color = fetch(colors, (color_base + ids[i]) * count(channels), channels)
             sums = start_sums(sum_scratch, channels)
-            m = fill_pixels(ZERO)
-            m_u = fill_pixels(ZERO)
-            m_e = fill_pixels(ZERO)
-            m_uu = fill_pixels(ZERO)
-            m_ue = fill_pixels(ZERO)
-            m_ee = fill_pixels(ZERO)
+            m, m_u, m_e, m_uu, m_ue, m_ee = zero, zero, zero, zero, zero, zero
             inside = blocks[i]
             while inside != 0:
                 b = lowest_bit(inside)
                 inside &= inside - np.uint64(1)
-                u = u_pixel + offsets[2 * BLOCKS * i + b]
-                e = e_pixel + offsets[2 * BLOCKS * i + BLOCKS + b]
-                power = log2_alpha(u, e, opacity)
-                seen = power >= LOG2_MIN_ALPHA
                 place = b * stride
-                before = load_pixels(state, place)
-                alpha = clamped_alpha(power)
-                weight = alpha * before
-                after = before - weight
-                lives = after > MIN_TRANSMITTANCE
-                blended = seen & lives
-                weight = select(blended, weight, ZERO)
-                stopped = negate(absolute(before))
-                store(state, place, select(seen, select(lives, after, stopped), before))
+                u, e, power, before, alpha, weight, blended = meet(
+                    u_pixel, e_pixel, offsets, 2 * BLOCKS * i, b, opacity, state, place
+                )
                 gain = project(state, place + 2 * LANES, colors, color, channels)
                 behind = fma(negate(weight), gain, load_pixels(state, place + LANES))
                 store(state, place + LANES, behind)
@@ -243,8 +269,8 @@ def tile_backward(
 @kernel
 def blend_backward(
     worker, counters, ends,
-    start, stops, first_slot, entries, geom, colors, color_repeat, width, height,
-    gaussians, images, remaining, v_images, v_alphas, slots, slot_size, slot_of, channels,
+    start, stops, first_slot, entries, geom, colors, color_repeat, width, height, gaussians,
+    images, remaining, v_images, v_alphas, slots, slot_size, slot_of, channels,
 ):  # fmt: skip
     """Gradients of every (splat, tile) pair that was looked at.
 
@@ -254,19 +280,15 @@ def blend_backward(
         images, remaining, stops: as `blend` left them.
         first_slot: int64 (tiles,); slot of the first entry of each tile.
         v_images, v_alphas: flat, upstream gradients of images and alphas; the latter may be empty.
-        slots: out, flat float32, `slot_size` for each pair; see `channels.finish_sums`.
+        slots: out, flat float32, `slot_size` for each pair; see `tiles.finish_sums`.
         slot_of: out, int32 (E,); slot of each entry in order of Gaussians, or -1.
         channels: as for `blend`.
     """
     size = count(channels)
     stride = (2 + size) * LANES
-    tiles_x = (width + TILE_WIDTH - 1) // TILE_WIDTH
-    tiles_y = (height + TILE_HEIGHT - 1) // TILE_HEIGHT
-    state = scratch(BLOCKS * stride)
-    offsets = scratch(2 * BLOCKS * BATCH)
+    state, offsets = scratch(BLOCKS * stride), scratch(BATCH_FLOATS)
     sum_scratch = scratch(size * LANES)
-    blocks = np.empty(BATCH, np.uint64)
-    ids = np.empty(BATCH, np.int64)
+    blocks, ids = np.empty(BATCH, np.uint64), np.empty(BATCH, np.int64)
     slopes = np.empty(BATCH, np.float32)
     while True:
         tile = next_job(worker, counters, ends)
@@ -279,9 +301,7 @@ def blend_backward(
             slot_of[np.int64(entries[k] >> np.uint64(32))] = -1
         if first == last:
             continue
-        image = tile // (tiles_x * tiles_y)
-        left = tile % tiles_x * TILE_WIDTH
-        top = tile // tiles_x % tiles_y * TILE_HEIGHT
+        image, left, top = corner_of(tile, width, height)
         columns, lines = min(TILE_WIDTH, width - left), min(TILE_HEIGHT, height - top)
         if columns < TILE_WIDTH or lines < TILE_HEIGHT:
             for b in range(BLOCKS):

@@ -4,6 +4,9 @@ The arrays of a call hold one Gaussian after another, (x, y, z), (x, y, z)...; t
 works on vectors (x, x, ...), (y, y, ...). Shuffles in registers do the exchange.
 """
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
@@ -17,7 +20,6 @@ from numba.core import cgutils
 from wildghand.splat.kernels.jit import inline
 from wildghand.splat.kernels.vectors import (
     Vector,
-    call,
     intrinsic,
     make_constant,
     make_fill,
@@ -163,26 +165,6 @@ def store_column(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
         return context.get_dummy_value()
 
     return types.void(array, types.intp, value), codegen
-
-
-@intrinsic
-def floor(typingctx: Any, value: Any) -> Any:
-    """The largest integer not above, in every lane."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return call(builder, "floor", value, args)
-
-    return value(value), codegen
-
-
-@intrinsic
-def ceil(typingctx: Any, value: Any) -> Any:
-    """The smallest integer not below, in every lane."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return call(builder, "ceil", value, args)
-
-    return value(value), codegen
 
 
 @intrinsic

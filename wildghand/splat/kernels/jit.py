@@ -1,5 +1,8 @@
 """How kernels are compiled (kept on disk, never with fast-math), and how threads share jobs."""
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import functools

@@ -1,4 +1,13 @@
-"""The visible Gaussians of each image from front to back: a radix sort on float32 depth."""
+"""The visible Gaussians of each image from front to back, and of each tile.
+
+First a radix sort on float32 depth, then a stable counting sort: the visible Gaussians of an image
+are cut into chunks. Each chunk finds the tiles that its splats touch and counts them; a prefix sum
+over (tile, chunk) says where each chunk writes; each chunk then writes. Any number of chunks gives
+the same lists.
+"""
+
+# Numba infers the types.
+# mypy: allow-untyped-defs
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""One row of 16 float32 for each Gaussian of each image: all that tiles need, one cache line.
+"""What a tile of pixels sees of a splat: its row of numbers, its alpha, its channels.
+
+A splat is a small blob. A vector of pixels shaped as a block (4 x 4 rather than 16 x 1) misses
+it less often, so fewer lanes are wasted. Each tile has 16 blocks, so that one 16-lane vector
+says which blocks of a tile a splat can reach.
+
+Of each Gaussian tiles need one row of 16 float32, one cache line.
 
 A projected Gaussian is kept as its exponent is evaluated. With e the distance across pixel rows
 and u the distance along the row from the splat's centre line, both scaled,
@@ -11,6 +17,9 @@ is visible, so a needle hundreds of pixels long loses no digits in float32; the 
 a dx^2 + 2 b dx dy + c dy^2 loses all of them. Centre and shear are pairs of float32 (value
 and rounding error) because the distance to a pixel is a difference of nearly equal numbers.
 """
+
+# Numba infers the types.
+# mypy: allow-untyped-defs
 
 from __future__ import annotations
 
@@ -103,15 +112,13 @@ LOG2_MIN_ALPHA = np.float32(math.log2(rules.MIN_ALPHA))
 LOG2_MAX_ALPHA = np.float32(math.log2(rules.MAX_ALPHA))
 MIN_TRANSMITTANCE = np.float32(rules.MIN_TRANSMITTANCE)
 ZERO, ONE = np.float32(0.0), np.float32(1.0)
-
-
 #: Slack, in log2(alpha), of the test that skips blocks; only adds blocks that blend nothing.
 _SLACK = np.float32(1e-3)
 _HALF_WIDTH = np.float32((BLOCK_WIDTH - 1) / 2)
 _HALF_HEIGHT = np.float32((BLOCK_HEIGHT - 1) / 2)
 #: Entries that are prepared together.
 BATCH = 16
-#: The half of an entry that names its Gaussian (see `bins.fill_tiles`).
+#: The half of an entry that names its Gaussian (see `lists.fill_tiles`).
 GAUSSIAN = np.uint64(0xFFFFFFFF)
 _ROUND = np.float32(1.5 * 2**23)
 
@@ -255,6 +262,11 @@ def place_of(x, y):
     block = y // BLOCK_HEIGHT * BLOCK_COLUMNS + x // BLOCK_WIDTH
     return block, y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH
 
+
+# Work over colour channels, twice: unrolled in registers, or as a loop of any length. `channels`
+# says which. A tuple of D zeros fixes D when the kernel is compiled, and colours and gradients live
+# in registers: the path of RGB. A plain number is a loop over memory, one compiled kernel for every
+# D. The kernels are written once against the functions here.
 
 #: Sums over pixels that the geometry's gradient needs, besides one for each channel.
 MOMENTS = 6

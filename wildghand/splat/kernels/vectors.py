@@ -262,26 +262,6 @@ def fma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
     return vector(a, b, c), codegen
 
 
-@intrinsic
-def square_root(typingctx: Any, a: Any) -> Any:
-    """Square root in every lane; NaN below zero."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return call(builder, "sqrt", sig.args[0], args)
-
-    return a(a), codegen
-
-
-@intrinsic
-def absolute(typingctx: Any, a: Any) -> Any:
-    """Absolute value in every lane."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
-        return call(builder, "fabs", sig.args[0], args)
-
-    return a(a), codegen
-
-
 def call(builder: ir.IRBuilder, name: str, vector: Vector, values: Sequence[Any]) -> ir.Value:
     """Emits a call of an LLVM intrinsic, such as `fma`, on whole vectors."""
     kind = ir.FunctionType(vector.llvm, [vector.llvm] * len(values))
@@ -290,6 +270,26 @@ def call(builder: ir.IRBuilder, name: str, vector: Vector, values: Sequence[Any]
         builder.module, kind, f"llvm.{name}.v{vector.lanes}{suffix}"
     )
     return builder.call(function, values)
+
+
+def make_unary(name: str) -> Callable[[Any], Any]:
+    """An intrinsic that applies an LLVM intrinsic of one argument in every lane."""
+
+    @intrinsic
+    def unary(typingctx: Any, a: Any) -> Any:
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+            return call(builder, name, sig.args[0], args)
+
+        return a(a), codegen
+
+    return unary
+
+
+#: NaN below zero.
+square_root = make_unary("sqrt")
+absolute = make_unary("fabs")
+floor = make_unary("floor")
+ceil = make_unary("ceil")
 
 
 @intrinsic
