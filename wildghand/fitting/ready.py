@@ -16,7 +16,7 @@ from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading import fill_harmonics
 from wildghand.model.dress import dress
 from wildghand.network import NetworkOutput, Refinement
-from wildghand.network.frame_heads import warm_up_heads as warm_up_heads
+from wildghand.network.frame_heads import warm_up_heads
 from wildghand.shadows import Obstacles
 
 

@@ -1,4 +1,9 @@
-"""Compiled passes over many tensors: the squares of gradients, and the step of Adam."""
+"""Adam with the norm of the gradient clipped: two passes over everything that is fitted.
+
+On the CPU a step of torch's optimizer and of its clipping starts some two hundred operations on
+tensors that are mostly tiny. Here all tensors are cut into pieces that compiled code goes through,
+on several threads. On other devices torch's own fused step does the work, and nothing is read back.
+"""
 
 # Numba infers the types.
 # mypy: allow-untyped-defs
@@ -60,13 +65,9 @@ def _floats(typingctx: Any, address: Any) -> Any:
 
 @compiled(nogil=True)
 def add_squares(worker, counters, ends, addresses, pieces, sums):
-    """Sum of the squares of each piece of the gradients.
+    """Squares of each piece of the gradients, summed into float64 (P,); a job is a piece.
 
-    Args:
-        worker, counters, ends: see `wildghand.splat.kernels.jit.next_job`; a job is a piece.
-        addresses: int64 (5, T), of parameters, gradients, moments and counts.
-        pieces: of the tensors.
-        sums: float64 (P,), filled.
+    `addresses` is int64 (5, T): of parameters, gradients, moments and counts.
     """
     while True:
         piece = next_job(worker, counters, ends)
@@ -89,12 +90,7 @@ def add_squares(worker, counters, ends, addresses, pieces, sums):
 def advance(addresses, rates, betas, factors):
     """Count a step of every tensor, and find what depends on the count.
 
-    Args:
-        addresses: see `add_squares`.
-        rates: float64 (T,), learning rates.
-        betas: the two decay rates.
-        factors: float32 (T, 2), filled: minus the rate over the first bias correction, and the
-            root of the second.
+    Into float32 (T, 2): minus the rate over the first bias correction, and the root of the second.
     """
     for tensor in range(len(rates)):
         count = carray(_floats(addresses[_STEPS, tensor]), (1,))
@@ -124,15 +120,7 @@ def _step(arrays, i, scale, rate, root, constants):
 
 @compiled(nogil=True)
 def update(worker, counters, ends, addresses, pieces, factors, scales, betas, epsilon):
-    """One step of Adam on every piece.
-
-    Args:
-        worker, counters, ends, addresses, pieces: see `add_squares`.
-        factors: see `advance`.
-        scales: float32 (T,), what gradients are multiplied with.
-        betas: the two decay rates.
-        epsilon: added to the root of the second moment.
-    """
+    """One step of Adam on every piece; float32 (T,) `scales` multiply the gradients."""
     constants = (
         np.float32(1.0 - betas[0]),
         np.float32(betas[1]),
@@ -218,9 +206,8 @@ class ClippedAdam(torch.optim.Adam):
     def take_step(self, loss: Tensor) -> None:
         """Move everything that has a gradient.
 
-        Args:
-            loss: the scalar that the gradients are of. Not on the CPU, nothing changes where it is
-                not finite, and nobody waits to learn whether it is; on the CPU the caller knows.
+        Not on the CPU, nothing changes where the scalar `loss` is not finite, and nobody waits to
+        learn whether it is; on the CPU the caller knows.
         """
         if loss.device.type == "cpu":
             self._step_compiled()
@@ -287,12 +274,7 @@ def _laid_out_alike(parameter: Tensor) -> Tensor:
 
 
 class _Tables:
-    """Where tensors lie in memory, and how they are cut into pieces.
-
-    Args:
-        tensors: parameters, each with its count of steps and its moments.
-        betas, epsilon: see `ClippedAdam`.
-    """
+    """Where tensors lie in memory, and how they are cut into pieces."""
 
     def __init__(
         self,
@@ -324,13 +306,9 @@ class _Tables:
     def step(
         self, gradients: Sequence[Tensor], rates: np.ndarray, clipped: np.ndarray, limit: float
     ) -> None:
-        """Take a step.
+        """Take a step with T gradients, contiguous, and their (T,) learning rates.
 
-        Args:
-            gradients: of the T parameters, contiguous.
-            rates: (T,) learning rates.
-            clipped: (T,) bool, which count in the norm and are scaled.
-            limit: largest norm; 0: none.
+        (T,) `clipped` says which count in the norm and are scaled; a `limit` of 0 is none.
         """
         addresses, pieces = self._addresses, self._pieces
         addresses[0] = [parameter.data_ptr() for parameter, _ in self._held]
@@ -345,10 +323,3 @@ class _Tables:
             scales[clipped] = np.minimum(np.float32(1.0), limit / np.float32(norm + _LEAST_NORM))
         advance(addresses, rates, self._betas, self._factors)
         run(update, jobs, addresses, pieces, self._factors, scales, self._betas, self._epsilon)
-
-
-def warm_up_adam() -> None:
-    """Make the kernels ready: compiled once on a machine, loaded later."""
-    values = torch.zeros(1, requires_grad=True)
-    values.grad = torch.zeros(1)
-    ClippedAdam([{"params": [values], "lr": 0.0}], 1.0).take_step(torch.zeros(()))

@@ -10,7 +10,7 @@ from types import MappingProxyType
 import torch
 from torch import Tensor
 
-from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.base.errors import ShapeMismatch
 from wildghand.gaussians.quaternions import quat_multiply, quat_rotate
 
 #: Channels of each raw attribute, in the order in which they are concatenated.
@@ -68,25 +68,14 @@ class RawAttributes:
         return RawAttributes(**{name: function(tensor) for name, tensor in self.items()})
 
     def concatenate(self) -> Tensor:
-        """Return all channels side by side.
-
-        Returns:
-            (..., N, 14), in the order of `SIZES`.
-        """
+        """All channels side by side: (..., N, 14), in the order of `SIZES`."""
         if self._joined is not None:
             return self._joined
         return torch.cat([tensor for _, tensor in self.items()], dim=-1)
 
     @classmethod
     def split(cls, channels: Tensor) -> RawAttributes:
-        """Take concatenated channels apart: the inverse of `concatenate`.
-
-        Args:
-            channels: (..., N, 14).
-
-        Raises:
-            ShapeMismatch: not 14 channels.
-        """
+        """Take (..., N, 14) channels apart: the inverse of `concatenate`."""
         if channels.ndim < 2 or channels.shape[-1] != CHANNELS:
             raise ShapeMismatch(
                 f"are {tuple(channels.shape)}, expected (..., N, {CHANNELS})", field="channels"
@@ -125,31 +114,8 @@ class Activation:
     #: Largest standard deviation, m; nor does a Gaussian as wide as a finger, and it costs time.
     max_scale: float = 1e-2
 
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.max_offset) and self.max_offset > 0.0):
-            raise UsageError(
-                f"is {self.max_offset}", field="max_offset", remedy="Use a length in m above 0."
-            )
-        if not math.isfinite(self.log_scale_bias):
-            raise UsageError(
-                f"is {self.log_scale_bias}", field="log_scale_bias", remedy="Use a finite number."
-            )
-        if not 0.0 < self.min_scale <= self.max_scale < math.inf:
-            raise UsageError(
-                f"are {self.min_scale} and {self.max_scale}",
-                field="min_scale, max_scale",
-                remedy="Use lengths in m above 0, the smaller one first.",
-            )
-
     def __call__(self, raw: RawAttributes) -> Attributes:
-        """Activate: bounded offsets and exponentials, unit quaternions, sigmoids.
-
-        Args:
-            raw: (..., N, k) each.
-
-        Returns:
-            Attributes with the same leading dimensions.
-        """
+        """Activate (..., N, k): bounded offsets and exponentials, unit quaternions, sigmoids."""
         return Attributes(
             # tanh(x / 2) = 2 (sigmoid(x) - 0.5)
             offsets=self.max_offset * torch.tanh(0.5 * raw.offsets),
@@ -195,17 +161,9 @@ class AnchoredGaussians:
         return {item.name: getattr(self, item.name) for item in fields(self)}
 
     def place(self, positions: torch.Tensor, orientations: torch.Tensor) -> PlacedGaussians:
-        """Carry the Gaussians into B frames.
+        """Carry the Gaussians into B frames, without their colours.
 
-        Args:
-            positions: (B, N, 3) m, world, of the anchors.
-            orientations: (B, N, 4) unit quaternions, world, of the anchors' frames.
-
-        Returns:
-            The arguments of the rasterizer, except the colours.
-
-        Raises:
-            ShapeMismatch: not N anchors.
+        `positions` are (B, N, 3) m, `orientations` (B, N, 4) unit quaternions, both of the anchors.
         """
         if positions.shape[1:] != (len(self), 3) or orientations.shape[1:] != (len(self), 4):
             raise ShapeMismatch(
@@ -246,12 +204,8 @@ def flat_gaussians(
 ) -> AnchoredGaussians:
     """Discs that lie on the surface and just cover it.
 
-    Args:
-        spacing: (N,) m, distance to the neighbouring anchors.
-        colors: (N, 3) or (3,) sRGB in [0, 1].
-        opacity: in (0, 1).
-        width: standard deviation along the surface, in units of the spacing.
-        thickness: standard deviation along the normal, in units of the spacing.
+    `spacing` is (N,) m to the neighbouring anchors, the unit of `width` along the surface and
+    `thickness` along the normal, both standard deviations; `colors` are (N, 3) or (3,) sRGB.
     """
     count = len(spacing)
     sigmas = torch.log(spacing.clamp(min=1e-7))[:, None].repeat(1, 3)

@@ -17,8 +17,8 @@ import torch
 from hwp_bench.base.errors import DidNotConverge, MissingDependency
 from hwp_bench.base.threads import count_is_chosen
 from hwp_bench.methods.contract import Budget, Report
-from wildghand.gaussians.adam import warm_up_adam
-from wildghand.gaussians.losses import warm_up_losses
+from wildghand.gaussians.adam import ClippedAdam
+from wildghand.gaussians.losses import LANES, photometric_loss
 from wildghand.gaussians.rig import warm_up_posing
 from wildghand.splat.numba_backend import warm_up
 from wildghand.splat.threads import at_most
@@ -39,21 +39,15 @@ def candidates(most: int) -> tuple[int, ...]:
 
 
 def fewest(seconds: Mapping[int, float]) -> int:
-    """Return the smallest number of threads that is less than `GAIN` slower than the fastest.
-
-    Args:
-        seconds: of the same work, by number of threads.
-    """
+    """The smallest number of threads that is less than `GAIN` slower than the fastest."""
     best = min(seconds.values())
     return min(number for number, value in seconds.items() if value * (1.0 - GAIN) <= best)
 
 
 class StepThreads:
-    """The choice for one fit.
+    """The choice for one fit among `numbers` of threads; one or none is not measured.
 
-    Args:
-        numbers: of threads, to choose from; one or none is not measured.
-        shared: steps that share work which one of them does; a block has all of them.
+    `shared` steps share work which one of them does; a block has all of them.
     """
 
     def __init__(self, numbers: tuple[int, ...] = (), shared: int = 1) -> None:
@@ -122,6 +116,15 @@ Snapshot = TypeVar("Snapshot", covariant=True)
 Kept = TypeVar("Kept")
 
 
+def _warm_up() -> None:
+    """Make the kernels of a loss and of a step ready: compiled once on a machine, loaded later."""
+    with torch.enable_grad():
+        row = torch.zeros(1, 1, LANES, 1, requires_grad=True)
+        loss = photometric_loss(row, row.detach(), torch.zeros(1, 1, LANES), 0.5)
+        loss.backward()
+    ClippedAdam([{"params": [row], "lr": 0.0}], 1.0).take_step(loss)
+
+
 def choose_device(name: str) -> torch.device:
     """Resolve `auto`, `cpu` or `cuda`; `auto` is CUDA where both a GPU and gsplat are available.
 
@@ -141,23 +144,16 @@ def choose_device(name: str) -> torch.device:
 
 
 def ready_device(name: str) -> torch.device:
-    """Choose the device, and compile for it what a fit needs.
+    """Choose the device (see `choose_device`), and compile for it what a fit needs.
 
     Compiling takes some ten seconds, once on a machine. It is not a part of a fit, so this goes
     before its clock.
-
-    Args:
-        name: `auto`, `cpu` or `cuda`.
-
-    Raises:
-        MissingDependency: CUDA was asked for and is not there.
     """
     device = choose_device(name)
     if device.type == "cpu":
         warm_up()
-        warm_up_losses()
-        warm_up_adam()
         warm_up_posing()
+        _warm_up()
     return device
 
 
@@ -196,16 +192,7 @@ def spent(step: int, steps: int, budget: Budget, report: Report) -> float:
 
 
 def batches(count: int, batch: int, seed: int) -> Iterator[torch.Tensor]:
-    """Batches of row numbers without end: every row once before any comes again.
-
-    Args:
-        count: rows.
-        batch: rows in a batch.
-        seed: of their order.
-
-    Yields:
-        (batch,) int64.
-    """
+    """Batches of row numbers, (batch,) int64, without end: every row once before any again."""
     random = np.random.default_rng(seed)
     queue = np.empty(0, dtype=np.int64)
     while True:
@@ -272,11 +259,7 @@ class Guard(Generic[Kept]):
         return all(math.isfinite(loss) for loss in read_losses(self._losses))
 
     def best(self) -> Kept:
-        """The state with the lowest loss.
-
-        Raises:
-            DidNotConverge: the fit diverged before there was one.
-        """
+        """The state with the lowest loss; `DidNotConverge` if there was none."""
         if self._best is None:
             raise DidNotConverge(
                 f"the fit diverged within its first {WINDOW} steps",

@@ -1,4 +1,11 @@
-"""Losses on images: SSIM with a closed-form gradient, and L1 + D-SSIM under pixel weights."""
+"""Losses on images: SSIM with a closed-form gradient, and L1 + D-SSIM under pixel weights.
+
+On the CPU, float32, loss and gradient are made in one go in a tenth of torch's time, row by row and
+16 numbers at a time. A row of an image is W x C numbers, channel after channel. Sums over the rows
+of the SSIM window are made first, straight from the images, and then the sums along the row, at
+distances of C. Far from everything that is not black, nothing is computed: there both images are
+equal.
+"""
 
 # Numba infers the types.
 # mypy: allow-untyped-defs
@@ -70,14 +77,10 @@ class Made(NamedTuple):
 
 @compiled(nogil=True)
 def find_content(worker, counters, ends, x, y, channels, content):
-    """The part of each image outside of which both images are zero.
+    """The part of each image outside of which both images are zero; a job is an image.
 
-    Args:
-        worker, counters, ends: see `wildghand.splat.kernels.jit.next_job`; a job is an image.
-        x, y: (B, H, W * C) float32.
-        channels: C.
-        content: int64 (B, 4), filled: first and last row, first and last number of a row, the last
-            ones excluded; zeros where all is zero.
+    Into int64 (B, 4): first and last row, first and last number of a row, the last ones excluded;
+    zeros where all is zero.
     """
     height, size = x.shape[1:]
     seen = np.empty(size, np.bool_)
@@ -194,14 +197,9 @@ def _compare_row(images, at, first, last, channels, constants, blurred, spread, 
 
 @compiled(nogil=True)
 def compare(worker, counters, ends, images, channels, constants, made):
-    """Errors of every row, and what their gradient is made of.
+    """Errors of every row, and what their gradient is made of; a job is a row of an image.
 
-    Args:
-        worker, counters, ends: see `find_content`; a job is a row of an image.
-        images: what is compared.
-        channels: C.
-        constants: of the loss.
-        made: filled; `factors` within 5 px of the content only.
+    `made.factors` are filled within 5 px of the content only.
     """
     height, size = images.x.shape[1:]
     width = size // channels
@@ -243,12 +241,7 @@ def compare(worker, counters, ends, images, channels, constants, made):
 def gather(worker, counters, ends, images, channels, window, made, gradient):
     """The gradient by x. The window is symmetric and the border zero: it is its own adjoint.
 
-    Args:
-        worker, counters, ends: see `find_content`; a job is a row of an image.
-        images, channels: as compared.
-        window: (11,) float32.
-        made: from `compare`.
-        gradient: (B, H, W * C) float32, filled.
+    A job is a row of an image.
     """
     height, size = images.x.shape[1:]
     # Windows of pixels that are 10 px away from the content still reach the factors.
@@ -363,13 +356,6 @@ class PhotometricCpu(torch.autograd.Function):
         if ctx.needs_input_grad[2]:
             to_weights = errors * (upstream / ctx.count)
         return to_prediction, None, to_weights, None, None, None
-
-
-def warm_up_losses() -> None:
-    """Make the kernels ready: compiled once on a machine, loaded later."""
-    image, mask = torch.zeros(1, 1, LANES, 1, requires_grad=True), torch.zeros(1, 1, LANES)
-    window = np.ones(11, np.float32)
-    PhotometricCpu.apply(image, image.detach(), mask, 0.5, window, (1.0, 1.0))
 
 
 #: Standard deviation of the SSIM window, px.

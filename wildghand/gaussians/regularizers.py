@@ -1,4 +1,9 @@
-"""Weighted sums of rows of which index and weight never change, on the CPU."""
+"""What keeps Gaussians even and closed over the skin: a Laplacian, and flat opaque discs.
+
+A picture says nothing of the side of the hand that it does not show, nor how far a Gaussian that
+faces the camera reaches along the line of sight, nor whether the one behind it is there at all.
+What no frame contradicts should look like skin from everywhere: no holes and no fur.
+"""
 
 # Numba infers the types.
 # mypy: allow-untyped-defs
@@ -70,18 +75,10 @@ def bags_kernel(worker, counters, ends, values, index, weight, start, out):
 
 
 def sum_bags(values: Tensor, index: Tensor, weight: Tensor, start: Tensor) -> Tensor:
-    """Sum rows: row i of the result sums terms start[i] to start[i + 1], the last one to the end.
+    """Row i sums the terms start[i] to start[i + 1], the last one to the end; no gradient.
 
+    A term is row `index` (K,) of `values` (inputs, C), times `weight` (K,); `start` is (outputs,).
     Torch's `embedding_bag` does the same, and takes three times as long where most bags are empty.
-
-    Args:
-        values: (inputs, C) float32 on the CPU; no gradient is recorded.
-        index: (K,) int64 in [0, inputs), which row each term takes.
-        weight: (K,) float32, its factor.
-        start: (outputs,) int64, not falling.
-
-    Returns:
-        (outputs, C).
     """
     # Memory that was used before: fresh memory costs as much as the sums.
     out = torch.from_numpy(lease((len(start), values.shape[1]), np.float32))
@@ -116,17 +113,7 @@ class SurfaceLaplacian:
     spacing: float
 
     def __call__(self, values: Tensor) -> Tensor:
-        """Differences to the neighbours' mean.
-
-        Args:
-            values: (..., N, C).
-
-        Returns:
-            (..., N, C) in the matrix's type.
-
-        Raises:
-            ShapeMismatch: not N rows.
-        """
+        """Differences of (..., N, C) to the neighbours' mean, in the matrix's type."""
         count = len(self.matrix)
         if values.ndim < 2 or values.shape[-2] != count:
             raise ShapeMismatch(
@@ -141,13 +128,10 @@ class SurfaceLaplacian:
         return self(values).square().sum(dim=-1).mean()
 
     def offsets(self, offsets: Tensor) -> Tensor:
-        """Roughness of displacements.
+        """Roughness of displacements (..., N, 3) m in the anchors' frames.
 
-        Displacements are compared in the axes of the rest pose and in units of the spacing:
-        the tangents of neighbouring anchor frames may point anywhere.
-
-        Args:
-            offsets: (..., N, 3) m, in the anchors' frames.
+        They are compared in the axes of the rest pose and in units of the spacing: the tangents of
+        neighbouring anchor frames may point anywhere.
         """
         turned = (self.frames.to(offsets) @ offsets.unsqueeze(-1)).squeeze(-1)
         return self.roughness(turned / self.spacing)
@@ -194,15 +178,9 @@ def rest_anchors(rig: HandRig) -> tuple[np.ndarray, np.ndarray]:
 
 
 def nearest_on_surface(positions: np.ndarray, normals: np.ndarray, count: int) -> np.ndarray:
-    """Nearest points whose normals differ by less than a right angle.
+    """The nearest points whose normals differ by less than a right angle.
 
-    Args:
-        positions: (N, 3).
-        normals: (N, 3) of length 1.
-        count: neighbours to find.
-
-    Returns:
-        (N, K) int64, K = count or N - 1 if that is less; -1 where fewer agree.
+    (N, K) int64, K = count or N - 1 if that is less; -1 where fewer agree.
     """
     total = len(positions)
     found = min(count, total - 1)
@@ -248,12 +226,7 @@ class _Product(torch.autograd.Function):
 
 
 def sparse_times(matrix: Tensor, rows: Tensor) -> Tensor:
-    """Product of a matrix of a `SurfaceLaplacian` and rows.
-
-    Args:
-        matrix: (N, N) sparse CSR.
-        rows: (N, C) of the same type; no gradient is recorded on the CPU.
-    """
+    """Product of a sparse CSR matrix and rows (N, C) of the same type; no gradient on the CPU."""
     if kernels_take(rows):
         starts = matrix.crow_indices()[:-1]
         return sum_bags(rows, matrix.col_indices(), matrix.values(), starts)
@@ -267,15 +240,9 @@ _STARTS = {name: sum(SIZES[other] for other in _NAMES[:i]) for i, name in enumer
 def attribute_roughness(
     laplacian: SurfaceLaplacian, raw: Tensor, scales: float, colors: float
 ) -> Tensor:
-    """`SurfaceLaplacian.roughness` of the raw log scales and of the sigmoid of the raw colours.
+    """`SurfaceLaplacian.roughness` of the log scales and colours in (B, N, 14) raw attributes.
 
-    Args:
-        laplacian: of N anchors.
-        raw: (B, N, 14) raw attributes of B frames.
-        scales, colors: weights of the two.
-
-    Returns:
-        scalar: the weighted sum.
+    Its gradient is by hand: autograd would join that of six channels from all fourteen.
     """
     return _Roughness.apply(raw, laplacian.matrix, laplacian.transposed, scales, colors)
 

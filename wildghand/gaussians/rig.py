@@ -1,4 +1,9 @@
-"""Anchors on one hand, posed frame by frame; the Gaussians ride on them."""
+"""Anchors on one hand, posed frame by frame; the Gaussians ride on them.
+
+On the CPU, float32, posing is compiled, with its gradient by hand. The equations are those of
+`hwp_bench.hands.skinning.pose_hand` and `hwp_bench.hands.anchors.anchor_frames`. Joints are
+computed in float64, points in float32.
+"""
 
 # Numba infers the types.
 # mypy: allow-untyped-defs
@@ -235,12 +240,7 @@ def skin_backward(of_points, corners, mix, rest, joint_of, weight_of, turns, of_
 
 @compiled(nogil=True)
 def vertex_normals(vertices, faces, normals):
-    """Unit normals of the vertices, faces weighed by area.
-
-    Args:
-        vertices: (V, 3) float32; `faces`: (F, 3) int.
-        normals: (V, 3) float32, filled; (0, 0, 1) where there is no face of any area.
-    """
+    """Unit normals (V, 3), faces weighed by area; (0, 0, 1) where there is no face of any area."""
     normals[:] = np.float32(0.0)
     for f in range(len(faces)):
         i, j, k = faces[f, 0], faces[f, 1], faces[f, 2]
@@ -375,12 +375,7 @@ class PosingTables:
 
     @classmethod
     def of(cls, template: TemplateTensors, anchors: SurfaceAnchors) -> PosingTables:
-        """The tables of anchors on a template.
-
-        Args:
-            template: float32, on the CPU.
-            anchors: N anchors.
-        """
+        """The tables of anchors on a float32 template on the CPU."""
         weights = template.weights.numpy()
         most = max(1, int((weights != 0.0).sum(axis=1).max()))
         order = np.argsort(-np.abs(weights), axis=1, kind="stable")[:, :most]
@@ -580,13 +575,7 @@ class HandRig:
 
     @torch.no_grad()
     def pose(self, pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> AnchorPoses:
-        """Pose the anchors; no gradient.
-
-        Args:
-            pose: (F, 16, 3) axis-angle, rad.
-            betas: (10,).
-            transl: (F, 3) m.
-        """
+        """Pose the anchors in F frames, (F, 16, 3) rad, (10,) and (F, 3) m; no gradient."""
         # Filled part by part: joining finished parts would hold all of them twice.
         posed = AnchorPoses(
             pose.new_empty(len(pose), len(self), 3), pose.new_empty(len(pose), len(self), 4)
@@ -601,13 +590,9 @@ class HandRig:
     def follow(self, pose: torch.Tensor, betas: torch.Tensor, transl: torch.Tensor) -> AnchorPoses:
         """Pose the anchors of a few frames; the positions are differentiable.
 
-        Their frames carry no gradient: it would double the cost, and turning a splat changes the
-        image much less than moving it.
-
-        Args:
-            pose: (F, 16, 3) axis-angle, rad.
-            betas: (10,) or (F, 10).
-            transl: (F, 3) m.
+        Poses (F, 16, 3) rad, shapes (10,) or (F, 10), translations (F, 3) m. The frames of the
+        anchors carry no gradient: it would double the cost, and turning a splat changes the image
+        much less than moving it.
         """
         if kernels_take(self.template.vertices, pose, betas, transl):
             return AnchorPoses(*FollowCpu.apply(pose, betas, transl, self.tables))
@@ -629,18 +614,7 @@ def make_rig(
     seed: int = 0,
     device: torch.device | str = "cpu",
 ) -> HandRig:
-    """Spread `count` anchors evenly over a hand.
-
-    Args:
-        template: the hand.
-        count: number of anchors, at least 1.
-        seed: of the anchors.
-        device: where the tensors live.
-
-    Raises:
-        UsageError: `count` is below 1.
-        BadHandModel: the surface has no area.
-    """
+    """Spread `count` anchors evenly over a hand; `seed` is that of the anchors."""
     return rig_of(template, sample_surface(template, count, seed), device)
 
 

@@ -52,14 +52,7 @@ def harmonics_kernel(worker, counters, ends, normals, degree, out, first):
 
 
 def fill_harmonics(normals: Tensor, degree: int, out: Tensor, first: int) -> None:
-    """`wildghand.gaussians.shading.sh_basis` without the constant, into columns of a tensor.
-
-    Args:
-        normals: (M, 3) float32 of length 1, on the CPU.
-        degree: 1 to 3.
-        out: (M, channels) float32; the columns from `first` on are filled.
-        first: column.
-    """
+    """`sh_basis` of (M, 3) normals without the constant, into columns of `out` from `first` on."""
     run_pieces(
         harmonics_kernel,
         len(normals),
@@ -77,11 +70,7 @@ MAX_DEGREE = 3
 
 
 def sh_count(degree: int) -> int:
-    """Number of basis functions up to `degree`: (degree + 1)^2.
-
-    Raises:
-        UsageError: not an integer in 0..3.
-    """
+    """Number of basis functions up to `degree`, 0 to 3: (degree + 1)^2."""
     if not isinstance(degree, int) or not 0 <= degree <= MAX_DEGREE:
         raise UsageError(f"is {degree!r}", field="degree", remedy=f"Use 0 to {MAX_DEGREE}.")
     return (degree + 1) ** 2

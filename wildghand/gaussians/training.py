@@ -1,4 +1,4 @@
-"""Numbers that belong to frames, ready where a fit runs, so that no step waits for them."""
+"""The training data of a fit in memory: frames as tables, and the posed hands and cameras."""
 
 from __future__ import annotations
 
@@ -24,14 +24,10 @@ _CHUNK = 32
 
 
 class FrameTable:
-    """Numbers that belong to R frames and do not change: made once, when they are first asked for.
+    """Numbers that belong to `count` frames and do not change: made once, when first asked for.
 
-    Args:
-        make: takes rows, (B,) int64 on the CPU, and makes what belongs to them, on the device.
-        count: R.
-        size: bytes of what belongs to one frame.
-        device: where it lives.
-        cache_bytes: most memory; a larger table is made batch by batch.
+    `make` takes rows, (B,) int64 on the CPU, and makes what belongs to them on the device. A table
+    of more than `cache_bytes`, `size` bytes a frame, is made batch by batch.
     """
 
     def __init__(
@@ -48,11 +44,7 @@ class FrameTable:
         self._made: torch.Tensor | None = None
 
     def __call__(self, rows: torch.Tensor) -> torch.Tensor:
-        """What belongs to B frames, (B, ...); it must not be changed.
-
-        Args:
-            rows: (B,) int64 on the CPU.
-        """
+        """What belongs to (B,) rows: (B, ...); it must not be changed."""
         if not len(self._all):
             return self._make(rows)
         if self._made is None:
@@ -73,12 +65,7 @@ class FrameTable:
 
 
 def soft_weights(masks: torch.Tensor, outside: float) -> torch.Tensor:
-    """Weights of pixels: 1 where the hand is visible, less outside.
-
-    Args:
-        masks: coverage in [0, 1].
-        outside: weight of a pixel that the mask leaves out.
-    """
+    """Weights of pixels: 1 where the coverage is 1, `outside` where it is 0."""
     return outside + (1.0 - outside) * masks
 
 
@@ -88,12 +75,7 @@ def shares_of_255(values: torch.Tensor, device: torch.device) -> torch.Tensor:
 
 
 def upload(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
-    """Copy a tensor from the host without waiting for the device.
-
-    Args:
-        tensor: on the CPU.
-        device: where the copy lives; for the CPU it is the tensor itself.
-    """
+    """Copy a tensor from the host without waiting for the device; the tensor itself for the CPU."""
     if device.type == "cpu":
         return tensor
     held = tensor.pin_memory() if device.type == "cuda" else tensor
@@ -122,14 +104,7 @@ class TrainingFrames:
         return len(self.indices)
 
     def images_on(self, device: torch.device) -> FrameTable:
-        """What renderings are compared with: float32 images, black outside the mask.
-
-        Args:
-            device: where the table gives them out.
-
-        Returns:
-            a table of (H, W, 3).
-        """
+        """What renderings are compared with: (H, W, 3) float32, black outside the mask."""
 
         def make(rows: torch.Tensor) -> torch.Tensor:
             images = upload(self.images[rows], device).float() / 255.0
@@ -138,11 +113,7 @@ class TrainingFrames:
         return FrameTable(make, len(self), 4 * self.images[0].numel(), device)
 
     def masks_on(self, device: torch.device) -> FrameTable:
-        """Estimated coverage of the visible hand: a table of (H, W) float32 in [0, 1].
-
-        Args:
-            device: where the table gives it out.
-        """
+        """Estimated coverage of the visible hand: a table of (H, W) float32 in [0, 1]."""
         each = 4 * self.masks[0].numel()
         return FrameTable(
             lambda rows: shares_of_255(self.masks[rows], device), len(self), each, device
@@ -180,17 +151,9 @@ def load_frames(training: TrainingCapture) -> TrainingFrames:
 
 
 def load_validation_frames(training: TrainingCapture, most: int) -> TrainingFrames:
-    """Read validation frames that show a hand and whose parameters are valid.
+    """Read at most so many validation frames, evenly spread; there may be none.
 
-    Args:
-        training: what may be seen of the capture.
-        most: how many, evenly spread over those there are.
-
-    Returns:
-        The frames; there may be none. What is fitted too is left out.
-
-    Raises:
-        BadImage: an image is missing or damaged.
+    What is fitted too is left out.
     """
     apart = np.setdiff1d(training.validation, training.train)
     return _read_frames(training, apart[evenly(len(apart), most)])
@@ -276,12 +239,7 @@ class TrainingClip:
             self._cache = {side: self._pose(side, rows) for side in rigs}
 
     def hand(self, side: str, rows: torch.Tensor) -> AnchorPoses:
-        """The anchors of one hand in a batch, without gradient; they must not be changed.
-
-        Args:
-            side: which.
-            rows: (B,) int64 positions in `indices`.
-        """
+        """The anchors of one hand in (B,) rows, without gradient; they must not be changed."""
         if self._cache is None:
             return self._pose(side, rows)
         posed = self._cache[side]

@@ -17,9 +17,7 @@ from wildghand.network.surface import COORDINATES, CellPooling, Chart, encode_po
 class PlaneCoder(nn.Module):
     """Encoder and decoder on a UV plane, three scales deep, with skips.
 
-    Args:
-        inputs: channels in.
-        width: channels out; twice as many at the two coarser scales.
+    `width` channels come out; there are twice as many at the two coarser scales.
     """
 
     def __init__(self, inputs: int, width: int) -> None:
@@ -82,13 +80,7 @@ class CompactGeometry(nn.Module):
         self.channels = harmonics + width
 
     def forward(self, chart: Chart, normals: Tensor, pose: Tensor) -> Tensor:
-        """Features of N Gaussians in B frames: (B, N, channels), harmonics first.
-
-        Args:
-            chart: of N Gaussians.
-            normals: (B, N, 3) of length 1, world.
-            pose: (B, 16, 3) axis-angle, rad.
-        """
+        """(B, N, channels) of (B, N, 3) unit normals and (B, 16, 3) rad, harmonics first."""
         # The constant harmonic is the bias of whatever reads them.
         light = sh_basis(normals, self.degree)[..., 1:]
         place = self.place(chart.coordinates.to(light.dtype))
@@ -108,12 +100,7 @@ BLOCKS = 5
 
 
 class PointPlaneCoder(nn.Module):
-    """Points to a plane of tokens, through a transformer, up to finer planes, back to points.
-
-    Args:
-        settings: dimensions.
-        inputs: channels of a point.
-    """
+    """Points to a plane of tokens, through a transformer, up to finer planes, back to points."""
 
     def __init__(self, settings: NetworkSettings, inputs: int) -> None:
         super().__init__()
@@ -189,13 +176,7 @@ class PaperGeometry(nn.Module):
         self.channels = self.coder.channels
 
     def forward(self, chart: Chart, normals: Tensor, pose: Tensor) -> Tensor:
-        """Features of N Gaussians in B frames: (B, N, channels).
-
-        Args:
-            chart: of N Gaussians.
-            normals: (B, N, 3) of length 1, world.
-            pose: (B, 16, 3) axis-angle, rad.
-        """
+        """(B, N, channels) of (B, N, 3) unit normals and (B, 16, 3) rad."""
         batch, count = normals.shape[:2]
         light = sh_basis(normals, self.degree)[..., 1:]
         place = chart.coordinates.to(light.dtype).expand(batch, -1, -1)
@@ -222,13 +203,8 @@ class LocalPointNet(nn.Module):
 
     After each block the mean over a point's cell is appended to its own features.
 
-    Args:
-        inputs: channels of a point.
-        width: hidden channels.
-        outputs: channels of a cell.
-
-    Source: the encoder of Peng et al., "Convolutional Occupancy Networks", with means in place
-    of maxima, whose gradient reaches all points.
+    Source: the encoder of Peng et al., "Convolutional Occupancy Networks", with means in place of
+    maxima, whose gradient reaches all points.
     """
 
     def __init__(self, inputs: int, width: int, outputs: int) -> None:
@@ -238,15 +214,7 @@ class LocalPointNet(nn.Module):
         self.leave = nn.Linear(width, outputs)
 
     def forward(self, points: Tensor, cells: CellPooling) -> tuple[Tensor, Tensor]:
-        """Encode points.
-
-        Args:
-            points: (B, N, inputs).
-            cells: which cell each point lies in.
-
-        Returns:
-            (B, N, width) features of the points and (B, cells, outputs) of the cells.
-        """
+        """(B, N, inputs) to (B, N, width) of the points and (B, cells, outputs) of the cells."""
         features = self.blocks[0](self.enter(points))
         for block in self.blocks[1:]:
             around = _pooled(features, cells)[:, cells.cell]

@@ -1,4 +1,9 @@
-"""Heads (i) and (ii) of `compact` on the CPU, float32: a compiled pass each way, on all threads."""
+"""What `compact` does for every frame, as one function with a gradient written by hand.
+
+It computes what `CompactGeometry` and the heads (i), (ii) compute, with the same parameters: on the
+CPU in compiled code (`products`), elsewhere some twenty products of matrices in place of a hundred
+operations of autograd, which cost more than their arithmetic.
+"""
 
 from __future__ import annotations
 
@@ -135,12 +140,8 @@ def layout_of(
 ) -> tuple[Widths, Layout]:
     """Padded widths, and where the parts of the packed weights begin.
 
-    Args:
-        places: coordinates of a Gaussian.
-        harmonics: of its normal.
-        width: of the two layers of the geometry branch.
-        head: width of the hidden layer of a head.
-        latent: identity features that the direct path reads; 0 without it.
+    Of `width` are the two layers of the geometry branch, of `head` the hidden layer of a head;
+    `latent` is 0 without the direct path.
     """
     first, features = places + harmonics, harmonics + width
     point, half = _up(width, LANES), _up(head, LANES)

@@ -32,10 +32,6 @@ class IdentityMap(nn.Module):
     """One square of learnable features for each hand: the two halves of the paper's atlas.
 
     A capture of one hand has one half only.
-
-    Args:
-        settings: resolution, channels and start.
-        sides: the hands.
     """
 
     def __init__(self, settings: NetworkSettings, sides: Iterable[str]) -> None:
@@ -59,13 +55,7 @@ def initial_attributes(
 ) -> RawAttributes:
     """Flat discs of the hand's mean colour, as seen through the initial shadow coefficient.
 
-    Args:
-        settings: opacity and shadow coefficient at the start.
-        surface: spacing and colour.
-        log_scale_bias: what the activation adds to the log scales.
-
-    Returns:
-        (N, k) each, float32.
+    `log_scale_bias` is what the activation adds to the log scales.
     """
     spacing = torch.full((len(surface),), float(surface.spacing))
     albedo = (surface.color / settings.initial_shadow).clamp(0.0, BRIGHTEST)
@@ -80,13 +70,7 @@ def initial_attributes(
 
 
 def hidden(inputs: int, width: int, layers: int) -> nn.Sequential:
-    """Linear layers, each followed by a SiLU.
-
-    Args:
-        inputs: channels in.
-        width: of each layer.
-        layers: at least 1.
-    """
+    """Linear layers of `width`, each followed by a SiLU."""
     parts: list[nn.Module] = []
     for _ in range(layers):
         parts += [nn.Linear(inputs, width), nn.SiLU()]
@@ -101,13 +85,7 @@ def mlp(inputs: int, width: int, outputs: int, layers: int) -> nn.Sequential:
 
 
 class AttributeHead(nn.Module):
-    """Head (i): raw attributes from both branches.
-
-    Args:
-        settings: widths; `direct` adds the map's first channels to the attributes.
-        texture: channels of the texture features.
-        geometry: channels of the geometry features.
-    """
+    """Head (i): raw attributes from both branches; `direct` adds the map's first channels."""
 
     def __init__(self, settings: NetworkSettings, texture: int, geometry: int) -> None:
         super().__init__()
@@ -132,16 +110,11 @@ class AttributeHead(nn.Module):
     def forward(
         self, hidden: Tensor, x_g: Tensor, latent: Tensor, initial: Tensor
     ) -> RawAttributes:
-        """Predict.
+        """Raw attributes (B, N, k).
 
-        Args:
-            hidden: (N, width) of `texture`, from the texture features.
-            x_g: (B, N, Fg) geometry features.
-            latent: (N, I) identity features for the direct path; (N, 0) without it.
-            initial: (N, 14) raw attributes that are predicted at the start.
-
-        Returns:
-            (B, N, k).
+        `hidden` (N, width) is from the texture features, `x_g` (B, N, Fg) the geometry features,
+        `latent` (N, I) the identity features (I is 0 without the direct path), `initial` (N, 14)
+        the start.
         """
         change = self.attributes(hidden + self.geometry(x_g))
         canonical = initial.to(change.dtype)

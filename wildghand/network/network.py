@@ -127,11 +127,7 @@ class PredictionNetwork(nn.Module):
             self.register_buffer(f"initial_{side}", start.concatenate(), persistent=False)
 
     def initial(self, side: str) -> RawAttributes:
-        """The raw attributes, (N, k), that head (i) starts from.
-
-        Raises:
-            UsageError: no such hand.
-        """
+        """The raw attributes, (N, k), that head (i) starts from."""
         return RawAttributes.split(self._initial(side))
 
     def _initial(self, side: str) -> Tensor:
@@ -139,31 +135,11 @@ class PredictionNetwork(nn.Module):
         return self.get_buffer(f"initial_{side}")
 
     def texture(self, side: str) -> Tensor:
-        """Texture features x_t of a hand, the same in every frame.
-
-        Returns:
-            (N, Ft).
-
-        Raises:
-            UsageError: no such hand.
-        """
+        """Texture features x_t of a hand, (N, Ft), the same in every frame."""
         return self.texture_branch(self._chart(side), self.identity, side)
 
     def geometry(self, side: str, normals: Tensor, pose: Tensor) -> Tensor:
-        """Geometry features x_g of a hand.
-
-        Args:
-            side: the hand.
-            normals: (B, N, 3) of length 1, world: the posed surface's.
-            pose: (B, 16, 3) axis-angle, rad.
-
-        Returns:
-            (B, N, Fg).
-
-        Raises:
-            UsageError: no such hand.
-            ShapeMismatch: not N normals, or not as many poses as frames.
-        """
+        """Geometry features x_g, (B, N, Fg); see `forward`."""
         return self.geometry_branch(self._checked(side, normals, pose), normals, pose)
 
     def _checked(self, side: str, normals: Tensor, pose: Tensor) -> Chart:
@@ -180,11 +156,7 @@ class PredictionNetwork(nn.Module):
         return chart
 
     def features(self, side: str) -> HandFeatures:
-        """Everything that the frames of a hand share: what depends on texture features only.
-
-        Raises:
-            UsageError: no such hand.
-        """
+        """Everything that the frames of a hand share: what depends on texture features only."""
         with self._precision():
             x_t = self.texture(side)
             mean = x_t.mean(dim=0)
@@ -327,11 +299,7 @@ class LayerRow:
 
 
 def parameter_table(network: PredictionNetwork) -> tuple[LayerRow, ...]:
-    """List every layer that learns; repeated layers of equal shape share a row.
-
-    Returns:
-        Rows in the network's order; their `parameters` add up to all there are.
-    """
+    """Every layer that learns, in order; repeated layers of equal shape share a row."""
     counted: dict[tuple[str, str, int], int] = {}
     for path, module in network.named_modules():
         own = list(module.parameters(recurse=False))

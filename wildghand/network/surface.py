@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import embedding_bag
 
-from hwp_bench.base.errors import BadInput, ShapeMismatch, UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.hands import HandTemplate, SurfaceAnchors, anchor_uv
 from wildghand.gaussians.regularizers import sum_bags
 from wildghand.network.settings import NetworkSettings
@@ -24,14 +24,7 @@ POSITION_CHANNELS = 3 * 2 * POSITION_FREQUENCIES
 
 
 def positional_encoding(values: Tensor, frequencies: int) -> Tensor:
-    """Sines and cosines of 2^k pi x for k below `frequencies`.
-
-    Args:
-        values: (..., D).
-        frequencies: at least 1.
-
-    Returns:
-        (..., 2 D frequencies): all sines, then all cosines.
+    """(..., 2 D frequencies): all sines of 2^k pi x, then all cosines, k below `frequencies`.
 
     Source: Mildenhall et al., "NeRF", equation 4.
     """
@@ -41,28 +34,13 @@ def positional_encoding(values: Tensor, frequencies: int) -> Tensor:
 
 
 def encode_positions(positions: Tensor) -> Tensor:
-    """Encode rest positions; unlike texture coordinates they know no seams.
-
-    Args:
-        positions: (N, 3) in [-1, 1].
-
-    Returns:
-        (N, 18).
-    """
+    """Encode (N, 3) rest positions in [-1, 1] as (N, 18); unlike uv they know no seams."""
     # Half of the range, so that the lowest frequency tells the two ends of the hand apart.
     return positional_encoding(0.5 * positions, POSITION_FREQUENCIES)
 
 
 def encode_pose(pose: Tensor, frequencies: int) -> Tensor:
-    """Embed a pose; 8 frequencies make the paper's 768 numbers.
-
-    Args:
-        pose: (B, 16, 3) axis-angle, rad.
-        frequencies: of each of the 48 numbers.
-
-    Returns:
-        (B, 96 frequencies).
-    """
+    """Embed (B, 16, 3) rad as (B, 96 frequencies); 8 make the paper's 768 numbers."""
     # A rotation vector is at most pi long: a quarter turn of the lowest sine is half of that.
     return positional_encoding(pose.flatten(1) / (2.0 * math.pi), frequencies)
 
@@ -70,15 +48,9 @@ def encode_pose(pose: Tensor, frequencies: int) -> Tensor:
 class FixedGather(nn.Module):
     """Weighted sums of rows, of which index and weight never change: a sparse matrix.
 
-    The matrix is kept by rows and by columns, so that the gradient is gathered too. Nothing is
-    ever scattered; the result is the same bit for bit every time, on a GPU as well.
-
-    Args:
-        rows: (K,) int64 in [0, outputs), which sum each term belongs to.
-        columns: (K,) int64 in [0, inputs), which row it takes.
-        weights: (K,) of the terms.
-        outputs: number of sums.
-        inputs: number of rows to take from.
+    Term k adds row columns[k] times weights[k] to sum rows[k]. The matrix is kept by rows and by
+    columns, so that the gradient is gathered too. Nothing is ever scattered; the result is the same
+    bit for bit every time, on a GPU as well.
     """
 
     index: Tensor
@@ -152,15 +124,9 @@ def _sum_bags(values: Tensor, index: Tensor, weight: Tensor, start: Tensor) -> T
 class PlaneSampler(FixedGather):
     """Bilinear reading of a square plane at N fixed points: (resolution^2, C) to (N, C).
 
-    The plane's rows go from its top left texel, row by row.
-
-    Args:
-        uv: (N, 2) in [0, 1], origin at the bottom left.
-        resolution: texels along each edge; their centres lie at (k + 0.5) / resolution, and
-            points beyond the outermost centres read the border.
-
-    Raises:
-        UsageError: `resolution` is below 1.
+    The plane's rows go from its top left texel, row by row; texels' centres lie at (k + 0.5) /
+    resolution. (N, 2) uv in [0, 1] have their origin at the bottom left; points beyond the
+    outermost centres read the border.
     """
 
     def __init__(self, uv: Tensor, resolution: int) -> None:
@@ -175,10 +141,6 @@ class CellPooling(FixedGather):
     """Means over the points of each cell of a square plane: (N, C) to (resolution^2, C).
 
     A cell without a point holds 0.
-
-    Args:
-        uv: (N, 2) in [0, 1], origin at the bottom left.
-        resolution: cells along each edge.
     """
 
     cell: Tensor
@@ -195,15 +157,7 @@ class CellPooling(FixedGather):
 
 
 def bilinear_taps(uv: Tensor, resolution: int) -> tuple[Tensor, Tensor]:
-    """The four texels around each point and their weights.
-
-    Args:
-        uv: (N, 2) in [0, 1], origin at the bottom left.
-        resolution: texels along each edge.
-
-    Returns:
-        (N, 4) int64 row-major texel numbers, and (N, 4) weights that sum to 1.
-    """
+    """The four texels around each of (N, 2) uv: (N, 4) int64 row-major, and their weights."""
     x = (uv[:, 0] * resolution - 0.5).clamp(0.0, resolution - 1.0)
     y = ((1.0 - uv[:, 1]) * resolution - 0.5).clamp(0.0, resolution - 1.0)
     left, top = x.floor().long(), y.floor().long()
@@ -248,18 +202,6 @@ class SurfacePoints:
     #: (3,) sRGB in [0, 1] that the fit starts from: the mean colour of the hand.
     color: Tensor
 
-    def __post_init__(self) -> None:
-        count = len(self.uv)
-        expected = {"uv": (count, 2), "positions": (count, 3), "color": (3,)}
-        for name, shape in expected.items():
-            tensor = getattr(self, name)
-            if tuple(tensor.shape) != shape or count == 0:
-                raise ShapeMismatch(f"is {tuple(tensor.shape)}, not {shape}", field=name)
-            if not bool(torch.isfinite(tensor).all()):
-                raise BadInput("holds NaN or infinity", field=name)
-        if not (np.isfinite(self.spacing) and self.spacing > 0.0):
-            raise BadInput(f"is {self.spacing}", field="spacing")
-
     def __len__(self) -> int:
         return len(self.uv)
 
@@ -267,17 +209,7 @@ class SurfacePoints:
 def surface_points(
     template: HandTemplate, anchors: SurfaceAnchors, spacing: float, color: Tensor
 ) -> SurfacePoints:
-    """Describe the anchors of a hand to the network.
-
-    Args:
-        template: the hand.
-        anchors: N anchors on it.
-        spacing: mean distance between neighbouring anchors, m.
-        color: (3,) sRGB in [0, 1].
-
-    Returns:
-        float32 tensors on the CPU.
-    """
+    """Describe the anchors of a hand, `spacing` m apart, to the network: float32 on the CPU."""
     faces = np.asarray(torch.as_tensor(anchors.face_index).cpu())
     mix = np.asarray(torch.as_tensor(anchors.barycentric).cpu(), dtype=np.float64)
     corners = template.vertices[template.faces[faces]]
@@ -318,12 +250,7 @@ def plane_resolutions(settings: NetworkSettings) -> tuple[int, ...]:
 
 
 class Chart(nn.Module):
-    """Everything about N anchors that does not change. Nothing here is learned or saved.
-
-    Args:
-        settings: resolutions.
-        surface: the anchors.
-    """
+    """Everything about N anchors that does not change. Nothing here is learned or saved."""
 
     coordinates: Tensor
 

@@ -135,11 +135,7 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
 
 
 def _usable(scene: FlatScene) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Quaternions whose squares stay in float32, and what of all arguments is usable.
-
-    Returns:
-        (S, N, 4), and masks (S, N) by name.
-    """
+    """Quaternions (S, N, 4) whose squares stay in float32, and masks (S, N) of what is usable."""
     longest = _largest(scene.quats)
     turns = (longest >= _LEAST_QUATERNION) & (longest <= _MAX_QUATERNION)
     good = {

@@ -71,16 +71,7 @@ def hand_scene(
     focal: float = 60.0,
     seed: int = 0,
 ) -> HardScene:
-    """A blob of the size of a hand (0.16 m), looked at by cameras side by side.
-
-    Args:
-        count: Gaussians.
-        width, height: pixels.
-        cameras: 1 cm apart.
-        distance: of the blob from the cameras, metres.
-        focal: length, px.
-        seed: of everything random.
-    """
+    """A blob of the size of a hand (0.16 m), looked at by cameras side by side, 1 cm apart."""
     generator = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> torch.Tensor:
@@ -110,11 +101,7 @@ def draw(
 ) -> DrawnScene:
     """Draws a scene and takes the gradients of a fixed random linear loss.
 
-    Args:
-        scene: to draw.
-        backend: as for `rasterize`.
-        dtype: of the arguments.
-        weights: (C, H, W), by which the loss of each pixel is multiplied.
+    (C, H, W) `weights` multiply the loss of each pixel.
     """
     device = torch.device("cuda" if backend == "gsplat" else "cpu")
     arguments = {
@@ -563,14 +550,10 @@ def _exact(
     tolerance: float = GRADIENT_TOLERANCE,
     gsplat: float | None = None,
 ) -> _Entry:
-    """A scene that is drawn as in float64.
+    """A scene that is drawn as in float64, gradients within `tolerance`.
 
-    Args:
-        name: of the case.
-        scene: what is drawn.
-        tolerance: of gradients.
-        gsplat: of its gradients, where its float32 does not hold `tolerance`; infinite: the image
-            is beyond it too, and its numbers must be finite, no more.
+    `gsplat` is for its gradients where its float32 does not hold that; infinite: the image is
+    beyond it too, and its numbers must be finite, no more.
     """
     must_hold = f"image to {IMAGE_TOLERANCE:g}, gradients to {tolerance:g} of float64, all finite"
     if gsplat is not None:

@@ -108,11 +108,7 @@ class Call:
 
 
 def rasterize_numba(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    """Draws the scene, float32 on the CPU; see `wildghand.splat.rasterize`.
-
-    Returns:
-        channels (I, H, W, X), alphas (I, H, W, 1) and the backend's part of `info`.
-    """
+    """Draws the scene, float32 on the CPU: channels (I, H, W, X), alphas, its part of `info`."""
     warm_up(channel_count(scene))
     return _draw(scene)
 
@@ -378,11 +374,7 @@ def _what_tiles_read(call: Call, colors: torch.Tensor) -> tuple[Any, ...]:
 
 
 def _list_tiles(projected: Projected, options: Options) -> Lists:
-    """Sorts by depth and lists the splats of each tile.
-
-    Raises:
-        HwpError: more (splat, tile) pairs than can be counted or held.
-    """
+    """Sorts by depth and lists the splats of each tile."""
     images, gaussians = projected.depths.shape
     work = images * gaussians
     chunks = min(thread_count(_MOST_CHUNKS, gaussians), _MOST_CHUNKS)
@@ -479,11 +471,7 @@ def _like_gaussians(tensor: torch.Tensor) -> torch.Tensor:
 
 
 def _refuse_second_order() -> None:
-    """Refuse second derivatives, which would be silently wrong.
-
-    Raises:
-        HwpError: the backward pass itself is being recorded.
-    """
+    """Refuse second derivatives, which would be silently wrong."""
     if torch.is_grad_enabled():
         raise HwpError(
             "the rasterizer has first derivatives only",
@@ -496,11 +484,8 @@ def warm_up(channels: int = UNROLLED[0]) -> None:
     """Makes the kernels ready; costs nothing from the second call on.
 
     Compiling takes some ten seconds, once on a machine. A person who waits is told on the log
-    (level WARNING, which goes to standard error unless logging is set up otherwise).
-
-    Args:
-        channels: how many are to be blended. Numbers that are not unrolled share one version,
-            which few programs need.
+    (level WARNING, which goes to standard error unless logging is set up otherwise). Numbers of
+    channels that are not unrolled share one version, which few programs need.
     """
     with _lock:
         _warm_up(channels if channels in UNROLLED else max(UNROLLED) + 1)

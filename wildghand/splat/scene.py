@@ -90,12 +90,7 @@ def channels_with_depth(
 ) -> tuple[torch.Tensor, torch.Tensor | None]:
     """The channels to blend and their backgrounds, for the scene's render mode.
 
-    Depth is one more channel, the last, over a background of 0, as in gsplat.
-
-    Args:
-        colors: (S, N, D).
-        depths: (I, N) camera-space z in world units.
-        scene: for the mode and the backgrounds.
+    Depth, (I, N), is one more channel, the last, over a background of 0, as in gsplat.
     """
     mode = scene.options.render_mode
     backgrounds = scene.backgrounds
@@ -110,13 +105,7 @@ def channels_with_depth(
 
 
 def expected_depth(channels: torch.Tensor, alphas: torch.Tensor, mode: str) -> torch.Tensor:
-    """Divides the accumulated depth, the last channel, by alpha in the modes that ask for it.
-
-    Args:
-        channels: (I, H, W, X).
-        alphas: (I, H, W, 1).
-        mode: one of `conventions.RENDER_MODES`.
-    """
+    """Divides the accumulated depth, the last channel, by alpha in the modes that ask for it."""
     if mode not in ("ED", "RGB+ED"):
         return channels
     depth = channels[..., -1:] / alphas.clamp(min=1e-10)
@@ -128,17 +117,7 @@ def flatten(
     backgrounds: torch.Tensor | None,
     options: Options,
 ) -> FlatScene:
-    """One `FlatScene` from the arguments as the caller gave them.
-
-    Args:
-        tensors: `means`, `quats`, `scales`, `opacities`, `colors`, `viewmats`, `Ks`.
-        backgrounds: (..., C, D) or (D,) or None.
-        options: already checked.
-
-    Raises:
-        ShapeMismatch: a tensor does not fit the others; names it.
-        UsageError: not a floating-point tensor, or on another device than `means`.
-    """
+    """One `FlatScene` from the arguments as the caller gave them, by name; names a wrong one."""
     given = dict(tensors) if backgrounds is None else {**tensors, "backgrounds": backgrounds}
     _check_kind(given)
     means, viewmats = tensors["means"], tensors["viewmats"]
@@ -194,11 +173,7 @@ def flatten(
 
 
 def check_options(options: Options, rasterize_mode: str) -> None:
-    """Refuses settings that make no sense.
-
-    Raises:
-        UsageError: names the argument and says which values it may have.
-    """
+    """Refuses settings that make no sense: names the argument and says which values it may have."""
     for name, choices, value in (
         ("render_mode", RENDER_MODES, options.render_mode),
         ("rasterize_mode", RASTERIZE_MODES, rasterize_mode),

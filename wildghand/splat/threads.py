@@ -45,11 +45,9 @@ _TEAM_MEMBER = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 
 def thread_count(jobs: int, work: int | None = None) -> int:
-    """Threads worth using.
+    """Threads worth using for so many jobs that are like `work` Gaussians or pairs.
 
-    Args:
-        jobs: pieces into which the work is cut.
-        work: how many Gaussians or pairs it is; None if every job is worth a thread.
+    Without `work` every job is worth a thread.
     """
     worth = jobs if work is None else min(jobs, work // WORTH_A_THREAD)
     return max(1, min(torch.get_num_threads(), _MOST.get() or worth, worth))
@@ -60,9 +58,6 @@ def at_most(threads: int | None) -> Iterator[None]:
     """Bound the threads of kernels that are called while this holds; results stay the same.
 
     torch's own operations keep their number, on which their last bits depend.
-
-    Args:
-        threads: 1 or more; None: as many as torch has.
     """
     token = _MOST.set(threads)
     try:
@@ -77,12 +72,7 @@ def even_jobs(jobs: int, threads: int) -> np.ndarray:
 
 
 def weighted_jobs(before: np.ndarray, threads: int) -> np.ndarray:
-    """Equal shares of jobs of which some are longer.
-
-    Args:
-        before: (jobs + 1,) work of all jobs before each, and of all.
-        threads: how many shares.
-    """
+    """Equal shares of unequal jobs, by (jobs + 1,) work before each, and of all."""
     if threads == 1:
         return np.array([0, len(before) - 1])
     goals = np.arange(1, threads) * (before[-1] / threads)
