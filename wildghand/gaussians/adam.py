@@ -19,7 +19,7 @@ import torch
 from numba import carray, types
 from torch import Tensor
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.kernels import compiled
 from wildghand.splat.kernels.groups import GROUP, fill_exact, load1, total
 from wildghand.splat.kernels.jit import inline, next_job
 from wildghand.splat.kernels.vectors import (

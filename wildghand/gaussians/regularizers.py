@@ -21,9 +21,9 @@ from numba import types
 from torch import Tensor, relu, stack
 from torch.nn.functional import normalize
 
-from hwp_bench.base.compiled import compiled
 from hwp_bench.base.errors import ShapeMismatch
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.kernels import compiled
+from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands.anchors import anchor_frames, anchor_positions
 from wildghand.gaussians.attributes import CHANNELS, SIZES, Activation, RawAttributes
 from wildghand.gaussians.rig import HandRig

@@ -11,8 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.base.compiled import compiled
 from hwp_bench.base.errors import UsageError
+from hwp_bench.base.kernels import compiled
 from wildghand.splat.kernels.jit import next_job
 from wildghand.splat.threads import run_pieces
 

@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
-from hwp_bench.base.compiled import compiled, helper
+from hwp_bench.base.kernels import compiled, helper
 from wildghand.gaussians.attributes import CHANNELS
 from wildghand.splat.kernels.jit import inline, next_job
 from wildghand.splat.kernels.tiles import exp2
