@@ -24,7 +24,7 @@ from hwp_bench.methods.manifest import find_method
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.ready import ready_fit
-from wildghand.gaussians.step_threads import StepThreads
+from wildghand.gaussians.fit_loop import StepThreads
 from wildghand.model.settings import read_settings
 from wildghand.splat.threads import denormals_flushed
 

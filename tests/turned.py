@@ -19,7 +19,7 @@ from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.atlas import painted_atlas
 from hwp_bench.sim.subject.hand import subject_hand
-from wildghand.network.sampling import PlaneSampler
+from wildghand.network.surface import PlaneSampler
 from wildghand.plain.avatar import PlainAvatar
 from wildghand.plain.model import make_model
 

@@ -33,7 +33,7 @@ from wildghand.evidence import ColorChanges, Evidence, rename_former
 from wildghand.light import KnownLight
 from wildghand.model.assemble import make_model
 from wildghand.model.settings import WildGHandSettings, read_stored, read_version_1
-from wildghand.network.weight_shapes import MAPS, shapes_of_settings
+from wildghand.network.network import MAPS, shapes_of_settings
 from wildghand.poses import ClipPoses
 from wildghand.shadows import CastLight
 from wildghand.subject import SubjectShape

@@ -223,7 +223,7 @@ def do_info(args: argparse.Namespace) -> int:
 def _print_network(size: str, as_json: bool) -> None:
     """List the parameters of one size of the network."""
     from hwp_bench.base.tables import Column, Table, print_table
-    from wildghand.network.parameters import blank_network, parameter_table
+    from wildghand.network.network import blank_network, parameter_table
     from wildghand.network.settings import network_settings
 
     settings = network_settings(size)

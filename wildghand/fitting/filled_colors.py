@@ -18,7 +18,7 @@ from torch import Tensor
 from wildghand.evidence import ColorChanges, kept_share
 from wildghand.fitting.borrowed_colors import BorrowedColors
 from wildghand.fitting.known_colors import changes_to, known_logits, log_linear
-from wildghand.gaussians.laplacian import nearest_on_surface, rest_anchors
+from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig
 from wildghand.model.model import WildGHandModel
 

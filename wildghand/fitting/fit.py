@@ -37,8 +37,7 @@ from wildghand.fitting.state_choice import StateChoice
 from wildghand.fitting.subject_shape import bent_templates, subject_of
 from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
 from wildghand.gaussians.fit_loop import Loss, repeatable
-from wildghand.gaussians.frame_table import upload
-from wildghand.gaussians.training import TrainingClip, load_frames
+from wildghand.gaussians.training import TrainingClip, load_frames, upload
 from wildghand.model.assemble import make_model
 from wildghand.model.model import WildGHandModel
 from wildghand.model.rendered import RenderedFrames

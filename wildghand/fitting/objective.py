@@ -10,12 +10,10 @@ from torch import Tensor
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fitting.networks import choose_perceptual
 from wildghand.fitting.weighting import FrameTarget
-from wildghand.gaussians.attribute_roughness import attribute_roughness
 from wildghand.gaussians.attributes import RawAttributes
-from wildghand.gaussians.closed_surface import off_surface
-from wildghand.gaussians.frame_table import upload
-from wildghand.gaussians.laplacian import surface_laplacian
+from wildghand.gaussians.regularizers import attribute_roughness, off_surface, surface_laplacian
 from wildghand.gaussians.rig import HandRig
+from wildghand.gaussians.training import upload
 from wildghand.model import terms
 from wildghand.model.model import WildGHandModel
 from wildghand.model.rendered import RenderedFrames

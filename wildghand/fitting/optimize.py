@@ -15,8 +15,15 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.fitting.averaging import AveragedAvatar
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.parallel import World
-from wildghand.gaussians.fit_loop import Guard, Loss, batches, read_losses, repeatable, spent
-from wildghand.gaussians.step_threads import StepThreads
+from wildghand.gaussians.fit_loop import (
+    Guard,
+    Loss,
+    StepThreads,
+    batches,
+    read_losses,
+    repeatable,
+    spent,
+)
 
 #: Fall of the mean loss from window to window, as a share, that still counts as progress.
 PROGRESS = 1e-3

@@ -10,14 +10,13 @@ import torch
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
 from wildghand.gaussians.attributes import CHANNELS, Activation, RawAttributes
-from wildghand.gaussians.bags import sum_bags
-from wildghand.gaussians.closed_surface import off_surface
 from wildghand.gaussians.fit_loop import ready_device
+from wildghand.gaussians.regularizers import off_surface, sum_bags
 from wildghand.gaussians.rig import AnchorPoses
-from wildghand.gaussians.shading_cpu import fill_harmonics
+from wildghand.gaussians.shading import fill_harmonics
 from wildghand.model.dress import dress
 from wildghand.network import NetworkOutput, Refinement
-from wildghand.network.frame_heads_cpu import warm_up as warm_up_heads
+from wildghand.network.frame_heads import warm_up_heads
 from wildghand.shadows import Obstacles
 
 

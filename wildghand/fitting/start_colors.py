@@ -19,8 +19,7 @@ from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
 from wildghand.model.model import WildGHandModel
-from wildghand.network.sampling import PlaneSampler
-from wildghand.network.surface import Chart
+from wildghand.network.surface import Chart, PlaneSampler
 
 #: Frames that are read, spread over the clip: of each part the one that the pre-pass weighs most.
 FRAMES = 16

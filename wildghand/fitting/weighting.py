@@ -16,8 +16,13 @@ from wildghand.dpd.pay_back import PayBack
 from wildghand.fitting.hidden_skin import hidden_skin
 from wildghand.fitting.networks import choose_segmenter
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
-from wildghand.gaussians.frame_table import FrameTable, shares_of_255, soft_weights, upload
-from wildghand.gaussians.training import TrainingFrames
+from wildghand.gaussians.training import (
+    FrameTable,
+    TrainingFrames,
+    shares_of_255,
+    soft_weights,
+    upload,
+)
 from wildghand.model.rendered import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.pao.pao import PerturbationAwareWeights, binary_weights

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import torch
 
-from wildghand.gaussians.anchored import AnchoredGaussians
+from wildghand.gaussians.attributes import AnchoredGaussians
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.gaussians.training import join_hands
 from wildghand.plain.model import PlainModel

@@ -9,9 +9,8 @@ from typing import Generic, TypeVar
 import torch
 
 from hwp_bench.methods.contract import Avatar, TrainingCapture
-from wildghand.gaussians.frame_table import soft_weights
 from wildghand.gaussians.losses import photometric_loss
-from wildghand.gaussians.training import TrainingFrames
+from wildghand.gaussians.training import TrainingFrames, soft_weights
 from wildghand.plain.settings import LoopSettings
 
 Settings = TypeVar("Settings", bound=LoopSettings)

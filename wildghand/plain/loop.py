@@ -9,8 +9,7 @@ import torch
 from hwp_bench.base.console import notice
 from hwp_bench.methods.contract import Avatar, Budget, Report
 from wildghand.gaussians.adam import ClippedAdam
-from wildghand.gaussians.fit_loop import Guard, batches, repeatable, spent
-from wildghand.gaussians.step_threads import StepThreads
+from wildghand.gaussians.fit_loop import Guard, StepThreads, batches, repeatable, spent
 from wildghand.plain.hooks import Batch, Recipe
 
 # Adam's epsilon: gradients of a mean over all pixels are small.

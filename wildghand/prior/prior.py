@@ -12,7 +12,7 @@ from torch import Tensor
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.records import Count, Seed
 from wildghand.network import PredictionNetwork
-from wildghand.network.weight_shapes import MAPS
+from wildghand.network.network import MAPS
 
 
 @dataclass(frozen=True)

@@ -9,8 +9,8 @@ import torch
 
 from occluder_splats_fit.occluders import make_occluders, mask_boxes
 from occluder_splats_fit.settings import OccluderSettings
-from wildghand.gaussians.frame_table import shares_of_255
 from wildghand.gaussians.losses import photometric_loss
+from wildghand.gaussians.training import shares_of_255
 from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
 
 # Standard deviations of occluders stay within these, px: finer than a pixel, half a frame.

@@ -14,8 +14,8 @@ from wildghand.model.assemble import make_model
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import read_settings
 from wildghand.network import NetworkSettings
-from wildghand.network.compact import CompactTexture
-from wildghand.network.identity import IdentityMap
+from wildghand.network.branches import CompactTexture
+from wildghand.network.heads import IdentityMap
 from wildghand.network.surface import Chart
 from wildghand.prior.files import choose_prior
 

@@ -14,7 +14,7 @@ from scan_texture_fit.shadow import ShadowNet
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
-from wildghand.network.sampling import FixedGather, PlaneSampler
+from wildghand.network.surface import FixedGather, PlaneSampler
 from wildghand.splat import rasterize
 
 # Thickness of a disc in units of the anchors' spacing, and its opacity.

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu
 
-from wildghand.network.sampling import CellPooling, PlaneSampler
+from wildghand.network.surface import CellPooling, PlaneSampler
 
 _WIDTH = 16
 # Axis-angle of fifteen joints, and two columns of the wrist's rotation.

@@ -10,7 +10,7 @@ import torch
 from shadow_albedo_fit.model import ShadowedModel
 from shadow_albedo_fit.settings import ShadowSettings
 from shadow_albedo_fit.visibility import RADIUS
-from wildghand.gaussians.laplacian import SurfaceLaplacian, surface_laplacian
+from wildghand.gaussians.regularizers import SurfaceLaplacian, surface_laplacian
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.plain.model import PlainModel
 from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe

@@ -8,7 +8,7 @@ import torch
 from trimmed_fit.inliers import ErrorHistogram, chance_of_all, find_inliers, pixel_errors
 from trimmed_fit.settings import TrimmedSettings
 from trimmed_fit.vote import LOOK, chances, encodings, look_features, make_network, vote_loss
-from wildghand.gaussians.frame_table import FrameTable, upload
+from wildghand.gaussians.training import FrameTable, upload
 from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
 
 

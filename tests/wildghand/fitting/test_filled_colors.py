@@ -19,7 +19,7 @@ from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.filled_colors import FilledColors, roughness, smooth_fill
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.known_colors import known_logits, log_linear
-from wildghand.gaussians.laplacian import nearest_on_surface, rest_anchors
+from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig, make_rig
 
 PLAIN: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False, "start_colors": False}
