@@ -19,11 +19,11 @@ from hwp_bench.base.embree import EmbreeMesh, library
 from hwp_bench.base.ray_mesh import EmbreexMesh
 from hwp_bench.metrics.psnr_ssim import decibels
 from hwp_bench.sim.effects.plan import hands_at, plan
-from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.render.frame import carry_out, render_frame
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.optics import intrinsics, pixel_rays, viewmat
-from hwp_bench.sim.scene.reader import load_scene
+from hwp_bench.sim.scene.motion import intrinsics, pixel_rays, viewmat
+from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.hand import MOVING
 
 #: Scenes whose frames with motion blur are compared with their clean frames, by what they show.

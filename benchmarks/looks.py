@@ -23,17 +23,18 @@ from dataclasses import replace
 import numpy as np
 
 from hwp_bench.sim.effects.plan import plan
-from hwp_bench.sim.produce.estimates import estimate_mask
-from hwp_bench.sim.produce.lookalikes import confused_mask
-from hwp_bench.sim.props.planes import plane_names
+from hwp_bench.sim.produce.estimates import confused_mask, estimate_mask
+from hwp_bench.sim.props.backdrops import plane_names
+from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm
 from hwp_bench.sim.render.frame import render_frame
-from hwp_bench.sim.scene.behind import Behind, Clutter, Face, OtherArm
-from hwp_bench.sim.scene.looks import Glove, Looks, Polish, Ring, Tattoo, WristWear
-from hwp_bench.sim.scene.reader import load_scene
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import load_scene
+from hwp_bench.sim.subject.arms import arm_atlas
 from hwp_bench.sim.subject.atlas import skin_atlas
-from hwp_bench.sim.subject.forearm import arm_atlas
-from hwp_bench.sim.subject.painting import of_side
+from hwp_bench.sim.subject.covers import Glove, Polish, Tattoo
+from hwp_bench.sim.subject.jewellery import Ring, WristWear
+from hwp_bench.sim.subject.skin import of_side
+from hwp_bench.sim.subject.subject import Looks
 
 #: Scene that is varied; frames over which it is spread, and the frame that is timed (clean).
 SCENE, SPREAD, FRAME = "capture1", 240, 235

@@ -12,9 +12,9 @@ import pytest
 
 import wildghand
 from benchmarks.scene_overlap import KINDS, counts, parts, shared
-from hwp_bench.sim.scene.reader import load_scene, scene_groups, scene_names
-from hwp_bench.sim.scene.schema import Lamp, Scene
-from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy
+from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.scene.scene import Lamp, Scene
+from hwp_bench.sim.scene_files import load_scene, scene_groups, scene_names
 from hwp_bench.taxonomy import PERTURBATIONS
 
 PRIORS = Path(wildghand.__file__).parent / "priors"

@@ -49,8 +49,8 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.files import check_places
     from hwp_bench.capture.splits import read_splits
+    from hwp_bench.commitments.inputs import check_place, write_inputs
     from hwp_bench.evaluation.evaluate import open_captures
-    from hwp_bench.publish.inputs import check_place, write_inputs
     from hwp_bench.sim import ensure_suite
 
     # Before a suite is rendered.

@@ -35,7 +35,7 @@ def run(args: argparse.Namespace) -> int:
     """Run the command."""
     from hwp_bench.base.files import check_places
     from hwp_bench.capture.splits import read_splits
-    from hwp_bench.publish import publish
+    from hwp_bench.commitments import publish
 
     check_places({"--out": args.out}, {"CAPTURES": args.captures, "--splits": args.splits})
     splits = read_splits(args.splits) if args.splits else None

@@ -9,7 +9,7 @@ from functools import cache
 from hwp_bench.capture.splits import split_for
 from hwp_bench.metrics.aggregate import CaptureScores
 from hwp_bench.sim.produce.suites import suite
-from hwp_bench.sim.scene.episodes import moments, severity
+from hwp_bench.sim.scene.motion import moments, severity
 
 #: By capture and perturbation: mean severity of the frames that show it, rounded.
 Severities = Mapping[str, Mapping[str, int]]

@@ -14,7 +14,7 @@ from hwp_bench.methods.contract import FRAME_CHOICES
 from hwp_bench.methods.material import TRUTHS, frames_with, known_truths
 from hwp_bench.results import Results
 from hwp_bench.run.engine import Engine, Needs
-from hwp_bench.sim.produce.subject_mesh import add_subject_mesh
+from hwp_bench.sim.produce.truth import add_subject_mesh
 
 #: Name of the evaluation in which nothing is replaced, and of that in which everything is.
 GIVEN, ALL = "as given", "all of them"

@@ -1,1 +1,1 @@
-"""Effects: what each of the four perturbations and the sensor changes, and the plan of a frame."""
+"""Effects: what each of the four perturbations changes, and the plan of a frame."""

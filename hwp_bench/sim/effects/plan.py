@@ -7,11 +7,18 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.sim.effects.base import ORDER, SENSOR, Placement, Shutter, registered
-from hwp_bench.sim.scene.episodes import level, moments, severity
-from hwp_bench.sim.scene.motion import HandMoment, track_moment
-from hwp_bench.sim.scene.optics import Lights, intrinsics, steady_light
-from hwp_bench.sim.scene.schema import EffectCall, Scene
+from hwp_bench.sim.camera.sensor import sensor_passes
+from hwp_bench.sim.effects.effects import ORDER, Placement, Shutter, registered
+from hwp_bench.sim.light.lights import Lights, steady_light
+from hwp_bench.sim.scene.motion import (
+    HandMoment,
+    intrinsics,
+    level,
+    moments,
+    severity,
+    track_moment,
+)
+from hwp_bench.sim.scene.scene import EffectCall, Scene
 
 #: Longest way between two sub-frames, in pixels.
 SUBFRAME_STEP = 1.5
@@ -83,8 +90,10 @@ def plan(
     passes += [*scene.subject.looks.passes, *scene.behind.passes]
     passes += ["lamps"] if scene.light.lamps else []
     passes += ["room"] if scene.light.room is not None else []
-    for kind in (*(kind for kind in ORDER if kind in acting), SENSOR):
-        passes += registered(kind).passes(scene)
+    for kind in ORDER:
+        if kind in acting:
+            passes += registered(kind).passes
+    passes += sensor_passes(scene.sensor)
     return FramePlan(
         frame=frame,
         seconds=seconds,
@@ -92,7 +101,7 @@ def plan(
         strength=acting,
         subframes=subframes,
         shutter=shutter,
-        readout=registered(SENSOR).readout(scene),
+        readout=scene.sensor.rolling_shutter,
         passes=tuple(passes),
     )
 

@@ -14,8 +14,8 @@ from hwp_bench.base.files import cache_root
 from hwp_bench.base.locks import exclusive
 from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
 from hwp_bench.run.engine.job import OnProgress
-from hwp_bench.sim.scene.reader import load_scene, scene_groups, scene_names
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import load_scene, scene_groups, scene_names
 
 #: Seconds between two counts of the frames that wait.
 _COUNT_SECONDS = 1.0
@@ -175,7 +175,7 @@ def _render_jobs(
     *,
     free_view: bool,
 ) -> list[Job]:
-    from hwp_bench.sim.produce.production import render_key
+    from hwp_bench.sim.produce.capture import render_key
 
     root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
     each = workers_each(workers, engine, needs)
@@ -262,7 +262,7 @@ class RenderCapture:
         return self.scene if self.seed is None else replace(self.scene, seed=self.seed)
 
     def _render(self, output: Path) -> None:
-        from hwp_bench.sim.produce.production import render_capture
+        from hwp_bench.sim.produce.capture import render_capture
 
         render_capture(
             self.scene,

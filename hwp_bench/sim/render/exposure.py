@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hwp_bench.sim.effects.base import Shutter
+from hwp_bench.sim.effects.effects import Shutter
 from hwp_bench.sim.effects.plan import FramePlan, hands_at, lights_at, objects_at
 from hwp_bench.sim.geometry.surface import Surface, transformed
+from hwp_bench.sim.light.lights import FOCUS_DISTANCE
 from hwp_bench.sim.render.instant import Lens, LinearImage, render_instant
 from hwp_bench.sim.render.stage import Body, Stage, between
-from hwp_bench.sim.scene.motion import HandMoment
-from hwp_bench.sim.scene.optics import FOCUS_DISTANCE, viewmat
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.motion import HandMoment, viewmat
+from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.hand import FINE, MOVING
 
 # The golden ratio's powers spread the sub-frames' rays evenly inside the pixel.

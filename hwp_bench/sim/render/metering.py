@@ -13,14 +13,14 @@ from functools import lru_cache
 import numpy as np
 
 from hwp_bench.base.colors import LUMINANCE
+from hwp_bench.sim.camera.sensor import AutoControl
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.light.lights import steady_light
 from hwp_bench.sim.render.instant import Lens, render_instant
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.motion import track_moment
-from hwp_bench.sim.scene.optics import intrinsics, steady_light, viewmat
-from hwp_bench.sim.scene.recorder import AutoControl
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.motion import intrinsics, track_moment, viewmat
+from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.hand import MOVING
 
 #: Edge of the image that is metered, px.

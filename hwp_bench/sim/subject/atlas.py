@@ -17,11 +17,11 @@ import numpy as np
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_write, cache_root, sha256_json
-from hwp_bench.sim.geometry.mesh import surface_normals, unit
-from hwp_bench.sim.geometry.raycast import Tracer
-from hwp_bench.sim.scene.schema import Subject
+from hwp_bench.sim.geometry.rays import Tracer
+from hwp_bench.sim.geometry.surface import surface_normals, unit
 from hwp_bench.sim.subject.hand import SubjectHand, anatomy_at, subject_hand
-from hwp_bench.sim.subject.painting import painted
+from hwp_bench.sim.subject.skin import painted
+from hwp_bench.sim.subject.subject import Subject
 
 #: Edge of the skin atlas in texels; about 0.25 mm of skin each.
 ATLAS = 1024

@@ -1,4 +1,9 @@
-"""A subject: hands with a surface finer than the hand model's, and skin of their own."""
+"""A subject's hand: its template and true parameters, and a surface finer than the hand model's.
+
+Off the hand model (a rig, or another anatomy) the true pose are the joint angles of the
+subject's own skeleton in the hand model's terms, and the true betas are those that fit best;
+`produce.truth` says what they miss.
+"""
 
 from __future__ import annotations
 
@@ -9,18 +14,146 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.sim.geometry.mesh import normal_operator, smoothing, subdivision, surface_normals
-from hwp_bench.sim.scene.looks import PLAIN
-from hwp_bench.sim.scene.schema import Scene, Subject
-from hwp_bench.sim.subject.anatomy import Anatomy
-from hwp_bench.sim.subject.growth import Nails, bone_relief, grown_nails
-from hwp_bench.sim.subject.painting import of_side, painted
-from hwp_bench.sim.subject.person import person, subject_anatomy
+from hwp_bench.hands.template import SHAPE_COUNT
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.geometry.surface import normal_operator, smoothing, subdivision, surface_normals
+from hwp_bench.sim.hand.anatomy import Anatomy
+from hwp_bench.sim.hand.off_template import (
+    Nails,
+    SubjectAnatomy,
+    bone_relief,
+    grown_nails,
+    off_template,
+)
+from hwp_bench.sim.hand.rigs import load_rig, rig_path
+from hwp_bench.sim.subject.skin import of_side, painted
+from hwp_bench.sim.subject.subject import PLAIN, Subject
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
     from hwp_bench.hands import HandTemplate, TemplateTensors
+
+
+# Cost of one standard deviation of shape, in m of misfit: decides where the surface does not.
+_RIDGE = 0.00002
+# Largest betas that a person has.
+_WIDEST = 3.0
+
+
+def betas_of_surface(model: HandTemplate, vertices: np.ndarray) -> np.ndarray:
+    """Betas whose surface is nearest to one of the same triangles: (10,).
+
+    Args:
+        model: the hand model.
+        vertices: (V, 3) m at rest; the whole may be elsewhere.
+
+    Source: bounded linear least squares, with a ridge on betas.
+    """
+    from scipy.optimize import lsq_linear
+
+    count = len(vertices)
+    shift = np.tile(np.eye(3), (count, 1))
+    system = np.hstack([model.shape_basis.reshape(3 * count, SHAPE_COUNT), shift])
+    ridge = np.zeros((SHAPE_COUNT, SHAPE_COUNT + 3))
+    ridge[:, :SHAPE_COUNT] = _RIDGE * np.sqrt(count) * np.eye(SHAPE_COUNT)
+    rest = (vertices - model.vertices).reshape(-1)
+    widest = np.array([_WIDEST] * SHAPE_COUNT + [np.inf] * 3)
+    solved = lsq_linear(
+        np.vstack([system, ridge]),
+        np.concatenate([rest, np.zeros(SHAPE_COUNT)]),
+        bounds=(-widest, widest),
+    )
+    return np.asarray(solved.x[:SHAPE_COUNT]).round(4)
+
+
+def betas_of_joints(model: HandTemplate, joints: np.ndarray) -> np.ndarray:
+    """Betas whose bones have the lengths of a rig: (10,).
+
+    Args:
+        model: the hand model.
+        joints: (16, 3) m at rest.
+
+    Source: nonlinear least squares over 15 bones, with a ridge on betas.
+    """
+    from scipy.optimize import least_squares
+
+    parents = np.array(PARENTS)
+    wanted = np.linalg.norm(joints[1:] - joints[parents[1:]], axis=1)
+
+    def misfit(betas: np.ndarray) -> np.ndarray:
+        places = model.joints + model.joint_basis @ betas
+        bones = np.linalg.norm(places[1:] - places[parents[1:]], axis=1)
+        return np.concatenate([bones - wanted, _RIDGE * betas])
+
+    return np.asarray(
+        least_squares(misfit, np.zeros(SHAPE_COUNT), bounds=(-_WIDEST, _WIDEST)).x
+    ).round(4)
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """One hand of a subject before its surface is refined."""
+
+    #: The surface: the hand model, or another one of the same joints.
+    template: HandTemplate
+    #: The hand model that parameters refer to.
+    model: HandTemplate
+    #: (10,) true shape.
+    betas: np.ndarray
+    #: (16, 3) m, joints of the skeleton at rest; the surface may bend about other places.
+    joints: np.ndarray
+    #: Colour of a rig, (H, W, 3) uint8 sRGB, or None to paint skin.
+    texture: np.ndarray | None
+
+
+def is_off_template(subject: Subject) -> bool:
+    """Whether no shape of the hand model is the subject's geometry."""
+    return rig_path(subject.model) is not None or subject_anatomy(subject) is not None
+
+
+def subject_anatomy(subject: Subject) -> SubjectAnatomy | None:
+    """How a subject differs from the hand model, or None if not at all."""
+    anatomy = subject.anatomy
+    return None if anatomy in (None, SubjectAnatomy()) else anatomy
+
+
+def subject_betas(subject: Subject) -> np.ndarray:
+    """Shape parameters that a subject is made from: (10,), within 1.5 standard deviations."""
+    return np.clip(generator(subject.seed, "betas").normal(0.0, 0.7, 10), -1.5, 1.5).round(4)
+
+
+def person(subject: Subject, side: str) -> Person:
+    """Make one hand of a subject.
+
+    Args:
+        subject: whose.
+        side: `right` or `left`.
+
+    Raises:
+        UsageError: the subject's model is unknown.
+        BadHandModel: its file is missing or damaged.
+    """
+    from hwp_bench.hands import load_template
+
+    texture, rig = None, rig_path(subject.model)
+    if rig is not None:
+        model = load_template("anny", side)
+        template, texture = load_rig(rig, side, model)
+        betas = np.zeros(10)
+    else:
+        template = model = load_template(subject.model, side)
+        betas = subject_betas(subject)
+    joints = template.joints + template.joint_basis @ betas
+    anatomy = subject_anatomy(subject)
+    if anatomy is not None:
+        template, joints = off_template(template, betas, anatomy, subject.seed)
+    if rig is not None:
+        betas = betas_of_joints(model, joints)
+    elif anatomy is not None:
+        betas = betas_of_surface(model, template.vertices)
+    return Person(template, model, betas, joints, texture)
+
 
 #: Midpoint subdivisions on top of the template: 1,609 vertices become 25,609.
 FINE = 2
@@ -221,8 +354,3 @@ def _subdivide_corners(corners: np.ndarray) -> np.ndarray:
     return np.concatenate(
         [np.stack(face, axis=1) for face in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
     )
-
-
-def scene_hands(scene: Scene, subdivisions: int = FINE) -> dict[str, SubjectHand]:
-    """The subject's hands that a scene shows, by side."""
-    return {side: subject_hand(scene.subject, side, subdivisions) for side in scene.sides}

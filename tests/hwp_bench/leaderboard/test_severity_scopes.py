@@ -15,9 +15,9 @@ from hwp_bench.leaderboard.severity_scopes import at_severity, suite_severities
 from hwp_bench.leaderboard.site import build_site
 from hwp_bench.report.sources import mean_severity
 from hwp_bench.results.schema import score_rows
-from hwp_bench.sim.produce.production import render_capture
+from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.suites import SuiteItem
-from hwp_bench.sim.scene.reader import load_scene
+from hwp_bench.sim.scene_files import load_scene
 
 
 @pytest.fixture

@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator
 import pytest
 from tiny_scene import SINGLE
 
-from hwp_bench.sim.render import person
-from hwp_bench.sim.scene.reader import parse_scene
-from hwp_bench.sim.scene.schema import Scene
-from hwp_bench.sim.subject import atlas, forearm
+from hwp_bench.sim.render import stage as person
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import parse_scene
+from hwp_bench.sim.subject import arms as forearm
+from hwp_bench.sim.subject import atlas
 
 
 @pytest.fixture

@@ -158,7 +158,7 @@ def test_a_capture_is_rendered_to_the_same_digest(nodes: Nodes, tmp_path: Path) 
     from hwp_bench.capture import open_capture
     from hwp_bench.run.engine.ray_engine import RayEngine
     from hwp_bench.sim.produce.suites import RenderCapture, render_job
-    from hwp_bench.sim.scene.reader import load_scene
+    from hwp_bench.sim.scene_files import load_scene
 
     work = RenderCapture(load_scene("capture0"), frame_count=10, size=32, workers=1)
     with RayEngine(nodes.address) as engine:

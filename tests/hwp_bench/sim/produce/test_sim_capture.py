@@ -12,11 +12,10 @@ import pytest
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.produce.capture import frame_file, render_capture, render_key, true_hands
 from hwp_bench.sim.produce.estimates import EASY_ERROR, estimate_hands
-from hwp_bench.sim.produce.frames import frame_file
-from hwp_bench.sim.produce.production import render_capture, render_key, true_hands
 from hwp_bench.sim.produce.suites import ensure_suite, suite
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.scene import Scene
 
 SceneMaker = Callable[..., Scene]
 FRAMES, SIZE = 20, 40
@@ -30,7 +29,7 @@ def _pixels(capture: Capture) -> np.ndarray:
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_scene import SINGLE
 
-    from hwp_bench.sim.scene.reader import parse_scene
+    from hwp_bench.sim.scene_files import parse_scene
 
     path = tmp_path_factory.mktemp("sim") / "tiny"
     scene = parse_scene(SINGLE, where="tiny.toml")
@@ -95,7 +94,7 @@ def test_workers_change_nothing(rendered: Path, make_scene: SceneMaker, tmp_path
 def test_an_interrupted_render_goes_on(
     rendered: Path, make_scene: SceneMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hwp_bench.sim.produce import production
+    from hwp_bench.sim.produce import capture as production
 
     scene, out = make_scene(), tmp_path / "late"
     honest, done = production.render_frames, []
@@ -136,7 +135,7 @@ def test_refusals(rendered: Path, make_scene: SceneMaker, tmp_path: Path) -> Non
 def test_layers_agree_with_the_geometry(rendered: Path) -> None:
     import OpenImageIO as oiio
 
-    from hwp_bench.sim.render.layers import CHANNELS
+    from hwp_bench.sim.render.frame import CHANNELS
 
     image = oiio.ImageBuf(str(rendered / "extra" / "exr" / "000019.exr"))
     assert tuple(image.spec().channelnames)[:3] == ("R", "G", "B")
@@ -186,7 +185,8 @@ def test_suites_name_existing_scenes() -> None:
 def test_a_suite_in_the_cache_is_not_rendered_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_scene: SceneMaker
 ) -> None:
-    from hwp_bench.sim.produce import production, suites
+    from hwp_bench.sim.produce import capture as production
+    from hwp_bench.sim.produce import suites
 
     item = suites.SuiteItem(make_scene(), 10, 32, 5)
     monkeypatch.setattr(suites, "suite", lambda name: (item,))

