@@ -44,11 +44,7 @@ _WALLS = Room(left=(0.9, 0.12, 0.08), right=(0.08, 0.55, 0.75))
 
 
 def lights_shown(light: Light) -> dict[str, tuple[Light, Sensor]]:
-    """Light and sensor of each picture, by its caption.
-
-    Args:
-        light: of the scene as it is.
-    """
+    """Light and sensor of each picture, by its caption."""
     fixed = Sensor(noise=0.0)
     window = Lamp(place=(-0.9, -0.2, 0.0), strength=1.5, width=0.9, height=1.2, kelvin=6500.0)
     bulb = Lamp(place=(-0.45, -0.1, -0.12), strength=1.0, width=0.04, kelvin=2900.0)
@@ -102,11 +98,7 @@ def sensors_shown() -> dict[str, Sensor]:
 
 
 def camera_sheet() -> np.ndarray:
-    """The middle of one frame in the cameras of `sensors_shown`, twice its size: (H, W, 3) uint8.
-
-    Raises:
-        HwpError: nothing here can encode H.264.
-    """
+    """The middle of one frame in the cameras of `sensors_shown`, twice its size: (H, W, 3)."""
     cells = []
     for name, sensor in sensors_shown().items():
         scene = replace(load_scene(_LIT), sensor=sensor)
@@ -244,9 +236,6 @@ def write_gallery(folder: Path) -> list[Path]:
     The sheets are `lights.jpg`, `looks.jpg` and `cameras.jpg`.
 
     The last one is left out where nothing can encode H.264.
-
-    Args:
-        folder: where to.
     """
     paths = []
     for name in track(scene_names(), "Strips of the captures"):

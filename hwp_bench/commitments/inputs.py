@@ -69,11 +69,7 @@ def write_inputs(
 
 
 def check_place(out: str | os.PathLike[str], name: str) -> None:
-    """Refuse what `write_inputs` would refuse, before captures are rendered for it.
-
-    Raises:
-        UsageError: `out` exists, or the name is not one of a method.
-    """
+    """Refuse what `write_inputs` would refuse, before captures are rendered for it."""
     refuse_existing(out)
     if not _NAME.fullmatch(name):
         raise UsageError(

@@ -47,17 +47,9 @@ SALT_BYTES = 32
 def target_content(capture: Capture, split: Split) -> dict[str, Any]:
     """Describe by digests the truth that test frames are scored against.
 
-    Args:
-        capture: the capture.
-        split: its split.
-
-    Returns:
-        JSON: id, split digest, and for every test frame the SHA-256 of its decoded pixels and of
-        its scoring mask, with whether the mask is exact coverage. The same of the free-view clip,
-        where there is one.
-
-    Raises:
-        BadImage: a test frame or mask is missing or damaged.
+    Returns JSON: id, split digest, and for every test frame the SHA-256 of its decoded pixels and
+    of its scoring mask, with whether the mask is exact coverage. The same of the free-view clip,
+    where there is one.
     """
     frames = _frame_digests(capture, split.test.tolist())
     content = {"id": capture.info.id, "split": split.digest, "frames": frames}
@@ -76,12 +68,7 @@ def _frame_digests(capture: Capture, frames: Iterable[int]) -> list[list[Any]]:
 
 
 def commitment(content: Mapping[str, Any], salt: str) -> str:
-    """Return the SHA-256 (hex) of a salted content.
-
-    Args:
-        content: from `target_content`.
-        salt: at least `SALT_BYTES` random bytes in hex.
-    """
+    """Return the SHA-256 (hex) of a salted content."""
     text = f"{SCHEME}\n{salt}\n{canonical_json(dict(content))}"
     return hashlib.sha256(text.encode()).hexdigest()
 
@@ -274,11 +261,7 @@ def _compare_public(root: Path, manifest: str | os.PathLike[str] | None, joint: 
 
 
 def read_manifest(public: str | os.PathLike[str]) -> PublicManifest:
-    """Read the manifest of a public part.
-
-    Raises:
-        BadInput: it is damaged, or its commitments do not make the joint one.
-    """
+    """Read the manifest of a public part."""
     path = Path(public) / MANIFEST
     found = _read(path, PUBLIC_SCHEMA, PublicManifest)
     if joint_commitment([entry.commitment for entry in found.captures]) != found.commitment:

@@ -57,11 +57,7 @@ def write_secret(path: str | os.PathLike[str], secret: str) -> None:
 
 
 def read_secret(path: str | os.PathLike[str]) -> str:
-    """Return the secret (hex) of a file.
-
-    Raises:
-        BadInput: it is not one, or of another version.
-    """
+    """Return the secret (hex) of a file."""
     value = without_schema(
         read_json(path, max_bytes=_MAX_FILE), SECRET_SCHEMA, where=path, error=BadInput
     )
@@ -69,12 +65,7 @@ def read_secret(path: str | os.PathLike[str]) -> str:
 
 
 def derived(secret: str, *purpose: str) -> bytes:
-    """Return the 32 bytes that a secret gives for one purpose.
-
-    Args:
-        secret: in hex.
-        purpose: what they are for, such as `("seed", "capture0", "subject")`.
-    """
+    """Return the 32 bytes that a secret gives for one purpose."""
     message = canonical_json([SECRET_SCHEMA, *purpose]).encode()
     return hmac.new(bytes.fromhex(secret), message, hashlib.sha256).digest()
 
@@ -92,10 +83,6 @@ def secret_commitment(secret: str, recipe: Mapping[str, Any]) -> str:
     """Return the SHA-256 (hex) that binds an organiser to a secret and a recipe.
 
     The secret has 256 random bits, so that the digest tells nothing of it.
-
-    Args:
-        secret: in hex.
-        recipe: JSON values of everything else that decides the captures.
     """
     text = canonical_json({"schema": SECRET_SCHEMA, "secret": secret, "recipe": dict(recipe)})
     return hashlib.sha256(text.encode()).hexdigest()
@@ -148,11 +135,7 @@ class Recipe:
         return {"scenes": scenes, "size": self.size, "renderer": self.renderer}
 
     def refuse_other_toolkit(self) -> None:
-        """Refuse a recipe that this version of the toolkit does not render as its maker's did.
-
-        Raises:
-            UsageError: the renderer or a scene is another one.
-        """
+        """Refuse a recipe that this version of the toolkit does not render as its maker's did."""
         remedy = "Install the version of the toolkit that made the suite."
         if self.renderer != RENDERER:
             raise UsageError(
@@ -166,16 +149,7 @@ class Recipe:
 
 
 def recipe_of(names: Sequence[str], frames: int, size: int) -> Recipe:
-    """Make a recipe of scenes that come with the package.
-
-    Args:
-        names: of scenes.
-        frames: of each capture.
-        size: edge of the images, px.
-
-    Raises:
-        UsageError: a scene is unknown or named twice, or a number is out of range.
-    """
+    """Make a recipe of scenes that come with the package."""
     if not 10 <= frames <= 100_000:
         raise UsageError(f"{frames} is not from 10 to 100000", field="--frames")
     if not 16 <= size <= 4096:
@@ -189,11 +163,7 @@ def recipe_of(names: Sequence[str], frames: int, size: int) -> Recipe:
 
 
 def suite_recipe(name: str) -> Recipe:
-    """Make a recipe of the scenes, frames and size of a suite.
-
-    Raises:
-        UsageError: there is no such suite.
-    """
+    """Make a recipe of the scenes, frames and size of a suite."""
     items = suite(name)
     rows = [RecipeScene(one.scene.id, one.scene.digest, one.frame_count) for one in items]
     return Recipe(tuple(rows), items[0].size)
@@ -204,7 +174,7 @@ def sealed_items(recipe: Recipe, secret: str) -> tuple[SuiteItem, ...]:
     found = []
     for row in recipe.scenes:
         scene = sealed_scene(load_scene(row.name), secret)
-        found.append(SuiteItem(scene, row.frames, recipe.size, scene.seed))
+        found.append(SuiteItem(scene, row.frames, recipe.size))
     return tuple(found)
 
 

@@ -40,7 +40,7 @@ from hwp_bench.commitments.recipe import (
 )
 from hwp_bench.methods.request import open_request
 from hwp_bench.run.engine import Engine, Needs
-from hwp_bench.sim.produce.suites import ensure_captures
+from hwp_bench.sim.produce.suites import ensure_suite
 
 #: Version of the public page.
 SUITE_SCHEMA = "hwp-sealed-suite/1"
@@ -82,11 +82,7 @@ def write_suite_page(folder: Path, page: SuitePage) -> None:
 
 
 def read_suite_page(public: str | os.PathLike[str]) -> SuitePage:
-    """Read the page of a part for authors.
-
-    Raises:
-        BadInput: the folder is not the public part of a sealed suite, or the page is damaged.
-    """
+    """Read the page of a part for authors."""
     path = Path(public) / SUITE
     if not path.is_file():
         raise BadInput(
@@ -145,7 +141,7 @@ def make_suite(
         keeper.mkdir(exist_ok=True)
         keeper.chmod(0o700)
         hidden = _secret_of(keeper / SECRET, secret)
-        captures = ensure_captures(
+        captures = ensure_suite(
             sealed_items(recipe, hidden),
             keeper / CAPTURES,
             workers,
@@ -242,11 +238,7 @@ def reveal(suite: str | os.PathLike[str], out: str | os.PathLike[str]) -> Reveal
 
 
 def read_revealed(path: str | os.PathLike[str]) -> Revealed:
-    """Read a revealed secret.
-
-    Raises:
-        BadInput: it is not one, or damaged.
-    """
+    """Read a revealed secret."""
     value = read_json(path, max_bytes=MAX_FILE)
     value = without_schema(value, REVEAL_SCHEMA, where=path, error=BadInput)
     return parse_record(Revealed, value, where=path, error=BadInput)
@@ -332,7 +324,7 @@ def check_revealed(
     chosen = [item for item in items if only is None or item.scene.id in only]
     if chosen:
         page.recipe.refuse_other_toolkit()
-    made = ensure_captures(chosen, work, workers)
+    made = ensure_suite(chosen, work, workers)
     committed = {entry.id: entry.commitment for entry in manifest.captures}
     captures = [open_capture(folder) for folder in made]
     return Checked(

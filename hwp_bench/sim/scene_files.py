@@ -100,11 +100,7 @@ def _shipped_scene(name: str) -> Scene:
 
 
 def parse_scene(text: str, *, where: str) -> Scene:
-    """Make a scene of TOML text.
-
-    Raises:
-        BadInput: see `load_scene`.
-    """
+    """Make a scene of TOML text."""
     content = parse_toml(text, where=where)
     effects = parse_record(
         _Effects,

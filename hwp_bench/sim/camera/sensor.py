@@ -114,12 +114,8 @@ def store(sensor: Sensor, image: np.ndarray) -> np.ndarray:
 def sharpened(image: np.ndarray, strength: float) -> np.ndarray:
     """Unsharp mask on the luma, as a phone applies it after the tone curve.
 
-    Args:
-        image: (H, W, 3) uint8 sRGB.
-        strength: share of the fine structure that is added.
-
-    Returns:
-        (H, W, 3) uint8; colours keep their differences from the luma.
+    Takes `image` (H, W, 3) uint8 sRGB. Returns (H, W, 3) uint8; colours keep their differences from
+    the luma.
     """
     import cv2
 
@@ -145,14 +141,7 @@ def has_encoder() -> bool:
 
 
 def check_encoder(where: str) -> None:
-    """Refuse a scene whose video cannot be encoded here.
-
-    Args:
-        where: name of the scene.
-
-    Raises:
-        HwpError: PyAV with x264 is not installed.
-    """
+    """Refuse a scene whose video cannot be encoded here."""
     _library(where)
 
 
@@ -161,19 +150,7 @@ def through_h264(
 ) -> Iterator[np.ndarray]:
     """Encode a clip and decode it again.
 
-    Args:
-        frames: (H, W, 3) uint8 sRGB, all of one size, in their order; they are read as they are
-            needed.
-        bits_per_pixel: mean size of the stream; a phone's camera writes 0.1 to 0.3, a messenger
-            0.03 to 0.1.
-        fps: frames per second.
-        where: name of the scene, for messages.
-
-    Yields:
-        (H, W, 3) uint8 sRGB for each frame.
-
-    Raises:
-        HwpError: there is no encoder, or it fails.
+    Takes `frames` (H, W, 3) uint8 sRGB. Yields (H, W, 3) uint8 sRGB for each frame.
     """
     av = _library(where)
     try:

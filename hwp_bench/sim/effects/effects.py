@@ -112,11 +112,7 @@ class Effect:
 
 
 def read_settings(kind: type[Settings], call: EffectCall, where: str) -> Settings:
-    """The settings of an effect as the dataclass of its kind.
-
-    Raises:
-        BadInput: a setting is missing, unknown or out of range; it is named.
-    """
+    """The settings of an effect as the dataclass of its kind."""
     return parse_record(kind, call.settings, where=where, field=_path(call), error=BadInput)
 
 
@@ -426,11 +422,7 @@ ORDER = tuple(EFFECTS)
 
 
 def registered(kind: str) -> Effect:
-    """Return the effect of a name.
-
-    Raises:
-        BadInput: no effect has that name.
-    """
+    """Return the effect of a name."""
     if kind not in EFFECTS:
         raise BadInput(f"there is no effect {kind!r}", remedy=f"Known: {', '.join(ORDER)}.")
     return EFFECTS[kind]

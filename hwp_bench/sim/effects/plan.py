@@ -60,15 +60,7 @@ def plan(
     size: int,
     strengths: Mapping[str, float] | None = None,
 ) -> FramePlan:
-    """Plan one frame.
-
-    Args:
-        scene: the scene.
-        frame: 0 to frame_count - 1.
-        frame_count: frames over which the capture is spread.
-        size: edge of the image in pixels; decides the number of sub-frames.
-        strengths: instead of those that follow from the severity of the effects that act.
-    """
+    """Plan one frame."""
     moment = float(moments(frame_count)[frame])
     seconds = moment * scene.duration
     acting = {

@@ -33,10 +33,7 @@ class Hits:
 class Tracer:
     """One mesh, ready to be asked what rays meet.
 
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3) vertex indices.
-        rays: counts rays by purpose.
+    Takes `vertices` (V, 3) m, `faces` (F, 3) vertex indices.
     """
 
     def __init__(self, vertices: np.ndarray, faces: np.ndarray, rays: Counter[str]) -> None:
@@ -46,10 +43,7 @@ class Tracer:
     def first_hits(self, origins: np.ndarray, directions: np.ndarray, purpose: str) -> Hits:
         """Find the first face on every ray.
 
-        Args:
-            origins: (N, 3) m, or (1, 3) for all rays.
-            directions: (N, 3), any length.
-            purpose: under which the rays are counted.
+        Takes `origins` (N, 3) m, `directions` (N, 3).
         """
         self._rays[purpose] += len(directions)
         ray, face, u, v, distance = self._mesh.first_hits(origins, directions)

@@ -18,13 +18,8 @@ if TYPE_CHECKING:
 def subdivision(faces: np.ndarray, vertex_count: int) -> tuple[csr_matrix, np.ndarray]:
     """One midpoint subdivision, written as a matrix.
 
-    Args:
-        faces: (F, 3).
-        vertex_count: V.
-
-    Returns:
-        (V', V) sparse matrix that turns per-vertex values into those of the finer mesh, the
-        first V rows unchanged, and its (4F, 3) faces.
+    Takes `faces` (F, 3). Returns (V', V) sparse matrix that turns per-vertex values into those of
+    the finer mesh, the first V rows unchanged, and its (4F, 3) faces.
     """
     from scipy.sparse import csr_matrix
 
@@ -88,13 +83,16 @@ def normal_operator(faces: np.ndarray, vertex_count: int) -> csr_matrix:
 def surface_normals(vertices: np.ndarray, faces: np.ndarray, operator: csr_matrix) -> np.ndarray:
     """Unit normals at the vertices, weighted by area: (V, 3).
 
-    Args:
-        vertices: (V, 3).
-        faces: (F, 3).
-        operator: `normal_operator` of the mesh; frames share it.
+    Takes `vertices` (V, 3), `faces` (F, 3).
     """
     a, b, c = (vertices[faces[:, corner]] for corner in range(3))
     return unit(operator @ np.cross(b - a, c - a))
+
+
+def ease(x: np.ndarray | float) -> np.ndarray:
+    """From 0 to 1 with zero slope at both ends: 3 x^2 - 2 x^3, constant outside of 0 to 1."""
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
@@ -205,12 +203,7 @@ def shape(
 ) -> Surface:
     """Make a surface that is not a hand.
 
-    Args:
-        vertices: (V, 3) m.
-        faces: (F, 3), counter-clockwise seen from outside.
-        corner_uv: (F, 3, 2).
-        material: what all of it is made of.
-        smooth: share normals between faces, or give every face its own.
+    Takes `vertices` (V, 3) m, `faces` (F, 3), `corner_uv` (F, 3, 2).
     """
     if not smooth:
         vertices = vertices[faces].reshape(-1, 3)
@@ -252,10 +245,7 @@ def box(size: tuple[float, float, float], material: Material) -> Surface:
 def turned(profile: np.ndarray, material: Material, around: int = 28) -> Surface:
     """A solid of revolution about z.
 
-    Args:
-        profile: (K, 2) rows of (radius, z) from one end to the other.
-        material: its material; u runs around, v along.
-        around: number of faces around.
+    Takes `profile` (K, 2) rows of (radius, z) from one end to the other.
     """
     angles = np.linspace(0.0, 2.0 * np.pi, around + 1)
     radius, z = profile[:, 0], profile[:, 1]
@@ -273,11 +263,7 @@ def turned(profile: np.ndarray, material: Material, around: int = 28) -> Surface
 def tube(spine: np.ndarray, radius: np.ndarray, material: Material, *, around: int = 12) -> Surface:
     """A tube with closed ends around a curve that runs along neither x nor y for long.
 
-    Args:
-        spine: (K, 3) m.
-        radius: (K,) m at each of its points.
-        material: its material; u runs around, v along.
-        around: number of faces around.
+    Takes `spine` (K, 3) m, `radius` (K,) m at each of its points.
     """
     way = np.gradient(spine, axis=0)
     way /= np.linalg.norm(way, axis=1, keepdims=True)

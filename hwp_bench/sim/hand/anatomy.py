@@ -13,7 +13,7 @@ import numpy as np
 
 from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT, finger_back
 from hwp_bench.sim.geometry.noise import fractal_noise
-from hwp_bench.sim.geometry.surface import unit
+from hwp_bench.sim.geometry.surface import ease, unit
 
 # Palm lines as rows of (along, across): 0-1 from the wrist to the middle knuckle, and from the
 # little finger's knuckle to the index finger's.
@@ -50,8 +50,7 @@ class Anatomy:
         thumb = self.weights[:, 13:16].sum(axis=1)[:, None]
         axis = unit((1.0 - thumb) * finger_back("index") + thumb * finger_back("thumb"))
         facing = np.einsum("ni,ni->n", self.normals, axis)
-        x = np.clip((facing + 0.35) / 0.6, 0.0, 1.0)
-        return x * x * (3.0 - 2.0 * x)
+        return ease((facing + 0.35) / 0.6)
 
     def joint_creases(self, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
         """Wrinkles across the finger joints, and the swelling of the knuckles: (N,), 0-1 each."""
@@ -153,12 +152,12 @@ class Anatomy:
         for finger in FINGERS:
             s, w, top, owned = self.nail_coordinates(finger)
             radius = (np.abs(s) ** 3 + np.abs(w) ** 3) ** (1 / 3)
-            inside = _step((1.0 - radius) / 0.08 + 0.5) * top * owned
+            inside = ease((1.0 - radius) / 0.08 + 0.5) * top * owned
             plate = np.maximum(plate, inside)
-            moon = np.maximum(moon, inside * _step((-0.62 - s - 0.35 * w * w) / 0.15 + 0.5))
-            edge = np.maximum(edge, inside * _step((s - 0.74 + 0.2 * w * w) / 0.1 + 0.5))
+            moon = np.maximum(moon, inside * ease((-0.62 - s - 0.35 * w * w) / 0.15 + 0.5))
+            edge = np.maximum(edge, inside * ease((s - 0.74 + 0.2 * w * w) / 0.1 + 0.5))
             rim = np.exp(-(((radius - 1.04) / 0.07) ** 2)) * top * owned
-            groove = np.maximum(groove, rim * _step((0.6 - s) / 0.3 + 0.5))
+            groove = np.maximum(groove, rim * ease((0.6 - s) / 0.3 + 0.5))
         return plate, moon, edge, groove
 
     def nail_coordinates(
@@ -166,12 +165,8 @@ class Anatomy:
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
         """Where places lie on a finger's nail: (N,) each.
 
-        Args:
-            finger: its name.
-
-        Returns:
-            Along the plate from -1 to 1 at its free edge, across it from -1 to 1, 1 on top of the
-            finger, and 1 on its last segment.
+        Returns along the plate from -1 to 1 at its free edge, across it from -1 to 1, 1 on top of
+        the finger, and 1 on its last segment.
         """
         joint = self.joints[FIRST_JOINT[finger] + 2]
         tip = self._tip(finger)
@@ -204,11 +199,6 @@ class Anatomy:
         return along, across - start[1] + 0.5
 
 
-def _step(x: np.ndarray) -> np.ndarray:
-    x = np.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
-
-
 def _rounded(bends: np.ndarray, samples: int = 24) -> np.ndarray:
     """Points along a smooth curve through the bends."""
     from scipy.interpolate import PchipInterpolator
@@ -220,10 +210,7 @@ def _rounded(bends: np.ndarray, samples: int = 24) -> np.ndarray:
 def _drawn(places: np.ndarray, line: np.ndarray, width: float) -> np.ndarray:
     """A line with soft borders: 1 on it, exp(-1) at `width` from it: (N,).
 
-    Args:
-        places: (N, 2).
-        line: (K, 2) points joined by segments.
-        width: in the unit of both.
+    Takes `places` (N, 2), `line` (K, 2) points joined by segments.
     """
     reach = width * np.sqrt(_LOST)
     low, high = line.min(axis=0) - reach, line.max(axis=0) + reach

@@ -36,14 +36,7 @@ _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 
 
 class Gltf:
-    """A file that was parsed; its parts are read when they are asked for.
-
-    Args:
-        path: a `.glb` or `.gltf` file.
-
-    Raises:
-        BadHandModel: missing, damaged, too large, or packed by an extension.
-    """
+    """A file that was parsed; its parts are read when they are asked for."""
 
     def __init__(self, path: Path) -> None:
         import pygltflib
@@ -70,14 +63,7 @@ class Gltf:
     def array(self, index: int | None) -> np.ndarray:
         """The rows of an accessor, sparse ones filled in.
 
-        Args:
-            index: of the accessor.
-
-        Returns:
-            (N, width) of the file's own type, or (N,) for scalars.
-
-        Raises:
-            BadHandModel: the accessor is absent, cut short or out of bounds.
+        Returns (N, width) of the file's own type, or (N,) for scalars.
         """
         if index is None:
             raise self.wrong("lacks an attribute that a skinned mesh needs")
@@ -103,11 +89,7 @@ class Gltf:
         return rows.astype(np.float64)
 
     def image(self, index: int) -> np.ndarray:
-        """An image of the file: (H, W, 3) uint8 sRGB.
-
-        Raises:
-            BadHandModel: it cannot be decoded, or is too large.
-        """
+        """An image of the file: (H, W, 3) uint8 sRGB."""
         import cv2
 
         image = self.content.images[index]
@@ -133,11 +115,7 @@ class Gltf:
         return above
 
     def chain(self, node: int, above: list[int]) -> list[int]:
-        """A node and all nodes above it, lowest first.
-
-        Raises:
-            BadHandModel: a node stands above itself.
-        """
+        """A node and all nodes above it, lowest first."""
         found = []
         while node >= 0:
             if node in found:
@@ -147,11 +125,7 @@ class Gltf:
         return found
 
     def placed(self, nodes: list[int]) -> np.ndarray:
-        """Product of the nodes' own transforms, highest first: (4, 4).
-
-        Args:
-            nodes: as `chain` gives them.
-        """
+        """Product of the nodes' own transforms, highest first: (4, 4)."""
         whole = np.eye(4)
         for node in nodes:
             whole = _local(self.content.nodes[node]) @ whole
@@ -280,9 +254,7 @@ def joined_sheet(parts: list[Part]) -> Sheet:
 def paintable(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates to paint skin on: these if every triangle has its own place, else packed ones.
 
-    Args:
-        uv: (T, 2) coordinates of a whole mesh, after it was cut and closed.
-        faces: (F, 3) indices into them.
+    Takes `uv` (T, 2) coordinates of a whole mesh, `faces` (F, 3) indices into them.
     """
     return (uv, faces) if _apart(uv[faces]) else packed(len(faces))
 
@@ -290,11 +262,7 @@ def paintable(uv: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def packed(count: int) -> tuple[np.ndarray, np.ndarray]:
     """Coordinates in which every triangle has a place of its own.
 
-    Args:
-        count: F, triangles.
-
-    Returns:
-        (3 F, 2) coordinates in [0, 1], and (F, 3) indices into them.
+    Returns (3 F, 2) coordinates in [0, 1], and (F, 3) indices into them.
     """
     edge = int(np.ceil(np.sqrt((count + 1) // 2)))
     cell = np.arange(count) // 2
@@ -387,14 +355,7 @@ class _Skin:
 
 
 def read_skinned_mesh(path: Path) -> SkinnedMesh:
-    """Read everything that a file's skins and joints move.
-
-    Args:
-        path: a `.glb` or `.gltf` file.
-
-    Raises:
-        BadHandModel: missing, damaged, too large, packed, or without a skinned mesh.
-    """
+    """Read everything that a file's skins and joints move."""
     file = Gltf(path)
     try:
         with np.errstate(all="ignore"):

@@ -79,15 +79,9 @@ def off_template(
 ) -> tuple[HandTemplate, np.ndarray]:
     """Give a hand model another anatomy.
 
-    Args:
-        template: the hand model, or a rig, of either side.
-        betas: (10,) its shape, which becomes part of the rest surface.
-        anatomy: what differs; nails and relief are not made here (`growth`).
-        seed: of what is drawn where the anatomy has none of its own.
-
-    Returns:
-        A template of the same triangles without shape parameters, which bends about the moved
-        joints, and the (16, 3) joints where they were before they were moved, m.
+    Takes `betas` (10,) its shape. Returns A template of the same triangles without shape
+    parameters, which bends about the moved joints, and the (16, 3) joints where they were before
+    they were moved, m.
     """
     if template.side == "left":
         made, joints = off_template(mirror_template(template), betas, anatomy, seed)
@@ -129,18 +123,10 @@ def resized(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Scale the segments of a right hand at rest.
 
-    Args:
-        vertices: (V, 3) m.
-        weights: (V, 16).
-        joints: (16, 3) m.
-        tips: (5, 3) m, thumb first.
-        lengths: (16,) factor along each segment's bone.
-        widths: (16,) factor across it.
-        palm_bones: (16,) factor of the way from the wrist to each finger's first joint.
-        palm: (3,) further factors along the fingers, across the palm, and through it.
-
-    Returns:
-        (V, 3) vertices and (16, 3) joints.
+    Takes `vertices` (V, 3) m, `weights` (V, 16), `joints` (16, 3) m, `tips` (5, 3) m, `lengths`
+    (16,) factor along each segment's bone, `widths` (16,) factor across it, `palm_bones` (16,)
+    factor of the way from the wrist to each finger's first joint, `palm` (3,) further factors along
+    the fingers. Returns (V, 3) vertices and (16, 3) joints.
     """
     wrist, axes = joints[0], palm[[0, 2, 1]]
     ends = np.vstack([joints[1:], wrist])
@@ -184,13 +170,8 @@ def untangled(before: np.ndarray, after: np.ndarray, faces: np.ndarray) -> tuple
     In the folds between fingers small triangles are squeezed. Around each that is, the change is
     averaged over wider and wider rings until it fits; the rest of the surface stays.
 
-    Args:
-        before: (V, 3) m.
-        after: (V, 3) m.
-        faces: (F, 3).
-
-    Returns:
-        (V, 3) m, and whether that succeeded.
+    Takes `before` (V, 3) m, `after` (V, 3) m, `faces` (F, 3). Returns (V, 3) m, and whether that
+    succeeded.
     """
     step = smoothing_step(faces, len(before), 0.5)
     reach = (step > 0).astype(np.float64)
@@ -246,11 +227,7 @@ def _palm_field(
 ) -> np.ndarray:
     """How the palm's skin moves where its bones grow: (V, 3) m.
 
-    Args:
-        vertices: (V, 3) m.
-        joints: (16, 3) m.
-        roots: first joints of the fingers.
-        pushed: (5, 3) m, the way that each of them goes.
+    Takes `vertices` (V, 3) m, `joints` (16, 3) m, `pushed` (5, 3) m.
     """
     field, total = np.zeros_like(vertices), np.full(len(vertices), 1e-9)
     for root, push in zip(roots, pushed, strict=True):
@@ -284,9 +261,7 @@ class Nails:
     def pushed(self, vertices: np.ndarray, turns: np.ndarray) -> np.ndarray:
         """The mesh with its nails.
 
-        Args:
-            vertices: (V, 3) m, posed.
-            turns: (16, 3, 3) rotation of each joint from the rest frame.
+        Takes `vertices` (V, 3) m, `turns` (16, 3, 3) rotation of each joint from the rest frame.
         """
         grown = vertices.copy()
         grown[self.rows] += np.einsum("nij,nj->ni", turns[self.joints], self.offsets)
@@ -294,12 +269,7 @@ class Nails:
 
 
 def bone_relief(places: Anatomy, anatomy: SubjectAnatomy) -> np.ndarray:
-    """Height of thick finger joints and of bones under the back's skin: (N,) m.
-
-    Args:
-        places: where, at rest.
-        anatomy: how much.
-    """
+    """Height of thick finger joints and of bones under the back's skin: (N,) m."""
     height = np.zeros(len(places.points))
     if not (anatomy.knuckles or anatomy.bony):
         return height
@@ -330,10 +300,7 @@ def grown_nails(places: Anatomy, anatomy: SubjectAnatomy, mirror: np.ndarray) ->
     The free edge of the painted nail is drawn out forwards; the skin below it stays, so that the
     nail is a blade.
 
-    Args:
-        places: the fine mesh at rest.
-        anatomy: length and shape.
-        mirror: (3,) signs that turn the anatomy's right hand into the hand's own side.
+    Takes `mirror` (3,) signs that turn the anatomy's right hand into the hand's own side.
     """
     if not anatomy.nail_length:
         return None

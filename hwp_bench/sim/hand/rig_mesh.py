@@ -39,9 +39,7 @@ class RigMesh:
 def kept(mesh: RigMesh, faces: np.ndarray) -> RigMesh:
     """Some of a mesh's triangles, with the vertices that they use.
 
-    Args:
-        mesh: the mesh.
-        faces: (F,) bool.
+    Takes `faces` (F,) bool.
     """
     used, corner = np.unique(mesh.faces[faces], return_inverse=True)
     used_uv, corner_uv = np.unique(mesh.face_uv[faces], return_inverse=True)
@@ -67,9 +65,7 @@ def components(faces: np.ndarray, count: int) -> np.ndarray:
 def cut(mesh: RigMesh, height: np.ndarray) -> RigMesh:
     """The part of a mesh where a height is positive; triangles across zero are split.
 
-    Args:
-        mesh: the mesh.
-        height: (V,) m, signed distance of the vertices from a plane.
+    Takes `height` (V,) m.
     """
     height = np.where(np.abs(height) < _ON_PLANE, 0.0, height)
     sign = np.sign(height[mesh.faces])
@@ -172,12 +168,7 @@ def outlines(faces: np.ndarray) -> list[np.ndarray]:
 
 
 def closed(mesh: RigMesh, loops: list[np.ndarray]) -> RigMesh:
-    """Close holes, each with a fan from its middle.
-
-    Args:
-        mesh: the mesh.
-        loops: outlines of the holes, as `outlines` gives them.
-    """
+    """Close holes, each with a fan from its middle."""
     if not loops:
         return mesh
     place_of: dict[int, int] = {}
@@ -220,18 +211,9 @@ _AROUND = 0.6
 def opened_at_wrist(mesh: RigMesh, joints: np.ndarray, forward: np.ndarray, where: str) -> RigMesh:
     """Make a mesh that is open at the wrist and nowhere else.
 
-    Args:
-        mesh: a rig in the hand model's rest frame.
-        joints: (16, 3) m.
-        forward: (3,) unit vector from the wrist to the fingers.
-        where: the file, for messages.
-
-    Returns:
-        The mesh; its only outline is the wrist's, whose middle lies at most `FARTHEST_BEHIND`
-        behind and `FARTHEST_BEFORE` before the wrist's joint.
-
-    Raises:
-        BadHandModel: no place near the wrist's joint has skin all around it.
+    Takes `joints` (16, 3) m, `forward` (3,) unit vector from the wrist to the fingers. Returns the
+    mesh; its only outline is the wrist's, whose middle lies at most `FARTHEST_BEHIND` behind and
+    `FARTHEST_BEFORE` before the wrist's joint.
     """
     mesh = _of_the_hand(mesh, joints, where)
     rim = _wrist_outline(mesh, joints[0], forward)
@@ -273,10 +255,7 @@ def _of_the_hand(mesh: RigMesh, joints: np.ndarray, where: str) -> RigMesh:
 def _plane(mesh: RigMesh, behind: np.ndarray, forward: np.ndarray) -> float:
     """How far behind the wrist's joint to cut, m: through skin around the arm, not its cap.
 
-    Args:
-        mesh: the mesh.
-        behind: (V,) m, how far each vertex lies behind the joint.
-        forward: (3,) unit vector.
+    Takes `behind` (V,) m, `forward` (3,) unit vector.
     """
     a, b, c = (mesh.vertices[mesh.faces[:, corner]] for corner in range(3))
     normal = np.cross(b - a, c - a)

@@ -106,12 +106,7 @@ def side_of_name(name: str) -> str | None:
 
 
 def is_elsewhere(name: str, side: str | None) -> bool:
-    """Whether a joint belongs to the body or to the other hand.
-
-    Args:
-        name: of the joint.
-        side: of the hand that is read, or None where names do not say.
-    """
+    """Whether a joint belongs to the body or to the other hand."""
     own = side_of_name(name)
     return bool(_BODY & set(words(name))) or (side is not None and own not in (None, side))
 
@@ -119,16 +114,7 @@ def is_elsewhere(name: str, side: str | None) -> bool:
 def hand_joints(names: list[str], wanted: str, where: str) -> tuple[list[int], str | None]:
     """Find the joints of a hand.
 
-    Args:
-        names: of a rig's joints.
-        wanted: the side to take where a rig has both hands.
-        where: the file, for messages.
-
-    Returns:
-        Row in `names` of the hand model's 16 joints, and the side that the names tell, if any.
-
-    Raises:
-        BadHandModel: joints are missing; the message names the first of them.
+    Returns row in `names` of the hand model's 16 joints, and the side that the names tell, if any.
     """
     plain = [_plain(name.lower()) for name in names]
     sides = {side_of_name(name) for name in names}
@@ -228,16 +214,9 @@ def into_rest_pose(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turn every finger bone to where the hand model's points, by linear blend skinning.
 
-    Args:
-        vertices: (V, 3) m, with the palm aligned already.
-        weights: (V, 16).
-        joints: (16, 3) m, the rig's.
-        tips: (5, 3) m, of thumb, index, middle, ring and little finger.
-        target: (16, 3) m, the hand model's.
-        target_tips: (5, 3) m.
-
-    Returns:
-        (V, 3) vertices and (16, 3) joints; bones keep their lengths.
+    Takes `vertices` (V, 3) m, `weights` (V, 16), `joints` (16, 3) m, `tips` (5, 3) m, `target` (16,
+    3) m, `target_tips` (5, 3) m. Returns (V, 3) vertices and (16, 3) joints; bones keep their
+    lengths.
     """
     ends, target_ends = _bone_ends(joints, tips), _bone_ends(target, target_tips)
     turns = np.tile(np.eye(3), (JOINT_COUNT, 1, 1))
@@ -289,11 +268,7 @@ _LAST = (15, 3, 6, 12, 9)
 
 
 def rig_path(model: str) -> str | None:
-    """The file of a subject's rig, or None where `model` names no rig.
-
-    Raises:
-        UsageError: no rig of that name comes with the package.
-    """
+    """The file of a subject's rig, or None where `model` names no rig."""
     if model.startswith(FROM_FILE):
         return model.removeprefix(FROM_FILE)
     if not model.startswith(SHIPPED):
@@ -312,18 +287,8 @@ def rig_path(model: str) -> str | None:
 def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, np.ndarray | None]:
     """Read a rigged hand.
 
-    Args:
-        path: a `.glb` or `.gltf` file with a skinned hand.
-        side: the hand to return; a rig of the other side is mirrored.
-        model: the hand model of that side, whose size and rest pose the rig takes.
-
-    Returns:
-        The rig as a template without shape parameters, open at the wrist only, and its base
-        colour, (H, W, 3) uint8 sRGB, or None if it has none.
-
-    Raises:
-        BadHandModel: the file is missing or damaged, joints are missing (it names them), or the
-            mesh has no wrist.
+    Returns the rig as a template without shape parameters, open at the wrist only, and its base
+    colour, (H, W, 3) uint8 sRGB, or None if it has none.
     """
     file = read_skinned_mesh(Path(path))
     index, told = hand_joints(file.joint_names, side, path)
@@ -338,8 +303,7 @@ def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, n
 def _side_by_curl(places: np.ndarray) -> str:
     """The side of a hand by where its fingers curl.
 
-    Args:
-        places: (16, 3) of the hand model's joints in the rig.
+    Takes `places` (16, 3) of the hand model's joints in the rig.
     """
     back_if_right = np.cross(places[4] - places[0], places[1] - places[7])
     curl = sum(places[i + 2] - places[i] for i in (1, 4, 7, 10, 13))

@@ -169,12 +169,7 @@ def area_light(lamp: Lamp, focus: np.ndarray) -> AreaLight:
 
 
 def wall_radiance(room: Room, sky: float) -> np.ndarray:
-    """Linear radiance of the walls in the directions +x, -x, +y, -y, +z, -z: (6, 3).
-
-    Args:
-        room: their colours.
-        sky: radiance of a white wall.
-    """
+    """Linear radiance of the walls in the directions +x, -x, +y, -y, +z, -z: (6, 3)."""
     walls = (room.right, room.left, room.floor, room.ceiling, room.far, room.near)
     return np.asarray(sky * srgb_to_linear(np.array(walls)))
 
@@ -182,8 +177,7 @@ def wall_radiance(room: Room, sky: float) -> np.ndarray:
 def wall_irradiance(radiance: np.ndarray) -> np.ndarray:
     """Irradiance over pi in the middle of a cube of walls, for normals along the axes: (6, 3).
 
-    Args:
-        radiance: (6, 3) as `wall_radiance` gives it.
+    Takes `radiance` (6, 3) as `wall_radiance` gives it.
     """
     behind = radiance.reshape(3, 2, 3)[:, ::-1].reshape(6, 3)
     borders = radiance.sum(axis=0) - radiance - behind

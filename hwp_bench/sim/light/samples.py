@@ -220,10 +220,7 @@ class Samples:
 def gather(surface: Surface, hits: Hits, directions: np.ndarray) -> Samples:
     """Collect what shading needs at the hits.
 
-    Args:
-        surface: what was hit.
-        hits: where.
-        directions: (N, 3) of the rays that were cast.
+    Takes `directions` (N, 3) of the rays that were cast.
     """
     faces = np.ascontiguousarray(surface.faces, np.int64)
     vertices = np.ascontiguousarray(surface.vertices)

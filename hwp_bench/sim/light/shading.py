@@ -124,10 +124,7 @@ _DISC = np.array([[-0.4, -0.8], [0.8, -0.4], [-0.8, 0.4], [0.4, 0.8]])
 def shade(samples: Samples, lights: Lights, lit: np.ndarray) -> np.ndarray:
     """Radiance towards the camera: (H, 3) linear.
 
-    Args:
-        samples: the points.
-        lights: the light.
-        lit: (H,) share of the key light that arrives, 0-1.
+    Takes `lit` (H,) share of the key light that arrives.
 
     Source: Lambert with wrapped terminator for skin, hemisphere sky, and the GGX lobe with
     Schlick's Fresnel term and Smith-Schlick visibility for the gloss.
@@ -146,13 +143,7 @@ def shade(samples: Samples, lights: Lights, lit: np.ndarray) -> np.ndarray:
 def openness(tracer: Tracer, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
     """Share of the half space above each point, weighted by the cosine, that nothing near blocks.
 
-    Args:
-        tracer: what may block.
-        vertices: (V, 3) m.
-        normals: (V, 3) unit.
-
-    Returns:
-        (V,) 0-1.
+    Takes `vertices` (V, 3) m, `normals` (V, 3) unit. Returns (V,) 0-1.
     """
     index = np.arange(SKY_RAYS) + 0.5
     height = np.sqrt(1.0 - index / SKY_RAYS)
@@ -174,15 +165,8 @@ def openness(tracer: Tracer, vertices: np.ndarray, normals: np.ndarray) -> np.nd
 def lit(samples: Samples, lights: Lights, tracers: list[Tracer], turn: np.ndarray) -> np.ndarray:
     """Whether the key light reaches each sample.
 
-    Args:
-        samples: the points.
-        lights: the light.
-        tracers: what may throw a shadow, at least one.
-        turn: (H,) 0-3, which part of the lamp each sample aims at; the samples of a pixel aim
-            at different parts, which softens the shadow's rim.
-
-    Returns:
-        (H,) 0 or 1. A point that faces away from the lamp is 1: its normal darkens it.
+    Takes `turn` (H,) 0-3. Returns (H,) 0 or 1. A point that faces away from the lamp is 1: its
+    normal darkens it.
     """
     reached = np.ones(len(samples.ray))
     if not lights.key.any():
@@ -217,11 +201,6 @@ def light_through(samples: Samples, lamp: AreaLight, tracers: list[Tracer]) -> n
     """Radiance towards the camera of light that came through the hand: (H, 3) linear.
 
     A ray from each point that faces away goes through the hand to the middle of the lamp.
-
-    Args:
-        samples: the points.
-        lamp: where the light is from.
-        tracers: hands first, then whatever else may be in the way.
     """
     found = np.zeros((len(samples.ray), 3))
     ways = lamp.centre - samples.points
@@ -255,11 +234,7 @@ def lamp_light(
 ) -> np.ndarray:
     """Radiance towards the camera that the lamps add: (H, 3) linear.
 
-    Args:
-        samples: the points.
-        lights: the light.
-        tracers: what may throw a shadow, at least one.
-        turn: (H,) 0-3, the quarter of a lamp that each sample aims at.
+    Takes `turn` (H,) 0-3.
     """
     total = np.zeros((len(samples.ray), 3))
     passed = 1.0 if lights.cast is None else lights.cast.passed(samples.points)

@@ -68,13 +68,7 @@ class Calibration:
 
 
 def calibrate(scene: Scene, call: EffectCall, size: int = SIZE) -> Calibration:
-    """Solve an effect's strengths for the stated losses.
-
-    Args:
-        scene: the scene.
-        call: one of its effects.
-        size: edge of the images in pixels.
-    """
+    """Solve an effect's strengths for the stated losses."""
     covering = call.kind == "hand_object_interaction"
     top = registered(call.kind).max_strength
     tried = top * (_TRIED_LINEAR if covering else _TRIED)
@@ -98,12 +92,7 @@ def calibrate(scene: Scene, call: EffectCall, size: int = SIZE) -> Calibration:
 
 
 def write_strengths(path: Path, calibrations: list[Calibration]) -> None:
-    """Write strengths into a scene file; the rest of it stays as it is.
-
-    Raises:
-        UsageError: the file does not exist.
-        BadInput: the file calls for no such effect, or would be damaged.
-    """
+    """Write strengths into a scene file; the rest of it stays as it is."""
     if not path.is_file():
         raise UsageError("does not exist", where=path)
     text = path.read_text(encoding="utf-8")

@@ -13,9 +13,9 @@ import os
 import shutil
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor, wait
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -36,41 +36,39 @@ from hwp_bench.capture import (
 )
 from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
 from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.run.engine import Job, Needs
 from hwp_bench.run.engine.job import OnProgress
 from hwp_bench.run.engine.process import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
 from hwp_bench.sim.camera.sensor import check_encoder, through_h264
 from hwp_bench.sim.effects.plan import FramePlan, hands_at, plan
 from hwp_bench.sim.hand.rigs import rig_path
-from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
-from hwp_bench.sim.produce.free_view import write_free_view
-from hwp_bench.sim.produce.truth import subject_json, write_truth
+from hwp_bench.sim.produce.free_view import add_free_view, has_free_view, write_free_view
+from hwp_bench.sim.produce.truth import distances, write_truth
 from hwp_bench.sim.render.frame import eight_bit_coverage, render_frame, write_layers
-from hwp_bench.sim.scene.motion import hand_parameters, intrinsics, scene_hands, viewmat
+from hwp_bench.sim.scene.motion import intrinsics, parameters_of, scene_hands, viewmat
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.atlas import skin_atlas
 from hwp_bench.sim.subject.skin import of_side
 
-#: Smallest and largest number of frames.
-FRAMES = (10, 100_000)
-#: Smallest and largest edge of a frame, px.
-SIZES = (32, 1024)
-#: Most processes.
-MAX_WORKERS = 1024
+#: Version of the pixels that the renderer makes; part of every render key.
+RENDERER = 10
+#: Edge of an image where no other is given.
+DEFAULT_SIZE = 256
+#: Terms under which simulated captures may be used.
+LICENCE = "CC0-1.0"
+#: Smallest and largest number of frames; smallest and largest edge of one, px; most processes.
+FRAMES, SIZES, MAX_WORKERS = (10, 100_000), (32, 1024), 1024
+# Frames below which a second process costs more than it saves.
+_FRAMES_PER_WORKER = 10
+# Seconds between two counts of the frames that wait.
+_COUNT_SECONDS = 1.0
+_REMEDY = "Finished frames are kept; the same command continues from there."
 
 
 def check_extent(frame_count: int, size: int, workers: int | None = None) -> None:
-    """Refuse what cannot be rendered or planned.
-
-    Args:
-        frame_count: frames over which a scene is spread.
-        size: edge of a frame, px.
-        workers: processes; None leaves their number open.
-
-    Raises:
-        UsageError: a number is out of range; it is named.
-    """
+    """Refuse what cannot be rendered or planned, before anything takes memory for it."""
     for name, value, low, high in (
         ("frame_count", frame_count, *FRAMES),
         ("size", size, *SIZES),
@@ -81,153 +79,111 @@ def check_extent(frame_count: int, size: int, workers: int | None = None) -> Non
             raise UsageError(f"{value} is not in {low}..{high}", field=name)
 
 
-_REMEDY = "Finished frames are kept; the same command continues from there."
-
-
-def frame_file(folder: Path, frame: int) -> Path:
-    """Path of a rendered frame."""
-    return folder / f"{frame:06d}.npz"
-
-
-def exr_file(folder: Path, frame: int) -> Path:
-    """Path of the linear layers of a rendered frame."""
-    return folder / f"{frame:06d}.exr"
-
-
-def read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
-    """Read a rendered frame; None if it is missing or damaged."""
-    try:
-        return read_npz(frame_file(folder, frame))
-    except BadInput:
-        return None
-
-
-def render_frames(
-    scene: Scene,
-    frames: Iterable[int],
-    frame_count: int,
-    size: int,
-    folder: Path,
-    exr: bool = False,
-) -> None:
-    """Render frames into a folder.
-
-    Args:
-        scene: the scene.
-        frames: which.
-        frame_count: frames over which the capture is spread.
-        size: edge of the image in pixels.
-        folder: where they go.
-        exr: also write linear layers as EXR.
-    """
-    for frame in frames:
-        result = render_frame(scene, frame, frame_count, size)
-        cost = {
-            "seconds": dict(result.cost.seconds),
-            "rays": dict(result.cost.rays),
-            "subframes": result.plan.subframes,
-        }
-        buffer = io.BytesIO()
-        np.savez(
-            buffer,
-            rgb=result.rgb,
-            clean=result.clean,
-            coverage=result.coverage.astype(np.float32),
-            clean_coverage=result.clean_coverage.astype(np.float32),
-            cost=np.frombuffer(json.dumps(cost).encode(), dtype=np.uint8),
-        )
-        if exr:
-            write_layers(exr_file(folder, frame), scene, result, frame_count, size)
-        # Last: the frame counts as rendered only when all of it is there.
-        atomic_write(frame_file(folder, frame), buffer.getvalue())
-
-
-@dataclass(frozen=True)
-class RenderFrames:
-    """Renders frames into a folder: the work of one process. Fields as in `render_frames`."""
-
-    #: The scene.
-    scene: Scene
-    #: Numbers of the frames.
-    frames: Sequence[int]
-    #: Frames over which the capture is spread.
-    frame_count: int
-    #: Edge of the image in pixels.
-    size: int
-    #: Whether linear layers are written too.
-    exr: bool
-
-    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
-        """Render; see `hwp_bench.run.engine.job.Work`."""
-        for done, frame in enumerate(self.frames, start=1):
-            render_frames(self.scene, [frame], self.frame_count, self.size, output, self.exr)
-            on_progress(done, len(self.frames))
-
-
-def render_in_processes(
-    works: Sequence[RenderFrames], folder: Path, on_progress: Callable[[int], None]
-) -> None:
-    """Render frames in as many processes as there are works; if one fails, all are ended.
-
-    Args:
-        works: the frames of each process.
-        folder: where the frames go.
-        on_progress: is told how many frames are finished.
-
-    Raises:
-        HwpError: a process failed or was killed.
-    """
-    stop = threading.Event()
-    done = [0] * len(works)
-
-    def run(index: int) -> None:
-        def count(steps: int, total: int) -> None:
-            done[index] = steps
-            on_progress(sum(done))
-
-        # One thread each: the processes share the processors.
-        job = LocalJob(works[index], {}, folder.absolute(), dict.fromkeys(THREADS, "1"))
-        try:
-            run_in_process(job, count, stop.is_set)
-        except BaseException:
-            stop.set()
-            raise
-
-    with ThreadPoolExecutor(len(works)) as pool:
-        futures = [pool.submit(run, index) for index in range(len(works))]
-        try:
-            while wait(futures, timeout=1.0).not_done:
-                pass  # a wait without end would not let Ctrl-C through on every system
-        finally:
-            stop.set()
-    for error in (future.exception() for future in futures):
-        if isinstance(error, WorkerLost):
-            problem = f"a rendering process was killed ({error})"
-            raise HwpError(problem, where=works[0].scene.id, remedy=_REMEDY) from error
-        if isinstance(error, HwpError):
-            raise type(error)(
-                error.problem,
-                where=error.where,
-                field=error.field,
-                remedy=error.remedy or _REMEDY,
-            ) from error
-        if error is not None and not isinstance(error, Stopped):
-            raise error
-
-
-#: Version of the pixels that the renderer makes; part of every render key.
-RENDERER = 10
-#: Edge of an image where no other is given.
-DEFAULT_SIZE = 256
-#: Terms under which simulated captures may be used.
-LICENCE = "CC0-1.0"
-# Frames below which a second process costs more than it saves.
-_FRAMES_PER_WORKER = 10
-
-
 def render_key(scene: Scene, frame_count: int, size: int) -> str:
     """Digest of everything that decides the pixels of a capture."""
     return sha256_json([RENDERER, scene.digest, frame_count, size])
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """A capture to render, in any process on any machine."""
+
+    #: The scene.
+    scene: Scene
+    #: Frames over which it is spread; its own if None.
+    frame_count: int | None = None
+    #: Edge of the square image in pixels; `DEFAULT_SIZE` if None.
+    size: int | None = None
+    #: Seed; the scene's own if None.
+    seed: int | None = None
+    #: Processes of one render; as many as are worth it if None.
+    workers: int | None = None
+    #: Whether linear layers are stored too.
+    exr: bool = False
+    #: Whether a capture that exists already is used as it is.
+    keep: bool = False
+    #: Whether one that is there is replaced.
+    overwrite: bool = False
+    #: Whether the free-view clip is rendered too.
+    free_view: bool = True
+
+    @property
+    def frames(self) -> int:
+        """Frames of the capture."""
+        return self.scene.frame_count if self.frame_count is None else self.frame_count
+
+    @property
+    def edge(self) -> int:
+        """Edge of its images, px."""
+        return DEFAULT_SIZE if self.size is None else self.size
+
+    def checked(self) -> RenderRequest:
+        """The request with its seed in the scene; refuses what cannot be rendered."""
+        scene = self.scene
+        if self.seed is not None:
+            if whole_number(self.seed, "seed") < 0:
+                raise UsageError(f"is {self.seed}", field="seed", remedy="Use 0 or more.")
+            scene = replace(scene, seed=self.seed)
+        check_extent(self.frames, self.edge, self.workers)
+        if scene.sensor.h264:
+            check_encoder(scene.id)
+        return replace(self, scene=scene, seed=None)
+
+    def job(self, output: Path, needs: Needs) -> Job:
+        """The render as a job of an engine."""
+        return Job(
+            text=self.scene.id,
+            # In turn, a render shows its own progress.
+            here=lambda on_progress: self.render(output),
+            work=self,
+            output=output,
+            finished=lambda: self.keep and self.is_whole(output),
+            needs=needs,
+        )
+
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
+        """Render; see `hwp_bench.run.engine.job.Work`."""
+        ended = threading.Event()
+        watch = threading.Thread(target=self._count, args=(output, on_progress, ended), daemon=True)
+        watch.start()
+        try:
+            self.render(output)
+        finally:
+            ended.set()
+            watch.join()
+
+    def render(self, output: Path) -> None:
+        """Render into a folder, or use the capture that exists there if `keep` says so.
+
+        The free-view clip of a capture that exists is rendered where it is missing.
+        """
+        if not self.keep:
+            _render(self.checked(), output)
+            return
+        with exclusive(output, wait=True):
+            if not _is_capture(output):
+                _render(replace(self.checked(), overwrite=True), output)
+            elif not self.is_whole(output):
+                add_free_view(self.checked().scene, open_capture(output))
+
+    def is_whole(self, output: Path) -> bool:
+        """Whether a folder holds a capture with all that is asked for."""
+        return _is_capture(output) and (not self.free_view or has_free_view(output))
+
+    def _count(self, output: Path, on_progress: OnProgress, ended: threading.Event) -> None:
+        """Report how many frames of the unfinished capture exist."""
+        while not ended.wait(_COUNT_SECONDS):
+            waiting = sum(1 for _ in output.parent.glob(f".{output.name}.*/*.npz"))
+            on_progress(waiting, self.frames)
+
+
+def _is_capture(folder: Path) -> bool:
+    """Whether a folder holds a capture that can be opened."""
+    try:
+        open_capture(folder)
+    except HwpError:
+        return False
+    return True
 
 
 def render_capture(
@@ -266,22 +222,29 @@ def render_capture(
     """
     if not isinstance(scene, Scene):
         scene = load_scene(os.fspath(place(scene, "scene")))
-    if seed is not None:
-        if whole_number(seed, "seed") < 0:
-            raise UsageError(f"is {seed}", field="seed", remedy="Use 0 or more.")
-        scene = replace(scene, seed=seed)
-    count = scene.frame_count if frame_count is None else frame_count
-    edge = DEFAULT_SIZE if size is None else size
-    check_extent(count, edge, workers)
-    if scene.sensor.h264:
-        check_encoder(scene.id)
+    request = RenderRequest(
+        scene,
+        frame_count,
+        size,
+        seed,
+        workers,
+        exr=exr,
+        overwrite=overwrite,
+        free_view=free_view,
+    ).checked()
     out = place(out, "out")
-    if out.exists() and not overwrite and (out.is_file() or any(out.iterdir())):
+    _render(request, out)
+    return open_capture(out)
+
+
+def _render(request: RenderRequest, out: Path) -> None:
+    """Render a request that was checked."""
+    if out.exists() and not request.overwrite and (out.is_file() or any(out.iterdir())):
         raise UsageError(
             "exists already", where=out, remedy="Choose another place, or --overwrite."
         )
-    kind = "-exr" if exr else ""
-    waiting = out.absolute().parent / f".{out.name}.{render_key(scene, count, edge)[:16]}{kind}"
+    key = render_key(request.scene, request.frames, request.edge)[:16]
+    waiting = out.absolute().parent / f".{out.name}.{key}{'-exr' if request.exr else ''}"
     with exclusive(waiting, wait=True):
         try:
             waiting.mkdir(parents=True, exist_ok=True)
@@ -289,9 +252,8 @@ def render_capture(
             raise HwpError(f"cannot be made ({reason_of(error)})", where=waiting) from error
         try:
             start = time.perf_counter()
-            _render_missing(scene, count, edge, waiting, workers, exr)
-            seconds = time.perf_counter() - start
-            _assemble(scene, count, edge, waiting, out, overwrite, seconds, free_view)
+            _render_missing(request, waiting)
+            _assemble(request, waiting, out, time.perf_counter() - start)
             shutil.rmtree(waiting, ignore_errors=True)
         finally:
             # Frames of a render that failed stay for the next start; nothing else does.
@@ -299,45 +261,128 @@ def render_capture(
                 waiting.rmdir()
             with contextlib.suppress(OSError):
                 waiting.with_name(f"{waiting.name}.lock").unlink()
-    return open_capture(out)
 
 
-def _render_missing(
-    scene: Scene, count: int, size: int, waiting: Path, workers: int | None, exr: bool
-) -> None:
-    missing = [frame for frame in range(count) if read_frame(waiting, frame) is None]
+def _render_missing(request: RenderRequest, waiting: Path) -> None:
+    scene = request.scene
+    missing = [frame for frame in range(request.frames) if _read_frame(waiting, frame) is None]
     if not missing:
         return
     # Built once here, so that no two processes paint the same skin.
     scene_hands(scene)
     for side in scene.sides:
         skin_atlas(of_side(scene.subject, side))
+    workers = request.workers
     if workers is None:
         workers = max(1, min(os.cpu_count() or 1, len(missing) // _FRAMES_PER_WORKER))
     with progress(f"Rendering {scene.id}", len(missing)) as update:
         if workers == 1:
-            for done, frame in enumerate(missing, start=1):
-                render_frames(scene, [frame], count, size, waiting, exr)
-                update(done)
+            RenderFrames(request, missing)({}, waiting, lambda done, total: update(done))
             return
-        works = [
-            RenderFrames(scene, missing[first::workers], count, size, exr)
-            for first in range(workers)
-        ]
-        render_in_processes(works, waiting, update)
+        works = [RenderFrames(request, missing[first::workers]) for first in range(workers)]
+        _render_in_processes(works, waiting, update)
         update(len(missing))
 
 
-def _assemble(
-    scene: Scene,
-    count: int,
-    size: int,
-    waiting: Path,
-    out: Path,
-    overwrite: bool,
-    seconds: float,
-    free_view: bool,
+@dataclass(frozen=True)
+class RenderFrames:
+    """Renders some frames of a request into a folder: the work of one process."""
+
+    #: What they are frames of.
+    request: RenderRequest
+    #: Numbers of the frames.
+    frames: Sequence[int]
+
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
+        """Render; see `hwp_bench.run.engine.job.Work`."""
+        for done, frame in enumerate(self.frames, start=1):
+            render_waiting(self.request, frame, output)
+            on_progress(done, len(self.frames))
+
+
+def frame_file(folder: Path, frame: int) -> Path:
+    """Path of a rendered frame; its linear layers lie beside it as `.exr`."""
+    return folder / f"{frame:06d}.npz"
+
+
+def render_waiting(request: RenderRequest, frame: int, folder: Path) -> None:
+    """Render one frame into the folder where it waits for its capture."""
+    count, size = request.frames, request.edge
+    result = render_frame(request.scene, frame, count, size)
+    cost = {
+        "seconds": dict(result.cost.seconds),
+        "rays": dict(result.cost.rays),
+        "subframes": result.plan.subframes,
+    }
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        rgb=result.rgb,
+        clean=result.clean,
+        coverage=result.coverage.astype(np.float32),
+        clean_coverage=result.clean_coverage.astype(np.float32),
+        cost=np.frombuffer(json.dumps(cost).encode(), dtype=np.uint8),
+    )
+    path = frame_file(folder, frame)
+    if request.exr:
+        write_layers(path.with_suffix(".exr"), request.scene, result, count, size)
+    # Last: the frame counts as rendered only when all of it is there.
+    atomic_write(path, buffer.getvalue())
+
+
+def _read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
+    """Read a rendered frame; None if it is missing or damaged."""
+    try:
+        return read_npz(frame_file(folder, frame))
+    except BadInput:
+        return None
+
+
+def _render_in_processes(
+    works: Sequence[RenderFrames], folder: Path, on_progress: Callable[[int], None]
 ) -> None:
+    """Render frames in as many processes as there are works; if one fails, all are ended."""
+    stop = threading.Event()
+    done = [0] * len(works)
+
+    def run(index: int) -> None:
+        def count(steps: int, total: int) -> None:
+            done[index] = steps
+            on_progress(sum(done))
+
+        # One thread each: the processes share the processors.
+        job = LocalJob(works[index], {}, folder.absolute(), dict.fromkeys(THREADS, "1"))
+        try:
+            run_in_process(job, count, stop.is_set)
+        except BaseException:
+            stop.set()
+            raise
+
+    with ThreadPoolExecutor(len(works)) as pool:
+        futures = [pool.submit(run, index) for index in range(len(works))]
+        try:
+            while wait(futures, timeout=1.0).not_done:
+                pass  # a wait without end would not let Ctrl-C through on every system
+        finally:
+            stop.set()
+    for error in (future.exception() for future in futures):
+        if isinstance(error, WorkerLost):
+            problem = f"a rendering process was killed ({error})"
+            raise HwpError(problem, where=works[0].request.scene.id, remedy=_REMEDY) from error
+        if isinstance(error, HwpError):
+            raise type(error)(
+                error.problem,
+                where=error.where,
+                field=error.field,
+                remedy=error.remedy or _REMEDY,
+            ) from error
+        if error is not None and not isinstance(error, Stopped):
+            raise error
+
+
+def _assemble(request: RenderRequest, waiting: Path, out: Path, seconds: float) -> None:
+    """Make the capture of the frames that wait."""
+    scene, count, size = request.scene, request.frames, request.edge
     plans = [plan(scene, frame, count, size) for frame in range(count)]
     truth = true_hands(scene, plans)
     cameras = Cameras(
@@ -347,6 +392,7 @@ def _assemble(
     info = _info(scene, plans, size)
     costs = []
     estimates = estimate_hands(scene, truth, plans)
+    overwrite = request.overwrite
     with CaptureWriter(out, info, estimates, cameras, overwrite=overwrite) as writer:
         videos = [_video(scene, waiting, info, name) for name in ("rgb", "clean")]
         for item in plans:
@@ -362,17 +408,18 @@ def _assemble(
             writer.clean_mask(item.frame, eight_bit_coverage(clean_coverage))
             mask = estimate_mask(scene, item, coverage, clean_coverage)
             writer.mask(item.frame, confused_mask(scene, item, mask, coverage, rgb))
-            layers = exr_file(waiting, item.frame)
+            layers = frame_file(waiting, item.frame).with_suffix(".exr")
             if layers.exists():
                 writer.extra(f"exr/{layers.name}", layers.read_bytes())
             costs.append(json.loads(arrays["cost"].tobytes()))
         writer.true_hands(truth)
         write_truth(writer.folder, scene.subject, scene.sides)
         writer.extra("scene.json", canonical_json(scene.to_json()))
-        if subject := subject_json(scene):
-            writer.extra("subject.json", canonical_json(subject))
+        if off := distances(scene):
+            rows = {side: asdict(distance) for side, distance in off.items()}
+            writer.extra("subject.json", canonical_json(rows))
         writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
-        if free_view:
+        if request.free_view:
             write_free_view(scene, writer.folder / FREE_VIEW, info, estimates)
 
 
@@ -387,7 +434,7 @@ def _video(scene: Scene, waiting: Path, info: CaptureInfo, name: str) -> Iterato
 
 
 def _waiting_frame(waiting: Path, frame: int) -> dict[str, np.ndarray]:
-    arrays = read_frame(waiting, frame)
+    arrays = _read_frame(waiting, frame)
     if arrays is None:
         frame_file(waiting, frame).unlink(missing_ok=True)
         raise HwpError(
@@ -400,22 +447,7 @@ def _waiting_frame(waiting: Path, frame: int) -> dict[str, np.ndarray]:
 
 def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters]:
     """The true hand parameters of every frame, by side."""
-    subjects = scene_hands(scene)
-    focus = focus_point()
-    truth = {}
-    staged = [hands_at(scene, item.seconds) for item in plans]
-    for side in scene.sides:
-        rows = [
-            hand_parameters(hands[side], side, subjects[side].model_joints, focus)
-            for hands in staged
-        ]
-        truth[side] = HandParameters(
-            pose=np.stack([pose for pose, _ in rows]),
-            betas=subjects[side].betas,
-            transl=np.stack([transl for _, transl in rows]),
-            valid=np.ones(len(plans), dtype=bool),
-        )
-    return truth
+    return parameters_of(scene, [hands_at(scene, item.seconds) for item in plans])
 
 
 def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:

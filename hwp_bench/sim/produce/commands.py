@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -70,10 +71,10 @@ def print_plan(args: argparse.Namespace) -> int:
     reports = [forecast(scene, args.frames, args.size, probe=not args.no_probe) for scene in scenes]
     off = {scene.id: hands for scene in scenes if (hands := distances(scene))}
     if args.json:
-        rows = [report.to_json() for report in reports]
+        rows = [asdict(report) for report in reports]
         for row in rows:
             for side, item in off.get(row["scene"], {}).items():
-                row.setdefault("subject", {})[side] = item.to_json()
+                row.setdefault("subject", {})[side] = asdict(item)
         print(json.dumps(rows, indent=1))
     else:
         tables = [plan_table(reports)] + ([] if args.no_probe else [share_table(reports)])
@@ -126,7 +127,8 @@ def render(args: argparse.Namespace) -> int:
 
 def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine) -> list[Path]:
     from hwp_bench.run.engine.options import needs_of
-    from hwp_bench.sim.produce.suites import RenderCapture, render_job, workers_each
+    from hwp_bench.sim.produce.capture import RenderRequest
+    from hwp_bench.sim.produce.suites import workers_each
 
     needs = needs_of(args)
     jobs = []
@@ -136,7 +138,7 @@ def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine
             raise UsageError(
                 "exists already", where=out, remedy="Choose another place or --overwrite."
             )
-        work = RenderCapture(
+        request = RenderRequest(
             scene,
             args.frames,
             args.size,
@@ -146,7 +148,7 @@ def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine
             overwrite=args.overwrite,
             free_view=args.free_view,
         )
-        jobs.append(render_job(work, out, needs))
+        jobs.append(request.job(out, needs))
     engine.run(jobs, lambda index: None)
     return [job.output for job in jobs]
 

@@ -39,15 +39,8 @@ def confused_mask(
 ) -> np.ndarray:
     """Add to an estimated mask what colours like skin do to it.
 
-    Args:
-        scene: the scene.
-        plan: the frame's recipe.
-        mask: (S, S) uint8, as `estimate_mask` gives it.
-        coverage: (S, S) exact share of visible hand, 0-1.
-        rgb: (S, S, 3) uint8 sRGB, the frame.
-
-    Returns:
-        (S, S) uint8, 255 = hand.
+    Takes `mask` (S, S) uint8, `coverage` (S, S) exact share of visible hand, `rgb` (S, S, 3) uint8
+    sRGB. Returns (S, S) uint8, 255 = hand.
     """
     from scipy.ndimage import distance_transform_edt, gaussian_filter
 
@@ -72,9 +65,7 @@ def confused_mask(
 def likeness(rgb: np.ndarray, coverage: np.ndarray) -> np.ndarray:
     """How much every pixel looks like the hand of its frame: (S, S), 0-1.
 
-    Args:
-        rgb: (S, S, 3) uint8 sRGB.
-        coverage: (S, S) share of hand; at least one pixel is more than half hand.
+    Takes `rgb` (S, S, 3) uint8 sRGB, `coverage` (S, S) share of hand.
     """
     import cv2
 
@@ -91,11 +82,7 @@ def likeness(rgb: np.ndarray, coverage: np.ndarray) -> np.ndarray:
 def _errs(name: str, scene: Scene, plan: FramePlan, chance: np.ndarray) -> np.ndarray:
     """Where one kind of error is: (S, S), 0-1. It wanders over the seconds.
 
-    Args:
-        name: the kind.
-        scene: the scene.
-        plan: the frame's recipe.
-        chance: (S, S) 0-1, how much colour and place speak for it.
+    Takes `chance` (S, S) 0-1.
     """
     size = len(chance)
     ticks = (np.arange(size) + 0.5) / size
@@ -133,11 +120,6 @@ def estimate_hands(
     estimator's habit, which no averaging over frames removes. A gross failure keeps finite
     parameters, far off, and is flagged by `valid`. Where the scene names an estimator, its errors
     come on top.
-
-    Args:
-        scene: the scene.
-        truth: the true parameters by side.
-        plans: the recipe of every frame.
     """
     angle, length = np.array([_errors(plan) for plan in plans]).T
     hard = np.array(
@@ -177,14 +159,8 @@ def estimate_mask(
     Soft and slightly displaced borders, bites around occluders, parts of occluders taken for
     hand, smeared borders taken for hand, and sometimes a missed part.
 
-    Args:
-        scene: the scene.
-        plan: the frame's recipe.
-        coverage: (S, S) exact share of visible hand, 0-1.
-        clean_coverage: (S, S) the same without the occluders.
-
-    Returns:
-        (S, S) uint8, 255 = hand.
+    Takes `coverage` (S, S) exact share of visible hand, `clean_coverage` (S, S) the same without
+    the occluders. Returns (S, S) uint8, 255 = hand.
     """
     from scipy.ndimage import gaussian_filter
 

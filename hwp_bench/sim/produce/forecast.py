@@ -5,8 +5,7 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -75,10 +74,6 @@ class Forecast:
                 shares[kind] = shares.get(kind, 0.0) + extra * weight / sum(weights)
         return shares
 
-    def to_json(self) -> dict[str, Any]:
-        """Return JSON values."""
-        return asdict(self)
-
 
 def forecast(
     scene: Scene, frame_count: int | None = None, size: int | None = None, *, probe: bool = True
@@ -87,15 +82,6 @@ def forecast(
 
     Frames are grouped by the effects that act in them. Of each group the frame with the median
     number of sub-frames is rendered once and its cost multiplied.
-
-    Args:
-        scene: the scene.
-        frame_count: frames over which it is spread; its own if None.
-        size: edge of the image in pixels; 256 if None.
-        probe: render the probes; without them nothing is predicted.
-
-    Raises:
-        UsageError: a number is out of range.
     """
     count = scene.frame_count if frame_count is None else frame_count
     edge = 256 if size is None else size

@@ -32,6 +32,7 @@ from hwp_bench.sim.scene.motion import (
     hand_parameters,
     heading_matrix,
     intrinsics,
+    parameters_of,
     scene_hands,
     track_moment,
 )
@@ -49,6 +50,18 @@ _FEWEST = 4
 _ANGLES, _TURN = 5.0, 15.0
 # Turn about the axis from one camera to the next, rad: no two azimuths meet.
 _GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
+#: Version of the clips; one of another version is made again.
+VERSION = 1
+#: What `source.kind` of a clip says.
+KIND = "simulated free view"
+#: Least distance between two hands, m.
+GAP = 0.015
+#: Largest distance of the hand from the middle of the image, in sizes of the image.
+REACH = 0.47
+#: Fewest pixels that the hand covers fully, of the image's; else the camera moves to the fingers.
+LEAST_HAND = 0.005
+# How often it moves at most, each time half of the way.
+_MOVES = 4
 
 
 def unseen_gestures(scene: Scene) -> tuple[str, ...]:
@@ -82,10 +95,6 @@ def free_moments(scene: Scene, count: int = FRAMES) -> list[dict[str, HandMoment
 
     Place and heading are the track's at times spread over the capture, with a turn of the whole
     hand; joint angles are those of an unseen gesture, varied.
-
-    Args:
-        scene: the scene.
-        count: frames.
     """
     names = unseen_gestures(scene)
     frames = []
@@ -114,10 +123,6 @@ def camera_directions(scene: Scene, count: int = FRAMES) -> np.ndarray:
 
     The z axis points along the fingers. Directions are spread evenly over the sphere without the
     cone about the forearm: a Fibonacci lattice, turned and shuffled by the scene's seed.
-
-    Args:
-        scene: the scene.
-        count: frames.
     """
     rng = generator(scene.seed, "free cameras")
     lowest = -np.cos(np.radians(FOREARM_CONE))
@@ -166,20 +171,6 @@ def looking_at(center: np.ndarray, eye: np.ndarray) -> np.ndarray:
     return view
 
 
-#: Version of the clips; one of another version is made again.
-VERSION = 1
-#: What `source.kind` of a clip says.
-KIND = "simulated free view"
-#: Least distance between two hands, m.
-GAP = 0.015
-#: Largest distance of the hand from the middle of the image, in sizes of the image.
-REACH = 0.47
-#: Fewest pixels that the hand covers fully, of the image's; else the camera moves to the fingers.
-LEAST_HAND = 0.005
-# How often it moves at most, each time half of the way.
-_MOVES = 4
-
-
 @dataclass(frozen=True, eq=False)
 class FreeView:
     """One frame of a clip before it is rendered."""
@@ -195,10 +186,6 @@ def free_views(scene: Scene, count: int = FRAMES) -> list[FreeView]:
 
     Two hands keep `GAP` between them. The camera looks at the middle of the hands from the
     distance of the scene's own camera, or from farther away where they would not fit.
-
-    Args:
-        scene: the scene.
-        count: frames.
     """
     directions = camera_directions(scene, count)
     return [
@@ -261,29 +248,17 @@ def has_free_view(capture: Path) -> bool:
 
 
 def add_free_view(scene: Scene, capture: Capture) -> None:
-    """Render the clip into a capture of this scene that has none.
-
-    Raises:
-        HwpError: it cannot be written.
-    """
+    """Render the clip into a capture of this scene that has none."""
     write_free_view(scene, capture.root / FREE_VIEW, capture.info, capture.hands)
 
 
 def write_free_view(
     scene: Scene, folder: Path, info: CaptureInfo, estimates: Mapping[str, HandParameters]
 ) -> None:
-    """Render the clip.
+    """Render the clip of a capture into a folder.
 
-    Args:
-        scene: the scene.
-        folder: where it goes; an existing clip is replaced.
-        info: description of the capture that it belongs to.
-        estimates: hand parameters that a method gets in that capture, by side. The clip has their
-            betas, because an avatar has one shape; angles are true, and the middle of the palm
-            is in its true place. `truth/hands.npz` has the true betas too.
-
-    Raises:
-        HwpError: it cannot be written.
+    It has the betas of the capture's estimates, because an avatar has one shape; angles are true,
+    and the middle of the palm is in its true place. `truth/hands.npz` has the true betas too.
     """
     cost = RenderCost()
     gain = steady_gain(scene, cost)
@@ -300,7 +275,8 @@ def write_free_view(
         viewmats=np.stack([item.view for item in views]),
     )
     betas = {side: hand.betas for side, hand in estimates.items()}
-    given, truth = (_parameters(scene, views, shapes) for shapes in (betas, None))
+    moments = [item.hands for item in views]
+    given, truth = (parameters_of(scene, moments, shapes) for shapes in (betas, None))
     with CaptureWriter(folder, _info(info, len(views)), given, cameras, overwrite=True) as writer:
         for frame, (_, rgb, coverage) in enumerate(pictures):
             writer.frame(frame, rgb)
@@ -319,8 +295,7 @@ def render_free(
     Where the hand is hidden, by the sleeve or by what is worn, the camera moves towards the
     fingers until some of it is seen.
 
-    Returns:
-        the frame with the camera that was taken, (S, S, 3) uint8 sRGB, (S, S) coverage 0-1.
+    Returns the frame with the camera that was taken, (S, S, 3) uint8 sRGB, (S, S) coverage 0-1.
     """
     for _ in range(_MOVES):
         rgb, coverage = render_view(scene, item.hands, item.view, size, gain, cost)
@@ -330,26 +305,6 @@ def render_free(
         towards = -item.view[2, :3] @ axes
         item = _view(scene, item.hands, unit(towards + np.array([0.0, 0.0, 1.0])))
     return item, rgb, coverage
-
-
-def _parameters(
-    scene: Scene, views: list[FreeView], betas: Mapping[str, np.ndarray] | None
-) -> dict[str, HandParameters]:
-    """Hand parameters of every frame, by side, with these betas or the true ones."""
-    found = {}
-    for side, subject in scene_hands(scene).items():
-        shape = subject.betas if betas is None else betas[side]
-        joints = subject.model_joints
-        if betas is not None:
-            joints = subject.model.joints + subject.model.joint_basis @ shape
-        rows = [hand_parameters(item.hands[side], side, joints, focus_point()) for item in views]
-        found[side] = HandParameters(
-            pose=np.stack([pose for pose, _ in rows]),
-            betas=shape,
-            transl=np.stack([transl for _, transl in rows]),
-            valid=np.ones(len(views), dtype=bool),
-        )
-    return found
 
 
 def _info(info: CaptureInfo, count: int) -> CaptureInfo:

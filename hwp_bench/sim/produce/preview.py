@@ -47,17 +47,7 @@ FRAME_MS = 140
 def write_preview(
     scene: Scene, folder: Path, *, frame_count: int = 48, size: int = 160
 ) -> tuple[Path, Path]:
-    """Write `ID-sheet.png` and `ID.gif`, each frame next to its clean version.
-
-    Args:
-        scene: the scene.
-        folder: where to.
-        frame_count: 10 to 400 frames over the whole capture.
-        size: edge of a frame in pixels, 32 to 512.
-
-    Raises:
-        UsageError: a number is out of range.
-    """
+    """Write `ID-sheet.png` and `ID.gif`, each frame next to its clean version."""
     if not 10 <= frame_count <= 400 or not 32 <= size <= 512:
         raise UsageError("10 to 400 frames of 32 to 512 px are drawn", field="--frames, --size")
     results = [
@@ -110,15 +100,7 @@ _PATH = 200
 
 
 def draw_stage(scene: Scene, folder: Path) -> Path:
-    """Write `ID-stage.png`: the busiest frame of the scene, seen from the side.
-
-    Args:
-        scene: the scene.
-        folder: where to.
-
-    Raises:
-        MissingDependency: pyvista is not installed, or there is no OpenGL to draw with.
-    """
+    """Write `ID-stage.png`: the busiest frame of the scene, seen from the side."""
     try:
         import pyvista
     except ImportError as error:

@@ -76,14 +76,7 @@ def growth(curl: np.ndarray, edge_on: np.ndarray) -> np.ndarray:
 def landmark_noise(
     rng: np.random.Generator, frames: int, step: float, habit: float = LANDMARK_HABIT
 ) -> np.ndarray:
-    """Unit noise of 21 landmarks: (F, 21, 5), x and y in the image, then x, y, z in the world.
-
-    Args:
-        rng: source of random numbers.
-        frames: number of frames.
-        step: seconds between two.
-        habit: share of the variance that is the same in all frames.
-    """
+    """Unit noise of 21 landmarks: (F, 21, 5), x and y in the image, then x, y, z in the world."""
     size = (21, _NUMBERS)
     constant = rng.normal(size=size)
     moving = wandering(rng, frames, step, 21 * _NUMBERS).reshape(frames, *size)
@@ -92,12 +85,6 @@ def landmark_noise(
 
 def wandering(rng: np.random.Generator, frames: int, step: float, width: int) -> np.ndarray:
     """Smooth noise of unit variance: (F, width), correlated by (1 + t / m) exp(-t / m).
-
-    Args:
-        rng: source of random numbers.
-        frames: number of frames.
-        step: seconds between two; any, the correlation is that of the time between them.
-        width: independent channels.
 
     Source: the Matern process of order 3/2 as a linear state of value and slope, sampled exactly
     (Hartikainen and Sarkka, 2010), with m = `MEMORY`.
@@ -127,8 +114,7 @@ _WRIST, _INDEX, _MIDDLE, _LITTLE = 0, 5, 9, 17
 def curl(pose: np.ndarray) -> np.ndarray:
     """How far the four fingers are bent: (F,), 0 straight to 1 fist.
 
-    Args:
-        pose: (F, 16, 3) axis-angle rad.
+    Takes `pose` (F, 16, 3) axis-angle rad.
     """
     four = [
         row
@@ -142,8 +128,7 @@ def curl(pose: np.ndarray) -> np.ndarray:
 def edge_on(landmarks: np.ndarray) -> np.ndarray:
     """How far a palm is turned from the camera: (F,), 0 facing it or away, 1 seen from its edge.
 
-    Args:
-        landmarks: (F, 21, 3) m, camera axes.
+    Takes `landmarks` (F, 21, 3) m.
     """
     wrist = landmarks[:, _WRIST]
     normal = np.cross(landmarks[:, _INDEX] - wrist, landmarks[:, _LITTLE] - wrist)
@@ -185,13 +170,7 @@ def tracked(
 ) -> HandParameters:
     """Add a tracker's errors to an estimate.
 
-    Args:
-        scene: the scene.
-        settings: of its estimator.
-        side: which hand.
-        estimate: parameters with the errors of the effects.
-        times: (F,) of the frames, s.
-        views: (F, 4, 4) world to camera.
+    Takes `times` (F,) of the frames, `views` (F, 4, 4) world to camera.
     """
     rng = generator(scene.seed, "tracker", side)
     failed = rng.uniform(size=len(times)) < settings.failures
@@ -220,12 +199,8 @@ def parameter_errors(
 ) -> ParameterErrors:
     """Answer of a fit to wrong landmarks, to first order.
 
-    Args:
-        rest: the hand at rest.
-        pose: (F, 16, 3) axis-angle rad.
-        transl: (F, 3) m.
-        views: (F, 4, 4) world to camera.
-        noise: (F, 21, 5) unit noise of the landmarks, as `landmark_noise` gives it.
+    Takes `pose` (F, 16, 3) axis-angle rad, `transl` (F, 3) m, `views` (F, 4, 4) world to camera,
+    `noise` (F, 21, 5) unit noise of the landmarks.
     """
     posed = posed_skeleton(rest, pose, transl).seen_by(views)
     grown = growth(curl(pose), edge_on(posed.landmarks))

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import astuple, dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,10 +23,8 @@ from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.hand import SubjectHand, is_off_template, subject_hand
 from hwp_bench.sim.subject.subject import Subject
 
-if TYPE_CHECKING:
-    from hwp_bench.sim.subject.hand import SubjectHand
-
-
+# The hand model whose geometry may lie in a capture; MANO's may not be passed on.
+_FREE = "anny"
 # Triangles of the hand model that are tried for each point.
 _TRIED = 24
 # What lies so far before the wrist's joint counts, m: sleeves hide the rest.
@@ -53,25 +50,16 @@ class TemplateDistance:
     #: The betas.
     betas: tuple[float, ...]
 
-    def to_json(self) -> dict[str, Any]:
-        """Return JSON values."""
-        return asdict(self)
-
 
 def template_distance(hand: SubjectHand) -> TemplateDistance:
-    """Measure a subject at rest against the hand model with the subject's betas.
-
-    Args:
-        hand: the subject's hand.
-    """
+    """Measure a subject at rest against the hand model with the subject's betas."""
     from trimesh.triangles import closest_point
 
     model = hand.model
     shaped = model.vertices + model.shape_basis @ hand.betas
     places, _ = hand.pose(np.zeros((16, 3)), np.zeros(3))
     forward = -1.0 if model.side == "right" else 1.0
-    # As in a capture, the middle of both palms is in the same place.
-    aside = palm_of(hand.model_joints) - palm_of(hand.joints)
+    aside = _aside(hand)
     places = places[(places[:, 0] - hand.joints[0, 0]) * forward > _BEFORE] + aside
     triangles = shaped[model.faces]
     _, near = kd_tree(triangles.mean(axis=1)).query(places, k=_TRIED)
@@ -91,8 +79,9 @@ def template_distance(hand: SubjectHand) -> TemplateDistance:
     )
 
 
-# The hand model whose geometry may lie in a capture; MANO's may not be passed on.
-_FREE = "anny"
+def _aside(hand: SubjectHand) -> np.ndarray:
+    """Way from the subject's palm to the model's, (3,) m: a capture puts both in one place."""
+    return palm_of(hand.model_joints) - palm_of(hand.joints)
 
 
 def subject_templates(subject: Subject, sides: Sequence[str]) -> dict[str, HandTemplate]:
@@ -107,25 +96,20 @@ def subject_templates(subject: Subject, sides: Sequence[str]) -> dict[str, HandT
 
 
 def subject_template(hand: SubjectHand) -> HandTemplate:
-    """A subject's hand as a template of the hand model's triangles without shape parameters.
-
-    Args:
-        hand: of a subject whose template has the hand model's triangles.
-    """
+    """A subject's hand as a template of the hand model's triangles without shape parameters."""
     template = hand.template
     smooth = hand.rest
     normals = surface_normals(smooth, hand.faces, hand.normal_sum)
     # The first vertices of the fine mesh are those of the template.
     surface = (smooth + hand.relief[:, None] * normals)[: len(template.vertices)]
     joints = template.joints + template.joint_basis @ hand.betas
-    # A capture puts the middle of both palms in one place, and turns hands about the model's wrist.
-    aside = palm_of(hand.model_joints) - palm_of(hand.joints)
-    joints = joints + aside
+    joints = joints + _aside(hand)
+    # A capture turns hands about the model's wrist.
     joints[0] = hand.model_joints[0]
     return rebuilt(
         template,
         name=hand.model.name,
-        vertices=surface + aside,
+        vertices=surface + _aside(hand),
         shape_basis=np.zeros_like(template.shape_basis),
         joints=joints,
         joint_basis=np.zeros_like(template.joint_basis),
@@ -145,9 +129,8 @@ def add_subject_mesh(capture: Capture) -> bool:
 
     They follow from the scene that lies in the capture. Digests do not change.
 
-    Returns:
-        Whether the capture has them now; False for other captures than simulated ones of the
-        free hand, and where the folder cannot be written to.
+    Returns whether the capture has them now; False for other captures than simulated ones of the
+    free hand, and where the folder cannot be written to.
     """
     path, source = capture.root / EXTRA / "scene.json", capture.info.source
     if (capture.root / TRUE_TEMPLATE).is_file():
@@ -166,9 +149,6 @@ def add_subject_mesh(capture: Capture) -> bool:
         return False
 
 
-_TITLE = "Subjects off the hand model: distance of its surface at the true betas, at rest"
-
-
 def distances(scene: Scene) -> dict[str, TemplateDistance]:
     """Distance of the hand model from each hand of a scene; empty for one that it describes."""
     if not is_off_template(scene.subject):
@@ -176,35 +156,15 @@ def distances(scene: Scene) -> dict[str, TemplateDistance]:
     return {side: template_distance(hand) for side, hand in scene_hands(scene).items()}
 
 
-def subject_json(scene: Scene) -> dict[str, dict[str, Any]]:
-    """The same as JSON values, by side."""
-    return {side: found.to_json() for side, found in distances(scene).items()}
-
-
 def subject_table(found: dict[str, dict[str, TemplateDistance]]) -> Table:
-    """One row for each hand.
-
-    Args:
-        found: `distances` by the name of the scene.
-    """
+    """One row for each hand."""
     rows: list[tuple[Cell, ...]] = [
-        (
-            name,
-            side,
-            item.surface,
-            item.mean_mm,
-            item.most_mm,
-            item.largest_mm,
-            item.joints_mm,
-            item.farthest_joint_mm,
-        )
+        (name, side, *astuple(item)[:-1])
         for name, hands in found.items()
         for side, item in hands.items()
     ]
     numbers = ("mean, mm", "95 %", "largest", "joints, mean mm", "farthest joint")
-    names = ("scene", "hand", "surface")
-    return Table(
-        _TITLE,
-        (*(Column(name) for name in names), *(Column(name, digits=1) for name in numbers)),
-        tuple(rows),
-    )
+    columns = [Column(name) for name in ("scene", "hand", "surface")]
+    columns += [Column(name, digits=1) for name in numbers]
+    title = "Subjects off the hand model: distance of its surface at the true betas, at rest"
+    return Table(title, tuple(columns), tuple(rows))

@@ -25,12 +25,7 @@ def plane_names() -> tuple[str, ...]:
 
 
 def plane_texture(name: str, seed: int) -> np.ndarray:
-    """Paint a backdrop: (PLANE_TEXTURE, PLANE_TEXTURE, 3) float32 linear.
-
-    Args:
-        name: one of `plane_names`.
-        seed: of the scene.
-    """
+    """Paint a backdrop: (PLANE_TEXTURE, PLANE_TEXTURE, 3) float32 linear."""
     import cv2
 
     ticks = np.linspace(-1.0, 1.0, PLANE_TEXTURE)
@@ -140,11 +135,7 @@ def backdrop_names() -> tuple[str, ...]:
 
 
 def check_backdrop(name: str, where: str) -> None:
-    """Refuse an unknown backdrop.
-
-    Raises:
-        BadInput: it lists the known ones.
-    """
+    """Refuse an unknown backdrop."""
     if name not in _BACKDROPS and name not in backdrop_names():
         raise BadInput(
             f"is {name!r}",
@@ -188,13 +179,7 @@ def _texture(name: str, seed: int) -> np.ndarray:
 def backdrop_colors(name: str, seed: int, directions: np.ndarray) -> np.ndarray:
     """The backdrop in each viewing direction, under white light.
 
-    Args:
-        name: a backdrop.
-        seed: seed of the scene.
-        directions: (H, W, 3) world, z away from the camera.
-
-    Returns:
-        (H, W, 3) linear reflectance.
+    Takes `directions` (H, W, 3) world. Returns (H, W, 3) linear reflectance.
     """
     import cv2
 

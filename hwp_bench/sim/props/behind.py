@@ -105,13 +105,7 @@ def paint(
 ) -> None:
     """Paint one shape into an image.
 
-    Args:
-        image: (H, W, 3) linear, is changed.
-        places: x and y (H, W) of the pixels, nearly the same down each column and each row.
-        at: the shape's middle.
-        reach: farthest that it extends from there.
-        color: (3,) linear.
-        cover: opacity 0-1 and a factor on the colour at each place.
+    Takes `image` (H, W, 3) linear, `color` (3,) linear.
     """
     x, y = places
     rows = np.flatnonzero(np.abs(y[:, [0, -1]] - at[1]).min(axis=1) < reach)
@@ -304,13 +298,7 @@ class _Grid:
 def face_picture(skin: tuple[float, float, float], seed: int, closed: bool) -> np.ndarray:
     """Paint a face.
 
-    Args:
-        skin: sRGB of the skin.
-        seed: which face.
-        closed: whether the eyes are.
-
-    Returns:
-        (_ROWS, _COLUMNS, 4) float32: linear reflectance times opacity, and opacity.
+    Returns (_ROWS, _COLUMNS, 4) float32: linear reflectance times opacity, and opacity.
     """
     import cv2
 
@@ -428,13 +416,8 @@ def draw_behind(
 ) -> np.ndarray:
     """Draw clutter, face and arm, the nearest last: (H, W, 3) float64 linear reflectance.
 
-    Args:
-        behind: what is there.
-        tone: the subject's skin tone, where a face or an arm has none of its own.
-        field_of_view: degrees.
-        directions: (H, W, 3) of the pixels, world, z away from the camera.
-        seconds: time of the capture.
-        image: (H, W, 3) linear reflectance of the backdrop.
+    Takes `directions` (H, W, 3) of the pixels, `image` (H, W, 3) linear reflectance of the
+    backdrop.
     """
     drawn = image.astype(np.float64)
     half = float(np.tan(np.radians(field_of_view) / 2.0))

@@ -517,11 +517,7 @@ def object_names() -> tuple[str, ...]:
 
 
 def check_object(name: str) -> None:
-    """Refuse an object that does not exist.
-
-    Raises:
-        BadInput: it lists the known ones.
-    """
+    """Refuse an object that does not exist."""
     if name not in _BUILDERS:
         raise BadInput(
             f"there is no object {name!r}",

@@ -37,12 +37,6 @@ def exposed(stage: Stage, window: Window, sky: dict[str, np.ndarray], lens: Lens
 
     Hands are posed at the opening, the middle and the closing of the shutter and move on
     parabolas between; each sub-frame casts one ray a pixel, at another place inside it.
-
-    Args:
-        stage: builds hands and objects.
-        window: the time that the shutter is open.
-        sky: what `Stage.seen_sky` says of the hands in the frame's middle.
-        lens: the camera in the frame's middle.
     """
     scene, recipe = window.scene, window.recipe
     lights = lights_at(scene, recipe)
@@ -130,13 +124,7 @@ class Window:
 
 
 class Rows:
-    """Hands, sleeves and objects for a sensor that reads its rows in turn.
-
-    Args:
-        stage: builds them.
-        window: the time around the frame.
-        sky: what `Stage.seen_sky` says of the hands in the frame's middle.
-    """
+    """Hands, sleeves and objects for a sensor that reads its rows in turn."""
 
     def __init__(self, stage: Stage, window: Window, sky: dict[str, np.ndarray]) -> None:
         self._stage = stage
@@ -186,10 +174,7 @@ def knots(
 ) -> Knots:
     """Take a surface at three instants, in the camera's axes.
 
-    Args:
-        surface_at: the surface at a time, world.
-        view_at: (4, 4) world to camera at a time.
-        reach: the times are -reach / 2, 0 and reach / 2.
+    Takes `view_at` (4, 4) world to camera at a time.
     """
     first, middle, last = (
         transformed(surface_at(time), view_at(time)) for time in (-reach / 2.0, 0.0, reach / 2.0)
@@ -200,15 +185,7 @@ def knots(
 def row_by_row(at: Knots, reach: float, time: float, readout: float, lens: Lens) -> Surface:
     """A surface with every vertex where it stands when its row is read.
 
-    Args:
-        at: the surface at three instants; it moves on parabolas between.
-        reach: time from the first of them to the last.
-        time: when the middle row is read, 0 at the second instant.
-        readout: time from the first row to the last, in the unit of the others.
-        lens: the camera, whose view is that of `time`.
-
-    Returns:
-        The surface in the world, to be seen through `lens` as if all rows were read at once.
+    Returns the surface in the world, to be seen through `lens` as if all rows were read at once.
     """
     moments = np.full((len(at[0].vertices), 1), time)
     for _ in range(_ROUNDS):

@@ -134,16 +134,8 @@ def render_view(
     Lamps, windows and walls stay where they are in the world. The backdrop is the one that the
     scene's own camera sees, and nothing moves before it.
 
-    Args:
-        scene: the scene.
-        hands: what the hands do, by side.
-        view: (4, 4) world to camera.
-        size: edge of the image, px.
-        gain: (3,) what `steady_gain` returns.
-        cost: is charged with time and rays.
-
-    Returns:
-        (S, S, 3) uint8 sRGB and (S, S) share of hand, 0-1.
+    Takes `view` (4, 4) world to camera, `gain` (3,) what `steady_gain` returns. Returns (S, S, 3)
+    uint8 sRGB and (S, S) share of hand, 0-1.
     """
     stage = Stage(scene, cost)
     with cost.time("hands"):
@@ -220,11 +212,7 @@ def frame_layers(scene: Scene, result: SimulatedFrame, frame_count: int, size: i
 def write_layers(
     path: Path, scene: Scene, result: SimulatedFrame, frame_count: int, size: int
 ) -> None:
-    """Write the layers of a frame as OpenEXR (32-bit floats, zip).
-
-    Raises:
-        HwpError: the file cannot be written.
-    """
+    """Write the layers of a frame as OpenEXR (32-bit floats, zip)."""
     import OpenImageIO as oiio
 
     layers = frame_layers(scene, result, frame_count, size)

@@ -56,16 +56,7 @@ class Lens:
 def render_instant(
     scene: Scene, lens: Lens, body: Body, things: Body | None, lights: Lights, cost: RenderCost
 ) -> LinearImage:
-    """Render one instant.
-
-    Args:
-        scene: for its backdrop.
-        lens: camera and sampling.
-        body: hands and sleeves.
-        things: objects, or None: then none is intersected.
-        lights: the light.
-        cost: is charged with time and rays.
-    """
+    """Render one instant."""
     with cost.time("backdrop"):
         directions = _directions(lens)
         color = backdrop_colors(scene.background, scene.seed, directions)

@@ -44,12 +44,6 @@ def metered_gain(scene: Scene, auto: AutoControl, seconds: float, cost: RenderCo
     """Factors on red, green and blue at a time: (3,).
 
     What the looks ask for is averaged in stops with weights that fall by e in one lag.
-
-    Args:
-        scene: the scene.
-        auto: how its camera controls itself.
-        seconds: time of the frame, from 0.
-        cost: is charged with the looks that this process has not had yet.
     """
     tick = auto.lag / LOOKS_PER_LAG
     last = int(np.floor(seconds / tick))

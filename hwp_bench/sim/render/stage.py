@@ -61,14 +61,7 @@ def person_parts(
     parameters: dict[str, tuple[np.ndarray, np.ndarray]],
     subdivisions: int = FINE,
 ) -> list[Part]:
-    """Build a person's parts: first the hands, then a sleeve or an arm for each, then the rest.
-
-    Args:
-        subject: who.
-        hands: what the hands do.
-        parameters: pose (16, 3) rad and transl (3,) m of every hand.
-        subdivisions: of the hands' mesh.
-    """
+    """Build a person's parts: first the hands, then a sleeve or an arm for each, then the rest."""
     skins, arms, worn = [], [], []
     bare = subject.looks.arm == "bare"
     for side, moment in hands.items():
@@ -109,14 +102,7 @@ def _worn(
 def person_openness(
     subject: Subject, shares: dict[str, np.ndarray], count: int, subdivisions: int = FINE
 ) -> np.ndarray:
-    """Share of the sky that a person's vertices see: (count,), 0-1.
-
-    Args:
-        subject: who.
-        shares: by side, what the vertices of the hands see.
-        count: vertices of all parts.
-        subdivisions: of the hands' mesh.
-    """
+    """Share of the sky that a person's vertices see: (count,), 0-1."""
     parts = list(shares.values())
     if subject.looks.arm == "bare":
         for side, share in shares.items():
@@ -205,12 +191,7 @@ class Body:
 
 
 class Stage:
-    """Builds what a scene shows.
-
-    Args:
-        scene: the scene.
-        cost: is charged with the time and the rays.
-    """
+    """Builds what a scene shows."""
 
     def __init__(self, scene: Scene, cost: RenderCost) -> None:
         self.scene = scene
@@ -232,13 +213,7 @@ class Stage:
         subdivisions: int = FINE,
         parameters: dict[str, tuple[np.ndarray, np.ndarray]] | None = None,
     ) -> Surface:
-        """Hands, sleeves and what is worn, posed.
-
-        Args:
-            hands: what the hands do.
-            subdivisions: of the hands' mesh.
-            parameters: pose and translation instead of the ones that follow from `hands`.
-        """
+        """Hands, sleeves and what is worn, posed."""
         return join([part.surface for part in self._parts(hands, subdivisions, parameters)])
 
     def owners(self, hands: dict[str, HandMoment]) -> np.ndarray:
@@ -262,11 +237,7 @@ class Stage:
         return Body(surface, Tracer(surface.vertices, surface.faces, self.cost.rays))
 
     def seen_sky(self, body: Body) -> dict[str, np.ndarray]:
-        """Share of the sky that the template's vertices see, by side: (T,) each.
-
-        Args:
-            body: hands of `FINE` subdivisions.
-        """
+        """Share of the sky that the template's vertices see, by side: (T,) each."""
         seen, start = {}, 0
         for side, subject in scene_hands(self.scene).items():
             coarse = slice(start, start + len(subject.template.vertices))
@@ -315,12 +286,7 @@ class Stage:
 
 
 def between(bodies: tuple[Surface, Surface, Surface], s: float | np.ndarray) -> Surface:
-    """A surface between three instants of the same hands.
-
-    Args:
-        bodies: at the opening, the middle and the closing of the shutter.
-        s: -0.5 to 0.5; the parabola through the three. Or (V, 1), one for each vertex.
-    """
+    """A surface between three instants of the same hands."""
     first, middle, last = bodies
     a, b, c = 2.0 * s * s - s, 1.0 - 4.0 * s * s, 2.0 * s * s + s
     return replace(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from hwp_bench.hands.gestures import finger_pose, gesture, mirrored, within_limits
+from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.scene.scene import CLEAN_FROM, EffectCall, HandKey, Scene
@@ -21,12 +23,7 @@ _PROBES = 2001
 
 
 def level(call: EffectCall, moment: float) -> float:
-    """How strongly an effect acts at one moment: 0, or from `ACTIVE_FROM` to 5.
-
-    Args:
-        call: the effect.
-        moment: fraction of the capture, 0-1.
-    """
+    """How strongly an effect acts at one moment: 0, or from `ACTIVE_FROM` to 5."""
     strongest = 0.0
     for episode in call.episodes:
         if episode.start <= moment <= episode.end:
@@ -109,15 +106,7 @@ def smoothstep(x: float) -> float:
 def along_keys(
     keys: list[HandMoment], phase: float, scene: Scene, label: str, variation: float
 ) -> HandMoment:
-    """State of a repeating row of keys at `phase` (one key per unit), varied in every round.
-
-    Args:
-        keys: the row.
-        phase: 0 at the first key; grows without end.
-        scene: whose seed the variation follows.
-        label: names the row, so that two rows vary independently.
-        variation: standard deviation of the angles, degrees.
-    """
+    """State of a repeating row of keys at `phase` (one key per unit), varied in every round."""
     index = int(np.floor(phase))
     before = _varied(keys[index % len(keys)], scene, label, index, variation)
     after = _varied(keys[(index + 1) % len(keys)], scene, label, index + 1, variation)
@@ -137,13 +126,7 @@ def _varied(key: HandMoment, scene: Scene, label: str, index: int, variation: fl
 
 
 def track_moment(scene: Scene, side: str, seconds: float) -> HandMoment:
-    """One hand of the undisturbed track at a time.
-
-    Args:
-        scene: the scene.
-        side: `right` or `left`.
-        seconds: time since the first frame.
-    """
+    """One hand of the undisturbed track at a time."""
     keys = [moment_of_key(key) for key in scene.track.keys[side]]
     phase = seconds / scene.track.period * len(keys)
     moment = along_keys(keys, phase, scene, side, scene.track.variation)
@@ -176,8 +159,7 @@ def heading_matrix(heading: np.ndarray, side: str) -> np.ndarray:
 def palm_of(joints: np.ndarray) -> np.ndarray:
     """The middle of the palm of a hand at rest, which keys place: (3,) m.
 
-    Args:
-        joints: (16, 3) m.
+    Takes `joints` (16, 3) m.
     """
     return 0.35 * joints[0] + 0.65 * joints[4]
 
@@ -187,14 +169,8 @@ def hand_parameters(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Turn a moment into the hand model's pose and translation.
 
-    Args:
-        moment: the hand.
-        side: `right` or `left`.
-        joints: (16, 3) rest joints of that side with the subject's shape, m.
-        focus: (3,) the point that places are relative to, world, m.
-
-    Returns:
-        pose (16, 3) axis-angle rad and transl (3,) m.
+    Takes `joints` (16, 3) rest joints of that side with the subject's shape, `focus` (3,) the point
+    that places are relative to. Returns pose (16, 3) axis-angle rad and transl (3,) m.
     """
     from scipy.spatial.transform import Rotation
 
@@ -247,16 +223,8 @@ def pixel_rays(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Rays through a regular grid inside every pixel.
 
-    Args:
-        K: (3, 3) px.
-        view: (4, 4) world to camera.
-        box: top, bottom, left, right: the rows and columns to cover.
-        grid: edge of the grid inside a pixel.
-        shift: moves the grid right and down, in steps of the grid.
-
-    Returns:
-        origin (3,) m and directions (rows * grid, columns * grid, 3), world, with length 1
-        along the camera's axis.
+    Takes `K` (3, 3) px, `view` (4, 4) world to camera. Returns origin (3,) m and directions (rows *
+    grid, columns * grid, 3), world, with length 1 along the camera's axis.
     """
     top, bottom, left, right = box
     across = left + (np.arange((right - left) * grid) + 0.5 + shift[0]) / grid
@@ -265,3 +233,25 @@ def pixel_rays(
     in_camera = np.stack([x, y, np.ones_like(x)], axis=-1)
     turn = view[:3, :3]
     return -turn.T @ view[:3, 3], in_camera @ turn
+
+
+def parameters_of(
+    scene: Scene,
+    moments: Sequence[Mapping[str, HandMoment]],
+    betas: Mapping[str, np.ndarray] | None = None,
+) -> dict[str, HandParameters]:
+    """Hand parameters of every frame, by side, with these betas (10,) or the true ones."""
+    found = {}
+    for side, subject in scene_hands(scene).items():
+        shape, joints = subject.betas, subject.model_joints
+        if betas is not None:
+            shape = betas[side]
+            joints = subject.model.joints + subject.model.joint_basis @ shape
+        rows = [hand_parameters(hands[side], side, joints, focus_point()) for hands in moments]
+        found[side] = HandParameters(
+            pose=np.stack([pose for pose, _ in rows]),
+            betas=shape,
+            transl=np.stack([transl for _, transl in rows]),
+            valid=np.ones(len(moments), dtype=bool),
+        )
+    return found

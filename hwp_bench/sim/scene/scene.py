@@ -210,11 +210,7 @@ class Scene:
 
 
 def with_severity(scene: Scene, severity: float) -> Scene:
-    """The scene with every episode at one severity.
-
-    Raises:
-        UsageError: the severity is not in 1 to 5.
-    """
+    """The scene with every episode at one severity."""
     if not 1 <= severity <= MAX_SEVERITY:
         raise UsageError(f"{severity} is not in 1..{MAX_SEVERITY}", field="severity")
     effects = tuple(
@@ -228,11 +224,7 @@ def with_severity(scene: Scene, severity: float) -> Scene:
 
 
 def with_subject(scene: Scene, seed: int) -> Scene:
-    """The scene with another person: shape, tone, age and sleeve follow from the seed.
-
-    Raises:
-        UsageError: the seed is negative.
-    """
+    """The scene with another person: shape, tone, age and sleeve follow from the seed."""
     if seed < 0:
         raise UsageError(f"{seed} is not a seed", field="subject")
     rng = generator(seed, "person")
@@ -254,13 +246,7 @@ def with_effects(scene: Scene, kinds: Collection[str]) -> Scene:
 
 
 def without_defaults(record: Any, keep: tuple[str, ...]) -> dict[str, Any]:
-    """Return a record as JSON values, without fields that say what they say by default.
-
-    Args:
-        record: a dataclass.
-        keep: fields that are always in it. Those are a format's first fields; what came later is
-            left out where it changes nothing, so that digests stay.
-    """
+    """Return a record as JSON values, without fields that say what they say by default."""
     content = asdict(record)
     for item in fields(record):
         default = item.default

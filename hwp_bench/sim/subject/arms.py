@@ -33,12 +33,8 @@ def ringed(
 ) -> Surface:
     """Join rings behind one another to a surface that looks outward and is not a hand.
 
-    Args:
-        vertices: (R * K, 3) m, R rings of K vertices each.
-        around: (K,) texture coordinate of each vertex of a ring, and (K,) of the one after it: at
-            the seam the two differ by a whole turn.
-        along: (R,) texture coordinate of each ring.
-        material: what all of it is made of.
+    Takes `vertices` (R * K, 3) m, `around` (K,) texture coordinate of each vertex of a ring,
+    `along` (R,) texture coordinate of each ring.
     """
     count, spokes = len(along), len(around[0])
     ring, spoke = np.meshgrid(np.arange(count - 1), np.arange(spokes), indexing="ij")
@@ -101,11 +97,7 @@ def wrist_rim(template: HandTemplate) -> np.ndarray:
 def sleeve(rim: np.ndarray, forward: np.ndarray, elbow: np.ndarray, material: Material) -> Surface:
     """Build a sleeve from the rim of a posed wrist towards the elbow.
 
-    Args:
-        rim: (R, 3) m, the wrist's rim in order.
-        forward: (3,) unit vector from the wrist to the fingers.
-        elbow: (3,) m.
-        material: the cloth.
+    Takes `rim` (R, 3) m, `forward` (3,) unit vector from the wrist to the fingers, `elbow` (3,) m.
     """
     center = rim.mean(axis=0)
     side = unit(rim[0] - center - ((rim[0] - center) @ forward) * forward)
@@ -169,13 +161,7 @@ class Rim:
 
 @lru_cache(maxsize=8)
 def wrist_loop(subject: Subject, side: str, subdivisions: int = FINE) -> Rim:
-    """The rim of a subject's hand.
-
-    Args:
-        subject: whose.
-        side: `right` or `left`.
-        subdivisions: of the hand's mesh.
-    """
+    """The rim of a subject's hand."""
     hand = subject_hand(subject, side, subdivisions)
     rest = hand.rest
     loop = boundary_loop(hand.faces)
@@ -191,12 +177,8 @@ def forearm(
 ) -> Surface:
     """Build an arm from the rim of a posed wrist towards the elbow.
 
-    Args:
-        rim: (K, 3) m, in the order of `Rim.loop`; the first K vertices of the arm.
-        around: (K,) `Rim.around`.
-        forward: (3,) unit vector from the wrist to the fingers.
-        elbow: (3,) m.
-        skin: what it is covered with.
+    Takes `rim` (K, 3) m, `around` (K,) `Rim.around`, `forward` (3,) unit vector from the wrist to
+    the fingers, `elbow` (3,) m.
     """
     vertices = _arm_rings(rim, forward, elbow)
     # From the middle of the first row of texels to that of the last: textures repeat beyond.
@@ -209,10 +191,7 @@ def forearm(
 def seamless(hand: Surface, arm: Surface, loop: np.ndarray) -> tuple[Surface, Surface]:
     """Hand and arm with common normals where they meet.
 
-    Args:
-        hand: the posed hand.
-        arm: what `forearm` made of its rim.
-        loop: (K,) `Rim.loop`.
+    Takes `loop` (K,) `Rim.loop`.
     """
     common = unit(hand.normals[loop] + arm.normals[: len(loop)])
     of_hand, of_arm = hand.normals.copy(), arm.normals.copy()
@@ -245,11 +224,7 @@ def rest_arm(subject: Subject, side: str, subdivisions: int = FINE) -> np.ndarra
 
 @lru_cache(maxsize=2)
 def arm_atlas(subject: Subject) -> SkinAtlas:
-    """Paint the forearm of a subject, or read it from the cache.
-
-    Args:
-        subject: as `painting.of_side` gives it; both arms share the painting, mirrored.
-    """
+    """Paint the forearm of a subject, or read it from the cache."""
     hand = subject_hand(subject, "right")
 
     def paint() -> SkinAtlas:

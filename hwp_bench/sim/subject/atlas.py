@@ -45,11 +45,7 @@ class SkinAtlas:
 
 @lru_cache(maxsize=2)
 def skin_atlas(subject: Subject) -> SkinAtlas:
-    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored.
-
-    Args:
-        subject: whose; `painting.of_side` where the hands look different.
-    """
+    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored."""
     hand = subject_hand(subject, "right")
     return kept(hand, subject, "", lambda: painted_atlas(hand, subject, ATLAS))
 
@@ -57,14 +53,7 @@ def skin_atlas(subject: Subject) -> SkinAtlas:
 def kept(
     hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], SkinAtlas]
 ) -> SkinAtlas:
-    """Read a painting from the cache, or paint it and keep it where the cache can be written.
-
-    Args:
-        hand: on which it lies.
-        subject: whose skin.
-        part: what is painted besides the hand; empty for the hand itself.
-        paint: makes it.
-    """
+    """Read a painting from the cache, or paint it and keep it where the cache can be written."""
     person: list[Any] = [subject.seed, subject.tone, subject.age]
     looks = replace(subject.looks, rings=(), wrist=()).to_json()
     if looks:
@@ -97,13 +86,7 @@ def _store(path: Path, atlas: SkinAtlas) -> None:
 
 
 def painted_atlas(hand: SubjectHand, subject: Subject, edge: int) -> SkinAtlas:
-    """Paint the skin of a hand; nothing is kept.
-
-    Args:
-        hand: on which it lies.
-        subject: whose skin.
-        edge: of the textures, in texels.
-    """
+    """Paint the skin of a hand; nothing is kept."""
     from scipy.ndimage import distance_transform_edt
 
     flat = np.concatenate([hand.corner_uv, np.zeros((*hand.corner_uv.shape[:2], 1))], axis=2)

@@ -13,7 +13,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.records import Seed, number
 from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT, finger_back
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
-from hwp_bench.sim.geometry.surface import Color, unit
+from hwp_bench.sim.geometry.surface import Color, ease, unit
 from hwp_bench.sim.hand.anatomy import Anatomy
 
 _EDGE = 512
@@ -249,32 +249,25 @@ def inside_glove(anatomy: Anatomy, glove: Glove) -> np.ndarray:
 
 def covered(anatomy: Anatomy, glove: Glove) -> np.ndarray:
     """Share of glove at each place: (N,), 0-1, soft at the rim."""
-    return _step(inside_glove(anatomy, glove) / _RIM + 0.5)
+    return ease(inside_glove(anatomy, glove) / _RIM + 0.5)
 
 
 def gloved(anatomy: Anatomy, glove: Glove, skin: SkinSample, *, fine: bool) -> SkinSample:
-    """Put a glove over skin.
-
-    Args:
-        anatomy: where the places are on the hand.
-        glove: which.
-        skin: what is below.
-        fine: also threads and stitches, which only a dense sampling can hold.
-    """
+    """Put a glove over skin."""
     inside = inside_glove(anatomy, glove)
-    cover = _step(inside / _RIM + 0.5)
+    cover = ease(inside / _RIM + 0.5)
     rng = generator(glove.seed, "glove")
     coarse, middle, grain = (
         fractal_noise(anatomy.points, scale, rng) for scale in (0.03, 0.012, 0.0025)
     )
     back = anatomy.back
-    hem = _step(1.5 - np.abs(inside / _HEM - 0.5) * 2.0)
-    grip = _step((0.45 - back) / 0.16 + 0.5)
+    hem = ease(1.5 - np.abs(inside / _HEM - 0.5) * 2.0)
+    grip = ease((0.45 - back) / 0.16 + 0.5)
     fingers = 1.0 - anatomy.weights[:, 0]
-    seam = np.exp(-(((back - 0.55) / 0.10) ** 2)) * _step(2.0 * fingers - 0.4)
+    seam = np.exp(-(((back - 0.55) / 0.10) ** 2)) * ease(2.0 * fingers - 0.4)
     forward = unit(anatomy.joints[4] - anatomy.joints[0])
     along = (anatomy.points - anatomy.joints[0]) @ forward
-    cuff = _step((0.012 - along) / 0.002 + 0.5) if glove.kind == "work" else np.zeros(len(along))
+    cuff = ease((0.012 - along) / 0.002 + 0.5) if glove.kind == "work" else np.zeros(len(along))
     height = glove.thickness + 0.00025 * coarse + 0.00018 * middle + 0.0005 * hem - 0.0004 * seam
     cloth, leather = srgb_to_linear(np.array(glove.color)), srgb_to_linear(np.array(glove.palm))
     color = cloth + grip[:, None] * (leather - cloth)
@@ -298,11 +291,6 @@ def gloved(anatomy: Anatomy, glove: Glove, skin: SkinSample, *, fine: bool) -> S
         height=skin.height + cover * (height - skin.height),
         roughness=skin.roughness + cover * (matt - skin.roughness),
     )
-
-
-def _step(x: np.ndarray) -> np.ndarray:
-    x = np.clip(x, 0.0, 1.0)
-    return x * x * (3.0 - 2.0 * x)
 
 
 @dataclass(frozen=True)

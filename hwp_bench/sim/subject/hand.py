@@ -44,9 +44,7 @@ _WIDEST = 3.0
 def betas_of_surface(model: HandTemplate, vertices: np.ndarray) -> np.ndarray:
     """Betas whose surface is nearest to one of the same triangles: (10,).
 
-    Args:
-        model: the hand model.
-        vertices: (V, 3) m at rest; the whole may be elsewhere.
+    Takes `vertices` (V, 3) m at rest.
 
     Source: bounded linear least squares, with a ridge on betas.
     """
@@ -70,9 +68,7 @@ def betas_of_surface(model: HandTemplate, vertices: np.ndarray) -> np.ndarray:
 def betas_of_joints(model: HandTemplate, joints: np.ndarray) -> np.ndarray:
     """Betas whose bones have the lengths of a rig: (10,).
 
-    Args:
-        model: the hand model.
-        joints: (16, 3) m at rest.
+    Takes `joints` (16, 3) m at rest.
 
     Source: nonlinear least squares over 15 bones, with a ridge on betas.
     """
@@ -124,16 +120,7 @@ def subject_betas(subject: Subject) -> np.ndarray:
 
 
 def person(subject: Subject, side: str) -> Person:
-    """Make one hand of a subject.
-
-    Args:
-        subject: whose.
-        side: `right` or `left`.
-
-    Raises:
-        UsageError: the subject's model is unknown.
-        BadHandModel: its file is missing or damaged.
-    """
+    """Make one hand of a subject."""
     from hwp_bench.hands import load_template
 
     texture, rig = None, rig_path(subject.model)
@@ -205,12 +192,8 @@ class SubjectHand:
     def pose(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose the fine mesh.
 
-        Args:
-            pose: (16, 3) axis-angle rad.
-            transl: (3,) m.
-
-        Returns:
-            vertices (V, 3) m and unit normals (V, 3).
+        Takes `pose` (16, 3) axis-angle rad, `transl` (3,) m. Returns vertices (V, 3) m and unit
+        normals (V, 3).
         """
         coarse = template_vertices(self.tensors, pose, self.betas, transl)
         smooth = self.lift @ coarse
@@ -243,8 +226,7 @@ def template_vertices(
 def joint_turns(pose: np.ndarray) -> np.ndarray:
     """Rotation of each joint's segment from the rest frame to the world: (16, 3, 3).
 
-    Args:
-        pose: (16, 3) axis-angle rad.
+    Takes `pose` (16, 3) axis-angle rad.
     """
     from scipy.spatial.transform import Rotation
 
@@ -257,17 +239,7 @@ def joint_turns(pose: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> SubjectHand:
-    """Build one hand of a subject; kept for the next frames.
-
-    Args:
-        subject: whose.
-        side: `right` or `left`.
-        subdivisions: how often each triangle of the template is split in four.
-
-    Raises:
-        UsageError: the subject's model is unknown.
-        BadHandModel: its file is missing or damaged.
-    """
+    """Build one hand of a subject; kept for the next frames."""
     import torch
 
     who = person(subject, side)
@@ -326,13 +298,8 @@ def anatomy_at(
 ) -> Anatomy:
     """The anatomy at places of a rest hand of either side.
 
-    Args:
-        template: the hand.
-        betas: (10,) its shape.
-        points: (N, 3) m.
-        normals: (N, 3) unit.
-        weights: (N, 16) skinning weights.
-        joints: (16, 3) m, of the skeleton at rest; the template's if None.
+    Takes `betas` (10,) its shape, `points` (N, 3) m, `normals` (N, 3) unit, `weights` (N, 16)
+    skinning weights, `joints` (16, 3) m.
     """
     if joints is None:
         joints = template.joints + template.joint_basis @ betas

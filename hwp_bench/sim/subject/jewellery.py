@@ -55,11 +55,7 @@ def angles() -> np.ndarray:
 def band(outline: np.ndarray, width: float, thickness: float, material: Material) -> Surface:
     """A closed band with a rounded section.
 
-    Args:
-        outline: (AROUND,) m from the axis at each of `angles()`: its inner side.
-        width: along the axis, m.
-        thickness: m.
-        material: what it is made of.
+    Takes `outline` (AROUND,) m from the axis at each of `angles()`.
     """
     turn = np.linspace(0.0, 2.0 * np.pi, _SECTION)
     # A superellipse: flat outside, round at the edges.
@@ -154,12 +150,7 @@ _STRAP = 0.011
 
 
 def wrist_watch(wrist: tuple[float, float], color: tuple[float, float, float]) -> Surface:
-    """Build a watch around the x axis, its dial to +y.
-
-    Args:
-        wrist: half axes of the strap along z and y, m.
-        color: sRGB of the strap.
-    """
+    """Build a watch around the x axis, its dial to +y."""
     leather = plain(srgb_to_linear(np.array(color)), gloss=0.55)
     steel = plain((0.6, 0.6, 0.62), gloss=0.18, specular=0.6)
     angles = np.linspace(0.0, 2.0 * np.pi, 41)

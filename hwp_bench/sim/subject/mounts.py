@@ -52,8 +52,7 @@ class Mount:
     def carried(self, vertices: np.ndarray) -> Surface:
         """The thing on the posed hand (or arm), moved by the best rigid motion of its skin.
 
-        Args:
-            vertices: (V, 3) m of the posed hand, or of the arm.
+        Takes `vertices` (V, 3) m of the posed hand.
 
         Source: the Kabsch algorithm.
         """
@@ -78,13 +77,7 @@ def ring_mounts(subject: Subject, side: str) -> tuple[Mount, ...]:
 
 @lru_cache(maxsize=8)
 def wrist_mounts(subject: Subject, side: str, subdivisions: int) -> tuple[Mount, ...]:
-    """Watch and bracelets of one wrist.
-
-    Args:
-        subject: whose.
-        side: `right` or `left`.
-        subdivisions: of the hand's mesh; the arm has vertices for each.
-    """
+    """Watch and bracelets of one wrist."""
     looks = of_side(subject, side).looks
     return tuple(_wrist_mount(subject, side, item, subdivisions) for item in looks.wrist)
 
@@ -162,8 +155,7 @@ def _rest_skin(hand: SubjectHand) -> np.ndarray:
 def _outline(points: np.ndarray) -> np.ndarray:
     """Radius of a section at `angles()`: (AROUND,) m, smooth, at most 5 % inside any point.
 
-    Args:
-        points: (N, 2) m around the origin.
+    Takes `points` (N, 2) m around the origin.
     """
     turn = np.arctan2(points[:, 1], points[:, 0])
     radius = np.linalg.norm(points, axis=1)

@@ -31,10 +31,7 @@ _STEPS, _STEP = 32, 0.0003
 def freckles(points: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
     """Round spots of 0.4 to 1.4 mm: (N,), 0 outside and up to 1 inside a spot.
 
-    Args:
-        points: (N, 3) m on the rest hand.
-        amount: 0 to 1, share of the places that carry one.
-        rng: decides which, where and how dark.
+    Takes `points` (N, 3) m on the rest hand.
     """
     ticks = [np.arange(low, high, _CELL) for low, high in _BOX]
     cells = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
@@ -58,9 +55,7 @@ def freckles(points: np.ndarray, amount: float, rng: np.random.Generator) -> np.
 def wrinkles(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """A net of fine folds, mostly across the fingers' direction: (N,), 0-1.
 
-    Args:
-        points: (N, 3) m on the rest hand.
-        rng: decides where they run.
+    Takes `points` (N, 3) m on the rest hand.
     """
     stretched = points * np.array([1.7, 0.8, 0.8])
     folds = np.zeros(len(points))
@@ -79,15 +74,8 @@ def hair(
 ) -> np.ndarray:
     """Fine strokes that follow the skin towards the finger tips and the little finger's side.
 
-    Args:
-        points: (N, 3) m on the rest hand, dense: neighbours at most 0.5 mm apart.
-        normals: (N, 3) unit.
-        share: (N,) 0-1, how much of the full growth a place has.
-        amount: 0 to 1.
-        rng: decides where the hairs start and how they bend.
-
-    Returns:
-        (N,) 0 (none) to 1 (covered by hair).
+    Takes `points` (N, 3) m on the rest hand, `normals` (N, 3) unit, `share` (N,) 0-1. Returns (N,)
+    0 (none) to 1 (covered by hair).
     """
     strokes = np.zeros(len(points))
     total = float(share.sum())
@@ -147,12 +135,7 @@ _INNER_ARM = 0.3
 
 
 def sample_skin(anatomy: Anatomy, subject: Subject) -> SkinSample:
-    """Paint skin at the places of an anatomy.
-
-    Args:
-        anatomy: where the places are on the hand.
-        subject: seed, tone and age.
-    """
+    """Paint skin at the places of an anatomy."""
     rng = generator(subject.seed, "skin")
     old = np.clip((subject.age - 20.0) / 60.0, 0.0, 1.0)
     points = anatomy.points
@@ -242,13 +225,7 @@ def of_side(subject: Subject, side: str) -> Subject:
 
 
 def painted(anatomy: Anatomy, subject: Subject, *, fine: bool) -> SkinSample:
-    """Paint one hand of a subject at the places of an anatomy.
-
-    Args:
-        anatomy: where the places are on the hand.
-        subject: as `of_side` gives it.
-        fine: also what only a dense sampling can hold: hairs, threads, the folds of wrinkles.
-    """
+    """Paint one hand of a subject at the places of an anatomy."""
     skin = sample_skin(anatomy, subject)
     looks = subject.looks
     if looks == PLAIN:

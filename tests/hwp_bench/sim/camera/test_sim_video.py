@@ -73,7 +73,7 @@ def test_a_capture_is_one_stream_however_often_it_was_interrupted(
     whole = render_capture(
         scene, tmp_path / "a", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
     )
-    honest, done = production.render_frames, []
+    honest, done = production.render_waiting, []
 
     def broken(*args: object, **settings: object) -> None:
         if len(done) == 5:
@@ -81,12 +81,12 @@ def test_a_capture_is_one_stream_however_often_it_was_interrupted(
         done.append(1)
         honest(*args, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(production, "render_frames", broken)
+    monkeypatch.setattr(production, "render_waiting", broken)
     with pytest.raises(KeyboardInterrupt):
         render_capture(
             scene, tmp_path / "b", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
         )
-    monkeypatch.setattr(production, "render_frames", honest)
+    monkeypatch.setattr(production, "render_waiting", honest)
     late = render_capture(
         scene, tmp_path / "b", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
     )

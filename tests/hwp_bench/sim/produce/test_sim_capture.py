@@ -97,7 +97,7 @@ def test_an_interrupted_render_goes_on(
     from hwp_bench.sim.produce import capture as production
 
     scene, out = make_scene(), tmp_path / "late"
-    honest, done = production.render_frames, []
+    honest, done = production.render_waiting, []
 
     def broken(*args: object, **settings: object) -> None:
         if len(done) == 7:
@@ -105,14 +105,14 @@ def test_an_interrupted_render_goes_on(
         done.append(1)
         honest(*args, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(production, "render_frames", broken)
+    monkeypatch.setattr(production, "render_waiting", broken)
     with pytest.raises(KeyboardInterrupt):
         render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     assert not out.exists()
     waiting = tmp_path / f".late.{render_key(scene, FRAMES, SIZE)[:16]}"
     assert sum(frame_file(waiting, frame).exists() for frame in range(FRAMES)) == 7
     frame_file(waiting, 3).write_bytes(b"cut short")
-    monkeypatch.setattr(production, "render_frames", honest)
+    monkeypatch.setattr(production, "render_waiting", honest)
     capture = render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     np.testing.assert_array_equal(_pixels(capture), _pixels(open_capture(rendered)))
     assert not waiting.exists()
@@ -188,10 +188,10 @@ def test_a_suite_in_the_cache_is_not_rendered_again(
     from hwp_bench.sim.produce import capture as production
     from hwp_bench.sim.produce import suites
 
-    item = suites.SuiteItem(make_scene(), 10, 32, 5)
+    item = suites.SuiteItem(make_scene(), 10, 32)
     monkeypatch.setattr(suites, "suite", lambda name: (item,))
     (first,) = ensure_suite("smoke", tmp_path, workers=1)
-    monkeypatch.setattr(production, "render_frames", None)
+    monkeypatch.setattr(production, "render_waiting", None)
     assert ensure_suite("smoke", tmp_path) == [first]
 
 

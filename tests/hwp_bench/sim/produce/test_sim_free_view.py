@@ -167,24 +167,24 @@ def test_the_clip_is_no_part_of_the_capture(
     from hwp_bench.sim.produce import capture as production
     from hwp_bench.sim.produce import suites
 
-    item = suites.SuiteItem(make_scene(), COUNT, SIZE, 5)
-    (bare,) = suites.ensure_captures([item], tmp_path, workers=1, free_view=False)
+    item = suites.SuiteItem(make_scene(), COUNT, SIZE)
+    (bare,) = suites.ensure_suite([item], tmp_path, workers=1, free_view=False)
     assert not (bare / FREE_VIEW).exists()
     assert open_capture(bare).digest == open_capture(rendered).digest
     assert open_capture(bare).free_view is None
     # A capture in the cache gets the clip, and is not rendered again.
-    monkeypatch.setattr(production, "render_frames", None)
-    assert suites.ensure_captures([item], tmp_path, workers=1) == [bare]
+    monkeypatch.setattr(production, "render_waiting", None)
+    assert suites.ensure_suite([item], tmp_path, workers=1) == [bare]
     assert _clip(bare).digest == _clip(rendered).digest
     # A clip of an older version is replaced, one of this version is not.
     metadata = bare / FREE_VIEW / "capture.json"
     value = read_json(metadata)
     write_json(metadata, {**value, "source": {**value["source"], "version": 0}})
     assert not has_free_view(bare)
-    suites.ensure_captures([item], tmp_path, workers=1)
+    suites.ensure_suite([item], tmp_path, workers=1)
     assert _clip(bare).digest == _clip(rendered).digest
     monkeypatch.setattr(free_view, "write_free_view", None)
-    suites.ensure_captures([item], tmp_path, workers=1)
+    suites.ensure_suite([item], tmp_path, workers=1)
 
 
 def test_effects_and_sensor_leave_the_clip_as_it_is(make_scene: SceneMaker) -> None:
