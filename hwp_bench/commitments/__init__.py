@@ -1,6 +1,6 @@
 """Hidden frames and seeds that their keeper is bound to: publications and sealed suites."""
 
-from hwp_bench.commitments.publish import Publication, SealedPart, open_sealed, publish
+from hwp_bench.commitments.publication import Publication, SealedPart, open_sealed, publish
 from hwp_bench.commitments.recipe import Recipe
 from hwp_bench.commitments.suite import (
     Checked,

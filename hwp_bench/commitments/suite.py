@@ -20,7 +20,7 @@ from hwp_bench.base.records import Digest, Line, parse_record, without_schema
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import split_for
-from hwp_bench.commitments.publish import (
+from hwp_bench.commitments.publication import (
     PUBLIC,
     SEALED,
     commitment,

@@ -131,15 +131,6 @@ ENCODER, PRESET, KEYFRAME_EVERY = "libx264", "veryfast", 30
 BUFFER_FRAMES = 30
 
 
-def has_encoder() -> bool:
-    """Whether H.264 can be encoded here."""
-    try:
-        _library("")
-    except HwpError:
-        return False
-    return True
-
-
 def check_encoder(where: str) -> None:
     """Refuse a scene whose video cannot be encoded here."""
     _library(where)

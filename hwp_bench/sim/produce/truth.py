@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import astuple, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -159,7 +159,13 @@ def distances(scene: Scene) -> dict[str, TemplateDistance]:
 def subject_table(found: dict[str, dict[str, TemplateDistance]]) -> Table:
     """One row for each hand."""
     rows: list[tuple[Cell, ...]] = [
-        (name, side, *astuple(item)[:-1])
+        (
+            name,
+            side,
+            item.surface,
+            *(item.mean_mm, item.most_mm, item.largest_mm, item.joints_mm),
+            item.farthest_joint_mm,
+        )
         for name, hands in found.items()
         for side, item in hands.items()
     ]

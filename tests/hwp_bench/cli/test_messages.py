@@ -49,7 +49,7 @@ def test_a_full_disc_is_named_when_captures_are_published(
     def refuse(source: object, target: object, **_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
 
-    monkeypatch.setattr("hwp_bench.commitments.publish.shutil.copyfile", refuse)
+    monkeypatch.setattr("hwp_bench.commitments.publication.shutil.copyfile", refuse)
     assert main(["data", "publish", str(root), "-o", str(tmp_path / "out")]) == 1
     said = capsys.readouterr().err
     assert "No space left on device" in said

@@ -18,7 +18,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.main import main
 from hwp_bench.commitments import Publication, open_sealed, publish
-from hwp_bench.commitments.publish import commitment, target_content
+from hwp_bench.commitments.publication import commitment, target_content
 from hwp_bench.methods.request import open_request
 
 SALT = "5a" * 32
@@ -61,7 +61,7 @@ def test_of_two_publications_at_once_one_is_told_and_no_salt_is_lost(
     captures: list[Capture], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Oracle: the salt on disc is that of the call that succeeded."""
-    from hwp_bench.commitments import publish as parts
+    from hwp_bench.commitments import publication as parts
 
     out, sources = tmp_path / "publication", [captures[0].root]
     honest, first = parts.write_request, []

@@ -17,7 +17,7 @@ from hwp_bench.capture.schema import frame_name
 from hwp_bench.cli.main import main
 from hwp_bench.commitments import SealedSuite, make_suite, open_sealed
 from hwp_bench.commitments import suite as making
-from hwp_bench.commitments.publish import joint_commitment
+from hwp_bench.commitments.publication import joint_commitment
 from hwp_bench.commitments.recipe import derived, read_secret, recipe_of, sealed_items
 from hwp_bench.methods.request import open_request
 

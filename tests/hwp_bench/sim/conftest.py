@@ -37,7 +37,7 @@ def small_paintings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """
     kept = (atlas.skin_atlas, forearm.arm_atlas, person._skin, person._arm_skin)
     monkeypatch.setattr(atlas, "ATLAS", 256)
-    monkeypatch.setattr(forearm, "_TEXTURE", (64, 64))
+    monkeypatch.setattr(forearm, "_ARM_TEXELS", (64, 64))
     for function in kept:
         function.cache_clear()
     yield

@@ -77,7 +77,7 @@ def test_it_moves_with_the_time_of_the_capture_and_repeats(make_scene: SceneMake
     scene = replace(make_scene(), behind=EVERYTHING)
     rays = directions(scene)
     still = np.full((SIZE, SIZE, 3), 0.4)
-    first, again, later = (draw_behind(scene, rays, t, still) for t in (0.2, 0.2, 1.4))
+    first, again, later = (drawn_behind(scene, rays, t, still) for t in (0.2, 0.2, 1.4))
     np.testing.assert_array_equal(first, again)
     assert np.abs(first - later).mean() > 0.01
     np.testing.assert_array_equal(still, 0.4)
