@@ -62,7 +62,7 @@ GROWTH: tuple[float, float, float] = (0.41, 1.64, 1.28)
 #: Time scale of the errors that a fit keeps, s: its smoothness removes what is faster.
 MEMORY = 0.14
 #: Share of the variance that never changes in a capture.
-LANDMARK_HABIT = 0.18
+HABIT = 0.18
 # Numbers of one landmark: two in the image and three in the world.
 _NUMBERS = 5
 
@@ -74,7 +74,7 @@ def growth(curl: np.ndarray, edge_on: np.ndarray) -> np.ndarray:
 
 
 def landmark_noise(
-    rng: np.random.Generator, frames: int, step: float, habit: float = LANDMARK_HABIT
+    rng: np.random.Generator, frames: int, step: float, habit: float = HABIT
 ) -> np.ndarray:
     """Unit noise of 21 landmarks: (F, 21, 5), x and y in the image, then x, y, z in the world."""
     size = (21, _NUMBERS)

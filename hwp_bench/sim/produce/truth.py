@@ -17,7 +17,6 @@ from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import EXTRA, SIMULATED, TRUE_TEMPLATE
 from hwp_bench.capture.subject_mesh import write_subject_mesh
 from hwp_bench.hands.template import HandTemplate, rebuilt
-from hwp_bench.sim.geometry.surface import surface_normals
 from hwp_bench.sim.scene.motion import palm_of, scene_hands
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.hand import SubjectHand, is_off_template, subject_hand
@@ -98,10 +97,8 @@ def subject_templates(subject: Subject, sides: Sequence[str]) -> dict[str, HandT
 def subject_template(hand: SubjectHand) -> HandTemplate:
     """A subject's hand as a template of the hand model's triangles without shape parameters."""
     template = hand.template
-    smooth = hand.rest
-    normals = surface_normals(smooth, hand.faces, hand.normal_sum)
     # The first vertices of the fine mesh are those of the template.
-    surface = (smooth + hand.relief[:, None] * normals)[: len(template.vertices)]
+    surface = hand.rest_skin[: len(template.vertices)]
     joints = template.joints + template.joint_basis @ hand.betas
     joints = joints + _aside(hand)
     # A capture turns hands about the model's wrist.

@@ -14,7 +14,6 @@ from hwp_bench.sim.geometry.surface import (
     Material,
     Surface,
     join,
-    surface_normals,
     transformed,
     unit,
 )
@@ -35,12 +34,15 @@ from hwp_bench.sim.subject.arms import (
 )
 from hwp_bench.sim.subject.atlas import SkinAtlas, skin_atlas
 from hwp_bench.sim.subject.covers import covered
-from hwp_bench.sim.subject.hand import FINE, anatomy_at, subject_hand
+from hwp_bench.sim.subject.hand import FINE, subject_hand
+from hwp_bench.sim.subject.mounts import ring_mounts, wrist_mounts
 from hwp_bench.sim.subject.skin import of_side
 from hwp_bench.sim.subject.subject import Subject
 
 # How far light wraps around the terminator inside skin, per linear channel.
 _WRAP = (0.28, 0.12, 0.07)
+# Place of the right elbow, m from the point looked at.
+_ELBOW = np.array([0.10, 0.42, 0.02])
 #: Who owns a part of the image: a hand, or nothing that counts as one.
 OWNERS = {"right": 1, "left": 2, "": 3}
 
@@ -55,93 +57,35 @@ class Part:
     surface: Surface
 
 
-def person_parts(
-    subject: Subject,
-    hands: dict[str, HandMoment],
-    parameters: dict[str, tuple[np.ndarray, np.ndarray]],
-    subdivisions: int = FINE,
-) -> list[Part]:
-    """Build a person's parts: first the hands, then a sleeve or an arm for each, then the rest."""
-    skins, arms, worn = [], [], []
-    bare = subject.looks.arm == "bare"
-    for side, moment in hands.items():
-        hand = subject_hand(subject, side, subdivisions)
-        skin = _hand_surface(subject, side, subdivisions, *hand.pose(*parameters[side]))
-        turn = heading_matrix(moment.heading, side)
-        forward = turn @ np.array([-1.0 if side == "right" else 1.0, 0.0, 0.0])
-        elbow = focus_point() + _elbow(side)
-        if bare:
-            rim = wrist_loop(subject, side, subdivisions)
-            paint = _arm_skin(of_side(subject, side))
-            arm = forearm(skin.vertices[rim.loop], rim.around, forward, elbow, paint)
-            skin, arm = seamless(skin, arm, rim.loop)
-        else:
-            cloth = sleeve_material(subject.sleeve, subject.seed)
-            arm = sleeve(skin.vertices[wrist_rim(hand.template)], forward, elbow, cloth)
-        skins.append(Part(side, skin))
-        arms.append(Part("", arm))
-        if subject.looks.rings or subject.looks.wrist:
-            worn += _worn(subject, side, skin, arm, subdivisions)
-    return skins + arms + worn
-
-
-def _worn(
-    subject: Subject, side: str, skin: Surface, arm: Surface, subdivisions: int
-) -> list[Part]:
-    # Only a person who wears something needs the modules that build it.
-    from hwp_bench.sim.subject.mounts import ring_mounts, wrist_mounts
-
-    rings = [Part(side, item.carried(skin.vertices)) for item in ring_mounts(subject, side)]
-    others = [
-        Part("", item.carried((arm if item.on_arm else skin).vertices))
-        for item in wrist_mounts(subject, side, subdivisions)
-    ]
-    return rings + others
-
-
-def person_openness(
-    subject: Subject, shares: dict[str, np.ndarray], count: int, subdivisions: int = FINE
-) -> np.ndarray:
-    """Share of the sky that a person's vertices see: (count,), 0-1."""
-    parts = list(shares.values())
-    if subject.looks.arm == "bare":
-        for side, share in shares.items():
-            parts.append(arm_openness(share[wrist_loop(subject, side, subdivisions).loop]))
-    others = np.ones(count - sum(len(part) for part in parts))
-    return np.clip(np.concatenate([*parts, others]), 0.0, 1.0)
-
-
 def _hand_surface(
-    subject: Subject, side: str, subdivisions: int, vertices: np.ndarray, normals: np.ndarray
+    subject: Subject, side: str, subdivisions: int, pose: np.ndarray, transl: np.ndarray
 ) -> Surface:
+    """A posed hand: `pose` (16, 3) rad, `transl` (3,) m."""
     hand = subject_hand(subject, side, subdivisions)
+    vertices, normals = hand.pose(pose, transl)
     skin = _skin(subject, side)
-    materials: tuple[Material, ...] = (skin,)
-    material = np.zeros(len(hand.faces), dtype=np.int64)
-    if hand.texture is None and of_side(subject, side).looks.gloves:
-        # Light does not wrap around the terminator inside cloth.
-        materials = (skin, replace(skin, wrap=(0.0, 0.0, 0.0), specular=0.02))
-        material = _gloved_faces(subject, side, subdivisions)
-    return Surface(
+    surface = Surface(
         vertices=vertices,
         normals=normals,
         faces=hand.faces,
         corner_uv=hand.corner_uv,
-        material=material,
-        materials=materials,
+        material=np.zeros(len(hand.faces), dtype=np.int64),
+        materials=(skin,),
         hand=np.ones(len(hand.faces), dtype=bool),
     )
+    if hand.texture is not None or not of_side(subject, side).looks.gloves:
+        return surface
+    # Light does not wrap around the terminator inside cloth.
+    cloth = replace(skin, wrap=(0.0, 0.0, 0.0), specular=0.02)
+    under = _gloved_faces(subject, side, subdivisions)
+    return replace(surface, material=under, materials=(skin, cloth))
 
 
 @lru_cache(maxsize=8)
 def _gloved_faces(subject: Subject, side: str, subdivisions: int) -> np.ndarray:
     """(F,) 1 where most of a face is under a glove."""
     hand = subject_hand(subject, side, subdivisions)
-    template = hand.template
-    rest = hand.rest
-    normals = surface_normals(rest, hand.faces, hand.normal_sum)
-    weights = hand.lift @ template.weights
-    anatomy = anatomy_at(template, hand.betas, rest, normals, weights, hand.joints)
+    anatomy = hand.anatomy(hand.rest, hand.rest_normals, hand.lift @ hand.template.weights)
     glove = of_side(subject, side).looks.gloves[0]
     return (covered(anatomy, glove)[hand.faces].mean(axis=1) > 0.5).astype(np.int64)
 
@@ -172,12 +116,6 @@ def _painted_skin(atlas: SkinAtlas) -> Material:
         height=atlas.height,
         wrap=_WRAP,
     )
-
-
-def _elbow(side: str) -> np.ndarray:
-    """Place of the elbow, m from the point looked at."""
-    mirror = 1.0 if side == "right" else -1.0
-    return np.array([0.10 * mirror, 0.42, 0.02])
 
 
 @dataclass(frozen=True, eq=False)
@@ -229,8 +167,32 @@ class Stage:
         subdivisions: int,
         parameters: dict[str, tuple[np.ndarray, np.ndarray]] | None,
     ) -> list[Part]:
+        """First the hands, then a sleeve or an arm for each, then what is worn."""
+        subject = self.scene.subject
         parameters = parameters or self.parameters(hands)
-        return person_parts(self.scene.subject, hands, parameters, subdivisions)
+        skins, arms, worn = [], [], []
+        for side, moment in hands.items():
+            skin = _hand_surface(subject, side, subdivisions, *parameters[side])
+            mirror = 1.0 if side == "right" else -1.0
+            forward = heading_matrix(moment.heading, side) @ np.array([-mirror, 0.0, 0.0])
+            elbow = focus_point() + _ELBOW * np.array([mirror, 1.0, 1.0])
+            if subject.looks.arm == "bare":
+                rim = wrist_loop(subject, side, subdivisions)
+                paint = _arm_skin(of_side(subject, side))
+                arm = forearm(skin.vertices[rim.loop], rim.around, forward, elbow, paint)
+                skin, arm = seamless(skin, arm, rim.loop)
+            else:
+                cloth = sleeve_material(subject.sleeve, subject.seed)
+                rim = wrist_rim(subject_hand(subject, side, subdivisions).template)
+                arm = sleeve(skin.vertices[rim], forward, elbow, cloth)
+            skins.append(Part(side, skin))
+            arms.append(Part("", arm))
+            for item in ring_mounts(subject, side):
+                worn.append(Part(side, item.carried(skin.vertices)))
+            for item in wrist_mounts(subject, side, subdivisions):
+                carrier = arm if item.on_arm else skin
+                worn.append(Part("", item.carried(carrier.vertices)))
+        return skins + arms + worn
 
     def traced(self, surface: Surface) -> Body:
         """A surface made ready for rays."""
@@ -251,10 +213,14 @@ class Stage:
         self, surface: Surface, seen: dict[str, np.ndarray], subdivisions: int = FINE
     ) -> Surface:
         """The surface with the share of the sky that each of its vertices sees."""
-        subjects = scene_hands(self.scene, subdivisions)
+        subject, subjects = self.scene.subject, scene_hands(self.scene, subdivisions)
         shares = {side: subjects[side].lift @ share for side, share in seen.items()}
-        count = len(surface.vertices)
-        sky = person_openness(self.scene.subject, shares, count, subdivisions)
+        parts = list(shares.values())
+        if subject.looks.arm == "bare":
+            for side, share in shares.items():
+                parts.append(arm_openness(share[wrist_loop(subject, side, subdivisions).loop]))
+        others = np.ones(len(surface.vertices) - sum(len(part) for part in parts))
+        sky = np.clip(np.concatenate([*parts, others]), 0.0, 1.0)
         return replace(surface, openness=sky)
 
     def things(

@@ -17,7 +17,7 @@ from hwp_bench.hands.topology import boundary_loop
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import Material, Surface, normal_operator, surface_normals, unit
 from hwp_bench.sim.subject.atlas import SkinAtlas, kept
-from hwp_bench.sim.subject.hand import FINE, anatomy_at, subject_hand
+from hwp_bench.sim.subject.hand import FINE, subject_hand
 from hwp_bench.sim.subject.skin import of_side, painted
 from hwp_bench.sim.subject.subject import Subject
 
@@ -241,7 +241,7 @@ def arm_atlas(subject: Subject) -> SkinAtlas:
         normals = unit(_spread_over_arm(arm.normals, rim.around))
         weights = np.zeros((len(points), hand.template.weights.shape[1]))
         weights[:, 0] = 1.0
-        anatomy = anatomy_at(hand.template, hand.betas, points, normals, weights, hand.joints)
+        anatomy = hand.anatomy(points, normals, weights)
         skin = painted(anatomy, of_side(subject, "right"), fine=True)
         albedo, height, roughness = (
             np.ascontiguousarray(values.reshape(*_ARM_TEXELS, *values.shape[1:]), dtype=np.float32)

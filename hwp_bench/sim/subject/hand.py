@@ -35,6 +35,12 @@ if TYPE_CHECKING:
     from hwp_bench.hands import HandTemplate, TemplateTensors
 
 
+#: Midpoint subdivisions on top of the template: 1,609 vertices become 25,609.
+FINE = 2
+#: A rig is not refined beyond so many triangles; the free hand has 51,136.
+RIG_FACES = 60_000
+#: Subdivisions of what moves during an exposure: finer detail would be blurred away.
+MOVING = 1
 # Cost of one standard deviation of shape, in m of misfit: decides where the surface does not.
 _RIDGE = 0.00002
 # Largest betas that a person has.
@@ -87,22 +93,6 @@ def betas_of_joints(model: HandTemplate, joints: np.ndarray) -> np.ndarray:
     ).round(4)
 
 
-@dataclass(frozen=True, eq=False)
-class Person:
-    """One hand of a subject before its surface is refined."""
-
-    #: The surface: the hand model, or another one of the same joints.
-    template: HandTemplate
-    #: The hand model that parameters refer to.
-    model: HandTemplate
-    #: (10,) true shape.
-    betas: np.ndarray
-    #: (16, 3) m, joints of the skeleton at rest; the surface may bend about other places.
-    joints: np.ndarray
-    #: Colour of a rig, (H, W, 3) uint8 sRGB, or None to paint skin.
-    texture: np.ndarray | None
-
-
 def is_off_template(subject: Subject) -> bool:
     """Whether no shape of the hand model is the subject's geometry."""
     return rig_path(subject.model) is not None or subject_anatomy(subject) is not None
@@ -119,8 +109,14 @@ def subject_betas(subject: Subject) -> np.ndarray:
     return np.clip(generator(subject.seed, "betas").normal(0.0, 0.7, 10), -1.5, 1.5).round(4)
 
 
-def person(subject: Subject, side: str) -> Person:
-    """Make one hand of a subject."""
+def person(
+    subject: Subject, side: str
+) -> tuple[HandTemplate, HandTemplate, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Make one hand of a subject, before its surface is refined.
+
+    Returns the surface, the hand model, the true betas, the joints at rest (the surface may bend
+    about other places), and the texture: fields of `SubjectHand`.
+    """
     from hwp_bench.hands import load_template
 
     texture, rig = None, rig_path(subject.model)
@@ -139,15 +135,7 @@ def person(subject: Subject, side: str) -> Person:
         betas = betas_of_joints(model, joints)
     elif anatomy is not None:
         betas = betas_of_surface(model, template.vertices)
-    return Person(template, model, betas, joints, texture)
-
-
-#: Midpoint subdivisions on top of the template: 1,609 vertices become 25,609.
-FINE = 2
-#: A rig is not refined beyond so many triangles; the free hand has 51,136.
-RIG_FACES = 60_000
-#: Subdivisions of what moves during an exposure: finer detail would be blurred away.
-MOVING = 1
+    return template, model, betas, joints, texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,6 +176,28 @@ class SubjectHand:
             self.template.vertices + self.template.shape_basis @ self.betas
         )
         return smooth
+
+    @property
+    def rest_normals(self) -> np.ndarray:
+        """(V, 3) unit normals of `rest`; computed at each call."""
+        return surface_normals(self.rest, self.faces, self.normal_sum)
+
+    @property
+    def rest_skin(self) -> np.ndarray:
+        """(V, 3) m, the fine mesh at rest with its relief; computed at each call."""
+        return self.rest + self.relief[:, None] * self.rest_normals
+
+    def anatomy(self, points: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> Anatomy:
+        """The anatomy at places of the rest hand, (N, 3) m, with normals and weights (N, 16)."""
+        mirror = np.array([1.0 if self.template.side == "right" else -1.0, 1.0, 1.0])
+        shaped = self.template.vertices + self.template.shape_basis @ self.betas
+        return Anatomy(
+            points=points * mirror,
+            normals=normals * mirror,
+            weights=weights,
+            joints=self.joints * mirror,
+            tips=shaped[self.template.fingertips] * mirror,
+        )
 
     def pose(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose the fine mesh.
@@ -242,8 +252,7 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
     """Build one hand of a subject; kept for the next frames."""
     import torch
 
-    who = person(subject, side)
-    template, betas, model = who.template, who.betas, who.model
+    template, model, betas, joints, texture = person(subject, side)
     faces = template.faces
     corner_uv = template.uv[template.face_uv]
     lift = None
@@ -259,59 +268,30 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
         faces, count = fine, step.shape[0]
     smooth = smoothing(faces, count, rounds=max(2 * subdivisions - 1, 0))
     lift = smooth if lift is None else (smooth @ lift).tocsr()
-    normal_sum = normal_operator(faces, count)
-    rest = lift @ (template.vertices + template.shape_basis @ betas)
-    normals = surface_normals(rest, faces, normal_sum)
-    places = anatomy_at(template, betas, rest, normals, lift @ template.weights, who.joints)
+    hand = SubjectHand(
+        template=template,
+        model=model,
+        tensors=template.to_torch(dtype=torch.float64),
+        betas=betas,
+        joints=joints,
+        model_joints=model.joints + model.joint_basis @ betas,
+        lift=lift,
+        faces=faces,
+        corner_uv=corner_uv,
+        normal_sum=normal_operator(faces, count),
+        relief=np.zeros(count),
+        texture=texture,
+    )
+    places = hand.anatomy(hand.rest, hand.rest_normals, lift @ template.weights)
     # A rig with a texture of its own keeps it, and so its bare surface.
-    paint = of_side(subject, side) if who.texture is None else replace(subject, looks=PLAIN)
+    paint = of_side(subject, side) if texture is None else replace(subject, looks=PLAIN)
     relief, nails = painted(places, paint, fine=False).height, None
     anatomy = subject_anatomy(subject)
     if anatomy is not None:
         mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
         relief = relief + bone_relief(places, anatomy)
         nails = grown_nails(places, anatomy, mirror)
-    return SubjectHand(
-        template=template,
-        model=model,
-        tensors=template.to_torch(dtype=torch.float64),
-        betas=betas,
-        joints=who.joints,
-        model_joints=model.joints + model.joint_basis @ betas,
-        lift=lift,
-        faces=faces,
-        corner_uv=corner_uv,
-        normal_sum=normal_sum,
-        relief=relief,
-        texture=who.texture,
-        nails=nails,
-    )
-
-
-def anatomy_at(
-    template: HandTemplate,
-    betas: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    weights: np.ndarray,
-    joints: np.ndarray | None = None,
-) -> Anatomy:
-    """The anatomy at places of a rest hand of either side.
-
-    Takes `betas` (10,) its shape, `points` (N, 3) m, `normals` (N, 3) unit, `weights` (N, 16)
-    skinning weights, `joints` (16, 3) m.
-    """
-    if joints is None:
-        joints = template.joints + template.joint_basis @ betas
-    mirror = np.array([1.0 if template.side == "right" else -1.0, 1.0, 1.0])
-    shaped = template.vertices + template.shape_basis @ betas
-    return Anatomy(
-        points=points * mirror,
-        normals=normals * mirror,
-        weights=weights,
-        joints=joints * mirror,
-        tips=shaped[template.fingertips] * mirror,
-    )
+    return replace(hand, relief=relief, nails=nails)
 
 
 def _subdivide_corners(corners: np.ndarray) -> np.ndarray:

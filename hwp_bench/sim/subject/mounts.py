@@ -9,7 +9,7 @@ import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.hands.gestures import FIRST_JOINT, finger_back
-from hwp_bench.sim.geometry.surface import Surface, join, plain, surface_normals, transformed, unit
+from hwp_bench.sim.geometry.surface import Surface, join, plain, transformed, unit
 from hwp_bench.sim.subject.arms import near_wrist, rest_arm, wrist_loop
 from hwp_bench.sim.subject.hand import SubjectHand, subject_hand
 from hwp_bench.sim.subject.jewellery import (
@@ -92,7 +92,7 @@ def _ring_mount(hand: SubjectHand, ring: Ring) -> Mount:
     axis = finger_back(ring.finger) * mirror
     axis = unit(axis - (axis @ bone) * bone)
     frame = np.stack([np.cross(axis, bone), axis, bone], axis=1)
-    rest = _rest_skin(hand)
+    rest = hand.rest_skin
     owned = hand.lift @ hand.template.weights[:, first : first + 3].sum(axis=1) > 0.5
     local = (rest - place) @ frame
     belt = owned & (np.abs(local[:, 2]) < 0.5 * ring.width + _BELT)
@@ -115,7 +115,7 @@ def _ring_mount(hand: SubjectHand, ring: Ring) -> Mount:
 def _wrist_mount(subject: Subject, side: str, item: WristWear, subdivisions: int) -> Mount:
     hand = subject_hand(subject, side, subdivisions)
     loop = wrist_loop(subject, side, subdivisions).loop
-    rest = _rest_skin(hand)
+    rest = hand.rest_skin
     rim = rest[loop].mean(axis=0)
     bare = subject.looks.arm == "bare"
     forward = unit(hand.joints[4] - hand.joints[0])
@@ -143,13 +143,6 @@ def _wrist_mount(subject: Subject, side: str, item: WristWear, subdivisions: int
     else:
         near = np.flatnonzero(np.abs(local[: len(hand.template.vertices), 2] - ahead) < 0.012)
     return Mount(_placed(made, frame, place, hand=False), near, skin[near], on_arm=bare)
-
-
-def _rest_skin(hand: SubjectHand) -> np.ndarray:
-    """The rest hand with its relief: (V, 3) m."""
-    smooth = hand.rest
-    normals = surface_normals(smooth, hand.faces, hand.normal_sum)
-    return smooth + hand.relief[:, None] * normals
 
 
 def _outline(points: np.ndarray) -> np.ndarray:

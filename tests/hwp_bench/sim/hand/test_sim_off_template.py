@@ -162,25 +162,26 @@ def test_weights_get_sharper_and_softer(free: HandTemplate) -> None:
 def test_the_left_hand_is_the_right_ones_mirror() -> None:
     subject = replace(SUBJECT, anatomy=ANATOMIES["drawn"])
     right, left = (person(subject, side) for side in ("right", "left"))
+    (one, _, betas, *_), (other, _, mirrored, *_) = right, left
     flip = np.array([-1.0, 1.0, 1.0])
-    np.testing.assert_allclose(left.template.vertices, right.template.vertices * flip, atol=1e-9)
-    np.testing.assert_allclose(left.template.joints, right.template.joints * flip, atol=1e-9)
-    np.testing.assert_allclose(left.betas, right.betas, atol=2e-3)
+    np.testing.assert_allclose(other.vertices, one.vertices * flip, atol=1e-9)
+    np.testing.assert_allclose(other.joints, one.joints * flip, atol=1e-9)
+    np.testing.assert_allclose(mirrored, betas, atol=2e-3)
 
 
 def test_the_same_seed_is_the_same_person() -> None:
     # Also when another spread is asked for: directions stay, sizes follow.
     one, other = (
-        person(replace(SUBJECT, anatomy=SubjectAnatomy(seed=3, joint_shift=mm)), "right").template
+        person(replace(SUBJECT, anatomy=SubjectAnatomy(seed=3, joint_shift=mm)), "right")[0]
         for mm in (2.0, 4.0)
     )
-    rest = person(replace(SUBJECT, anatomy=SubjectAnatomy(seed=3, bony=0.1)), "right").template
+    rest = person(replace(SUBJECT, anatomy=SubjectAnatomy(seed=3, bony=0.1)), "right")[0]
     np.testing.assert_allclose(other.joints - rest.joints, 2 * (one.joints - rest.joints))
     drawn = [
-        person(replace(SUBJECT, anatomy=SubjectAnatomy(seed=seed, bone_length=5.0)), "right")
+        person(replace(SUBJECT, anatomy=SubjectAnatomy(seed=seed, bone_length=5.0)), "right")[0]
         for seed in (1, 1, 2)
     ]
-    assert drawn[0].template.digest == drawn[1].template.digest != drawn[2].template.digest
+    assert drawn[0].digest == drawn[1].digest != drawn[2].digest
 
 
 def test_betas_of_the_models_own_shapes_come_back(free: HandTemplate) -> None:
@@ -271,7 +272,7 @@ def test_a_scene_without_the_table_is_as_it_was(make_scene: SceneMaker) -> None:
     # An empty table asks for nothing.
     empty = make_scene(("[camera]", "[subject.anatomy]\n\n[camera]"))
     assert not is_off_template(empty.subject)
-    assert person(empty.subject, "right").template.name == "anny-1"
+    assert person(empty.subject, "right")[0].name == "anny-1"
 
 
 @pytest.mark.parametrize(

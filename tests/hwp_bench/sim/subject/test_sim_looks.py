@@ -18,14 +18,13 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.gestures import FIRST_JOINT
 from hwp_bench.sim.effects.plan import hands_at, plan
 from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.geometry.surface import surface_normals
 from hwp_bench.sim.hand.anatomy import Anatomy
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.arms import wrist_loop
 from hwp_bench.sim.subject.covers import Glove, Polish, Tattoo
-from hwp_bench.sim.subject.hand import anatomy_at, subject_hand
+from hwp_bench.sim.subject.hand import subject_hand
 from hwp_bench.sim.subject.jewellery import Ring, WristWear
 from hwp_bench.sim.subject.mounts import ring_mounts
 from hwp_bench.sim.subject.skin import of_side, painted, sample_skin
@@ -40,10 +39,7 @@ RED = (0.8, 0.05, 0.1)
 def places() -> Anatomy:
     """The vertices of a rest hand, 1.4 mm apart."""
     hand = subject_hand(PERSON, "right")
-    template = hand.template
-    rest = hand.lift @ (template.vertices + template.shape_basis @ hand.betas)
-    normals = surface_normals(rest, hand.faces, hand.normal_sum)
-    return anatomy_at(template, hand.betas, rest, normals, hand.lift @ template.weights)
+    return hand.anatomy(hand.rest, hand.rest_normals, hand.lift @ hand.template.weights)
 
 
 def wearing(**looks: object) -> Subject:
