@@ -20,7 +20,12 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from hwp_bench.base.errors import BadCapture, BadInput, UsageError
-from hwp_bench.base.files import atomic_folder, canonical_json, read_json, write_json
+from hwp_bench.base.files import (
+    atomic_folder,
+    canonical_json,
+    read_json,
+    write_json,
+)
 from hwp_bench.base.images import pixel_digest
 from hwp_bench.base.records import Line, Record, parse_record, without_schema
 from hwp_bench.base.version import __version__
@@ -42,6 +47,12 @@ from hwp_bench.methods.request import write_request
 SCHEME = "hwp-commitment/1"
 #: Length of a salt in bytes: too long to be guessed.
 SALT_BYTES = 32
+#: Version of the public manifest.
+PUBLIC_SCHEMA = "hwp-public/1"
+#: Version of the sealed part's key file.
+SEALED_SCHEMA = "hwp-sealed/1"
+#: Names inside the folder of a publication.
+PUBLIC, SEALED, MANIFEST, KEY = "public", "sealed", "manifest.json", "sealed.json"
 
 
 def target_content(capture: Capture, split: Split) -> dict[str, Any]:
@@ -76,14 +87,6 @@ def commitment(content: Mapping[str, Any], salt: str) -> str:
 def joint_commitment(commitments: Sequence[str]) -> str:
     """Return one digest (hex) of the commitments of all captures, in the manifest's order."""
     return hashlib.sha256("\n".join([SCHEME, *commitments]).encode()).hexdigest()
-
-
-#: Version of the public manifest.
-PUBLIC_SCHEMA = "hwp-public/1"
-#: Version of the sealed part's key file.
-SEALED_SCHEMA = "hwp-sealed/1"
-#: Names inside the folder of a publication.
-PUBLIC, SEALED, MANIFEST, KEY = "public", "sealed", "manifest.json", "sealed.json"
 
 
 @dataclass(frozen=True)
@@ -269,11 +272,6 @@ def read_manifest(public: str | os.PathLike[str]) -> PublicManifest:
     return found
 
 
-def _read(path: Path, schema: str, kind: type[Record]) -> Record:
-    value = without_schema(read_json(path), schema, where=path, error=BadInput)
-    return parse_record(kind, value, where=path, error=BadInput, ignore_unknown=True)
-
-
 @dataclass(frozen=True)
 class CommittedCapture:
     """One capture in a manifest or a sealed part's key file."""
@@ -297,9 +295,13 @@ class PublicManifest:
 
 
 @dataclass(frozen=True)
-class _SealedKey:
+class _SealedKey(PublicManifest):
     """The fields of a sealed part's key file."""
 
+    #: Hex.
     salt: Annotated[str, Meta(min_length=2 * SALT_BYTES, max_length=10_000)]
-    commitment: Line
-    captures: Annotated[list[CommittedCapture], Meta(min_length=1)]
+
+
+def _read(path: Path, schema: str, kind: type[Record]) -> Record:
+    value = without_schema(read_json(path), schema, where=path, error=BadInput)
+    return parse_record(kind, value, where=path, error=BadInput, ignore_unknown=True)

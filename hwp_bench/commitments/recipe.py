@@ -11,7 +11,7 @@ import hmac
 import os
 import secrets
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, fields, is_dataclass, replace
+from dataclasses import dataclass, fields, is_dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import canonical_json, read_json, write_json
-from hwp_bench.base.records import MAX_SEED, Digest, Line, parse_record, without_schema
+from hwp_bench.base.records import MAX_SEED, Digest, Line, Record, parse_record, without_schema
 from hwp_bench.sim.produce.capture import RENDERER
 from hwp_bench.sim.produce.suites import SuiteItem, suite
 from hwp_bench.sim.scene.scene import Scene, with_subject
@@ -29,8 +29,8 @@ from hwp_bench.sim.scene_files import known_scenes, load_scene
 SECRET_SCHEMA = "hwp-secret/1"
 #: Length of a secret in bytes.
 SECRET_BYTES = 32
-#: Most bytes of the file.
-_MAX_FILE = 10_000
+# Most bytes of a secret, a page or a reveal.
+_MAX_FILE = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -58,10 +58,14 @@ def write_secret(path: str | os.PathLike[str], secret: str) -> None:
 
 def read_secret(path: str | os.PathLike[str]) -> str:
     """Return the secret (hex) of a file."""
-    value = without_schema(
-        read_json(path, max_bytes=_MAX_FILE), SECRET_SCHEMA, where=path, error=BadInput
-    )
-    return parse_record(_File, value, where=path, error=BadInput).secret
+    return read_strictly(path, SECRET_SCHEMA, _File).secret
+
+
+def read_strictly(path: str | os.PathLike[str], schema: str, kind: type[Record]) -> Record:
+    """Read a small JSON file of a stated schema, with no field besides the record's."""
+    value = read_json(path, max_bytes=_MAX_FILE)
+    value = without_schema(value, schema, where=path, error=BadInput)
+    return parse_record(kind, value, where=path, error=BadInput)
 
 
 def derived(secret: str, *purpose: str) -> bytes:
@@ -128,11 +132,6 @@ class Recipe:
                 field="scenes",
                 remedy="Those who check a suite must have its scenes: `hwp-bench sim list`.",
             )
-
-    def to_json(self) -> dict[str, Any]:
-        """Return JSON values; what a commitment binds."""
-        scenes = [asdict(scene) for scene in self.scenes]
-        return {"scenes": scenes, "size": self.size, "renderer": self.renderer}
 
     def refuse_other_toolkit(self) -> None:
         """Refuse a recipe that this version of the toolkit does not render as its maker's did."""

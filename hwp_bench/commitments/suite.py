@@ -8,15 +8,15 @@ from __future__ import annotations
 
 import os
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
 import numpy as np
 
 from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.files import read_json, refuse_existing, write_json
+from hwp_bench.base.files import refuse_existing, write_json
 from hwp_bench.base.locks import exclusive
-from hwp_bench.base.records import Digest, Line, parse_record, without_schema
+from hwp_bench.base.records import Digest, Line
 from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import split_for
@@ -34,6 +34,7 @@ from hwp_bench.commitments.recipe import (
     derived,
     draw_secret,
     read_secret,
+    read_strictly,
     sealed_items,
     secret_commitment,
     write_secret,
@@ -44,13 +45,13 @@ from hwp_bench.sim.produce.suites import ensure_suite
 
 #: Version of the public page.
 SUITE_SCHEMA = "hwp-sealed-suite/1"
+#: Version of a reveal.
+REVEAL_SCHEMA = "hwp-revealed/1"
 #: Names inside the folder of a sealed suite. The keeper's part holds the secret and the captures,
 #: the publication the part for authors and the sealed part that scores them.
 KEEPER, SECRET, CAPTURES, PUBLICATION = "keeper", "secret.json", "captures", "publication"
 #: The page, inside the part for authors.
 SUITE = "suite.json"
-#: Largest page or reveal, bytes.
-MAX_FILE = 1_000_000
 
 
 @dataclass(frozen=True)
@@ -69,16 +70,7 @@ class SuitePage:
 
 def write_suite_page(folder: Path, page: SuitePage) -> None:
     """Write the page into the part for authors."""
-    write_json(
-        folder / SUITE,
-        {
-            "schema": SUITE_SCHEMA,
-            "recipe": page.recipe.to_json(),
-            "secret_commitment": page.secret_commitment,
-            "frames_commitment": page.frames_commitment,
-            "toolkit": page.toolkit,
-        },
-    )
+    write_json(folder / SUITE, {"schema": SUITE_SCHEMA, **asdict(page)})
 
 
 def read_suite_page(public: str | os.PathLike[str]) -> SuitePage:
@@ -90,9 +82,7 @@ def read_suite_page(public: str | os.PathLike[str]) -> SuitePage:
             where=public,
             remedy="Give the folder public of a suite that `hwp-bench sealed make` made.",
         )
-    value = read_json(path, max_bytes=MAX_FILE)
-    value = without_schema(value, SUITE_SCHEMA, where=path, error=BadInput)
-    return parse_record(SuitePage, value, where=path, error=BadInput)
+    return read_strictly(path, SUITE_SCHEMA, SuitePage)
 
 
 @dataclass(frozen=True)
@@ -165,7 +155,7 @@ def suite_salt(secret: str) -> str:
 
 
 def _page(recipe: Recipe, secret: str, joint: str) -> SuitePage:
-    return SuitePage(recipe, secret_commitment(secret, recipe.to_json()), joint, __version__)
+    return SuitePage(recipe, secret_commitment(secret, asdict(recipe)), joint, __version__)
 
 
 def _secret_of(path: Path, given: str | None) -> str:
@@ -182,10 +172,6 @@ def _secret_of(path: Path, given: str | None) -> str:
     chosen = given or draw_secret()
     write_secret(path, chosen)
     return chosen
-
-
-#: Version of a reveal.
-REVEAL_SCHEMA = "hwp-revealed/1"
 
 
 @dataclass(frozen=True)
@@ -215,7 +201,7 @@ def reveal(suite: str | os.PathLike[str], out: str | os.PathLike[str]) -> Reveal
     refuse_existing(target)
     page = read_suite_page(folder / PUBLICATION / PUBLIC)
     secret = read_secret(folder / KEEPER / SECRET)
-    if secret_commitment(secret, page.recipe.to_json()) != page.secret_commitment:
+    if secret_commitment(secret, asdict(page.recipe)) != page.secret_commitment:
         raise BadInput(
             "is not the secret that the suite's page is committed to",
             where=folder / KEEPER / SECRET,
@@ -226,22 +212,13 @@ def reveal(suite: str | os.PathLike[str], out: str | os.PathLike[str]) -> Reveal
             where=folder / PUBLICATION,
         )
     found = Revealed(secret, page.secret_commitment)
-    write_json(
-        target,
-        {
-            "schema": REVEAL_SCHEMA,
-            "secret": found.secret,
-            "secret_commitment": found.secret_commitment,
-        },
-    )
+    write_json(target, {"schema": REVEAL_SCHEMA, **asdict(found)})
     return found
 
 
 def read_revealed(path: str | os.PathLike[str]) -> Revealed:
     """Read a revealed secret."""
-    value = read_json(path, max_bytes=MAX_FILE)
-    value = without_schema(value, REVEAL_SCHEMA, where=path, error=BadInput)
-    return parse_record(Revealed, value, where=path, error=BadInput)
+    return read_strictly(path, REVEAL_SCHEMA, Revealed)
 
 
 @dataclass(frozen=True)
@@ -301,7 +278,7 @@ def check_revealed(
         UsageError: this toolkit renders other captures than its maker's, or `only` names none.
     """
     page, found = read_suite_page(public), read_revealed(revealed)
-    expected = secret_commitment(found.secret, page.recipe.to_json())
+    expected = secret_commitment(found.secret, asdict(page.recipe))
     if not expected == page.secret_commitment == found.secret_commitment:
         raise BadInput(
             "is not the secret that the suite was committed to",

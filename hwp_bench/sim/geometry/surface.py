@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Annotated
 
@@ -186,6 +187,23 @@ def plain(color: tuple[float, float, float] | np.ndarray, **settings: float) -> 
     """A material of one linear colour."""
     albedo = np.asarray(color, dtype=np.float32).reshape(1, 1, 3)
     return Material(albedo=albedo, **settings)  # type: ignore[arg-type]
+
+
+def coat(color: Sequence[float] | np.ndarray, **settings: float) -> Material:
+    """A material of one sRGB colour."""
+    return plain(srgb_to_linear(np.array(color)), **settings)
+
+
+def picture_material(image: np.ndarray, gloss: float) -> Material:
+    """A material with the colours of a painted (H, W, 3) uint8 image."""
+    return Material(albedo=albedo(image), gloss=gloss)
+
+
+def shift(surface: Surface, place: tuple[float, float, float] | np.ndarray) -> Surface:
+    """A surface moved by (3,) m."""
+    move = np.eye(4)
+    move[:3, 3] = place
+    return transformed(surface, move)
 
 
 _Channel = Annotated[float, Meta(ge=0.0, le=1.0)]

@@ -15,9 +15,7 @@ SteamVR (`finger_index_0_r`).
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 
 import numpy as np
 
@@ -29,61 +27,37 @@ from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, make_template
 from hwp_bench.sim.hand.gltf import SkinnedMesh, paintable, read_skinned_mesh
 from hwp_bench.sim.hand.rig_mesh import RigMesh, kept, opened_at_wrist
 
+_THREE = ("proximal", "intermediate", "distal")
 #: Joints of the hand model, in its order, as WebXR names them.
 WEBXR = (
     "wrist",
-    *(
-        f"{finger}-finger-phalanx-{part}"
-        for finger in ("index", "middle", "pinky", "ring")
-        for part in ("proximal", "intermediate", "distal")
-    ),
-    "thumb-metacarpal",
-    "thumb-phalanx-proximal",
-    "thumb-phalanx-distal",
+    *(f"{x}-finger-phalanx-{y}" for x in ("index", "middle", "pinky", "ring") for y in _THREE),
+    *("thumb-metacarpal", "thumb-phalanx-proximal", "thumb-phalanx-distal"),
 )
 #: The same as OpenXR rigs name them, without the side's suffix.
 OPENXR = (
     "wrist",
-    *(
-        f"{finger}_{part}"
-        for finger in ("index", "middle", "little", "ring")
-        for part in ("proximal", "intermediate", "distal")
-    ),
-    "thumb_metacarpal",
-    "thumb_proximal",
-    "thumb_distal",
+    *(f"{x}_{y}" for x in ("index", "middle", "little", "ring") for y in _THREE),
+    *("thumb_metacarpal", "thumb_proximal", "thumb_distal"),
 )
 #: Words of a finger, in the hand model's order.
-_FINGERS: Mapping[str, tuple[str, ...]] = MappingProxyType(
-    {
-        "index": ("index", "forefinger", "pointer"),
-        "middle": ("middle", "mid"),
-        "little": ("little", "pinky", "pinkie", "small"),
-        "ring": ("ring",),
-        "thumb": ("thumb",),
-    }
-)
-_SIDES: Mapping[str, str] = MappingProxyType(
-    {"right": "right", "r": "right", "left": "left", "l": "left"}
-)
+_FINGERS = {
+    "index": ("index", "forefinger", "pointer"),
+    "middle": ("middle", "mid"),
+    "little": ("little", "pinky", "pinkie", "small"),
+    "ring": ("ring",),
+    "thumb": ("thumb",),
+}
+_SIDES = {"right": "right", "r": "right", "left": "left", "l": "left"}
 _PARTS = ("metacarpal", "meta", "proximal", "intermediate", "medial", "distal")
 # Words of joints beyond the last one, or of helpers.
 _ASIDE = frozenset(
     (
-        "tip",
-        "end",
-        "nub",
-        "aux",
-        "null",
-        "ik",
-        "pole",
-        "target",
-        "ctrl",
-        "twist",
-        "roll",
+        *("tip", "end", "nub", "aux", "null", "ik", "pole", "target", "ctrl", "twist", "roll"),
         "effector",
     )
 )
+# Words of the rest of a body.
 _BODY = frozenset(
     (
         *("spine", "chest", "neck", "head", "jaw", "eye", "hip", "hips", "pelvis", "torso"),

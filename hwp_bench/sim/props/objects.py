@@ -18,11 +18,13 @@ from hwp_bench.sim.geometry.surface import (
     albedo,
     box,
     canvas,
+    coat,
     grid,
     ink,
     join,
+    picture_material,
     plain,
-    transformed,
+    shift,
     tube,
     turned,
 )
@@ -58,22 +60,14 @@ def _block(variant: int) -> Surface:
 
 def _pen(variant: int) -> Surface:
     """Build a pen of 15 cm along z and 17 mm across, its tip at -z."""
-    barrel = plain(srgb_to_linear(np.array(_BARRELS[variant % len(_BARRELS)])), gloss=0.25)
+    barrel = coat(_BARRELS[variant % len(_BARRELS)], gloss=0.25)
     rubber = plain((0.02, 0.02, 0.02), gloss=0.8)
     metal = plain((0.55, 0.55, 0.57), gloss=0.2, specular=0.6)
     shaft = np.array([[0.0, 0.076], [0.007, 0.076], [0.0082, 0.072], [0.0084, -0.03]])
     grip = np.array([[0.0084, -0.03], [0.009, -0.035], [0.0086, -0.052], [0.0072, -0.06]])
     tip = np.array([[0.0072, -0.06], [0.0032, -0.07], [0.002, -0.076], [0.0, -0.0765]])
-    move = np.eye(4)
-    move[:3, 3] = [0.0, 0.0096, 0.05]
-    return join(
-        [
-            turned(shaft, barrel),
-            turned(grip, rubber),
-            turned(tip, metal),
-            transformed(box((0.004, 0.0022, 0.045), metal), move),
-        ]
-    )
+    clip = shift(box((0.004, 0.0022, 0.045), metal), (0.0, 0.0096, 0.05))
+    return join([turned(shaft, barrel), turned(grip, rubber), turned(tip, metal), clip])
 
 
 def _phone(variant: int) -> Surface:
@@ -82,13 +76,10 @@ def _phone(variant: int) -> Surface:
     screen = Material(
         albedo=srgb_to_linear(_page(variant)).astype(np.float32), gloss=0.12, glow=0.6
     )
-    move = np.eye(4)
-    move[2, 3] = _PHONE_SIZE[2] / 2
-    glass = transformed(box((0.065, 0.136, 0.0004), screen), move)
-    lens = plain((0.01, 0.01, 0.015), gloss=0.08)
-    move = np.eye(4)
-    move[:3, 3] = [0.018, 0.05, -_PHONE_SIZE[2] / 2]
-    return join([body, glass, transformed(box((0.024, 0.03, 0.002), lens), move)])
+    half = _PHONE_SIZE[2] / 2
+    glass = shift(box((0.065, 0.136, 0.0004), screen), (0.0, 0.0, half))
+    lens = box((0.024, 0.03, 0.002), plain((0.01, 0.01, 0.015), gloss=0.08))
+    return join([body, glass, shift(lens, (0.018, 0.05, -half))])
 
 
 def _page(variant: int) -> np.ndarray:
@@ -127,10 +118,6 @@ def _card(variant: int) -> Surface:
     return _sheet(_card_front(variant), _card_back(), (0.058, 0.089), bend=0.006)
 
 
-def _material(image: np.ndarray) -> Material:
-    return Material(albedo=albedo(image), gloss=0.4)
-
-
 def _sheet(front: np.ndarray, back: np.ndarray, size: tuple[float, float], bend: float) -> Surface:
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.5, 0.5, 7))
     z = bend * (1.0 - 4.0 * x * x)
@@ -149,22 +136,18 @@ def _two_sided(
     vertices: np.ndarray, front: np.ndarray, back: np.ndarray, columns: int = 7
 ) -> Surface:
     rows = len(vertices) // columns
-    top = grid(vertices, rows, columns, _material(front))
+    top = grid(vertices, rows, columns, picture_material(front, 0.4))
     if columns == 4:
         flat = vertices[top.faces][..., :2] / (2.0 * _RADIUS) + 0.5
         top = replace(top, corner_uv=flat)
     if top.normals[:, 2].mean() < 0:
         top = _reversed(top)
-    under = _reversed(transformed(grid(vertices, rows, columns, _material(back)), _lowered()))
+    under = _reversed(
+        shift(grid(vertices, rows, columns, picture_material(back, 0.4)), (0.0, 0.0, -0.0004))
+    )
     if under.normals[:, 2].mean() > 0:
         under = _reversed(under)
     return join([top, under])
-
-
-def _lowered() -> np.ndarray:
-    move = np.eye(4)
-    move[2, 3] = -0.0004
-    return move
 
 
 def _reversed(surface: Surface) -> Surface:
@@ -263,7 +246,7 @@ def _tube(variant: int) -> Surface:
     label = canvas(_LABEL_TEXTURE, _LABEL_TEXTURE, (0.93, 0.95, 0.96))
     label[70:100] = ink((0.20, 0.55, 0.62))
     cv2.putText(label, "care", (22, 52), cv2.FONT_HERSHEY_DUPLEX, 1.2, ink((0.1, 0.3, 0.4)), 3)
-    skin = Material(albedo=albedo(label), gloss=0.3)
+    skin = picture_material(label, 0.3)
     ticks = np.linspace(0.0, 1.0, 12)
     angles = np.linspace(0.0, 2.0 * np.pi, 33)
     radius = 0.019
@@ -277,7 +260,7 @@ def _tube(variant: int) -> Surface:
         ],
         axis=-1,
     ).reshape(-1, 3)
-    cap = plain(srgb_to_linear(np.array([0.15, 0.42, 0.5])), gloss=0.35)
+    cap = coat((0.15, 0.42, 0.5), gloss=0.35)
     lid = np.array([[0.0, -0.072], [0.016, -0.072], [0.0165, -0.052], [0.019, -0.05]])
     return join([grid(vertices, len(ticks), len(angles), skin), turned(lid, cap)])
 
@@ -331,8 +314,8 @@ def _mug(variant: int) -> Surface:
     for _ in range(9):
         place = (int(rng.integers(12, 244)), int(rng.integers(18, 54)))
         cv2.circle(image, place, int(rng.integers(3, 9)), ink(band), -1, cv2.LINE_AA)
-    glaze = Material(albedo=albedo(image), gloss=0.18)
-    inside = plain(srgb_to_linear(np.array([0.93, 0.92, 0.88])), gloss=0.2)
+    glaze = picture_material(image, 0.18)
+    inside = coat((0.93, 0.92, 0.88), gloss=0.2)
     outer = np.array([[0.0, -0.045], [0.034, -0.045], [0.039, -0.04], [0.041, 0.043]])
     inner = np.array([[0.041, 0.043], [0.038, 0.045], [0.0365, 0.04], [0.034, -0.038], [0, -0.04]])
     bend = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 15)
@@ -355,12 +338,12 @@ def _ball(variant: int) -> Surface:
             cv2.ellipse(image, place, (14, 11), 0, 0, 360, ink(patch), -1, cv2.LINE_AA)
     along = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 25)
     profile = 0.031 * np.stack([np.cos(along), np.sin(along)], axis=1)
-    return turned(profile, Material(albedo=albedo(image), gloss=0.35), 40)
+    return turned(profile, picture_material(image, 0.35), 40)
 
 
 def _spoon(variant: int) -> Surface:
     """A wooden or steel spoon of 19 cm along z, its bowl at +z, hollow to +y."""
-    wood = plain(srgb_to_linear(np.array([0.62, 0.42, 0.24])), gloss=0.6)
+    wood = coat((0.62, 0.42, 0.24), gloss=0.6)
     steel = plain((0.58, 0.58, 0.6), gloss=0.2, specular=0.6)
     material = steel if variant % 2 else wood
     along = np.linspace(0.0, 1.0, 25)
@@ -385,7 +368,7 @@ def _banana(variant: int) -> Surface:
         row, column = int(rng.integers(0, 64)), int(rng.integers(0, 256))
         image[row : row + 2, column : column + int(rng.integers(2, 9))] = ink((0.45, 0.30, 0.12))
     image[:, :5] = image[:, -7:] = ink((0.35, 0.26, 0.12))
-    peel = Material(albedo=albedo(np.ascontiguousarray(image.transpose(1, 0, 2))), gloss=0.45)
+    peel = picture_material(np.ascontiguousarray(image.transpose(1, 0, 2)), 0.45)
     along = np.linspace(0.0, 1.0, 31)
     angle = 1.25 * (along - 0.5)
     spine = np.stack([np.zeros(31), 0.13 * (1.0 - np.cos(angle)), 0.13 * np.sin(angle)], axis=1)
@@ -410,9 +393,14 @@ def _remote(variant: int) -> Surface:
     for row in range(5):
         for column in range(3):
             cv2.circle(face, (14 + 18 * column, 128 + 22 * row), 6, key, -1, cv2.LINE_AA)
-    shell = plain(srgb_to_linear(np.array([0.07] * 3 if dark else [0.72] * 3)), gloss=0.4)
-    top = Material(albedo=albedo(face[::-1]), gloss=0.5)
-    return join([box((0.045, 0.16, 0.018), shell), _above(box((0.042, 0.156, 0.001), top), 0.0095)])
+    shell = coat((0.07,) * 3 if dark else (0.72,) * 3, gloss=0.4)
+    top = picture_material(face[::-1], 0.5)
+    return join(
+        [
+            box((0.045, 0.16, 0.018), shell),
+            shift(box((0.042, 0.156, 0.001), top), (0.0, 0.0, 0.0095)),
+        ]
+    )
 
 
 def _bottle(variant: int) -> Surface:
@@ -423,8 +411,8 @@ def _bottle(variant: int) -> Surface:
     label = canvas(128, 256, (0.94, 0.93, 0.90))
     label[20:108] = ink(color)
     cv2.putText(label, "No. 7", (20, 78), cv2.FONT_HERSHEY_DUPLEX, 1.4, ink((0.97, 0.95, 0.9)), 3)
-    body = Material(albedo=albedo(label[::-1]), gloss=0.22)
-    cap = plain(srgb_to_linear(np.array([0.15, 0.15, 0.16])), gloss=0.4)
+    body = picture_material(label[::-1], 0.22)
+    cap = coat((0.15, 0.15, 0.16), gloss=0.4)
     hull = np.array(
         [
             [0.0, -0.08],
@@ -442,14 +430,14 @@ def _bottle(variant: int) -> Surface:
 def _brush(variant: int) -> Surface:
     """A hair brush of 20 cm along y: a handle, a head, and rows of bristles to +z."""
     tone = (0.40, 0.22, 0.12) if variant % 2 else (0.68, 0.50, 0.32)
-    wood = plain(srgb_to_linear(np.array(tone)), gloss=0.5)
+    wood = coat(tone, gloss=0.5)
     dark = plain((0.03, 0.03, 0.03), gloss=0.7)
-    parts = [_at(box((0.018, 0.11, 0.014), wood), (0.0, -0.05, 0.0))]
-    parts.append(_at(box((0.05, 0.09, 0.012), wood), (0.0, 0.05, 0.0)))
+    parts = [shift(box((0.018, 0.11, 0.014), wood), (0.0, -0.05, 0.0))]
+    parts.append(shift(box((0.05, 0.09, 0.012), wood), (0.0, 0.05, 0.0)))
     for row in range(7):
         for column in range(4):
             place = (-0.018 + 0.012 * column, 0.014 + 0.012 * row, 0.013)
-            parts.append(_at(box((0.0025, 0.0025, 0.016), dark), place))
+            parts.append(shift(box((0.0025, 0.0025, 0.016), dark), place))
     return join(parts)
 
 
@@ -466,26 +454,16 @@ def _notebook(variant: int) -> Surface:
     for line in (54, 66):
         cv2.line(cover, (42, line), (102, line), ink((0.4, 0.38, 0.36)), 1)
     cover[:, 14:18] = ink((0.08, 0.08, 0.09))
-    pages = plain(srgb_to_linear(np.array([0.92, 0.90, 0.84])), gloss=0.8)
-    lid = Material(albedo=albedo(np.ascontiguousarray(cover[::-1])), gloss=0.5)
-    back = plain(srgb_to_linear(np.array(color)), gloss=0.5)
+    pages = coat((0.92, 0.90, 0.84), gloss=0.8)
+    lid = picture_material(np.ascontiguousarray(cover[::-1]), 0.5)
+    back = coat(color, gloss=0.5)
     return join(
         [
             box((0.088, 0.138, 0.011), pages),
-            _above(box((0.09, 0.14, 0.001), lid), 0.006),
-            _above(box((0.09, 0.14, 0.001), back), -0.006),
+            shift(box((0.09, 0.14, 0.001), lid), (0.0, 0.0, 0.006)),
+            shift(box((0.09, 0.14, 0.001), back), (0.0, 0.0, -0.006)),
         ]
     )
-
-
-def _above(surface: Surface, height: float) -> Surface:
-    return _at(surface, (0.0, 0.0, height))
-
-
-def _at(surface: Surface, place: tuple[float, float, float]) -> Surface:
-    move = np.eye(4)
-    move[:3, 3] = place
-    return transformed(surface, move)
 
 
 # What builds each object; the variant chooses among its colours, sizes and pictures.

@@ -9,7 +9,6 @@ from typing import Literal
 
 import numpy as np
 
-from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.base.records import number
 from hwp_bench.sim.geometry.surface import (
     Color,
@@ -17,6 +16,7 @@ from hwp_bench.sim.geometry.surface import (
     Surface,
     albedo,
     canvas,
+    coat,
     grid,
     ink,
     join,
@@ -44,7 +44,7 @@ METALS: Mapping[str, tuple[tuple[float, float, float], float]] = MappingProxyTyp
 def metal(name: str) -> Material:
     """A polished metal by its name in `METALS`."""
     color, roughness = METALS[name]
-    return plain(srgb_to_linear(np.array(color)), gloss=roughness, specular=0.55)
+    return coat(color, gloss=roughness, specular=0.55)
 
 
 def angles() -> np.ndarray:
@@ -85,7 +85,7 @@ def stone(diameter: float, color: tuple[float, float, float], setting: Material)
     cup = turned(
         np.array([[0.75 * r, -0.3 * r], [1.12 * r, 0.35 * r], [0.95 * r, 0.45 * r]]), setting
     )
-    gem = plain(srgb_to_linear(np.array(color)), gloss=0.08, specular=0.12)
+    gem = coat(color, gloss=0.08, specular=0.12)
     cut = turned(
         np.array([[1.0 * r, 0.3 * r], [0.98 * r, 0.5 * r], [0.6 * r, 0.85 * r], [1e-5, 0.86 * r]]),
         gem,
@@ -151,7 +151,7 @@ _STRAP = 0.011
 
 def wrist_watch(wrist: tuple[float, float], color: tuple[float, float, float]) -> Surface:
     """Build a watch around the x axis, its dial to +y."""
-    leather = plain(srgb_to_linear(np.array(color)), gloss=0.55)
+    leather = coat(color, gloss=0.55)
     steel = plain((0.6, 0.6, 0.62), gloss=0.18, specular=0.6)
     angles = np.linspace(0.0, 2.0 * np.pi, 41)
     profile = ((-1.0, 0.0), (-1.0, 0.0028), (1.0, 0.0028), (1.0, 0.0))

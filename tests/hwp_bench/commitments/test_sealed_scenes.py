@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import hmac
 import json
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -66,7 +67,7 @@ def test_numbers_are_those_of_hmac_sha256(secret: str, label: str) -> None:
 
 @given(secret=SECRETS)
 def test_the_commitment_is_a_digest_of_secret_and_recipe(secret: str) -> None:
-    recipe = recipe_of(["capture2"], 20, 64).to_json()
+    recipe = asdict(recipe_of(["capture2"], 20, 64))
     text = json.dumps(
         {"recipe": recipe, "schema": "hwp-secret/1", "secret": secret},
         sort_keys=True,
