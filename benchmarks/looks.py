@@ -22,7 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.effects import plan
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_mask
 from hwp_bench.sim.props.backdrops import plane_names
 from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm
@@ -31,10 +31,9 @@ from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.arms import arm_atlas
 from hwp_bench.sim.subject.atlas import skin_atlas
-from hwp_bench.sim.subject.covers import Glove, Polish, Tattoo
-from hwp_bench.sim.subject.jewellery import Ring, WristWear
 from hwp_bench.sim.subject.skin import of_side
 from hwp_bench.sim.subject.subject import Looks
+from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
 #: Scene that is varied; frames over which it is spread, and the frame that is timed (clean).
 SCENE, SPREAD, FRAME = "capture1", 240, 235

@@ -10,7 +10,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 
-from hwp_bench.sim.effects.effects import ComplexPoses, ObjectInteraction, read_settings
+from hwp_bench.sim.effects import ComplexPoses, ObjectInteraction, read_settings
 from hwp_bench.sim.hand.rigs import FROM_FILE, SHIPPED
 from hwp_bench.sim.scene.scene import HandKey, Scene
 from hwp_bench.sim.subject.subject import Subject

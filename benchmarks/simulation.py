@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.effects import plan
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import load_scene, scene_names

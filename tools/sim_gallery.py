@@ -16,9 +16,7 @@ from hwp_bench.base.errors import HwpError
 from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import atomic_write, check_places
 from hwp_bench.base.progress import track
-from hwp_bench.sim.camera.sensor import AutoControl, Sensor, check_encoder, through_h264
-from hwp_bench.sim.effects.effects import registered
-from hwp_bench.sim.effects.plan import hands_at
+from hwp_bench.sim.effects import hands_at, registered
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.light.lights import Lamp, Light, Room, focus_point
@@ -29,9 +27,9 @@ from hwp_bench.sim.render.frame import SimulatedFrame, render_frame, steady_gain
 from hwp_bench.sim.scene.motion import hand_parameters, intrinsics, scene_hands, viewmat
 from hwp_bench.sim.scene.scene import EffectCall, HandKey, Scene, Track, with_effects, with_severity
 from hwp_bench.sim.scene_files import load_scene, scene_names
-from hwp_bench.sim.subject.covers import Glove, Polish, Tattoo
-from hwp_bench.sim.subject.jewellery import Ring, WristWear
+from hwp_bench.sim.sensor import AutoControl, Sensor, check_encoder, through_h264
 from hwp_bench.sim.subject.subject import Looks
+from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 from hwp_bench.taxonomy import MAX_SEVERITY
 
 #: Scene that is shown, the moment of it, and the edge of an image in pixels.

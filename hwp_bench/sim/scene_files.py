@@ -13,11 +13,11 @@ from msgspec import Meta
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.records import parse_record
 from hwp_bench.base.toml_text import MAX_CHARACTERS, parse_toml
-from hwp_bench.sim.camera.sensor import Sensor
-from hwp_bench.sim.effects.effects import check_settings, check_sides
+from hwp_bench.sim.effects import check_settings, check_sides
 from hwp_bench.sim.props.backdrops import check_backdrop
 from hwp_bench.sim.scene.motion import clean_share
 from hwp_bench.sim.scene.scene import CLEAN_FROM, MIN_CLEAN_SHARE, EffectCall, Episode, Scene
+from hwp_bench.sim.sensor import Sensor
 from hwp_bench.sim.subject.subject import Words
 from hwp_bench.taxonomy import MAX_SEVERITY, PERTURBATIONS
 
@@ -25,7 +25,7 @@ from hwp_bench.taxonomy import MAX_SEVERITY, PERTURBATIONS
 MAX_STRENGTH = 10.0
 
 _Strength = Annotated[float, Meta(ge=0.0, le=MAX_STRENGTH)]
-_SCENES = Path(__file__).with_name("scene") / "scenes"
+_SCENES = Path(__file__).with_name("scenes")
 
 
 @cache

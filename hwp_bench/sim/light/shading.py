@@ -168,9 +168,8 @@ def lit(samples: Samples, lights: Lights, tracers: list[Tracer], turn: np.ndarra
     Takes `turn` (H,) 0-3. Returns (H,) 0 or 1. A point that faces away from the lamp is 1: its
     normal darkens it.
     """
-    reached = np.ones(len(samples.ray))
     if not lights.key.any():
-        return reached
+        return np.ones(len(samples.ray))
     facing = np.flatnonzero(samples.flat @ lights.direction > 0.0)
     helper = np.array([0.0, 0.0, 1.0])
     if abs(lights.direction[2]) > 0.9:
@@ -179,13 +178,23 @@ def lit(samples: Samples, lights: Lights, tracers: list[Tracer], turn: np.ndarra
     first /= np.linalg.norm(first)
     second = np.cross(lights.direction, first)
     aim = lights.direction + _LIGHT_RADIUS * (_DISC @ np.stack([first, second]))
-    directions = aim[turn[facing]]
-    origins = samples.points[facing] + LIFT * samples.flat[facing]
-    dark = tracers[0].blocked(origins, directions, "shadow")
-    for tracer in tracers[1:]:
-        open_ = np.flatnonzero(~dark)
-        dark[open_] = tracer.blocked(origins[open_], directions[open_], "shadow")
-    reached[facing[dark]] = 0.0
+    return _reached(samples, facing, aim[turn[facing]], tracers, "shadow")
+
+
+def _reached(
+    samples: Samples, rows: np.ndarray, directions: np.ndarray, tracers: list[Tracer], purpose: str
+) -> np.ndarray:
+    """Whether light reaches the samples: (H,) 0 or 1; 1 for all but `rows` (R,).
+
+    `directions` (R, 3) lead from these samples to the light. One that faces away from it is no
+    row: its normal darkens it.
+    """
+    reached = np.ones(len(samples.ray))
+    origins = samples.points[rows] + LIFT * samples.flat[rows]
+    for tracer in tracers:
+        dark = tracer.blocked(origins, directions, purpose)
+        reached[rows[dark]] = 0.0
+        rows, origins, directions = rows[~dark], origins[~dark], directions[~dark]
     return reached
 
 
@@ -247,7 +256,9 @@ def lamp_light(
             directions = ways / np.sqrt(squared)[:, None]
             leaving = np.clip(-(directions @ lamp.facing), 0.0, 1.0)
             arrives = leaving * lamp.distance**2 / squared / len(places)
-            arrives = arrives * passed * _reached(samples, directions, tracers)
+            rows = np.flatnonzero(np.einsum("hk,hk->h", samples.flat, directions) > 0.0)
+            arrives = arrives * passed
+            arrives = arrives * _reached(samples, rows, directions[rows], tracers, "lamps")
             total += _from_point(
                 (samples.normals, samples.view),
                 (samples.albedo, samples.wrap, samples.roughness, samples.specular),
@@ -283,21 +294,6 @@ def _places(lamp: AreaLight) -> np.ndarray:
     edge = next(edge for limit, edge in GRIDS if lamp.slope <= limit)
     ticks = (np.arange(edge) + 0.5) / edge - 0.5
     return np.stack(np.meshgrid(ticks, ticks), axis=-1).reshape(-1, 2)
-
-
-def _reached(samples: Samples, directions: np.ndarray, tracers: list[Tracer]) -> np.ndarray:
-    """Whether light from the directions reaches the samples: (H,) 0 or 1.
-
-    A point that faces away from it is 1, as for the key light: its normal darkens it.
-    """
-    reached = np.ones(len(samples.ray))
-    open_ = np.flatnonzero(np.einsum("hk,hk->h", samples.flat, directions) > 0.0)
-    for tracer in tracers:
-        origins = samples.points[open_] + LIFT * samples.flat[open_]
-        dark = tracer.blocked(origins, directions[open_], "lamps")
-        reached[open_[dark]] = 0.0
-        open_ = open_[~dark]
-    return reached
 
 
 @compiled(nogil=True)

@@ -21,9 +21,7 @@ from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.progress import track
-from hwp_bench.sim.camera.sensor import Sensor
-from hwp_bench.sim.effects.effects import registered
-from hwp_bench.sim.effects.plan import hands_at, plan
+from hwp_bench.sim.effects import hands_at, plan, registered
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.light.lights import steady_light
@@ -33,6 +31,7 @@ from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.motion import intrinsics, viewmat
 from hwp_bench.sim.scene.scene import EffectCall, Scene, with_effects
 from hwp_bench.sim.scene_files import parse_scene
+from hwp_bench.sim.sensor import Sensor
 from hwp_bench.sim.subject.hand import MOVING
 
 #: What severity 1 to 5 means: mean PSNR over the hand in dB, or its covered share.

@@ -39,8 +39,7 @@ from hwp_bench.hands.parameters import HandParameters
 from hwp_bench.run.engine import Job, Needs
 from hwp_bench.run.engine.job import OnProgress
 from hwp_bench.run.engine.process import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
-from hwp_bench.sim.camera.sensor import check_encoder, through_h264
-from hwp_bench.sim.effects.plan import FramePlan, hands_at, plan
+from hwp_bench.sim.effects import FramePlan, hands_at, plan
 from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
 from hwp_bench.sim.produce.free_view import add_free_view, has_free_view, write_free_view
@@ -49,6 +48,7 @@ from hwp_bench.sim.render.frame import eight_bit_coverage, render_frame, write_l
 from hwp_bench.sim.scene.motion import intrinsics, parameters_of, scene_hands, viewmat
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import load_scene
+from hwp_bench.sim.sensor import check_encoder, through_h264
 from hwp_bench.sim.subject.atlas import skin_atlas
 from hwp_bench.sim.subject.skin import of_side
 

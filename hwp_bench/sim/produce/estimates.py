@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.sim.effects.effects import registered
-from hwp_bench.sim.effects.plan import FramePlan
+from hwp_bench.sim.effects import FramePlan, registered
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.produce.tracker import tracked
 from hwp_bench.sim.props.backdrops import plane_names

@@ -10,14 +10,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.base.tables import Cell, Column, Table
-from hwp_bench.sim.camera.sensor import through_h264
-from hwp_bench.sim.effects.effects import ORDER
-from hwp_bench.sim.effects.plan import FramePlan, plan
+from hwp_bench.sim.effects import ORDER, FramePlan, plan
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.produce.capture import check_extent
 from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free
 from hwp_bench.sim.render.frame import carry_out, steady_gain
 from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.sensor import through_h264
 
 # Joins the names of effects that act in the same frame.
 _PLUS = " + "

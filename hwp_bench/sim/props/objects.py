@@ -28,7 +28,7 @@ from hwp_bench.sim.geometry.surface import (
     tube,
     turned,
 )
-from hwp_bench.sim.subject.jewellery import wrist_watch
+from hwp_bench.sim.subject.wear import wrist_watch
 
 _BLOCK_COLORS = ((0.85, 0.16, 0.14), (0.12, 0.38, 0.80), (0.95, 0.75, 0.10), (0.15, 0.58, 0.26))
 _BLOCK_SIZES = (

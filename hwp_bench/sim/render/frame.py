@@ -11,15 +11,13 @@ import numpy as np
 
 from hwp_bench.base.colors import eight_bit_srgb
 from hwp_bench.base.errors import HwpError
-from hwp_bench.sim.camera.sensor import record, store
-from hwp_bench.sim.effects.plan import FramePlan, hands_at, lights_at, objects_at, plan
+from hwp_bench.sim.effects import FramePlan, hands_at, lights_at, objects_at, plan
 from hwp_bench.sim.geometry.rays import RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import join
 from hwp_bench.sim.light.lights import steady_light
 from hwp_bench.sim.props.behind import NOTHING
-from hwp_bench.sim.render.exposure import Rows, Window, exposed
+from hwp_bench.sim.render.exposure import Rows, Window, exposed, metered_gain
 from hwp_bench.sim.render.instant import Lens, LinearImage, render_instant
-from hwp_bench.sim.render.metering import metered_gain
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.motion import (
     HandMoment,
@@ -28,6 +26,7 @@ from hwp_bench.sim.scene.motion import (
     viewmat,
 )
 from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.sensor import record, store
 
 #: Edge of the grid of rays inside a pixel.
 SUPERSAMPLING = 2

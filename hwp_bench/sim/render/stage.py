@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.sim.effects.effects import Placement
+from hwp_bench.sim.effects import Placement
 from hwp_bench.sim.geometry.rays import RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import (
     Material,
@@ -33,11 +33,11 @@ from hwp_bench.sim.subject.arms import (
     wrist_rim,
 )
 from hwp_bench.sim.subject.atlas import SkinAtlas, skin_atlas
-from hwp_bench.sim.subject.covers import covered
 from hwp_bench.sim.subject.hand import FINE, subject_hand
 from hwp_bench.sim.subject.mounts import ring_mounts, wrist_mounts
 from hwp_bench.sim.subject.skin import of_side
 from hwp_bench.sim.subject.subject import Subject
+from hwp_bench.sim.subject.wear import covered
 
 # How far light wraps around the terminator inside skin, per linear channel.
 _WRAP = (0.28, 0.12, 0.07)

@@ -17,10 +17,10 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import Seed, number
 from hwp_bench.hands.gestures import gesture
-from hwp_bench.sim.camera.sensor import NOISELESS, Sensor
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.light.lights import Light
 from hwp_bench.sim.props.behind import NOTHING, Behind
+from hwp_bench.sim.sensor import NOISELESS, Sensor
 from hwp_bench.sim.subject.subject import Subject, Words
 from hwp_bench.taxonomy import MAX_SEVERITY
 

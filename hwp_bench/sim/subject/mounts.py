@@ -12,7 +12,9 @@ from hwp_bench.hands.gestures import FIRST_JOINT, finger_back
 from hwp_bench.sim.geometry.surface import Surface, join, plain, transformed, unit
 from hwp_bench.sim.subject.arms import near_wrist, rest_arm, wrist_loop
 from hwp_bench.sim.subject.hand import SubjectHand, subject_hand
-from hwp_bench.sim.subject.jewellery import (
+from hwp_bench.sim.subject.skin import of_side
+from hwp_bench.sim.subject.subject import Subject
+from hwp_bench.sim.subject.wear import (
     Ring,
     WristWear,
     angles,
@@ -22,8 +24,6 @@ from hwp_bench.sim.subject.jewellery import (
     stone,
     wrist_watch,
 )
-from hwp_bench.sim.subject.skin import of_side
-from hwp_bench.sim.subject.subject import Subject
 
 # Where a ring sits on the first bone, as a share of it.
 _ON_BONE = {"thumb": 0.5}

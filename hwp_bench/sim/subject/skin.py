@@ -16,8 +16,8 @@ from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import unit
 from hwp_bench.sim.hand.anatomy import Anatomy
-from hwp_bench.sim.subject.covers import SkinSample, _polished, gloved, tattoo_cover
 from hwp_bench.sim.subject.subject import PLAIN, Subject
+from hwp_bench.sim.subject.wear import SkinSample, _polished, gloved, tattoo_cover
 
 # Freckles lie one to a cell of a grid that fills this box around hand and forearm, m.
 _CELL = 0.0031

@@ -17,8 +17,7 @@ from hwp_bench.base.records import Seed, number
 from hwp_bench.base.text import ODD_CHARACTERS
 from hwp_bench.sim.geometry.surface import Color
 from hwp_bench.sim.hand.off_template import SubjectAnatomy
-from hwp_bench.sim.subject.covers import Glove, Polish, Tattoo
-from hwp_bench.sim.subject.jewellery import Ring, WristWear
+from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
 
 @dataclass(frozen=True)

@@ -98,7 +98,7 @@ def test_a_stopped_start_goes_on_with_its_secret(
 
     with monkeypatch.context() as patched:
         patched.setattr(making, "publish", stopped)
-        patched.setattr(making, "ensure_captures", lambda *a, **k: [])
+        patched.setattr(making, "ensure_suite", lambda *a, **k: [])
         with pytest.raises(HwpError, match="stopped"):
             make_suite(folder, RECIPE)
     secret = read_secret(folder / "keeper" / "secret.json")
@@ -106,7 +106,7 @@ def test_a_stopped_start_goes_on_with_its_secret(
         make_suite(folder, RECIPE, secret=SECRETS[0])
     sources = [made[0].secret.parent / "captures"]
     sources = sorted(path for path in sources[0].iterdir() if path.is_dir())
-    monkeypatch.setattr(making, "ensure_captures", lambda *a, **k: sources)
+    monkeypatch.setattr(making, "ensure_suite", lambda *a, **k: sources)
     again = make_suite(folder, RECIPE)
     assert read_secret(again.secret) == secret
     with pytest.raises(UsageError, match="exists already"):

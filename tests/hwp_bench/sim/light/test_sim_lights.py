@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim.camera.sensor import AutoControl, Sensor
-from hwp_bench.sim.effects.plan import lights_at, plan
+from hwp_bench.sim.effects import lights_at, plan
 from hwp_bench.sim.geometry.rays import LIFT, RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import Surface, plain
 from hwp_bench.sim.light.lights import (
@@ -36,6 +35,7 @@ from hwp_bench.sim.light.samples import Samples
 from hwp_bench.sim.light.shading import GRIDS, SKIN_REACH, lamp_light, room_light
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.sensor import AutoControl, Sensor
 
 SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48

@@ -13,12 +13,12 @@ import pytest
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.tables import to_markdown
-from hwp_bench.sim.camera.sensor import Sensor
-from hwp_bench.sim.effects.plan import SUBFRAME_STEP, plan
+from hwp_bench.sim.effects import SUBFRAME_STEP, plan
 from hwp_bench.sim.produce.forecast import forecast, plan_table
 from hwp_bench.sim.props.objects import build_object
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.scene.scene import Scene, with_effects
+from hwp_bench.sim.sensor import Sensor
 
 SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48

@@ -13,8 +13,7 @@ import numpy as np
 import pytest
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
-from hwp_bench.sim.camera.sensor import Sensor
-from hwp_bench.sim.effects.plan import hands_at, plan
+from hwp_bench.sim.effects import hands_at, plan
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.geometry.surface import Surface
 from hwp_bench.sim.light.lights import FOCUS_DISTANCE
@@ -22,6 +21,7 @@ from hwp_bench.sim.render.frame import SUPERSAMPLING, SimulatedFrame, render_fra
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.motion import intrinsics, pixel_rays, viewmat
 from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.sensor import Sensor
 
 SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 12

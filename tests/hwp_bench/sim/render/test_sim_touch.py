@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from hwp_bench.sim.effects.plan import hands_at
+from hwp_bench.sim.effects import hands_at
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.motion import scene_hands

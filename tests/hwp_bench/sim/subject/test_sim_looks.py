@@ -16,19 +16,18 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.gestures import FIRST_JOINT
-from hwp_bench.sim.effects.plan import hands_at, plan
+from hwp_bench.sim.effects import hands_at, plan
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.hand.anatomy import Anatomy
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.stage import Stage
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.subject.arms import wrist_loop
-from hwp_bench.sim.subject.covers import Glove, Polish, Tattoo
 from hwp_bench.sim.subject.hand import subject_hand
-from hwp_bench.sim.subject.jewellery import Ring, WristWear
 from hwp_bench.sim.subject.mounts import ring_mounts
 from hwp_bench.sim.subject.skin import of_side, painted, sample_skin
 from hwp_bench.sim.subject.subject import PLAIN, Looks, Subject
+from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
 SceneMaker = Callable[..., Scene]
 PERSON = Subject(seed=11, tone=0.22, age=31.0)

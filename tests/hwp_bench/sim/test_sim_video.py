@@ -15,12 +15,12 @@ import pytest
 
 from hwp_bench.base.errors import HwpError
 from hwp_bench.capture import open_capture
-from hwp_bench.sim.camera.sensor import Sensor, through_h264
-from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.effects import plan
 from hwp_bench.sim.produce import capture as production
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.forecast import forecast
 from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.sensor import Sensor, through_h264
 
 SceneMaker = Callable[..., Scene]
 FRAMES, SIZE = 12, 48

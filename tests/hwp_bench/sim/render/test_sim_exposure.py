@@ -17,13 +17,13 @@ from tiny_scene import CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.colors import LUMINANCE
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim.camera.sensor import AutoControl, Sensor, sharpened
-from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.effects import plan
 from hwp_bench.sim.geometry.rays import RenderCost
-from hwp_bench.sim.render import metering
+from hwp_bench.sim.render import exposure as metering
+from hwp_bench.sim.render.exposure import metered_gain
 from hwp_bench.sim.render.frame import render_frame
-from hwp_bench.sim.render.metering import metered_gain
 from hwp_bench.sim.scene.scene import Scene, with_effects
+from hwp_bench.sim.sensor import AutoControl, Sensor, sharpened
 
 SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48

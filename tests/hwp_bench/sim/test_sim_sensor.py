@@ -16,9 +16,7 @@ from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim.camera.sensor import Sensor
-from hwp_bench.sim.effects.effects import ORDER
-from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.effects import ORDER, plan
 from hwp_bench.sim.geometry.rays import RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import Surface
 from hwp_bench.sim.light.lights import steady_light
@@ -27,6 +25,7 @@ from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
 from hwp_bench.sim.render.instant import Lens, render_instant
 from hwp_bench.sim.render.stage import Body
 from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.sensor import Sensor
 from hwp_bench.taxonomy import PERTURBATIONS
 
 SceneMaker = Callable[..., Scene]

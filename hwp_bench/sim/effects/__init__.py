@@ -1,1 +1,0 @@
-"""Effects: what each of the four perturbations changes, and the plan of a frame."""
