@@ -22,7 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hwp_bench.sim.effects import plan
+from hwp_bench.sim import effects as plan
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_mask
 from hwp_bench.sim.props.backdrops import plane_names
 from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm

@@ -12,10 +12,10 @@ from pathlib import Path
 
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.console import track
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.evenly import evenly
 from hwp_bench.base.files import atomic_write, check_places
-from hwp_bench.base.progress import track
 from hwp_bench.sim.effects import hands_at, registered
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.rays import RenderCost

@@ -27,8 +27,8 @@ from hwp_bench.base.files import (
     write_json,
 )
 from hwp_bench.base.images import pixel_digest
+from hwp_bench.base.packages import __version__
 from hwp_bench.base.records import Line, Record, parse_record, without_schema
-from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.schema import (
     CAMERAS,

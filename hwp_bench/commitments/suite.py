@@ -15,9 +15,9 @@ import numpy as np
 
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import refuse_existing, write_json
-from hwp_bench.base.locks import exclusive
+from hwp_bench.base.folders import exclusive
+from hwp_bench.base.packages import __version__
 from hwp_bench.base.records import Digest, Line
-from hwp_bench.base.version import __version__
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import split_for
 from hwp_bench.commitments.publication import (

@@ -11,8 +11,7 @@ from typing import Annotated, Any
 from msgspec import Meta
 
 from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.base.records import parse_record
-from hwp_bench.base.toml_text import MAX_CHARACTERS, parse_toml
+from hwp_bench.base.records import MAX_CHARACTERS, parse_record, parse_toml
 from hwp_bench.sim.effects import check_settings, check_sides
 from hwp_bench.sim.props.backdrops import check_backdrop
 from hwp_bench.sim.scene.motion import clean_share

@@ -19,7 +19,7 @@ from msgspec import Meta
 
 from hwp_bench.base.colors import LUMA
 from hwp_bench.base.errors import HwpError
-from hwp_bench.base.movies import yuv_planes
+from hwp_bench.base.images import yuv_planes
 from hwp_bench.base.records import number
 from hwp_bench.sim.geometry.noise import generator
 

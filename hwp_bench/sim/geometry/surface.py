@@ -10,7 +10,7 @@ import numpy as np
 from msgspec import Meta
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.hands.topology import boundary_vertices
+from hwp_bench.hands.template import boundary_vertices
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.base.errors import BadHandModel
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import kd_tree
 
 # Vertices nearer to a plane than this, m, count as on it, so that a cut leaves no slivers.
 _ON_PLANE = 0.0003

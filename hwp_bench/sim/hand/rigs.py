@@ -21,9 +21,8 @@ import numpy as np
 
 from hwp_bench.base.errors import BadHandModel, UsageError
 from hwp_bench.hands import HandTemplate, mirror_template
-from hwp_bench.hands.gestures import FINGERS
-from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.hands.template import JOINT_COUNT, SHAPE_COUNT, make_template
+from hwp_bench.hands.skeleton import FINGERS, JOINT_COUNT, PARENTS, SHAPE_COUNT
+from hwp_bench.hands.template import make_template
 from hwp_bench.sim.hand.gltf import SkinnedMesh, paintable, read_skinned_mesh
 from hwp_bench.sim.hand.rig_mesh import RigMesh, kept, opened_at_wrist
 

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled, helper
+from hwp_bench.base.kernels import compiled, helper
 from hwp_bench.sim.geometry.rays import Hits
 from hwp_bench.sim.geometry.surface import Surface
 

@@ -10,8 +10,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled, helper
-from hwp_bench.base.vectors import dot
+from hwp_bench.base.kernels import compiled, dot, helper
 from hwp_bench.sim.geometry.rays import LIFT, Tracer
 from hwp_bench.sim.light.lights import AreaLight, Lights, wall_irradiance
 from hwp_bench.sim.light.samples import Samples

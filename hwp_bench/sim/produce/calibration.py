@@ -18,10 +18,11 @@ from types import MappingProxyType
 import numpy as np
 
 from hwp_bench.base.colors import linear_to_srgb
+from hwp_bench.base.console import track
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.base.progress import track
-from hwp_bench.sim.effects import hands_at, plan, registered
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import hands_at, registered
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.light.lights import steady_light

@@ -20,12 +20,11 @@ from pathlib import Path
 
 import numpy as np
 
-from hwp_bench.base.arguments import place, whole_number
 from hwp_bench.base.arrays import read_npz
-from hwp_bench.base.errors import BadInput, HwpError, UsageError, reason_of
+from hwp_bench.base.console import progress
+from hwp_bench.base.errors import BadInput, HwpError, UsageError, place, reason_of, whole_number
 from hwp_bench.base.files import atomic_write, canonical_json, sha256_json
-from hwp_bench.base.locks import exclusive
-from hwp_bench.base.progress import progress
+from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import (
     Cameras,
     Capture,
@@ -35,11 +34,12 @@ from hwp_bench.capture import (
     open_capture,
 )
 from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.run.engine import Job, Needs
 from hwp_bench.run.engine.job import OnProgress
 from hwp_bench.run.engine.process import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
-from hwp_bench.sim.effects import FramePlan, hands_at, plan
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import FramePlan, hands_at
 from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
 from hwp_bench.sim.produce.free_view import add_free_view, has_free_view, write_free_view

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.effects import FramePlan, registered
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.produce.tracker import tracked

@@ -10,7 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.base.tables import Cell, Column, Table
-from hwp_bench.sim.effects import ORDER, FramePlan, plan
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import ORDER, FramePlan
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.produce.capture import check_extent
 from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free

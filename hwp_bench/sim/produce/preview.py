@@ -8,11 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.base.console import track
 from hwp_bench.base.errors import MissingDependency, UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import write_image
-from hwp_bench.base.progress import track
-from hwp_bench.sim.effects import hands_at, lights_at, objects_at, plan
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import hands_at, lights_at, objects_at
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.geometry.surface import Surface
 from hwp_bench.sim.light.lights import focus_point

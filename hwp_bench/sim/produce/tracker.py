@@ -18,8 +18,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hwp_bench.hands.parameters import HandParameters
-from hwp_bench.hands.posed_skeleton import (
+from hwp_bench.hands.poses import (
     DEGREES,
     PosedSkeleton,
     RestSkeleton,
@@ -29,7 +28,7 @@ from hwp_bench.hands.posed_skeleton import (
     rest_skeleton,
     turned,
 )
-from hwp_bench.hands.skeleton import JOINT_NAMES
+from hwp_bench.hands.skeleton import JOINT_NAMES, HandParameters
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.scene.motion import scene_hands
 from hwp_bench.sim.scene.scene import Estimator, Scene

@@ -11,7 +11,8 @@ import numpy as np
 
 from hwp_bench.base.colors import eight_bit_srgb
 from hwp_bench.base.errors import HwpError
-from hwp_bench.sim.effects import FramePlan, hands_at, lights_at, objects_at, plan
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import FramePlan, hands_at, lights_at, objects_at
 from hwp_bench.sim.geometry.rays import RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import join
 from hwp_bench.sim.light.lights import steady_light

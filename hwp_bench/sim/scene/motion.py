@@ -7,8 +7,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hwp_bench.hands.gestures import finger_pose, gesture, mirrored, within_limits
-from hwp_bench.hands.parameters import HandParameters
+from hwp_bench.hands.poses import finger_pose, gesture, mirrored, within_limits
+from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.scene.scene import CLEAN_FROM, EffectCall, HandKey, Scene

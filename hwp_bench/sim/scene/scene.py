@@ -16,7 +16,7 @@ from msgspec import Meta
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_json
 from hwp_bench.base.records import Seed, number
-from hwp_bench.hands.gestures import gesture
+from hwp_bench.hands.poses import gesture
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.light.lights import Light
 from hwp_bench.sim.props.behind import NOTHING, Behind

@@ -13,8 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.hands.template import SHAPE_COUNT
+from hwp_bench.hands.skeleton import PARENTS, SHAPE_COUNT
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.surface import normal_operator, smoothing, subdivision, surface_normals
 from hwp_bench.sim.hand.anatomy import Anatomy

@@ -8,7 +8,7 @@ from functools import lru_cache
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.hands.gestures import FIRST_JOINT, finger_back
+from hwp_bench.hands.poses import FIRST_JOINT, finger_back
 from hwp_bench.sim.geometry.surface import Surface, join, plain, transformed, unit
 from hwp_bench.sim.subject.arms import near_wrist, rest_arm, wrist_loop
 from hwp_bench.sim.subject.hand import SubjectHand, subject_hand

@@ -11,8 +11,9 @@ from dataclasses import replace
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
-from hwp_bench.base.nearest import kd_tree
-from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT
+from hwp_bench.base.numerics import kd_tree
+from hwp_bench.hands.poses import FIRST_JOINT
+from hwp_bench.hands.skeleton import FINGERS
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import unit
 from hwp_bench.sim.hand.anatomy import Anatomy

@@ -12,9 +12,8 @@ from typing import Annotated, Any, Literal
 
 from msgspec import Meta
 
-from hwp_bench.base.errors import UsageError
+from hwp_bench.base.errors import ODD_CHARACTERS, UsageError
 from hwp_bench.base.records import Seed, number
-from hwp_bench.base.text import ODD_CHARACTERS
 from hwp_bench.sim.geometry.surface import Color
 from hwp_bench.sim.hand.off_template import SubjectAnatomy
 from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear

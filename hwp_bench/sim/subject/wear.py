@@ -17,7 +17,8 @@ import numpy as np
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.records import Seed, number
-from hwp_bench.hands.gestures import FINGERS, FIRST_JOINT, finger_back
+from hwp_bench.hands.poses import FIRST_JOINT, finger_back
+from hwp_bench.hands.skeleton import FINGERS
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
 from hwp_bench.sim.geometry.surface import (
     Color,

@@ -19,7 +19,7 @@ from benchmarks.penetration import (
     segments,
     self_penetration,
 )
-from hwp_bench.hands.gestures import gestures
+from hwp_bench.hands.poses import gestures
 from hwp_bench.sim.scene.motion import moment_of_key, scene_hands
 from hwp_bench.sim.scene.scene import HandKey
 from hwp_bench.sim.scene_files import load_scene, scene_names

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim.effects import ORDER, plan
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import ORDER
 from hwp_bench.sim.geometry.rays import RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import Surface
 from hwp_bench.sim.light.lights import steady_light

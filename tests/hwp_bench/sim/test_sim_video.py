@@ -15,7 +15,7 @@ import pytest
 
 from hwp_bench.base.errors import HwpError
 from hwp_bench.capture import open_capture
-from hwp_bench.sim.effects import plan
+from hwp_bench.sim import effects as plan
 from hwp_bench.sim.produce import capture as production
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.forecast import forecast

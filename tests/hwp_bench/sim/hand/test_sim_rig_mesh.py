@@ -25,7 +25,7 @@ from benchmarks.rig_files import (
 )
 from hwp_bench.base.errors import BadHandModel
 from hwp_bench.hands import HandTemplate, load_template
-from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.hands.template import boundary_loop
 from hwp_bench.sim.hand.rig_mesh import FARTHEST_BEFORE, FARTHEST_BEHIND, components, outlines
 from hwp_bench.sim.hand.rigs import hand_joints, load_rig
 from hwp_bench.sim.render.frame import render_frame
@@ -284,7 +284,7 @@ def test_a_rest_pose_of_its_own_becomes_the_hand_models(tmp_path: Path, free: Ha
     import torch
 
     from hwp_bench.hands import pose_hand
-    from hwp_bench.hands.gestures import finger_pose, gesture
+    from hwp_bench.hands.poses import finger_pose, gesture
     from hwp_bench.hands.template import rebuilt
 
     pose = np.vstack([np.zeros(3), 0.4 * finger_pose(gesture("fist"), free.joints)])

@@ -16,7 +16,8 @@ from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim.effects import lights_at, plan
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import lights_at
 from hwp_bench.sim.geometry.rays import LIFT, RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import Surface, plain
 from hwp_bench.sim.light.lights import (

@@ -11,7 +11,7 @@ import pytest
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.sim.effects import plan
+from hwp_bench.sim import effects as plan
 from hwp_bench.sim.produce.capture import frame_file, render_capture, render_key, true_hands
 from hwp_bench.sim.produce.estimates import EASY_ERROR, estimate_hands
 from hwp_bench.sim.produce.suites import ensure_suite, suite

@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hwp_bench.sim.effects import plan
+from hwp_bench.sim import effects as plan
 from hwp_bench.sim.produce.estimates import confusable, confused_mask, estimate_mask, likeness
 from hwp_bench.sim.props.behind import Behind, Face
 from hwp_bench.sim.scene.scene import Scene

@@ -13,8 +13,8 @@ import pytest
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
-from hwp_bench.hands.posed_skeleton import RestSkeleton, posed_skeleton, rest_skeleton, turned
-from hwp_bench.sim.effects import plan
+from hwp_bench.hands.poses import RestSkeleton, posed_skeleton, rest_skeleton, turned
+from hwp_bench.sim import effects as plan
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.produce.capture import true_hands
 from hwp_bench.sim.produce.estimates import estimate_hands

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim.effects import plan
+from hwp_bench.sim import effects as plan
 from hwp_bench.sim.props import backdrops as planes
 from hwp_bench.sim.props.backdrops import backdrop_colors, plane_names
 from hwp_bench.sim.props.behind import NOTHING, Behind, Clutter, Face, OtherArm, draw_behind

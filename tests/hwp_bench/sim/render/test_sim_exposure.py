@@ -17,7 +17,7 @@ from tiny_scene import CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.colors import LUMINANCE
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim.effects import plan
+from hwp_bench.sim import effects as plan
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.render import exposure as metering
 from hwp_bench.sim.render.exposure import metered_gain

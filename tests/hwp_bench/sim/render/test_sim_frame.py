@@ -13,7 +13,8 @@ import pytest
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.tables import to_markdown
-from hwp_bench.sim.effects import SUBFRAME_STEP, plan
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import SUBFRAME_STEP
 from hwp_bench.sim.produce.forecast import forecast, plan_table
 from hwp_bench.sim.props.objects import build_object
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame

@@ -13,7 +13,8 @@ import numpy as np
 import pytest
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
-from hwp_bench.sim.effects import hands_at, plan
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import hands_at
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.geometry.surface import Surface
 from hwp_bench.sim.light.lights import FOCUS_DISTANCE

@@ -12,7 +12,7 @@ from tiny_scene import SINGLE
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
-from hwp_bench.hands.gestures import LIMITS, finger_pose, gesture, gestures, within_limits
+from hwp_bench.hands.poses import LIMITS, finger_pose, gesture, gestures, within_limits
 from hwp_bench.sim.light.lights import focus_point
 from hwp_bench.sim.scene.motion import (
     HandMoment,

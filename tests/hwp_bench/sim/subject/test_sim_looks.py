@@ -15,8 +15,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.gestures import FIRST_JOINT
-from hwp_bench.sim.effects import hands_at, plan
+from hwp_bench.hands.poses import FIRST_JOINT
+from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import hands_at
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.hand.anatomy import Anatomy
 from hwp_bench.sim.render.frame import render_frame
