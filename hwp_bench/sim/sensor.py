@@ -178,7 +178,9 @@ def _encoder(av: ModuleType, size: tuple[int, int], bits_per_pixel: float, fps: 
     rate = Fraction(fps).limit_denominator(1000)
     bits = max(int(bits_per_pixel * height * width * float(rate)), 1000)
     encoder = av.CodecContext.create(ENCODER, "w")
-    most = f"vbv-maxrate={bits // 1000 + 1}:vbv-bufsize={_buffer(bits, rate) // 1000 + 1}"
+    most = (
+        f"vbv-maxrate={bits // 1000 + 1}:vbv-bufsize={int(bits / rate * BUFFER_FRAMES) // 1000 + 1}"
+    )
     settings = {
         "width": width,
         "height": height,
@@ -194,11 +196,6 @@ def _encoder(av: ModuleType, size: tuple[int, int], bits_per_pixel: float, fps: 
     for name, value in settings.items():
         setattr(encoder, name, value)
     return encoder
-
-
-def _buffer(bits: int, rate: Fraction) -> int:
-    """Bits of `BUFFER_FRAMES` frames."""
-    return int(bits / rate * BUFFER_FRAMES)
 
 
 def _to_rgb(planes: np.ndarray, height: int, width: int) -> np.ndarray:

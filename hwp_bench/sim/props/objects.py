@@ -110,31 +110,22 @@ _RED, _BLACK = (0.78, 0.08, 0.10), (0.06, 0.06, 0.08)
 
 def _sticker(variant: int) -> Surface:
     """A round sticker of 44 mm, facing +z."""
-    return _disc(_sticker_front(variant), canvas(4, 4, (0.93, 0.93, 0.93)))
+    radius, angle = np.meshgrid(np.linspace(1e-3, 1.0, 4), np.linspace(0, 2 * np.pi, 33))
+    place = _RADIUS * radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
+    vertices = np.concatenate([place, 0.002 * radius[..., None] ** 2], axis=-1).reshape(-1, 3)
+    back = canvas(4, 4, (0.93, 0.93, 0.93))
+    return _two_sided(vertices, _sticker_front(variant), back, columns=4)
 
 
 def _card(variant: int) -> Surface:
     """A playing card of 58 x 89 mm, facing +z."""
-    return _sheet(_card_front(variant), _card_back(), (0.058, 0.089), bend=0.006)
-
-
-def _sheet(front: np.ndarray, back: np.ndarray, size: tuple[float, float], bend: float) -> Surface:
     x, y = np.meshgrid(np.linspace(-0.5, 0.5, 7), np.linspace(-0.5, 0.5, 7))
-    z = bend * (1.0 - 4.0 * x * x)
-    vertices = np.stack([x * size[0], y * size[1], z], axis=-1).reshape(-1, 3)
-    return _two_sided(vertices, front, back)
+    z = 0.006 * (1.0 - 4.0 * x * x)
+    vertices = np.stack([x * 0.058, y * 0.089, z], axis=-1).reshape(-1, 3)
+    return _two_sided(vertices, _card_front(variant), _card_back(), columns=7)
 
 
-def _disc(front: np.ndarray, back: np.ndarray) -> Surface:
-    radius, angle = np.meshgrid(np.linspace(1e-3, 1.0, 4), np.linspace(0, 2 * np.pi, 33))
-    place = _RADIUS * radius[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-    vertices = np.concatenate([place, 0.002 * radius[..., None] ** 2], axis=-1).reshape(-1, 3)
-    return _two_sided(vertices, front, back, columns=4)
-
-
-def _two_sided(
-    vertices: np.ndarray, front: np.ndarray, back: np.ndarray, columns: int = 7
-) -> Surface:
+def _two_sided(vertices: np.ndarray, front: np.ndarray, back: np.ndarray, columns: int) -> Surface:
     rows = len(vertices) // columns
     top = grid(vertices, rows, columns, picture_material(front, 0.4))
     if columns == 4:

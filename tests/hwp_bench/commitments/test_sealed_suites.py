@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +21,24 @@ from hwp_bench.commitments import suite as making
 from hwp_bench.commitments.publication import joint_commitment
 from hwp_bench.commitments.recipe import derived, read_secret, recipe_of, sealed_items
 from hwp_bench.methods.request import open_request
+from hwp_bench.sim.render import stage
+from hwp_bench.sim.subject import atlas
 
 RECIPE = recipe_of(["capture2"], 10, 40)
 NAME = "sealed-capture2"
 SECRETS = ("5a" * 32, "a5" * 32)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_skin() -> Iterator[None]:
+    """Skin of few texels: painting a person's whole one takes 8 seconds, and there are two."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(atlas, "ATLAS", 256)
+        atlas.skin_atlas.cache_clear()
+        stage._skin.cache_clear()
+        yield
+    atlas.skin_atlas.cache_clear()
+    stage._skin.cache_clear()
 
 
 @pytest.fixture(scope="module")
