@@ -1,4 +1,4 @@
-"""What a sealed suite is made of: public scenes, and a secret that exchanges seeds and people.
+"""The recipe of a sealed suite: public scenes, and a secret that exchanges seeds and people.
 
 Every number is HMAC-SHA256 under the secret, of a label that says what the number is for. So none
 tells anything of another one or of the secret (RFC 2104; as the expand step of HKDF, RFC 5869).

@@ -301,7 +301,7 @@ class RenderFrames:
 
 
 def frame_file(folder: Path, frame: int) -> Path:
-    """Path of a rendered frame; its linear layers lie beside it as `.exr`."""
+    """Path of a rendered frame; its linear layers have the same name as `.exr`."""
     return folder / f"{frame:06d}.npz"
 
 

@@ -66,7 +66,7 @@ class HandKey:
 
 
 def by_side(table: Any) -> dict[str, Any]:
-    """What a table has in its fields `right` and `left`, where they are not None, right first."""
+    """The fields `right` and `left` of a table, where they are not None, right first."""
     both = {"right": table.right, "left": table.left}
     return {side: found for side, found in both.items() if found is not None}
 

@@ -1,4 +1,4 @@
-"""What a person has on skin and fingers: settings and pictures, or meshes, of each thing.
+"""Things that a person has on skin and fingers: settings and pictures, or meshes, of each thing.
 
 Tattoos, nail polish and gloves change the skin; rings, watches and bracelets are meshes that
 `mounts` fits to a hand.
