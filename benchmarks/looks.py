@@ -22,7 +22,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_mask
 from hwp_bench.sim.props.backdrops import plane_names
 from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm
@@ -69,7 +69,7 @@ def items(scene: Scene) -> dict[str, Scene]:
 def measure_cost(repeats: int, size: int) -> None:
     """Print passes, seconds a frame and seconds of painting for every item."""
     plain = replace(load_scene(SCENE), effects=())
-    usual = plan(plain, FRAME, SPREAD, size).passes
+    usual = plan_frame(plain, FRAME, SPREAD, size).passes
     render_frame(plain, FRAME, SPREAD, size)  # loads and compiles what every item needs
     print("| item | added passes | s a frame without | with | more | painted once, s |")
     print("| --- | --- | ---: | ---: | ---: | ---: |")
@@ -82,7 +82,7 @@ def measure_cost(repeats: int, size: int) -> None:
                 render_frame(shown, FRAME, SPREAD, size)
                 best.setdefault(key, []).append(time.process_time() - start)
         seconds = {key: min(values[1:]) for key, values in best.items()}
-        passes = [row for row in plan(scene, FRAME, SPREAD, size).passes if row not in usual]
+        passes = [row for row in plan_frame(scene, FRAME, SPREAD, size).passes if row not in usual]
         more = seconds["with"] - seconds["without"]
         row = f"{seconds['without']:.3f} | {seconds['with']:.3f} | {more:+.3f} | {painting:.1f}"
         print(f"| {name} | {', '.join(passes)} | {row} |", flush=True)
@@ -113,7 +113,7 @@ def measure_masks(frames: int, size: int) -> None:
     for name, scene in shown.items():
         rows = []
         for step in range(frames):
-            recipe = plan(scene, int((step + 0.5) * SPREAD / frames), SPREAD, size)
+            recipe = plan_frame(scene, int((step + 0.5) * SPREAD / frames), SPREAD, size)
             result = render_frame(scene, recipe.frame, SPREAD, size)
             exact = result.coverage
             mask = estimate_mask(scene, recipe, exact, exact)

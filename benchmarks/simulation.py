@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from hwp_bench.sim.effects import plan
+from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.scene.scene import Scene
 from hwp_bench.sim.scene_files import load_scene, scene_names
@@ -66,7 +66,7 @@ def frames_of(kind: Kind, scene: Scene, size: int, count: int) -> list[int]:
     fitting = [
         frame
         for frame in range(SPREAD)
-        if tuple(plan(scene, frame, SPREAD, size).strength) == kind.acting
+        if tuple(plan_frame(scene, frame, SPREAD, size).strength) == kind.acting
     ]
     if not fitting:
         raise SystemExit(f"{scene.id} has no frame of the kind: {kind.title}")

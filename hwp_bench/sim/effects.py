@@ -472,7 +472,7 @@ class FramePlan:
         return any(name in self.passes for name in ("objects", "light", "shutter"))
 
 
-def plan(
+def plan_frame(
     scene: Scene,
     frame: int,
     frame_count: int,

@@ -21,8 +21,7 @@ from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.base.console import track
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.sim import effects as plan
-from hwp_bench.sim.effects import hands_at, registered
+from hwp_bench.sim.effects import hands_at, plan_frame, registered
 from hwp_bench.sim.geometry.noise import generator
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.light.lights import steady_light
@@ -130,7 +129,7 @@ def _measure(
     def loss(strength: float) -> float:
         values = []
         for frame in frames:
-            recipe = plan(alone, frame, alone.frame_count, size, {call.kind: strength})
+            recipe = plan_frame(alone, frame, alone.frame_count, size, {call.kind: strength})
             result = carry_out(alone, recipe, size)
             hand = result.clean_coverage > 0.999
             if call.kind == "hand_object_interaction":
@@ -146,7 +145,7 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
     """PSNR between a hand and the same hand in an erroneous pose, over the true hand."""
     cost = RenderCost()
     stage = Stage(scene, cost)
-    seconds = plan(scene, frame, scene.frame_count, size).seconds
+    seconds = plan_frame(scene, frame, scene.frame_count, size).seconds
     hands = hands_at(scene, seconds)
     angle, length = registered("complex_poses").estimate_error(strength)
     rng = generator(scene.seed, "calibration", frame)

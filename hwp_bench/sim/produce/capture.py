@@ -38,8 +38,7 @@ from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.run.engine import Job, Needs
 from hwp_bench.run.engine.job import OnProgress
 from hwp_bench.run.engine.process import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
-from hwp_bench.sim import effects as plan
-from hwp_bench.sim.effects import FramePlan, hands_at
+from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame
 from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
 from hwp_bench.sim.produce.free_view import add_free_view, has_free_view, write_free_view
@@ -383,7 +382,7 @@ def _render_in_processes(
 def _assemble(request: RenderRequest, waiting: Path, out: Path, seconds: float) -> None:
     """Make the capture of the frames that wait."""
     scene, count, size = request.scene, request.frames, request.edge
-    plans = [plan(scene, frame, count, size) for frame in range(count)]
+    plans = [plan_frame(scene, frame, count, size) for frame in range(count)]
     truth = true_hands(scene, plans)
     cameras = Cameras(
         Ks=np.repeat(intrinsics(scene, size)[None], count, axis=0),

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.base.tables import Cell, Column, Table
-from hwp_bench.sim import effects as plan
-from hwp_bench.sim.effects import ORDER, FramePlan
+from hwp_bench.sim.effects import ORDER, FramePlan, plan_frame
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.produce.capture import check_extent
 from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free
@@ -86,7 +85,7 @@ def forecast(
     count = scene.frame_count if frame_count is None else frame_count
     edge = 256 if size is None else size
     check_extent(count, edge)
-    plans = [plan(scene, frame, count, edge) for frame in range(count)]
+    plans = [plan_frame(scene, frame, count, edge) for frame in range(count)]
     groups: dict[str, list[FramePlan]] = {}
     for item in plans:
         groups.setdefault(group_name(item), []).append(item)

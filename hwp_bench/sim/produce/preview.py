@@ -12,8 +12,7 @@ from hwp_bench.base.console import track
 from hwp_bench.base.errors import MissingDependency, UsageError
 from hwp_bench.base.files import atomic_write
 from hwp_bench.base.images import write_image
-from hwp_bench.sim import effects as plan
-from hwp_bench.sim.effects import hands_at, lights_at, objects_at
+from hwp_bench.sim.effects import hands_at, lights_at, objects_at, plan_frame
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.geometry.surface import Surface
 from hwp_bench.sim.light.lights import focus_point
@@ -108,7 +107,7 @@ def draw_stage(scene: Scene, folder: Path) -> Path:
         raise MissingDependency(
             "the stage is drawn by pyvista", remedy="pip install 'hwp-bench[preview]'"
         ) from error
-    plans = [plan(scene, frame, 100, 256) for frame in range(100)]
+    plans = [plan_frame(scene, frame, 100, 256) for frame in range(100)]
     recipe = max(plans, key=lambda item: ("objects" in item.passes, sum(item.severity.values())))
     stage = Stage(scene, RenderCost())
     hands = hands_at(scene, recipe.seconds)

@@ -11,8 +11,7 @@ import numpy as np
 
 from hwp_bench.base.colors import eight_bit_srgb
 from hwp_bench.base.errors import HwpError
-from hwp_bench.sim import effects as plan
-from hwp_bench.sim.effects import FramePlan, hands_at, lights_at, objects_at
+from hwp_bench.sim.effects import FramePlan, hands_at, lights_at, objects_at, plan_frame
 from hwp_bench.sim.geometry.rays import RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import join
 from hwp_bench.sim.light.lights import steady_light
@@ -60,7 +59,7 @@ def render_frame(scene: Scene, frame: int, frame_count: int, size: int) -> Simul
         frame_count: frames over which the capture is spread.
         size: edge of the image in pixels.
     """
-    recipe = plan(scene, frame, frame_count, size)
+    recipe = plan_frame(scene, frame, frame_count, size)
     return carry_out(scene, recipe, size)
 
 

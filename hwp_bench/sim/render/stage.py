@@ -183,8 +183,8 @@ class Stage:
                 skin, arm = seamless(skin, arm, rim.loop)
             else:
                 cloth = sleeve_material(subject.sleeve, subject.seed)
-                rim = wrist_rim(subject_hand(subject, side, subdivisions).template)
-                arm = sleeve(skin.vertices[rim], forward, elbow, cloth)
+                loop = wrist_rim(subject_hand(subject, side, subdivisions).template)
+                arm = sleeve(skin.vertices[loop], forward, elbow, cloth)
             skins.append(Part(side, skin))
             arms.append(Part("", arm))
             for item in ring_mounts(subject, side):

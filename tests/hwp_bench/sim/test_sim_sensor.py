@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim import effects as plan
-from hwp_bench.sim.effects import ORDER
+from hwp_bench.sim.effects import ORDER, plan_frame
 from hwp_bench.sim.geometry.rays import RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import Surface
 from hwp_bench.sim.light.lights import steady_light
@@ -82,10 +81,10 @@ def test_every_frame_needs_what_the_sensor_asks_for_last(
 ) -> None:
     scene = with_sensor(lines)
     for frame, before in ((CLEAN, ()), (OBJECT, ("objects",)), (BLUR, ("shutter",))):
-        item = plan(scene, frame, COUNT, SIZE)
+        item = plan_frame(scene, frame, COUNT, SIZE)
         assert item.passes == ("hands", "shadow", "sky", "backdrop", *before, *passes)
         assert set(item.severity) == set(PERTURBATIONS) & {call.kind for call in scene.effects}
-    assert not plan(scene, CLEAN, COUNT, SIZE).perturbed
+    assert not plan_frame(scene, CLEAN, COUNT, SIZE).perturbed
 
 
 def test_jpeg_changes_frame_and_clean_version_alike(with_sensor: Callable[[str], Scene]) -> None:

@@ -15,7 +15,7 @@ import pytest
 
 from hwp_bench.base.errors import HwpError
 from hwp_bench.capture import open_capture
-from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.produce import capture as production
 from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.forecast import forecast
@@ -69,7 +69,7 @@ def test_a_capture_is_one_stream_however_often_it_was_interrupted(
     make_scene: SceneMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     scene = replace(make_scene(), sensor=Sensor(noise=0.01, h264=0.4))
-    assert plan(scene, 0, FRAMES, SIZE).passes[-1] == "h264"
+    assert plan_frame(scene, 0, FRAMES, SIZE).passes[-1] == "h264"
     whole = render_capture(
         scene, tmp_path / "a", frame_count=FRAMES, size=SIZE, workers=1, free_view=False
     )

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim import effects as plan
-from hwp_bench.sim.effects import lights_at
+from hwp_bench.sim.effects import lights_at, plan_frame
 from hwp_bench.sim.geometry.rays import LIFT, RenderCost, Tracer
 from hwp_bench.sim.geometry.surface import Surface, plain
 from hwp_bench.sim.light.lights import (
@@ -184,7 +183,7 @@ def test_a_scene_pays_for_what_it_asks(make_scene: SceneMaker) -> None:
     bare = make_scene()
     lit = make_scene(("[track]", f"{lines}[light.room]\nleft = [0.9, 0.1, 0.1]\n[track]"))
     assert set(lit.to_json()["light"]) - set(bare.to_json()["light"]) == {"lamps", "room"}
-    assert plan(lit, CLEAN, COUNT, SIZE).passes[4:6] == ("lamps", "room")
+    assert plan_frame(lit, CLEAN, COUNT, SIZE).passes[4:6] == ("lamps", "room")
     before, after = (render_frame(scene, CLEAN, COUNT, SIZE) for scene in (bare, lit))
     assert before.cost.rays["lamps"] == 0 < after.cost.rays["lamps"]
     assert {"lamps", "room"} <= set(after.cost.seconds)
@@ -204,7 +203,9 @@ def test_effects_change_lamps_too(make_scene: SceneMaker) -> None:
     steady = steady_light(light)
     warm = steady.tinted(np.array([2.0, 1.0, 0.5]))
     np.testing.assert_allclose(warm.lamps[0].irradiance, steady.lamps[0].irradiance * [2, 1, 0.5])
-    assert lights_at(scene, plan(scene, CLEAN, COUNT, SIZE)).lamps[0].slope == pytest.approx(0.5)
+    assert lights_at(scene, plan_frame(scene, CLEAN, COUNT, SIZE)).lamps[0].slope == pytest.approx(
+        0.5
+    )
 
 
 def test_a_light_behind_the_hand_leaves_it_dark_with_a_rim_on_its_side(
@@ -246,7 +247,7 @@ def test_lights_and_sensors_combine(make_scene: SceneMaker) -> None:
     scene = replace(scene, light=light, sensor=sensor)
     wanted = ("lamps", "room", "rolling", "auto", "sensor", "sharpening", "jpeg")
     for frame in (CLEAN, BLUR):
-        passes = plan(scene, frame, COUNT, SIZE).passes
+        passes = plan_frame(scene, frame, COUNT, SIZE).passes
         assert tuple(name for name in passes if name in wanted) == wanted
         first, second = (render_frame(scene, frame, COUNT, SIZE) for _ in range(2))
         np.testing.assert_array_equal(first.rgb, second.rgb)

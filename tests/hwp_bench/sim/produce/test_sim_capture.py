@@ -11,7 +11,7 @@ import pytest
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.produce.capture import frame_file, render_capture, render_key, true_hands
 from hwp_bench.sim.produce.estimates import EASY_ERROR, estimate_hands
 from hwp_bench.sim.produce.suites import ensure_suite, suite
@@ -158,7 +158,7 @@ def test_estimates_are_worse_where_it_is_harder(make_scene: SceneMaker) -> None:
             'kind = "complex_poses"\nepisodes = [[0.3, 0.4, 5]]\nright = [{ gesture = "claw" }]',
         )
     )
-    plans = [plan(scene, frame, 400, SIZE) for frame in range(400)]
+    plans = [plan_frame(scene, frame, 400, SIZE) for frame in range(400)]
     truth = true_hands(scene, plans)
     given = estimate_hands(scene, truth, plans)["right"]
     error = np.abs(given.pose - truth["right"].pose)[:, 1:].mean(axis=(1, 2))

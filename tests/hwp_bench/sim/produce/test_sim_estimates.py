@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.produce.estimates import confusable, confused_mask, estimate_mask, likeness
 from hwp_bench.sim.props.behind import Behind, Face
 from hwp_bench.sim.scene.scene import Scene
@@ -39,7 +39,7 @@ def picture(coverage: np.ndarray, background: np.ndarray) -> np.ndarray:
 def masks(scene: Scene, coverage: np.ndarray, background: np.ndarray) -> list[np.ndarray]:
     """The confused masks of twelve frames."""
     rgb = picture(coverage, background)
-    recipes = [plan(scene, number, 40, SIZE) for number in range(26, 38)]
+    recipes = [plan_frame(scene, number, 40, SIZE) for number in range(26, 38)]
     return [
         confused_mask(scene, item, estimate_mask(scene, item, coverage, coverage), coverage, rgb)
         for item in recipes
@@ -56,7 +56,7 @@ def test_masks_of_other_scenes_stay_as_they_are(
 ) -> None:
     scene = make_scene()
     assert not confusable(scene)
-    recipe = plan(scene, 36, 40, SIZE)
+    recipe = plan_frame(scene, 36, 40, SIZE)
     mask = estimate_mask(scene, recipe, coverage, coverage)
     assert confused_mask(scene, recipe, mask, coverage, picture(coverage, SKIN)) is mask
 
@@ -101,7 +101,7 @@ def test_likeness_tells_skin_from_another_colour(coverage: np.ndarray) -> None:
 
 def test_a_frame_without_a_hand_keeps_its_mask(make_scene: SceneMaker) -> None:
     scene = replace(make_scene(), background="wood")
-    recipe = plan(scene, 36, 40, SIZE)
+    recipe = plan_frame(scene, 36, 40, SIZE)
     empty = np.zeros((SIZE, SIZE))
     mask = np.zeros((SIZE, SIZE), dtype=np.uint8)
     assert confused_mask(scene, recipe, mask, empty, picture(empty, SKIN)) is mask

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from tiny_scene import BLUR, CLEAN
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.props import backdrops as planes
 from hwp_bench.sim.props.backdrops import backdrop_colors, plane_names
 from hwp_bench.sim.props.behind import NOTHING, Behind, Clutter, Face, OtherArm, draw_behind
@@ -52,7 +52,7 @@ def test_nothing_behind_leaves_no_trace(make_scene: SceneMaker) -> None:
     asked = make_scene(("[camera]", "[behind.face]\nseed = 3\n\n[camera]"))
     assert asked.behind == Behind(face=Face(seed=3))
     assert asked.digest != scene.digest
-    passes = plan(replace(scene, behind=EVERYTHING), CLEAN, 40, SIZE).passes
+    passes = plan_frame(replace(scene, behind=EVERYTHING), CLEAN, 40, SIZE).passes
     assert passes[4:] == ("clutter", "face", "other_arm", "sensor")
 
 

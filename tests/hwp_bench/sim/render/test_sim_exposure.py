@@ -17,7 +17,7 @@ from tiny_scene import CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.colors import LUMINANCE
 from hwp_bench.base.errors import BadInput
-from hwp_bench.sim import effects as plan
+from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.render import exposure as metering
 from hwp_bench.sim.render.exposure import metered_gain
@@ -110,7 +110,7 @@ def test_a_frame_and_its_clean_version_get_the_same_gain(
     automatic: Callable[[AutoControl], Scene],
 ) -> None:
     scene = automatic(AutoControl(level=0.12))
-    assert plan(scene, CLEAN, COUNT, SIZE).passes[-1] == "auto"
+    assert plan_frame(scene, CLEAN, COUNT, SIZE).passes[-1] == "auto"
     result = render_frame(scene, CLEAN, COUNT, SIZE)
     np.testing.assert_array_equal(result.rgb, result.clean)
     fixed = render_frame(replace(scene, sensor=Sensor(noise=0.0)), CLEAN, COUNT, SIZE)

@@ -13,8 +13,7 @@ import pytest
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.tables import to_markdown
-from hwp_bench.sim import effects as plan
-from hwp_bench.sim.effects import SUBFRAME_STEP
+from hwp_bench.sim.effects import SUBFRAME_STEP, plan_frame
 from hwp_bench.sim.produce.forecast import forecast, plan_table
 from hwp_bench.sim.props.objects import build_object
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
@@ -91,12 +90,12 @@ def test_rays_are_those_of_the_passes(render: Callable[[int], SimulatedFrame]) -
 def test_subframes_follow_the_motion_on_the_screen(make_scene: SceneMaker) -> None:
     scene = make_scene()
     counts = [
-        plan(scene, BLUR, COUNT, 256, {"motion_blur": strength}).subframes
+        plan_frame(scene, BLUR, COUNT, 256, {"motion_blur": strength}).subframes
         for strength in (0.001, 0.02, 0.04, 0.08)
     ]
     assert counts == sorted(counts)
     assert counts[-1] >= 0.08 * 256 / SUBFRAME_STEP / 1.5
-    assert plan(scene, CLEAN, COUNT, 256).subframes == 1
+    assert plan_frame(scene, CLEAN, COUNT, 256).subframes == 1
 
 
 def test_blur_moves_light_but_makes_none(make_scene: SceneMaker) -> None:

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.poses import FIRST_JOINT
-from hwp_bench.sim import effects as plan
-from hwp_bench.sim.effects import hands_at
+from hwp_bench.sim.effects import hands_at, plan_frame
 from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.hand.anatomy import Anatomy
 from hwp_bench.sim.render.frame import render_frame
@@ -177,7 +176,7 @@ def test_worn_things_are_in_frame_and_mask_as_documented(make_scene: SceneMaker)
     )
     scene = replace(make_scene(), subject=subject)
     worn = render_frame(scene, 36, 40, 48)
-    assert plan(scene, 36, 40, 48).passes[4:6] == ("bare_arm", "rings")
+    assert plan_frame(scene, 36, 40, 48).passes[4:6] == ("bare_arm", "rings")
     np.testing.assert_array_equal(worn.rgb, worn.clean)
     # A glove makes the hand thicker and counts as hand.
     assert 1.0 < worn.coverage.sum() / plain.coverage.sum() < 1.3
