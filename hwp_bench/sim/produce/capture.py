@@ -37,7 +37,7 @@ from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.run.engine import Job, Needs
 from hwp_bench.run.engine.job import OnProgress
-from hwp_bench.run.engine.process import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
+from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
 from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame
 from hwp_bench.sim.hand.rigs import rig_path
 from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
