@@ -110,7 +110,7 @@ def test_an_overlap_is_found_in_every_part() -> None:
         "room": replace(first, background=second.background),
         "light": replace(first, light=replace(first.light, lamps=second.light.lamps)),
         "object": replace(first, effects=second.effects),
-        "gestures": replace(first, track=replace(first.track, keys={"right": turned})),
+        "gestures": replace(first, track=replace(first.track, right=turned)),
     }
     assert tuple(made) == KINDS
     for kind, scene in made.items():

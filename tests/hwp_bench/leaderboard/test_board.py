@@ -312,7 +312,7 @@ def entry():
 def test_scenes_say_what_captures_say(tmp_path, monkeypatch) -> None:
     """Oracle: the severities that a rendered capture holds."""
     scene = load_scene("capture0")
-    item = SuiteItem(scene, 20, 32, scene.seed)
+    item = SuiteItem(scene, 20, 32)
     monkeypatch.setattr(severity_scopes, "suite", lambda name: (item,))
     capture = render_capture(
         scene, tmp_path / "c", frame_count=20, size=32, workers=1, free_view=False
