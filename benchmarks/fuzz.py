@@ -166,8 +166,8 @@ def preload() -> dict[str, Callable[[Sequence[str]], int]]:
     for name in (
         "cv2", "OpenImageIO", "scipy.sparse", "scipy.spatial", "safetensors.torch", "psutil",
         "hwp_bench.evaluation.evaluate", "hwp_bench.report.page", "hwp_bench.capture.check",
-        "hwp_bench.leaderboard.entries", "hwp_bench.publish", "hwp_bench.sim",
-        "hwp_bench.sim.produce.production", "wildghand.avatar.files", "wildghand.fitting",
+        "hwp_bench.leaderboard.entries", "hwp_bench.commitments", "hwp_bench.sim",
+        "hwp_bench.sim.produce.capture", "wildghand.avatar.files", "wildghand.fitting",
         "wildghand.export.formats", "wildghand.from_video.make", "matplotlib",
     ):  # fmt: skip
         try:

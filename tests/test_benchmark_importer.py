@@ -12,8 +12,8 @@ from benchmarks.tracker_clips import KINDS, scene_text
 from hwp_bench.hands import load_template
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.importers.video import FitSettings
-from hwp_bench.sim.scene.reader import parse_scene
-from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy
+from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.scene_files import parse_scene
 
 
 def test_a_shift_is_found_in_space_and_in_the_image() -> None:

@@ -378,8 +378,8 @@ def add_inputs(parser: argparse.ArgumentParser) -> None:
 def do_inputs(args: argparse.Namespace) -> int:
     """Run `data inputs`."""
     from hwp_bench.base.files import check_places
+    from hwp_bench.commitments.inputs import check_place, write_inputs
     from hwp_bench.evaluation.evaluate import open_captures
-    from hwp_bench.publish.inputs import check_place, write_inputs
     from hwp_bench.sim import ensure_suite
 
     # Before a suite is rendered.
@@ -434,7 +434,7 @@ def add_publish(parser: argparse.ArgumentParser) -> None:
 def do_publish(args: argparse.Namespace) -> int:
     """Run `data publish`."""
     from hwp_bench.base.files import check_places
-    from hwp_bench.publish import publish
+    from hwp_bench.commitments import publish
 
     check_places({"--out": args.out}, {"CAPTURES": args.captures, "--splits": args.splits})
     splits = splits_of(args)

@@ -23,11 +23,11 @@ if TYPE_CHECKING:
 
     from hwp_bench.base.console import JobsView
     from hwp_bench.capture.splits import Split
+    from hwp_bench.commitments import SealedPart
     from hwp_bench.evaluation.ablate.runs import AblationRuns
     from hwp_bench.evaluation.budget.budget import BudgetRuns
     from hwp_bench.evaluation.evaluate import EvaluationSettings, OnCapture
     from hwp_bench.methods.manifest import MethodManifest
-    from hwp_bench.publish import SealedPart
     from hwp_bench.results import Results
 
 _EVALUATE = """examples:
@@ -217,7 +217,7 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
         return None
     from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.publish import open_sealed
+    from hwp_bench.commitments import open_sealed
 
     if args.capture or args.splits:
         raise UsageError("has its own captures and splits", field="--sealed")

@@ -11,7 +11,7 @@ from hwp_bench.run.engine.options import add_engine_arguments
 from hwp_bench.taxonomy import SUITES
 
 if TYPE_CHECKING:
-    from hwp_bench.sealed import Recipe
+    from hwp_bench.commitments import Recipe
 
 _EXAMPLES = """examples:
   hwp-bench sealed make --suite mini -o exam                      # the organiser
@@ -98,9 +98,9 @@ def run(args: argparse.Namespace) -> int:
 
 def _make(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
+    from hwp_bench.commitments import make_suite
+    from hwp_bench.commitments.recipe import read_secret
     from hwp_bench.run.engine.options import engine_for, needs_of
-    from hwp_bench.sealed import make_suite
-    from hwp_bench.sealed.secret import read_secret
 
     check_places({"--out": args.out}, {"--secret": args.secret})
     recipe = _recipe(args)
@@ -130,7 +130,7 @@ def _make(args: argparse.Namespace) -> int:
 
 def _recipe(args: argparse.Namespace) -> Recipe:
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.sealed.recipe import recipe_of, suite_recipe
+    from hwp_bench.commitments.recipe import recipe_of, suite_recipe
 
     if (args.suite is None) == (not args.scenes):
         raise UsageError("give scenes, or a suite with --suite")
@@ -143,7 +143,7 @@ def _recipe(args: argparse.Namespace) -> Recipe:
 
 def _reveal(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
-    from hwp_bench.sealed import reveal
+    from hwp_bench.commitments import reveal
 
     check_places({"--out": args.out}, {"SUITE": args.suite})
     reveal(args.suite, args.out)
@@ -155,7 +155,7 @@ def _check(args: argparse.Namespace) -> int:
     from dataclasses import asdict
 
     from hwp_bench.base.files import check_places
-    from hwp_bench.sealed import check_revealed
+    from hwp_bench.commitments import check_revealed
 
     check_places({"--work": args.work}, {"PUBLIC": args.public, "REVEALED": args.revealed})
     only = () if args.no_render else args.capture

@@ -32,7 +32,6 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     _add_plan(action("plan", "print what a scene's frames need and will cost"))
     _add_render(action("render", "render captures"))
     _add_preview(action("preview", "contact sheet and animation of a scene"))
-    _add_gallery(action("gallery", "images for the documentation"))
     _add_calibrate(action("calibrate", "solve strengths for stated losses"))
 
 
@@ -45,7 +44,6 @@ def run(args: argparse.Namespace) -> int:
         "plan": commands.print_plan,
         "render": commands.render,
         "preview": commands.preview,
-        "gallery": commands.gallery,
         "calibrate": commands.calibrate_scenes,
     }[args.action]
     return action(args)
@@ -98,10 +96,6 @@ def _add_preview(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--stage", action="store_true", help="draw hand, objects, light and camera in 3D instead"
     )
-
-
-def _add_gallery(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("-o", "--out", default="docs/pictures/sim", help="folder")
 
 
 def _add_calibrate(parser: argparse.ArgumentParser) -> None:

@@ -28,7 +28,7 @@ from hwp_bench.report.tables import score_column
 from hwp_bench.results import Results
 from hwp_bench.results.schema import score_rows
 from hwp_bench.sim.produce.suites import suite
-from hwp_bench.sim.scene.episodes import moments, severity
+from hwp_bench.sim.scene.motion import moments, severity
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: The badge of a row is the first of these that one of its entries has.

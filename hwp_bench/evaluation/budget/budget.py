@@ -26,7 +26,7 @@ from hwp_bench.metrics.pixels import decibels
 from hwp_bench.metrics.protocol import PSNR_CAP
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.run.engine import Engine, Needs
-from hwp_bench.sim.produce.subject_mesh import add_subject_mesh
+from hwp_bench.sim.produce.truth import add_subject_mesh
 
 #: Name of the evaluation in which nothing is replaced, and of that in which everything is.
 GIVEN, ALL = "as given", "all of them"

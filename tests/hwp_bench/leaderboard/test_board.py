@@ -29,9 +29,9 @@ from hwp_bench.leaderboard.entries import Submission, make_entry, write_check, w
 from hwp_bench.leaderboard.site import build_site
 from hwp_bench.report.sources import mean_severity
 from hwp_bench.results.schema import score_rows
-from hwp_bench.sim.produce.production import render_capture
+from hwp_bench.sim.produce.capture import render_capture
 from hwp_bench.sim.produce.suites import SuiteItem
-from hwp_bench.sim.scene.reader import load_scene
+from hwp_bench.sim.scene_files import load_scene
 
 
 def results(name: str, level: float, seed: int):
@@ -312,7 +312,7 @@ def entry():
 def test_scenes_say_what_captures_say(tmp_path, monkeypatch) -> None:
     """Oracle: the severities that a rendered capture holds."""
     scene = load_scene("capture0")
-    item = SuiteItem(scene, 20, 32, scene.seed)
+    item = SuiteItem(scene, 20, 32)
     monkeypatch.setattr(severity_scopes, "suite", lambda name: (item,))
     capture = render_capture(
         scene, tmp_path / "c", frame_count=20, size=32, workers=1, free_view=False

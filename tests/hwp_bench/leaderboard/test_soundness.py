@@ -37,7 +37,7 @@ from hwp_bench.leaderboard.suite_data import (
     write_suite_data,
 )
 from hwp_bench.results import Results, write_results
-from hwp_bench.sim.produce.production import RENDERER
+from hwp_bench.sim.produce.capture import RENDERER
 
 
 def forged(folder: Path, change: Callable[[dict], object], *, keys: bool = False) -> Path:

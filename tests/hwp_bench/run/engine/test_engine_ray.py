@@ -156,12 +156,12 @@ def test_a_node_is_killed_in_the_middle_and_the_results_are_those_without_ray(
 def test_a_capture_is_rendered_to_the_same_digest(nodes: Nodes, tmp_path: Path) -> None:
     from hwp_bench.capture import open_capture
     from hwp_bench.run.engine.ray import RayEngine
-    from hwp_bench.sim.produce.suites import RenderCapture, render_job
-    from hwp_bench.sim.scene.reader import load_scene
+    from hwp_bench.sim.produce.capture import RenderRequest
+    from hwp_bench.sim.scene_files import load_scene
 
-    work = RenderCapture(load_scene("capture0"), frame_count=10, size=32, workers=1)
+    work = RenderRequest(load_scene("capture0"), frame_count=10, size=32, workers=1)
     with RayEngine(nodes.address) as engine:
-        engine.run([render_job(work, tmp_path / "ray", Needs())], lambda index: None)
+        engine.run([work.job(tmp_path / "ray", Needs())], lambda index: None)
     work.render(tmp_path / "turn")
     there, here = (open_capture(tmp_path / name) for name in ("ray", "turn"))
     assert there.digest == here.digest
