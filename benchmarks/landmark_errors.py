@@ -54,7 +54,7 @@ def real_clip(video: Path, landmarks: Path, keep: Path) -> RealClip:
         clip = fit_video(read_source(video, landmarks, options), options)
         model, source = clip.first.fitted.model, clip.source.landmarks
         with torch.no_grad():
-            posed = model.posed()
+            posed = model.pose()
             pixels = model.pixels(posed.landmarks).numpy()
         arrays = (
             source.image,

@@ -15,7 +15,7 @@ from hwp_bench.hands.anchors import vertex_normals
 from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.video.model import posed_vertices
+from hwp_bench.importers.video.model import pose_vertices
 from hwp_bench.importers.video.pictures import HandPictures, PictureResidual, TextureResidual
 from hwp_bench.importers.video.solve import FitSettings, FittedClip, Footage, fit_landmarks
 
@@ -107,7 +107,7 @@ def _fit_to_errors() -> FittedClip:
 def pixel_error(fitted: FittedClip) -> float:
     """Mean distance of the vertices from their true places, px of the whole frame."""
     with torch.no_grad():
-        pixels = fitted.model.pixels(torch.as_tensor(posed_vertices(fitted.model))).numpy()
+        pixels = fitted.model.pixels(torch.as_tensor(pose_vertices(fitted.model))).numpy()
     return float(np.linalg.norm(pixels - footage()[0].vertex_pixels, axis=-1).mean())
 
 
@@ -118,7 +118,7 @@ def assert_slopes_lead_down(
     first, second = energies
     for energy in (first, second):
         energy.rematch(fitted.model)
-    posed = fitted.model.posed()
+    posed = fitted.model.pose()
     value = first(fitted.model, posed)
     assert float(value.detach()) == 0.0
     value.backward()
@@ -136,4 +136,4 @@ def assert_says_nothing(fitted: FittedClip, energy: TextureResidual | PictureRes
     energy.rematch(fitted.model)
     with torch.no_grad():
         fitted.model.variables.turn.add_(0.1)
-    assert float(energy(fitted.model, fitted.model.posed()).detach()) == 0.0
+    assert float(energy(fitted.model, fitted.model.pose()).detach()) == 0.0

@@ -93,9 +93,9 @@ def do_video(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from hwp_bench.importers.video import (
         VideoImport,
-        finished_import,
         import_video,
         parse_frame_range,
+        read_finished_import,
     )
 
     inputs = {"VIDEO": args.video, "--landmarks": args.landmarks, "--masks": args.masks}
@@ -117,7 +117,7 @@ def do_video(args: argparse.Namespace) -> int:
         sheet=args.sheet,
         overwrite=args.force,
     )
-    finished = finished_import(args.video, args.landmarks, args.out, options)
+    finished = read_finished_import(args.video, args.landmarks, args.out, options)
     if finished is not None:
         notice(f"{args.out} is complete: the same call has made it; --force imports again")
         print(json.dumps(finished, indent=1) if args.json else f"capture: {args.out}")

@@ -35,7 +35,7 @@ class Region:
         )
         return np.column_stack([linear, np.array([self.x, self.y]) - linear.sum(axis=1) / 2])
 
-    def grown(self, scale: float, shift: float) -> Region:
+    def grow(self, scale: float, shift: float) -> Region:
         """Return the square around this rectangle, moved and then scaled.
 
         Its edge is `scale` times the longer side; it is moved along the second axis by `shift`
@@ -144,7 +144,7 @@ class Palm:
         centre, size = (self.low + self.high) / 2, self.high - self.low
         angle = angle_of(self.keypoints[_PALM_WRIST], self.keypoints[_PALM_MIDDLE])
         box = Region(float(centre[0]), float(centre[1]), float(size[0]), float(size[1]), angle)
-        return box.grown(_PALM_GROWTH, _PALM_SHIFT)
+        return box.grow(_PALM_GROWTH, _PALM_SHIFT)
 
 
 def anchors() -> np.ndarray:
@@ -267,13 +267,13 @@ class SeenHand:
         x, y = axes @ ((low + high) / 2)
         width, height = high - low
         box = Region(float(x), float(y), float(width), float(height), angle)
-        return box.grown(_GROWTH, _SHIFT)
+        return box.grow(_GROWTH, _SHIFT)
 
     def size(self) -> float:
         """Return the longer side of the box around all landmarks, px."""
         return float(np.ptp(self.image[:, :2], axis=0).max())
 
-    def placed(self, region: Region) -> SeenHand:
+    def place_in(self, region: Region) -> SeenHand:
         """Put what the network says of a region, a square, into the image.
 
         The network's points are px of its own image, and its axes those of the region.

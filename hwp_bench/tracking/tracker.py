@@ -87,7 +87,7 @@ class HandTracker:
             values = (reading.presence, reading.right)
             if not np.isfinite(values).all() or reading.presence < self._settings.min_presence:
                 continue
-            hand = reading.placed(region)
+            hand = reading.place_in(region)
             if not (np.isfinite(hand.image).all() and np.isfinite(hand.world).all()):
                 continue
             moved = np.inf if before is None else _distance(hand, before.hand)

@@ -81,7 +81,7 @@ def import_video(
     options = options or VideoImport()
     _check_output(Path(out), options)
     call = _call(video, landmarks, out, options)
-    source = without_blank_frames(read_source(video, landmarks, options))
+    source = drop_blank_frames(read_source(video, landmarks, options))
     refuse_other_units(source)
     doubts = landmark_doubts(source)
     for doubt in doubts:
@@ -93,7 +93,7 @@ def import_video(
     return clip
 
 
-def finished_import(
+def read_finished_import(
     video: str | os.PathLike[str],
     landmarks: str | os.PathLike[str],
     out: str | os.PathLike[str],
@@ -135,7 +135,7 @@ def _call(
     return sha256_json([chosen, digests])
 
 
-def without_blank_frames(source: VideoSource) -> VideoSource:
+def drop_blank_frames(source: VideoSource) -> VideoSource:
     """The same clip; no hand counts as detected in a frame of one colour, such as a black one."""
     blank = np.array([is_blank(frame) for frame in source.images.frames])
     hands = {
@@ -167,7 +167,7 @@ def fit_video(
     first_errors = [
         reprojection_error(fitted, hand) for fitted, hand in zip(fits, hands, strict=True)
     ]
-    good = map(followed, first_errors, hands)
+    good = map(follow_landmarks, first_errors, hands)
     refuse_unfitted(dict(zip(source.hands, good, strict=True)), source, doubts)
     turns = _Turns(source, options, fits)
     projected, masks = turns.cut(WIDE, reduction=2)
@@ -185,14 +185,14 @@ def fit_video(
         source.hands.items(), fits, projected.hands, first_errors, strict=True
     ):
         error = reprojection_error(fitted, landmarks)
-        parameters = fitted.model.parameters(followed(error, landmarks))
+        parameters = fitted.model.parameters(follow_landmarks(error, landmarks))
         imported[side] = ImportedHand(landmarks, parameters, fitted, clip, error, first)
     valid = {side: hand.parameters.valid for side, hand in imported.items()}
     refuse_unfitted(valid, source, doubts)
     return ImportedClip(source, imported, masks, overlap_landmarks_only, tuple(doubts))
 
 
-def followed(error: ReprojectionError, landmarks: Landmarks) -> np.ndarray:
+def follow_landmarks(error: ReprojectionError, landmarks: Landmarks) -> np.ndarray:
     """(F,) bool, the frames in which a fit follows the landmarks."""
     missed = np.nan_to_num(error.by_frame, nan=np.inf) > FAILED_FIT * landmarks.hand_size
     return np.asarray(landmarks.detected & ~missed)

@@ -244,7 +244,7 @@ def _tables(transfer: int, primaries: int) -> tuple[np.ndarray, ...]:
     if transfer in (_HLG, _PQ):
         top = PEAK / REFERENCE_WHITE
         largest = np.linspace(0.0, top, TABLE)
-        factors[1:] = rolled_off(largest[1:]) / largest[1:]
+        factors[1:] = roll_off(largest[1:]) / largest[1:]
     luminance = _to_xyz(_WIDE.get(primaries, _BT709))[1]
     matrix = np.linalg.inv(_to_xyz(_BT709)) @ _to_xyz(_WIDE.get(primaries, _BT709))
     codes = eight_bit_srgb(signal**2)
@@ -275,7 +275,7 @@ def pq_signal(light: np.ndarray) -> np.ndarray:
     return ((_C1 + _C2 * power) / (1.0 + _C3 * power)) ** _M2
 
 
-def rolled_off(light: np.ndarray) -> np.ndarray:
+def roll_off(light: np.ndarray) -> np.ndarray:
     """Bend light so that the peak becomes reference white (ITU-R BT.2390, EETF).
 
     Light is relative to reference white, 0 or more; the result in [0, 1], the same up to 0.43.

@@ -21,7 +21,7 @@ from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame, resample
 from hwp_bench.importers.shared.landmarks import Landmarks
 from hwp_bench.importers.video.decode import ClipImages
-from hwp_bench.importers.video.model import ClipModel, posed_vertices
+from hwp_bench.importers.video.model import ClipModel, pose_vertices
 from hwp_bench.importers.video.residuals import FIELD_SIZE, signed_distance
 
 # --- Colours
@@ -345,10 +345,10 @@ class ProjectedClip:
 
 def project_clip(model: ClipModel, windows: CropWindows) -> ProjectedClip:
     """Pose and project every frame of a fit as it is now."""
-    vertices = posed_vertices(model)
+    vertices = pose_vertices(model)
     with torch.no_grad():
         pixels = model.pixels(torch.as_tensor(vertices)).numpy()
-        points = model.posed().landmarks
+        points = model.pose().landmarks
         landmarks, depths = model.pixels(points).numpy(), points[..., 2].numpy()
     faces = model.template.faces
     ring = boundary_vertices(faces)

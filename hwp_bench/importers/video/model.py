@@ -116,7 +116,7 @@ class ClipModel:
         """() focal length, px."""
         return self.variables.log_focal.exp()
 
-    def posed(self) -> PosedClip:
+    def pose(self) -> PosedClip:
         """Pose every frame; differentiable."""
         free = self.variables
         frames = len(free.turn)
@@ -165,11 +165,11 @@ class ClipModel:
     def parameters(self, valid: np.ndarray) -> HandParameters:
         """Return the clip as hand parameters, the root rotation continuous in time."""
         with torch.no_grad():
-            posed = self.posed()
+            posed = self.pose()
             wrist = self.tensors.joints[0] + self.tensors.joint_basis[0] @ self.variables.betas
             # `pose_hand` turns about the rest wrist, `posed` about the origin.
             transl = posed.place + (posed.rotation @ wrist) - wrist
-        root = continuous_rotation_vectors(posed.rotation.double().numpy())
+        root = unwrap_rotations(posed.rotation.double().numpy())
         pose = posed.pose.double().numpy().copy()
         pose[:, 0] = root
         return HandParameters(
@@ -184,7 +184,7 @@ class ClipModel:
 _CHUNK = 64
 
 
-def posed_vertices(model: ClipModel, chunk: int = _CHUNK) -> np.ndarray:
+def pose_vertices(model: ClipModel, chunk: int = _CHUNK) -> np.ndarray:
     """Return the vertices of every frame in the camera frame, (F, V, 3) float32 m."""
     parameters = model.parameters(np.ones(len(model.variables.turn), dtype=bool))
     betas = torch.as_tensor(parameters.betas, dtype=torch.float32)
@@ -198,7 +198,7 @@ def posed_vertices(model: ClipModel, chunk: int = _CHUNK) -> np.ndarray:
     return torch.cat(pieces).numpy()
 
 
-def continuous_rotation_vectors(rotations: np.ndarray) -> np.ndarray:
+def unwrap_rotations(rotations: np.ndarray) -> np.ndarray:
     """Axis-angle vectors (F, 3) rad of (F, 3, 3), without jumps by a full turn between frames."""
     from scipy.spatial.transform import Rotation
 
@@ -351,7 +351,7 @@ class SurfaceMotion:
             return np.asarray(tensor.detach().double().numpy())
 
         with torch.no_grad():
-            posed = model.posed()
+            posed = model.pose()
             shaped = array(tensors.vertices + tensors.shape_basis @ free.betas)
             self._joints = array(tensors.joints + tensors.joint_basis @ free.betas)
         self._shaped = shaped

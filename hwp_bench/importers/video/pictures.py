@@ -20,7 +20,7 @@ from hwp_bench.importers.video.model import (
     PosedClip,
     SurfaceMotion,
     frame_variables,
-    posed_vertices,
+    pose_vertices,
 )
 from hwp_bench.importers.video.texture import (
     LitTexture,
@@ -68,9 +68,9 @@ class HandPictures:
         """The frames that count."""
         return [int(frame) for frame in np.flatnonzero(self.usable)]
 
-    def placed(self, model: ClipModel) -> tuple[np.ndarray, np.ndarray]:
+    def place(self, model: ClipModel) -> tuple[np.ndarray, np.ndarray]:
         """Place a model in the images: its vertices (F, V, 3) m, and (F, V, 2) px of them."""
-        vertices = posed_vertices(model)
+        vertices = pose_vertices(model)
         with torch.no_grad():
             pixels = model.pixels(torch.as_tensor(vertices)).numpy()
         inside = (pixels - self.windows.corners[:, None]) * self.ratio
@@ -165,7 +165,7 @@ class SurfaceResidual(ABC):
     def rematch(self, model: ClipModel) -> None:
         """Collect the surface and linearise the differences, with the model as it is now."""
         usable = self.pictures.frames
-        vertices, pixels = self.pictures.placed(model)
+        vertices, pixels = self.pictures.place(model)
         motion = SurfaceMotion(model)
 
         # Each frame is drawn twice: all drawings together would need 1 MB for each frame.
@@ -176,7 +176,7 @@ class SurfaceResidual(ABC):
             found = self.differences(frame, self.draw(vertices[frame], pixels[frame]))
             if found is None:
                 return None
-            return linearised(motion, frame, self._faces, found, self.pictures.ratio)
+            return linearize(motion, frame, self._faces, found, self.pictures.ratio)
 
         self.collect(usable, each_frame(seen, usable))
         self._start = frame_variables(model.variables).detach().clone()
@@ -195,7 +195,7 @@ class SurfaceResidual(ABC):
         return self._weight * (step * (0.5 * bent + self._slope)).sum()
 
 
-def linearised(
+def linearize(
     motion: SurfaceMotion, frame: int, faces: np.ndarray, found: Differences, ratio: float
 ) -> tuple[np.ndarray, np.ndarray]:
     """Differentiate half the weighed squared differences by the variables of their frame.

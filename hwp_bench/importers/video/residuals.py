@@ -20,7 +20,7 @@ from hwp_bench.hands.skeleton import FINGERS, finger_joints, palm_directions, un
 from hwp_bench.hands.template import boundary_vertices
 from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.video.model import ClipModel, PosedClip, posed_vertices
+from hwp_bench.importers.video.model import ClipModel, PosedClip, pose_vertices
 from hwp_bench.importers.video.texture import sample
 
 # --- Landmarks, motion, and what is known of hands
@@ -343,7 +343,7 @@ class OutlineResidual:
         faces = model.template.faces
         candidates = np.setdiff1d(np.arange(len(model.template.vertices)), boundary_vertices(faces))
         with torch.no_grad():
-            vertices = torch.as_tensor(posed_vertices(model))
+            vertices = torch.as_tensor(pose_vertices(model))
             pixels = self._in_field(model.pixels(vertices)).numpy()
 
         def match(frame: int) -> Outline:

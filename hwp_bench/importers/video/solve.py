@@ -219,10 +219,10 @@ def reprojection_error(fitted: FittedClip, landmarks: Landmarks) -> Reprojection
     """Measure how well the fit explains the tracked landmarks."""
     model = fitted.model
     with torch.no_grad():
-        pixels = model.pixels(model.posed().landmarks).numpy()
+        pixels = model.pixels(model.pose().landmarks).numpy()
         offsets = model.variables.offsets.clone()
         model.variables.offsets.zero_()
-        bare = model.pixels(model.posed().landmarks).numpy()
+        bare = model.pixels(model.pose().landmarks).numpy()
         model.variables.offsets.copy_(offsets)
     seen = landmarks.detected
     error = np.linalg.norm(pixels - landmarks.image, axis=-1)
@@ -267,7 +267,7 @@ def descend(
     with _one_thread():
         for step in range(steps):
             optimizer.zero_grad(set_to_none=True)
-            loss = energy(model, model.posed())
+            loss = energy(model, model.pose())
             if not math.isfinite(float(loss.detach())):
                 raise DidNotConverge(
                     f"the fit of the hand left the finite numbers in step {step}",
@@ -342,7 +342,7 @@ def side_scores(landmarks: Landmarks, hand_model: str, footage: Footage) -> Side
         residual = LandmarkResidual(few, model, None, footage.first_focal)
         descend(model, residual.from_afar, _SIDE_STEPS, hold=_CONSTANTS)
         with torch.no_grad():
-            fitted = model.posed().landmarks
+            fitted = model.pose().landmarks
             centred = fitted - fitted.mean(dim=1, keepdim=True)
             return float(torch.linalg.vector_norm(centred - residual.world, dim=-1).mean())
 

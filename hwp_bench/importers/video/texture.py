@@ -89,14 +89,14 @@ class Atlas:
         """Where points of faces (P,) with mixes (P, 2) of `draw_faces` lie: (P, 2) texels."""
         return mix_corners(self._corners, self._corner_faces, face, mix)
 
-    def drawn(self, values: np.ndarray) -> np.ndarray:
+    def draw(self, values: np.ndarray) -> np.ndarray:
         """Draw values of the texels (K,) or (K, C) as a map, borders of charts drawn on."""
         image = self._scattered(values)
         around = smooth_within(image, self._within, _MARGIN)
         inside = self._within.reshape(*self._within.shape, *(1,) * (values.ndim - 1))
         return np.where(inside, image, around)
 
-    def drawn_weights(self, weights: np.ndarray) -> np.ndarray:
+    def draw_weights(self, weights: np.ndarray) -> np.ndarray:
         """Draw weights of the texels (K,) as a map; beyond a chart the largest one next to it."""
         image = self._scattered(weights)
         return np.where(self._within, image, cv2.dilate(image, np.ones((3, 3), np.uint8)))
@@ -134,8 +134,8 @@ class MeanTexture:
         """Form the mean of the frames added, and start again without any."""
         mean = self._sum / (self._weight + 1.0)
         self._mean = mean.astype(np.float32)
-        self._drawn = self.atlas.drawn(self._mean)
-        self._known = self.atlas.drawn_weights(self._weight)
+        self._drawn = self.atlas.draw(self._mean)
+        self._known = self.atlas.draw_weights(self._weight)
         self._sum, self._weight = (np.zeros(len(self.atlas)) for _ in range(2))
 
     def expected(self, face: np.ndarray, mix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -195,8 +195,8 @@ class LitTexture:
             self._colors = np.tile(common, (len(self.atlas), 1))
         for _ in range(turns):
             self._turn(seen)
-        self._map = self.atlas.drawn(self._colors)
-        self._known = self.atlas.drawn_weights(np.minimum(self._count / self._ENOUGH, 1.0))
+        self._map = self.atlas.draw(self._colors)
+        self._known = self.atlas.draw_weights(np.minimum(self._count / self._ENOUGH, 1.0))
 
     def expected(
         self, frame: int, face: np.ndarray, mix: np.ndarray, normals: np.ndarray

@@ -92,7 +92,7 @@ def test_landmarks_of_a_crop_return_to_the_image(region: Region, seed: int) -> N
     rng = np.random.default_rng(seed)
     points = rng.uniform(0, 224, (21, 3))
     world = rng.normal(0, 0.05, (21, 3))
-    hand = SeenHand(points, world, 0.9, 0.8).placed(square)
+    hand = SeenHand(points, world, 0.9, 0.8).place_in(square)
     turn = cmath.exp(1j * region.rotation)
     for k in range(21):
         local = complex(*(points[k, :2] / 224 - 0.5)) * square.width

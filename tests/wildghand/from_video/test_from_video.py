@@ -10,6 +10,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -49,7 +50,7 @@ SETTINGS: dict[str, Any] = {
 }
 #: An import that is only as good as the perfect landmarks of the clip.
 IMPORT = landmark_import(30, outline_steps=3)
-#: Edge, px, and frames of turntables that are drawn again; the first one has full size.
+#: Edge, px, and frames of the turntables: one of full size is most of a run's time.
 SMALL = 96, 12
 CLIP = Path(__file__).resolve().parents[4] / "shared" / "data" / "real_hand"
 
@@ -61,6 +62,14 @@ def choices(folder: Path, **changes: Any) -> VideoFit:
         "settings": SETTINGS,
     }
     return VideoFit(**{**given, **changes})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_turntable() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in zip(("SIZE", "FRAMES"), SMALL, strict=True):
+            patch.setattr(pictures, name, value)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -80,13 +89,6 @@ def folder(made: Path, tmp_path: Path) -> Path:
     """A copy of it; the record has no paths."""
     shutil.copytree(made, tmp_path / "copy")
     return tmp_path / "copy"
-
-
-@pytest.fixture
-def small_turntable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of full size is most of a run's time."""
-    for name, value in zip(("SIZE", "FRAMES"), SMALL, strict=True):
-        monkeypatch.setattr(pictures, name, value)
 
 
 def tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -113,10 +115,10 @@ def test_the_folder_is_an_avatar_with_clip_and_sheet(made: Path, tmp_path: Path)
     views = []
     while (read := clip.read())[0]:
         views.append(read[1])
-    assert len(views) == 96
+    assert len(views) == SMALL[1]
     # The hand is there, and turns.
     assert all((view.max(axis=2) > 60).mean() > 0.05 for view in views)
-    assert np.abs(views[0].astype(int) - views[48]).mean() > 1
+    assert np.abs(views[0].astype(int) - views[SMALL[1] // 2]).mean() > 1
     assert read_rgb(out / "sheet.jpg").shape[0] > 1000
     # What other commands expect of an avatar.
     words = ["render", str(out), "--poses", str(out / "work" / "capture"), "--frames", "3:5"]
@@ -144,10 +146,8 @@ def test_the_same_command_keeps_everything(folder: Path, capsys) -> None:
     ],
 )
 def test_what_changed_is_named_and_made_again(
-    changes: dict[str, Any], again: list[str], named: str, folder: Path, capsys, request
+    changes: dict[str, Any], again: list[str], named: str, folder: Path, capsys
 ) -> None:
-    if "turntable" in again:
-        request.getfixturevalue("small_turntable")
     result = make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder, **changes))
     assert [name for name in NAMES if name not in result.kept] == again
     assert f"changed since the last run: {named}." in capsys.readouterr().err
@@ -155,7 +155,6 @@ def test_what_changed_is_named_and_made_again(
     assert len(result.avatar.record.frames) == pytest.approx(fitted, abs=1)
 
 
-@pytest.mark.usefixtures("small_turntable")
 def test_another_video_of_the_same_name_is_noticed(folder: Path, capsys) -> None:
     clip = make_clip(COUNT, bend=0.2)
     write_video(folder / "hand.avi", [clip.picture(frame) for frame in range(COUNT)])
@@ -198,7 +197,6 @@ make_avatar(folder / "hand.avi", out, choices(folder))
 """
 
 
-@pytest.mark.usefixtures("small_turntable")
 @pytest.mark.parametrize(
     ("where", "kept", "told"),
     [
@@ -316,7 +314,6 @@ def test_wrong_calls_are_one_line(
     assert (folder / "taken" / "thesis.tex").exists()
 
 
-@pytest.mark.usefixtures("small_turntable")
 def test_two_hands_by_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Oracle: the synthetic clip has a right and a left hand."""
     video, landmarks = write_two_hands(tmp_path, make_two_hands(COUNT), (5,), range(7, 9))
@@ -378,7 +375,6 @@ def test_a_video_without_a_hand(tmp_path: Path, capsys) -> None:
     assert "--landmarks" in told
 
 
-@pytest.mark.usefixtures("small_turntable")
 def test_a_real_hand(tmp_path: Path) -> None:
     """The whole chain on 16 frames of a real video. Oracle: its hand is known to be a right one."""
     video = CLIP / "human_hand_video.mp4"

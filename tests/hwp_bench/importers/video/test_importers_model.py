@@ -13,7 +13,7 @@ from hwp_bench.importers.video.model import (
     ClipModel,
     SurfaceMotion,
     frame_variables,
-    posed_vertices,
+    pose_vertices,
     rigid_start,
 )
 
@@ -48,7 +48,7 @@ def pixels_at(model: ClipModel, values: torch.Tensor) -> np.ndarray:
         free.fingers.copy_(values[:, 3:48].unflatten(1, (15, 3)))
         free.anchor.copy_(values[:, 48:50])
         free.log_depth.copy_(values[:, 50:])
-        return np.asarray(model.pixels(torch.as_tensor(posed_vertices(model))).double().numpy())
+        return np.asarray(model.pixels(torch.as_tensor(pose_vertices(model))).double().numpy())
 
 
 @pytest.mark.parametrize("correctives", [False, True])

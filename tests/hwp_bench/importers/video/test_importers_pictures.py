@@ -22,17 +22,12 @@ from painted_clip import (
 )
 
 from hwp_bench.hands.raster import draw_faces, mix_corners
-from hwp_bench.importers.video.model import (
-    ClipModel,
-    SurfaceMotion,
-    frame_variables,
-    posed_vertices,
-)
+from hwp_bench.importers.video.model import ClipModel, SurfaceMotion, frame_variables, pose_vertices
 from hwp_bench.importers.video.pictures import (
     Differences,
     PictureResidual,
     TextureResidual,
-    linearised,
+    linearize,
 )
 from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
 from hwp_bench.importers.video.solve import FittedClip, fit_outline, fit_picture
@@ -173,11 +168,11 @@ def test_the_atlas_gives_back_what_lies_on_the_surface() -> None:
     face = np.arange(0, len(hand.faces), 5)
     mix = np.full((len(face), 2), 1 / 3, np.float32)
     places = atlas.places(face, mix)
-    found = sample(atlas.drawn(atlas.on_surface(values)), places)
+    found = sample(atlas.draw(atlas.on_surface(values)), places)
     error = np.linalg.norm(found - mix_corners(values, hand.faces, face, mix), axis=1)
     assert np.median(error) < 2e-4
     assert np.quantile(error, 0.95) < 2e-3
-    ones = atlas.drawn_weights(np.ones(len(atlas)))
+    ones = atlas.draw_weights(np.ones(len(atlas)))
     np.testing.assert_array_equal(sample(ones, places), 1.0)
     assert sample(ones, np.array([[-5.0, 3.0], [1e4, 3.0]])).tolist() == [0.0, 0.0]
 
@@ -187,7 +182,7 @@ def displaced(model: ClipModel, column: int, step: float) -> np.ndarray:
     free = model.variables
     with torch.no_grad():
         free.turn[3, column] += step
-        pixels = model.pixels(torch.as_tensor(posed_vertices(model))).double().numpy()[3]
+        pixels = model.pixels(torch.as_tensor(pose_vertices(model))).double().numpy()[3]
         free.turn[3, column] -= step
     return np.asarray(pixels)
 
@@ -202,7 +197,7 @@ def test_the_slope_is_that_of_half_the_weighed_squares(column: int) -> None:
     face, mix = rng.integers(0, len(faces), count), rng.uniform(0, 0.5, (count, 2))
     error, across, down = rng.normal(size=(3, count, 3))
     trust, ratio = rng.uniform(size=count), 0.7
-    curvature, slope = linearised(
+    curvature, slope = linearize(
         SurfaceMotion(fitted.model),
         3,
         faces,

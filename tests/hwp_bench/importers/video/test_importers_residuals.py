@@ -125,7 +125,7 @@ def test_rest_is_free_and_a_crossing_finger_is_not(side: str) -> None:
     energies = []
     for pose in poses:
         clip = model(side, pose[None])
-        energies.append(ContactResidual(template(side))(clip, clip.posed()))
+        energies.append(ContactResidual(template(side))(clip, clip.pose()))
     assert float(energies[0].detach()) < 5e-7
     assert float(energies[1].detach()) > 5
     assert float(energies[2].detach()) > 5
@@ -135,7 +135,7 @@ def test_gradients_are_finite_where_centres_meet() -> None:
     clip = model("right", np.zeros((1, 15, 3)))
     contact = ContactResidual(template())
     contact.least.fill_(0.01)  # every sphere touches itself
-    contact(clip, clip.posed()).backward()
+    contact(clip, clip.pose()).backward()
     assert clip.variables.fingers.grad is not None
     assert torch.isfinite(clip.variables.fingers.grad).all()
 
@@ -157,4 +157,4 @@ def test_the_fist_of_a_synthetic_clip_costs_little() -> None:
     # An ordinary closing hand must not be fought: below one ordinary overlap a frame.
     known = make_clip(5, bend=0.5)
     clip = model("right", known.hand.pose[:, 1:])
-    assert float(ContactResidual(template())(clip, clip.posed()).detach()) < 2.5
+    assert float(ContactResidual(template())(clip, clip.pose()).detach()) < 2.5

@@ -26,10 +26,10 @@ from hwp_bench.hands.template import rebuilt
 from hwp_bench.importers.shared.frames import cut, follow_hands
 from hwp_bench.importers.shared.landmarks import Landmarks, read_landmarks
 from hwp_bench.importers.video.model import (
-    continuous_rotation_vectors,
     interpolate,
-    posed_vertices,
+    pose_vertices,
     rigid_start,
+    unwrap_rotations,
 )
 from hwp_bench.importers.video.residuals import OutlineResidual, signed_distance
 from hwp_bench.importers.video.solve import (
@@ -113,7 +113,7 @@ def test_noise_is_smoothed() -> None:
     noisy = Landmarks(image, world, clip.landmarks.score, clip.landmarks.detected)
     fitted = fit(clip, noisy)
     with torch.no_grad():
-        track = fitted.model.pixels(fitted.model.posed().landmarks).numpy()
+        track = fitted.model.pixels(fitted.model.pose().landmarks).numpy()
     assert np.abs(np.diff(track, 2, axis=0)).mean() < np.abs(np.diff(image, 2, axis=0)).mean() / 3
     assert np.linalg.norm(track - clip.landmarks.image, axis=-1).mean() < 2.0
 
@@ -131,7 +131,7 @@ def test_gaps_and_outliers_do_no_harm() -> None:
     assert np.isfinite(hand.pose).all()
     assert np.isfinite(hand.transl).all()
     with torch.no_grad():
-        track = fitted.model.pixels(fitted.model.posed().landmarks).numpy()
+        track = fitted.model.pixels(fitted.model.pose().landmarks).numpy()
     error = np.linalg.norm(track - clip.landmarks.image, axis=-1).mean(axis=1)
     # The gap of three frames is bridged, and one finger tip that jumps is ignored.
     assert error[12:15].max() < 6.0
@@ -186,7 +186,7 @@ def test_rotation_vectors_do_not_jump() -> None:
     axis = np.array([0.6, 0.8, 0.0])
     truth = angles[:, None] * axis
     rotations = Rotation.from_rotvec(truth).as_matrix()
-    np.testing.assert_allclose(continuous_rotation_vectors(rotations), truth, atol=1e-9)
+    np.testing.assert_allclose(unwrap_rotations(rotations), truth, atol=1e-9)
 
 
 def test_interpolation_holds_the_ends() -> None:
@@ -212,8 +212,8 @@ def test_outline_vertices_are_those_of_the_hand_model(correctives: bool) -> None
     fields = np.stack([signed_distance(mask) for mask in masks])
     contour = OutlineResidual(fields, clip.landmarks.detected, windows, 150.0)
     contour.rematch(fitted.model)
-    everything = posed_vertices(fitted.model)
-    some = fitted.model.vertices(fitted.model.posed(), contour.outline)
+    everything = pose_vertices(fitted.model)
+    some = fitted.model.vertices(fitted.model.pose(), contour.outline)
     expected = np.take_along_axis(everything, contour.outline.index.numpy()[..., None], axis=1)
     np.testing.assert_allclose(some.detach().numpy(), expected, atol=1e-5)
 
@@ -239,7 +239,7 @@ def test_the_outline_pulls_a_displaced_hand_back() -> None:
 
     def offset() -> float:
         with torch.no_grad():
-            pixels = fitted.model.pixels(torch.as_tensor(posed_vertices(fitted.model))).numpy()
+            pixels = fitted.model.pixels(torch.as_tensor(pose_vertices(fitted.model))).numpy()
         return float(np.abs((pixels - clip.vertex_pixels).mean(axis=(0, 1)))[0])
 
     before = offset()

@@ -27,7 +27,7 @@ from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import overlap
-from hwp_bench.importers.video.api import import_video, without_blank_frames
+from hwp_bench.importers.video.api import drop_blank_frames, import_video
 from hwp_bench.importers.video.clip import IMPORTER_VERSION
 from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
 from hwp_bench.importers.video.solve import FitSettings
@@ -279,7 +279,7 @@ def test_black_frames_show_no_hand(
 ) -> None:
     pictures = [clip.picture(frame) * (frame not in (3, 9)) for frame in range(FRAMES)]
     video = write_video(tmp_path / "hand.avi", pictures)
-    source = without_blank_frames(read_source(video, folder / "hand.npz", VideoImport()))
+    source = drop_blank_frames(read_source(video, folder / "hand.npz", VideoImport()))
     assert "no hand is taken from frames of one colour: 3, 9." in capsys.readouterr().err
     np.testing.assert_array_equal(np.flatnonzero(~source.detected), [3, 5, 9])
 
