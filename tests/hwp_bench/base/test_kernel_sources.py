@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from hwp_bench.base import kernels as kernel_sources
+from hwp_bench.base import kernels
 from hwp_bench.base.kernels import kernel_digest, kernel_modules
 
 
@@ -17,10 +17,10 @@ def root(tmp_path: Path) -> Path:
         "hwp_bench/unrelated.py": "",
         "hwp_bench/base/kernels.py": "import hwp_bench.unrelated",
         "hwp_bench/room/__init__.py": "from hwp_bench.unrelated import x",
-        "hwp_bench/room/kernels.py": "import numpy\nfrom hwp_bench.base.kernels import compiled\n"
+        "hwp_bench/room/kernels.py": "import numpy\nfrom hwp_bench.base.kernels import (\n    compiled,\n    helper,\n)\n"
         "from hwp_bench.room import constants as at\nfrom hwp_bench.room.helpers import f",
         "hwp_bench/room/constants.py": "",
-        "hwp_bench/room/helpers.py": "def f():\n    from .deep import g",
+        "hwp_bench/room/helpers.py": "def f():\n    from hwp_bench.room.deep import g",
         "hwp_bench/room/deep.py": "import hwp_bench.room.last",
         "hwp_bench/room/last.py": "from hwp_bench.room import kernels",
         "hwp_bench/room/taker.py": "from hwp_bench.room import name",
@@ -35,7 +35,7 @@ def root(tmp_path: Path) -> Path:
 def test_imports_are_followed_and_machinery_is_not(root: Path) -> None:
     found = kernel_modules("hwp_bench.room.kernels", root)
     names = ("constants", "deep", "helpers", "kernels", "last")
-    assert list(found) == [f"hwp_bench.room.{name}" for name in names]
+    assert list(found) == ["hwp_bench.base.kernels", *(f"hwp_bench.room.{name}" for name in names)]
 
 
 def test_a_name_that_is_no_module_stands_in_the_package(root: Path) -> None:
@@ -62,7 +62,10 @@ def test_kernels_depend_on_little(module: str, also: str | None) -> None:
     found = set(kernel_modules(module))
     assert found >= {module, *([also] if also else [])}
     assert all(
-        name == module or name.startswith(("wildghand.splat.kernels.", "wildghand.splat.conv"))
+        name == module
+        or name.startswith(
+            ("hwp_bench.base.kernels", "wildghand.splat.kernels.", "wildghand.splat.conv")
+        )
         for name in found
     )
 
@@ -74,7 +77,7 @@ def test_source_that_changed_since_the_start_gives_no_digest(
     kernel_digest.cache_clear()
     assert kernel_digest("hwp_bench.hands.raster") is not None
     kernel_digest.cache_clear()
-    monkeypatch.setattr(kernel_sources, "_STARTED", 0.0)
+    monkeypatch.setattr(kernels, "_STARTED", 0.0)
     assert kernel_digest("hwp_bench.hands.raster") is None
     kernel_digest.cache_clear()
 
