@@ -71,16 +71,7 @@ PERTURBATIONS: tuple[str, ...] = tuple(item.name for item in _ALL)
 
 
 def perturbation(name: str, *, where: str | None = None, field: str | None = None) -> Perturbation:
-    """Look a perturbation up by name.
-
-    Args:
-        name: its name.
-        where: the file that names it, for the message.
-        field: the field in it.
-
-    Raises:
-        BadInput: no perturbation has that name; the message lists the four.
-    """
+    """Look a perturbation up by name."""
     for item in _ALL:
         if item.name == name:
             return item
@@ -93,11 +84,7 @@ def perturbation(name: str, *, where: str | None = None, field: str | None = Non
 
 
 def check_severity(values: Iterable[int], *, where: str, field: str) -> tuple[int, ...]:
-    """Check the severities of one perturbation, one integer from 0 to 5 for each frame.
-
-    Raises:
-        BadInput: a value is not an integer or is out of range; the frame is named.
-    """
+    """Check the severities of one perturbation, one integer from 0 to 5 for each frame."""
     checked = []
     for frame, value in enumerate(values):
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEVERITY:

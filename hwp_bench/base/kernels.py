@@ -89,10 +89,6 @@ def helper(function: Callable[..., Any], **options: Any) -> Any:
 
     Python cannot call it, and the disk does not keep it: its code is part of theirs. Wrappers for
     callers outside would take a tenth of the time.
-
-    Args:
-        function: to compile.
-        options: further options of `numba.njit`.
     """
     return _njit(
         boundscheck=False,
@@ -148,10 +144,6 @@ class MachineCode:
 
     A file is the digest of its content, then a pickle of its key and of what numba needs. A file
     that is damaged, or that others could have written, is as good as none.
-
-    Args:
-        function: the Python function.
-        options: the options of `numba.njit` that it is compiled with.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:

@@ -44,11 +44,7 @@ _COUNT = re.compile(r"[0-9]{1,9}")
 
 
 def waiting_variables(environment: Mapping[str, str]) -> dict[str, str]:
-    """Return the variables by which threads that wait sleep, without those that a person has set.
-
-    Args:
-        environment: what is set.
-    """
+    """Variables by which threads that wait sleep, without those that a person has set."""
     variables = {}
     if not any(name in environment for name in OPENMP_WAITING):
         variables["OMP_WAIT_POLICY"] = "PASSIVE"
@@ -70,15 +66,7 @@ def share_processors() -> None:
 
 
 def check_thread_variables(environment: Mapping[str, str]) -> None:
-    """Check what a person has set, which libraries ignore or end the process for.
-
-    Args:
-        environment: what is set.
-
-    Raises:
-        UsageError: a number of threads is none from 1 to 1024, or threads are to wait in an
-            unknown way.
-    """
+    """Check what a person has set, which libraries ignore or end the process for."""
     for name in dict.fromkeys((*TORCH_COUNTS, *BLAS_COUNTS, "NUMBA_NUM_THREADS")):
         text = environment.get(name, "").strip()
         # OpenMP takes a number for each depth of nested regions.
@@ -103,11 +91,7 @@ def _is_count(text: str) -> bool:
 
 
 def count_is_chosen(environment: Mapping[str, str]) -> bool:
-    """Whether a person, or the engine that runs several jobs, says how many threads torch has.
-
-    Args:
-        environment: what is set.
-    """
+    """Whether a person, or the engine that runs several jobs, says how many threads torch has."""
     return any(environment.get(name, "").strip() for name in TORCH_COUNTS)
 
 
@@ -131,14 +115,7 @@ def flushes() -> bool:
 
 
 def set_flush(on: bool) -> bool:
-    """Switch the calling thread.
-
-    Args:
-        on: flush denormals to zero, or compute with them.
-
-    Returns:
-        Whether it flushed before.
-    """
+    """Switch the calling thread."""
     before = flushes()
     library = _library() if on != before else None
     if library is not None:

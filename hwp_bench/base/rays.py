@@ -165,12 +165,8 @@ class EmbreeMesh:
     """One mesh, built where it is.
 
     Args:
-        loaded: what `library` returned.
         vertices: (V, 3) m.
         faces: (F, 3) vertex indices.
-
-    Raises:
-        HwpError: Embree refuses the mesh.
     """
 
     def __init__(self, loaded: Library, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -284,9 +280,6 @@ def ray_mesh(vertices: np.ndarray, faces: np.ndarray) -> EmbreeMesh | EmbreexMes
     Args:
         vertices: (V, 3) m.
         faces: (F, 3) vertex indices.
-
-    Raises:
-        HwpError: Embree refuses the mesh.
     """
     loaded = library()
     return EmbreexMesh(vertices, faces) if loaded is None else EmbreeMesh(loaded, vertices, faces)

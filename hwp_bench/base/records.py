@@ -385,11 +385,7 @@ def without_schema(
     error: type[HwpError] = BadResult,
     remedy: str | None = None,
 ) -> dict[str, Any]:
-    """Check the version that a file states in its field `schema`; return the other fields.
-
-    Raises:
-        error: the value is not a table, or is of another version.
-    """
+    """Check the version that a file states in its field `schema`; return the other fields."""
     if not isinstance(value, dict):
         raise error("must be a JSON object", where=where)
     found = value.get("schema")
@@ -446,21 +442,7 @@ def check_json_values(
     depth: int = 16,
     null: bool = False,
 ) -> None:
-    """Refuse what JSON cannot hold: for values of type `Any` that are kept or digested.
-
-    Args:
-        value: numbers, texts, truth values, or lists or tables of such.
-        where: the file, for messages.
-        field: path of `value` in the file.
-        error: raised when something is wrong.
-        depth: deepest nesting that is accepted.
-        null: accept None, which JSON has and TOML has not.
-
-    Raises:
-        error: there is a date or other object, a number that is not finite or is absurdly large,
-            a text that is too long or holds a control character, or too deep a nesting; the field
-            is named.
-    """
+    """Refuse what JSON cannot hold: for values of type `Any` that are kept or digested."""
     problem = None
     check = partial(check_json_values, where=where, error=error, depth=depth - 1, null=null)
     if depth == 0:
@@ -509,19 +491,7 @@ def parse_toml(
     field: str | None = None,
     error: type[HwpError] = BadInput,
 ) -> dict[str, Any]:
-    """Make tables of TOML text.
-
-    Args:
-        text: the content of a file, or a value of a command line.
-        where: the file, for messages.
-        field: the field that the text is the value of.
-        error: raised when something is wrong.
-
-    Raises:
-        error: the text is too long, no Unicode or not TOML, nested too deeply, or holds an integer
-            of more than `MAX_BITS`. Its cause is a `tomllib.TOMLDecodeError` where the text is
-            merely not TOML.
-    """
+    """Make tables of TOML text."""
 
     def refuse(problem: str) -> HwpError:
         return error(problem, where=where, field=field)

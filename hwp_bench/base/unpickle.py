@@ -246,15 +246,7 @@ _HOLDERS = (dict, list, tuple, StandIn)
 
 
 def _check_expanded(loaded: Any, most: int) -> None:
-    """Refuse what numpy would copy into far more memory than the pickle takes.
-
-    Args:
-        loaded: the object.
-        most: largest sum of numbers and characters; what is shared counts each time.
-
-    Raises:
-        ValueError: it is larger, contains itself, or is nested too deeply.
-    """
+    """Refuse what numpy would copy into far more memory than the pickle takes."""
     # Size and depth of each container, from the inside out; None while its parts are looked at,
     # so that a part without one contains the container that it is in.
     known: dict[int, tuple[int, int] | None] = {}

@@ -97,11 +97,7 @@ def sample_surface(
 
 
 def anchors_from_vertices(template: HandTemplate) -> SurfaceAnchors:
-    """Make one anchor on every vertex, in the order of the vertices.
-
-    Raises:
-        UsageError: a vertex belongs to no face.
-    """
+    """Make one anchor on every vertex, in the order of the vertices."""
     count = len(template.vertices)
     first = np.full(count, -1, dtype=np.int64)
     flat = template.faces.reshape(-1)
@@ -202,7 +198,6 @@ def unit_or(vectors: torch.Tensor, fallback: torch.Tensor) -> torch.Tensor:
 
     Args:
         vectors: (..., 3).
-        fallback: broadcastable to `vectors`.
     """
     squared = (vectors * vectors).sum(dim=-1, keepdim=True)
     usable = squared > _TINY
@@ -280,7 +275,6 @@ class HandSurfaces:
     """The surfaces of a capture's hands, cut into cells: the places that frames have in common.
 
     Args:
-        templates: by side.
         patch_size: edge of a cell, m.
     """
 
@@ -331,11 +325,9 @@ class HandSurfaces:
         """Draw the hands in some frames, in their order.
 
         Args:
-            hands: parameters of every frame, by side.
             Ks: (F, 3, 3) px.
             viewmats: (F, 4, 4).
             frames: (R,) which frames.
-            size: height and width of the images.
         """
         before: tuple[int, np.ndarray] | None = None
         for start in range(0, len(frames), _CHUNK):

@@ -17,7 +17,7 @@ def root(tmp_path: Path) -> Path:
         "hwp_bench/unrelated.py": "",
         "hwp_bench/base/kernels.py": "import hwp_bench.unrelated",
         "hwp_bench/room/__init__.py": "from hwp_bench.unrelated import x",
-        "hwp_bench/room/kernels.py": "import numpy\nfrom hwp_bench.base.kernels import (\n    a,\n)\n"
+        "hwp_bench/room/kernels.py": "import numpy\nfrom hwp_bench.base.kernels import (\n  a\n)\n"
         "from hwp_bench.room import constants as at\nfrom hwp_bench.room.helpers import f",
         "hwp_bench/room/constants.py": "",
         "hwp_bench/room/helpers.py": "def f():\n    from hwp_bench.room.deep import g",
