@@ -37,7 +37,6 @@ _.formatter_class  # argparse reads it
 _.channelnames  # OpenImageIO reads it
 _.camera_position  # pyvista reads it
 _.pareto  # read by the report's template
-_.holistic  # a fact of the paper's taxonomy, for readers of the API
 _.perfect  # a fact of a metric, which tests compare the score of the truth with
 _.gain_deviation  # the table CUES names it; getattr reads it
 _.residual_deviation  # a measured cue of the pre-pass, for tests and benchmarks

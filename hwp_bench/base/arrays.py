@@ -1,4 +1,4 @@
-"""Named arrays on disk (`.npz`) from others: no pickles, sizes bounded, shapes checked."""
+"""Named arrays from others: no pickles, sizes bounded, shapes checked; tables of tensors."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Colour: sRGB and linear light, brightness, and the colour of a lamp."""
+"""Colour: sRGB and linear light, brightness, lamps, and light as a function of the normal."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The one root of every error that the toolkit raises on purpose.
+"""The one root of every error that the toolkit raises on purpose, its words, and checked arguments.
 
 A message says what is wrong, in which file and field, and what to do about it. The command
 line prints `str(error)` on one line and leaves with `error.exit_status`; any other exception

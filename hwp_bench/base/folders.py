@@ -115,6 +115,10 @@ def _user(facts: os.stat_result) -> int:
 DEEPEST = 32
 
 
+# `shutil.rmtree` and `os.walk` call themselves for every level (before Python 3.12), so that a folder
+# nested a thousand deep ends them; and neither gets into a folder whose owner has closed it.
+
+
 def remove_tree(folder: str | os.PathLike[str]) -> None:
     """Remove a folder and everything in it; what is not there, or cannot be removed, is left.
 

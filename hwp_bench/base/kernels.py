@@ -127,7 +127,10 @@ def _without_collections(function: Callable[..., Any]) -> Callable[..., Any]:
 
 @helper
 def dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Scalar product of two vectors (3,)."""
+    """Scalar product of two vectors (3,).
+
+    The sum is written out: a library's order of summing depends on the processor.
+    """
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 

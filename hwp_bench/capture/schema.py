@@ -349,7 +349,13 @@ _FARTHEST = 1.0
 
 
 def write_subject_mesh(path: str | os.PathLike[str], templates: Mapping[str, HandTemplate]) -> None:
-    """Write the rest hands of a subject by side, to be read with `read_subject_mesh`."""
+    """Write the rest hands of a subject by side: `truth/template.npz`.
+
+    A subject may be another person than every shape of the hand model. Of a subject with the hand
+    model's triangles, the file holds the surface, the joints it bends about, and its skinning; the
+    rest of a template is the hand model's. It is truth with the capture and no part of its digest:
+    it follows from the scene.
+    """
     arrays = {
         f"{side}_{field}": getattr(template, field).astype(np.float32)
         for side, template in templates.items()

@@ -96,19 +96,6 @@ def sample_surface(
     return SurfaceAnchors(face_index, _square_to_triangle(square))
 
 
-def anchors_from_vertices(template: HandTemplate) -> SurfaceAnchors:
-    """Make one anchor on every vertex, in the order of the vertices."""
-    count = len(template.vertices)
-    first = np.full(count, -1, dtype=np.int64)
-    flat = template.faces.reshape(-1)
-    first[flat[::-1]] = np.arange(len(flat))[::-1]
-    if (first < 0).any():
-        raise UsageError(
-            f"vertex {int(np.argmin(first))} belongs to no face", field="template.faces"
-        )
-    return SurfaceAnchors(first // 3, np.eye(3)[first % 3])
-
-
 def anchor_positions(
     vertices: torch.Tensor, faces: torch.Tensor, anchors: SurfaceAnchors
 ) -> torch.Tensor:

@@ -1,4 +1,4 @@
-"""A hand template: the rest mesh, how it changes with shape and pose, and its skeleton."""
+"""A hand template: rest mesh, shape, pose, skeleton; its open end, subdivision, and MANO-HD."""
 
 from __future__ import annotations
 

@@ -1,4 +1,10 @@
-"""LPIPS in plain torch: two backbones, no torchvision (Zhang et al., CVPR 2018, version 0.1)."""
+"""LPIPS in plain torch (Zhang et al., CVPR 2018, version 0.1), and where its weights lie.
+
+Nothing is downloaded. The backbone is the torchvision checkpoint in the torch hub cache or a
+file given by path; the linear layers come from the `lpips` package (or torchmetrics, which
+ships the same bytes) or a file given by path. A file that is not byte for byte the published
+one is refused: the number would not be LPIPS.
+"""
 
 from __future__ import annotations
 
