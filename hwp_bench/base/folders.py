@@ -115,8 +115,8 @@ def _user(facts: os.stat_result) -> int:
 DEEPEST = 32
 
 
-# `shutil.rmtree` and `os.walk` call themselves for every level (before Python 3.12), so that a folder
-# nested a thousand deep ends them; and neither gets into a folder whose owner has closed it.
+# `shutil.rmtree` and `os.walk` call themselves for every level (before Python 3.12), so that a
+# folder nested a thousand deep ends them; and neither gets into one whose owner has closed it.
 
 
 def remove_tree(folder: str | os.PathLike[str]) -> None:
