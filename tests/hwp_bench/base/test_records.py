@@ -28,7 +28,7 @@ from hwp_bench.base.records import (
     unfold,
     without_schema,
 )
-from hwp_bench.cli.overrides import overrides
+from hwp_bench.cli.options import overrides
 from hwp_bench.sim.scene.reader import parse_scene, scene_path
 
 
