@@ -3,17 +3,26 @@
 from __future__ import annotations
 
 import math
+import random
 
 import cv2
 import numpy as np
+import OpenImageIO as oiio
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from skimage.metrics import structural_similarity
 
-from hwp_bench.base.errors import BadImage, BadPrediction, EmptyMask, ShapeMismatch
+from hwp_bench.base.errors import (
+    BadImage,
+    BadPrediction,
+    BadResult,
+    EmptyMask,
+    HwpError,
+    ShapeMismatch,
+)
 from hwp_bench.base.images import as_uint8
-from hwp_bench.metrics import HWP_V1, PAPER_WILDGHAND, metric, metric_names
+from hwp_bench.metrics import HWP_V1, PAPER_WILDGHAND, metric, metric_names, penalty
 from hwp_bench.metrics.pixels import (
     bounding_box,
     crop,
@@ -26,7 +35,14 @@ from hwp_bench.metrics.pixels import (
     ssim_map,
 )
 from hwp_bench.metrics.protocol import PSNR_CAP
-from hwp_bench.metrics.score import score_frame
+from hwp_bench.metrics.score import (
+    CaptureScores,
+    Frame,
+    aggregate,
+    mean_scores,
+    score_frame,
+    score_frames,
+)
 
 
 def blob_mask(rng: np.random.Generator, height: int, width: int) -> np.ndarray:
@@ -273,3 +289,278 @@ def test_what_does_not_fit_is_refused_by_name():
     small = np.zeros((10, 10, 3), np.uint8)
     with pytest.raises(ShapeMismatch, match="window"):
         score_frame(small, small, np.full((10, 10), 255, np.uint8))
+
+
+def frames(count: int) -> list[Frame]:
+    rng = np.random.default_rng(0)
+    mask = np.zeros((40, 44), np.uint8)
+    mask[8:30, 10:36] = 255
+    made = []
+    for index in range(count):
+        target = rng.integers(0, 256, (40, 44, 3), dtype=np.uint8)
+        prediction = np.clip(target + rng.normal(0, 3 + index, target.shape), 0, 255)
+        made.append(Frame(prediction.astype(np.uint8), target, mask))
+    return made
+
+
+@pytest.mark.parametrize("workers", [1, 2, 5])
+def test_order_and_scores_do_not_depend_on_the_workers(workers):
+    listed = frames(30)
+    expected = [score_frame(f.prediction, f.target, f.mask) for f in listed]
+    got = list(score_frames(iter(listed), workers=workers))
+    assert [score.values for score in got] == expected
+    assert not any(score.failure or score.empty for score in got)
+
+
+def test_frames_may_be_read_on_the_workers():
+    listed = frames(5)
+    lazy = [(lambda frame=frame: frame) for frame in listed]
+    assert list(score_frames(lazy, workers=2)) == list(score_frames(listed, workers=2))
+
+
+def test_a_failed_prediction_costs_its_penalty_and_no_row():
+    listed = frames(5)
+    target, mask = listed[0].target, listed[0].mask
+    listed[1] = Frame(BadPrediction("does not exist", where="0001.png"), target, mask)
+    listed[2] = Frame(target[:-1], target, mask)
+    listed[3] = Frame(target / 255.0, target, mask)
+    got = list(score_frames(listed, (HWP_V1,), workers=2))
+    assert len(got) == 5
+    assert [score.failure is not None for score in got] == [False, True, True, True, False]
+    assert "0001.png: does not exist" in got[1].failure
+    assert "(39, 44, 3)" in got[2].failure
+    assert "float64" in got[3].failure
+    for score in got[1:4]:
+        assert score.values == penalty((HWP_V1,))
+
+
+def test_a_failed_frame_gets_the_penalty_of_the_networks_too():
+    broken = Frame(BadPrediction("is empty"), frames(1)[0].target, frames(1)[0].mask)
+
+    def never(x: np.ndarray, y: np.ndarray) -> float:
+        raise AssertionError
+
+    (score,) = score_frames([broken], networks={"alex": never})
+    assert score.values == penalty(networks=["alex"])
+
+
+@pytest.mark.parametrize("prediction", ["good", "failed"])
+def test_a_frame_without_a_hand_is_empty_whatever_was_predicted(prediction):
+    target = frames(1)[0].target
+    given = target if prediction == "good" else BadPrediction("does not exist")
+    (score,) = score_frames([Frame(given, target, np.zeros((40, 44), np.uint8))])
+    assert score.empty
+    assert score.failure is None
+
+
+def test_a_fault_of_the_data_set_is_raised_not_penalised():
+    good = frames(3)
+    bad = Frame(good[0].prediction, good[0].target, good[0].mask[1:])
+    with pytest.raises(ShapeMismatch, match="mask"):
+        list(score_frames([*good, bad, *good], workers=2))
+
+
+def test_a_removed_frame_never_scores_better_than_a_delivered_one():
+    """The declared penalties are at the bad end: a noise image gains nothing by failing."""
+    rng = np.random.default_rng(0)
+    target, mask = frames(1)[0].target, frames(1)[0].mask
+    delivered = score_frame(rng.integers(0, 256, target.shape, dtype=np.uint8), target, mask)
+    declared = penalty()
+    assert delivered["psnr"] > declared["psnr"]
+    assert delivered["oriented_distance"] < declared["oriented_distance"]
+
+
+def test_frames_are_read_only_a_little_ahead():
+    read = 0
+
+    def source():
+        nonlocal read
+        for frame in frames(60):
+            read += 1
+            yield frame
+
+    results = score_frames(source(), workers=2)
+    next(results)
+    assert read <= 2 * 4 + 1
+    results.close()
+
+
+def textured(shape: tuple[int, int], seed: int) -> np.ndarray:
+    return np.random.default_rng(seed).integers(0, 256, (*shape, 3), dtype=np.uint8)
+
+
+def best(scores: dict[str, float]) -> None:
+    """A perfect frame: PSNR at the cap, SSIM 1, distance 0."""
+    for name, value in scores.items():
+        expected = PSNR_CAP if "psnr" in name else 1.0 if "ssim" in name else 0.0
+        assert value == expected, name
+
+
+@pytest.mark.parametrize("shape", [(11, 4096), (4096, 11), (4096, 12), (16, 4096)])
+def test_images_of_4096_pixels_agree_with_other_programs(shape: tuple[int, int]) -> None:
+    prediction, target = textured(shape, 0), textured(shape, 1)
+    scores = score_frame(prediction, target, np.ones(shape, bool), coverage=True)
+    x, y = prediction / 255.0, target / 255.0
+    images = [oiio.ImageBuf(image.astype(np.float32)) for image in (x, y)]
+    expected = oiio.ImageBufAlgo.compare(*images, 1.0, 1.0).PSNR
+    assert scores["psnr"] == pytest.approx(expected, abs=1e-5)
+    assert scores["psnr_full"] == pytest.approx(expected, abs=1e-5)
+    _, similar = structural_similarity(
+        x, y, full=True, gaussian_weights=True, sigma=1.5, use_sample_covariance=False,
+        data_range=1.0, channel_axis=2,
+    )  # fmt: skip
+    inside = similar.mean(2)[5:-5, 5:-5].mean()
+    assert scores["ssim_full"] == pytest.approx(inside, abs=1e-10)
+    best(score_frame(target, target, np.ones(shape, bool), coverage=True))
+
+
+@pytest.mark.parametrize("shape", [(1, 1), (1, 64), (64, 1), (10, 4096), (4096, 10)])
+def test_an_image_smaller_than_the_window_is_refused_by_name(shape: tuple[int, int]) -> None:
+    image = textured(shape, 0)
+    with pytest.raises(ShapeMismatch, match="smaller than the window of SSIM"):
+        score_frame(image, image, np.ones(shape, bool), coverage=True)
+
+
+@pytest.mark.parametrize("level", [0, 1, 127, 255])
+def test_constant_frames_as_truth_and_entry(level: int) -> None:
+    image = np.full((32, 24, 3), level, np.uint8)
+    mask = np.zeros((32, 24), bool)
+    mask[8:20, 6:18] = True
+    best(score_frame(image, image, mask))
+
+
+@pytest.mark.parametrize("level", [1, 51, 255])
+def test_a_black_video_against_a_constant_one(level: int) -> None:
+    black = np.zeros((32, 24, 3), np.uint8)
+    scores = score_frame(black + np.uint8(level), black, np.ones((32, 24), bool), coverage=True)
+    # Variances are 0, so that only SSIM's luminance term with C1 = 0.01^2 is left.
+    share = level / 255.0
+    assert scores["psnr"] == pytest.approx(-20.0 * np.log10(share), abs=1e-9)
+    inner = 1e-4 / (share**2 + 1e-4)
+    assert scores["ssim_full"] == pytest.approx(inner, abs=1e-9)
+    assert all(np.isfinite(value) for value in scores.values())
+
+
+def test_memory_layout_changes_no_bit() -> None:
+    prediction, target = textured((40, 30), 2), textured((40, 30), 3)
+    mask = np.zeros((40, 30), np.uint8)
+    mask[6:30, 5:25] = 255
+    expected = score_frame(prediction, target, mask)
+    wide = np.repeat(prediction, 2, axis=1)[:, ::2]
+    given = wide, np.asfortranarray(target), mask[::-1][::-1]
+    assert not any(array.flags.c_contiguous for array in given[:2])
+    assert score_frame(*given) == expected
+
+
+def test_half_precision_scores_as_the_eight_bits_that_it_rounds_to() -> None:
+    target = textured((40, 30), 4)
+    mask = np.ones((40, 30), bool)
+    # A half between two 8-bit levels is off by 2^-12 at most, an eighth of a level: nothing moves.
+    best(score_frame((target / 255.0).astype(np.float16), target, mask, coverage=True))
+
+
+def test_2000_frames_are_read_as_they_are_scored() -> None:
+    """At no time more frames are alive than are read ahead."""
+    alive, most = 0, 0
+
+    class Counted(np.ndarray):
+        def __del__(self) -> None:
+            nonlocal alive
+            if self.base is None:
+                alive -= 1
+
+    image = textured((16, 16), 5)
+    mask = np.ones((16, 16), bool)
+
+    def read() -> Frame:
+        nonlocal alive, most
+        own = np.ndarray.__new__(Counted, image.shape, np.uint8)
+        own[:] = image
+        alive += 1
+        most = max(most, alive)
+        return Frame(image, own, mask, coverage=True)
+
+    done = sum(score.failure is None for score in score_frames([read] * 2000, workers=1))
+    assert done == 2000
+    assert most <= 3
+
+
+def test_numbers_that_no_image_has_are_refused() -> None:
+    image, mask = textured((16, 16), 6), np.ones((16, 16), bool)
+    for dtype in (np.int32, np.complex64, bool):
+        with pytest.raises(HwpError):
+            score_frame(image, image.astype(dtype), mask)
+    with pytest.raises(BadImage):
+        score_frame(image, np.full(image.shape, np.nan, np.float16), mask)
+
+
+def capture(id_, hands, perturbations, scores):
+    frames = {index: {"psnr": value} for index, value in enumerate(scores)}
+    return CaptureScores(id_, hands, tuple(perturbations), frames)
+
+
+CAPTURES = [
+    capture("a", "right", ["blur", "light"], [10.0, 20.0]),
+    capture("b", "both", ["blur"], [30.0, 30.0, 36.0]),
+    capture("c", "left", [], [7.0]),
+]
+
+
+def test_by_hand():
+    result = aggregate(CAPTURES)
+    overall = result.overall
+    assert overall.captures == {"a": {"psnr": 15.0}, "b": {"psnr": 32.0}, "c": {"psnr": 7.0}}
+    assert overall.perturbations == {"blur": {"psnr": 23.5}, "light": {"psnr": 15.0}}
+    assert overall.macro == {"psnr": 19.25}
+    assert overall.capture_mean == {"psnr": 18.0}
+    assert overall.micro == {"psnr": pytest.approx(133 / 6)}
+    assert result.single is not None
+    assert result.single.macro == {"psnr": 15.0}
+    assert result.single.capture_mean == {"psnr": 11.0}
+    assert result.interacting is not None
+    assert result.interacting.perturbations == {"blur": {"psnr": 32.0}}
+
+
+def test_a_clean_capture_has_no_macro_mean_and_no_interacting_half():
+    result = aggregate(CAPTURES[2:])
+    assert result.overall.macro == {}
+    assert result.overall.capture_mean == {"psnr": 7.0}
+    assert result.interacting is None
+
+
+@given(st.lists(st.floats(-1e6, 1e6), min_size=1, max_size=30), st.randoms())
+def test_order_changes_no_digit(values, shuffler: random.Random):
+    captures = [
+        capture(str(k), ("right", "both")[k % 2], ["p" + str(k % 3)], values[k:] + values[:k])
+        for k in range(4)
+    ]
+    shuffled = captures[:]
+    shuffler.shuffle(shuffled)
+    reordered = []
+    for c in shuffled:
+        frames = list(c.frames.items())
+        shuffler.shuffle(frames)
+        reordered.append(CaptureScores(c.id, c.hands, c.perturbations, dict(frames)))
+    assert aggregate(captures) == aggregate(reordered)
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
+def test_what_is_no_number_is_refused_with_its_place(bad):
+    with pytest.raises(BadResult, match=r"b: frames\[1\]\.psnr"):
+        aggregate([CAPTURES[0], capture("b", "left", [], [1.0, bad])])
+
+
+def test_missing_frames_metrics_and_captures_are_refused():
+    with pytest.raises(BadResult, match="no scored frame"):
+        aggregate([capture("a", "left", [], [])])
+    with pytest.raises(BadResult, match="no capture"):
+        aggregate([])
+    with pytest.raises(BadResult, match="twice"):
+        aggregate([CAPTURES[0], CAPTURES[0]])
+    odd = CaptureScores("d", "left", (), {0: {"psnr": 1.0}, 1: {"psnr": 1.0, "ssim": 1.0}})
+    with pytest.raises(BadResult, match=r"d: frames\[1\].*ssim"):
+        aggregate([odd])
+
+
+def test_mean_of_nothing_is_nothing():
+    assert mean_scores([]) == {}

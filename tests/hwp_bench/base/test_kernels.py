@@ -1,21 +1,147 @@
-"""Machine code on disk: found again where nothing changed, made again where something did.
-
-Oracle: small installations of the toolkit, whose kernels are called in processes of their own;
-numba's own count of what was found on disk.
-"""
+"""Compiling leaves Python's collector of garbage as it was; oracle: what the collector says."""
 
 from __future__ import annotations
 
+import gc
 import hashlib
 import os
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
+from numba.core import event
+from numba.core.errors import TypingError
 
+from hwp_bench.base import kernels
+from hwp_bench.base.kernels import compiled, kernel_digest, kernel_modules
 from hwp_bench.base.packages import PACKAGES
+
+
+@pytest.fixture(autouse=True)
+def _collector() -> Iterator[None]:
+    on = gc.isenabled()
+    yield
+    (gc.enable if on else gc.disable)()
+
+
+class _Seen(event.Listener):  # type: ignore[misc]
+    """Whether the collector is on where numba starts to compile."""
+
+    def __init__(self) -> None:
+        self.on: list[bool] = []
+
+    def on_start(self, event: Any) -> None:
+        self.on.append(gc.isenabled())
+
+    def on_end(self, event: Any) -> None:
+        pass
+
+
+@pytest.mark.parametrize("on", [True, False])
+def test_the_collector_rests_while_a_kernel_is_compiled(on: bool) -> None:
+    @compiled()
+    def double(x: Any) -> Any:
+        return x + x
+
+    (gc.enable if on else gc.disable)()
+    seen = _Seen()
+    with event.install_listener("numba:compile", seen):
+        assert double(2) == 4
+    assert seen.on == [False]
+    assert gc.isenabled() == on
+
+
+def test_a_kernel_that_cannot_be_compiled_leaves_it_on() -> None:
+    @compiled()
+    def impossible(x: Any) -> Any:
+        return x + "one"
+
+    gc.enable()
+    with pytest.raises(TypingError):
+        impossible(2)
+    assert gc.isenabled()
+
+
+@pytest.fixture
+def root(tmp_path: Path) -> Path:
+    texts = {
+        "hwp_bench/__init__.py": "import hwp_bench.unrelated",
+        "hwp_bench/unrelated.py": "",
+        "hwp_bench/base/kernels.py": "import hwp_bench.unrelated",
+        "hwp_bench/room/__init__.py": "from hwp_bench.unrelated import x",
+        "hwp_bench/room/kernels.py": "import numpy\nfrom hwp_bench.base.kernels import (\n  a\n)\n"
+        "from hwp_bench.room import constants as at\nfrom hwp_bench.room.helpers import f",
+        "hwp_bench/room/constants.py": "",
+        "hwp_bench/room/helpers.py": "def f():\n    from hwp_bench.room.deep import g",
+        "hwp_bench/room/deep.py": "import hwp_bench.room.last",
+        "hwp_bench/room/last.py": "from hwp_bench.room import kernels",
+        "hwp_bench/room/taker.py": "from hwp_bench.room import name",
+    }
+    for name, text in texts.items():
+        path = tmp_path / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text(text)
+    return tmp_path
+
+
+def test_imports_are_followed_and_machinery_is_not(root: Path) -> None:
+    found = kernel_modules("hwp_bench.room.kernels", root)
+    names = ("constants", "deep", "helpers", "kernels", "last")
+    assert list(found) == ["hwp_bench.base.kernels", *(f"hwp_bench.room.{name}" for name in names)]
+
+
+def test_a_name_that_is_no_module_stands_in_the_package(root: Path) -> None:
+    found = kernel_modules("hwp_bench.room.taker", root)
+    assert {"hwp_bench.room", "hwp_bench.unrelated"} < set(found)
+
+
+@pytest.mark.parametrize(
+    ("module", "also"),
+    [
+        ("wildghand.splat.kernels.blend", "wildghand.splat.conventions"),
+        ("wildghand.splat.kernels.blend", "wildghand.splat.kernels.vectors"),
+        ("wildghand.gaussians.losses", "wildghand.splat.kernels.vectors"),
+        ("wildghand.gaussians.adam", None),
+        ("wildghand.gaussians.regularizers", "wildghand.splat.kernels.jit"),
+        ("wildghand.gaussians.rig", "wildghand.splat.kernels.jit"),
+        ("wildghand.gaussians.regularizers", "wildghand.splat.kernels.jit"),
+        ("wildghand.model.dress_kernels", "wildghand.splat.kernels.jit"),
+        ("hwp_bench.hands.raster", None),
+    ],
+)
+def test_kernels_depend_on_little(module: str, also: str | None) -> None:
+    """A release that leaves them alone finds its machine code."""
+    found = set(kernel_modules(module))
+    assert found >= {module, *([also] if also else [])}
+    assert all(
+        name == module
+        or name.startswith(
+            ("hwp_bench.base.kernels", "wildghand.splat.kernels.", "wildghand.splat.conv")
+        )
+        for name in found
+    )
+
+
+def test_source_that_changed_since_the_start_gives_no_digest(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """What was imported may be another text than what the file holds now."""
+    kernel_digest.cache_clear()
+    assert kernel_digest("hwp_bench.hands.raster") is not None
+    kernel_digest.cache_clear()
+    monkeypatch.setattr(kernels, "_STARTED", 0.0)
+    assert kernel_digest("hwp_bench.hands.raster") is None
+    kernel_digest.cache_clear()
+
+
+def test_modules_of_others_give_no_digest() -> None:
+    assert kernel_digest("numpy.linalg") is None
+    assert kernel_digest("hwp_bench.no_such_module") is None
+
 
 _KERNELS = """
 from hwp_bench.base.kernels import compiled

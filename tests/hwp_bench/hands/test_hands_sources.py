@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 from synthetic_mano import as_published, mano_content, write_mano_folder
 
-from hwp_bench.base.errors import BadHandModel, BadInput, HwpError, UnsafePickle
-from hwp_bench.hands import HandTemplate, load_template
-from hwp_bench.hands.skeleton import PARENTS
+from hwp_bench.base.arrays import read_npz, write_npz
+from hwp_bench.base.errors import BadHandModel, BadInput, HwpError, UnsafePickle, UsageError
+from hwp_bench.hands import HandTemplate, load_template, to_trimesh
+from hwp_bench.hands import sources as template_sources
+from hwp_bench.hands.skeleton import FINGERS, PARENTS, finger_joints
 from hwp_bench.hands.sources import load_mano
 
 
@@ -146,3 +148,120 @@ def test_every_truncation_is_a_named_error(tmp_path: Path) -> None:
         with pytest.raises(HwpError) as caught:
             load_mano(tmp_path, "right")
         assert isinstance(caught.value, BadInput)
+
+
+def test_every_machine_finds_the_same_hand(free_right: HandTemplate) -> None:
+    assert free_right.name == "anny-1"
+    assert free_right.digest == template_sources.FREE_DIGEST
+
+
+def test_left_is_the_mirrored_right(free_right: HandTemplate, free_left: HandTemplate) -> None:
+    assert free_left.side == "left"
+    np.testing.assert_array_equal(free_left.vertices, free_right.vertices * [-1.0, 1.0, 1.0])
+    np.testing.assert_array_equal(free_left.faces, free_right.faces[:, ::-1])
+    np.testing.assert_array_equal(free_left.weights, free_right.weights)
+
+
+def test_surface_is_one_sheet_open_at_the_wrist_only(free_right: HandTemplate) -> None:
+    mesh = to_trimesh(free_right.vertices, free_right.faces)
+    assert mesh.is_winding_consistent
+    assert len(mesh.vertices) == 1609
+    assert mesh.euler_number == 1  # a disc: one open boundary
+    (outline,) = mesh.outline().entities
+    assert free_right.vertices[outline.points][:, 0].min() > 0.0  # behind the wrist joint
+    assert mesh.area_faces.min() > 1e-8
+    assert 0.0002 < mesh.volume < 0.0006
+
+
+def test_rest_hand_is_open_and_turned_as_documented(free_right: HandTemplate) -> None:
+    joints, tips = free_right.joints, free_right.vertices[free_right.fingertips]
+    np.testing.assert_allclose(joints[0], 0.0, atol=1e-12)
+    # Between the wrist and the middle knuckle lies the -x axis.
+    np.testing.assert_allclose(joints[4, 1:], 0.0, atol=1e-12)
+    assert joints[4, 0] < -0.08
+    # Tips of the four fingers are far ahead, fanned out from index (+z) to little finger (-z).
+    assert (tips[1:, 0] < -0.12).all()
+    assert (np.diff(tips[1:, 2]) < -0.015).all()
+    assert tips[0, 2] > tips[1, 2]
+    # An adult's hand: 17 to 21 cm from the wrist to the middle finger's tip.
+    assert 0.17 < np.linalg.norm(tips[2]) < 0.21
+
+
+def test_joints_lie_inside_their_fingers(free_right: HandTemplate) -> None:
+    """Each joint has skin on both sides of it, out of the back and out of the palm."""
+    mesh = to_trimesh(free_right.vertices, free_right.faces)
+    up = np.array([0.0, 1.0, 0.0])
+    for sign in (1.0, -1.0):
+        hits = mesh.ray.intersects_any(free_right.joints, np.tile(sign * up, (16, 1)))
+        assert hits.all()
+
+
+def test_fingertips_are_the_ends_of_the_fingers(free_right: HandTemplate) -> None:
+    for finger, tip in zip(FINGERS, free_right.fingertips, strict=True):
+        last = finger_joints(finger)[-1]
+        assert free_right.weights[tip, last] > 0.9
+        reach = np.linalg.norm(free_right.vertices[tip] - free_right.joints[last])
+        assert 0.015 < reach < 0.04
+
+
+def test_texture_is_one_chart_without_overlap(free_right: HandTemplate) -> None:
+    assert free_right.uv.min() >= 0.0
+    assert free_right.uv.max() <= 1.0
+    a, b, c = np.moveaxis(free_right.uv[free_right.face_uv], 1, 0)
+    areas = 0.5 * ((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0])
+    assert areas.min() > 0.0
+    # Points of the unit square that fall into two triangles would make the areas exceed the
+    # part of the square that is covered at all.
+    size = 700
+    import cv2
+
+    covered = np.zeros((size, size), np.uint8)
+    for triangle in free_right.uv[free_right.face_uv] * size:
+        cv2.fillConvexPoly(covered, np.round(triangle * 16).astype(np.int32), 1, cv2.LINE_8, 4)
+    assert areas.sum() < covered.mean() < 1.15 * areas.sum()
+
+
+def test_shape_parameters_are_deviations_of_sensible_hands(free_right: HandTemplate) -> None:
+    """Two deviations either way: still a hand, and each parameter moves the skin visibly."""
+    for component in range(10):
+        change = free_right.shape_basis[..., component]
+        moved = np.sqrt((change**2).sum(axis=1).mean())
+        assert moved > 0.3e-3
+        for sign in (-2.0, 2.0):
+            mesh = to_trimesh(free_right.vertices + sign * change, free_right.faces)
+            assert 0.0001 < mesh.volume < 0.0008
+            rest = to_trimesh(free_right.vertices, free_right.faces)
+            assert (mesh.face_normals * rest.face_normals).sum(axis=1).mean() > 0.97
+
+
+def test_joints_follow_the_shape_to_a_fifth_of_a_millimetre() -> None:
+    residual = float(read_npz(template_sources.FREE_FILE)["joint_residual"])
+    assert residual < 0.2e-3
+
+
+@pytest.mark.parametrize("source", ["smplx", "anny:x", "mano", "mano:", "mano-hd:", ""])
+def test_unknown_sources_are_refused(source: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        load_template(source)
+    assert caught.value.field == "source"
+
+
+def test_unknown_sides_are_refused() -> None:
+    with pytest.raises(UsageError) as caught:
+        load_template(side="both")
+    assert caught.value.field == "side"
+
+
+def test_a_damaged_installation_is_named(
+    free_right: HandTemplate, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    arrays = read_npz(template_sources.FREE_FILE)
+    monkeypatch.setattr(template_sources, "FREE_FILE", tmp_path / "hand.npz")
+    with pytest.raises(BadInput, match="does not exist"):
+        load_template()
+    write_npz(template_sources.FREE_FILE, {"vertices": np.zeros((2, 3))})
+    with pytest.raises(BadInput, match="is missing"):
+        load_template()
+    write_npz(template_sources.FREE_FILE, arrays | {"vertices": arrays["vertices"] * 1.01})
+    with pytest.raises(BadHandModel, match="not the published free hand"):
+        load_template()
