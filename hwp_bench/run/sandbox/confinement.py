@@ -29,7 +29,7 @@ _PROJECT_MARKS = ("pyproject.toml", "setup.py", "setup.cfg", ".git")
 #: other stays out of sight; those render, seal, score or rank test frames.
 VISIBLE_PACKAGES = frozenset(
     {"_data", "analysis", "base", "capture", "cli", "hands", "importers", "methods", "metrics"}
-    | {"report", "results", "run", "taxonomy", "tracking"}
+    | {"report", "results", "run", "tracking"}
 )
 #: Most folders of a method that are looked into.
 MAX_FOLDERS = 20_000
@@ -388,10 +388,10 @@ def _parts(package: str) -> list[str]:
 
 
 def foreign_folders(method: Path) -> list[str]:
-    """Return the folders below a method's that do not belong to it: captures and outputs of runs, which hold true frames.
+    """Return the folders below a method's that do not belong to it: captures and outputs of runs.
 
-    `is_foreign` knows them, as the digest of a method does. Links are not followed; inside walls
-    they lead nowhere.
+    They hold true frames. `is_foreign` knows them, as the digest of a method does. Links are not
+    followed; inside walls they lead nowhere.
     """
     found = []
     for seen, (folder, folders, files) in enumerate(os.walk(method)):
