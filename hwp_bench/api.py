@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from hwp_bench.analysis.statistics.comparison import Comparison, compare_results
+from hwp_bench.analysis.compare import Comparison, compare_results
 from hwp_bench.base.console import JobsView, notice
 from hwp_bench.base.errors import UsageError, of_type, place, whole_number
 from hwp_bench.capture import Capture
@@ -29,7 +29,7 @@ from hwp_bench.evaluation.sentences import outcome_lines
 from hwp_bench.methods.contract import Budget, RunSettings
 from hwp_bench.methods.manifest import find_method, read_manifest
 from hwp_bench.metrics.score import score_frame
-from hwp_bench.report.evaluation_tables import HEADLINE
+from hwp_bench.report.tables import HEADLINE
 from hwp_bench.results import Results, read_all
 from hwp_bench.run.engine import Engine, LocalEngine
 from hwp_bench.run.engine.processes import ParallelEngine

@@ -30,8 +30,7 @@ from hwp_bench.evaluation.capture_evaluation import (
     read_result,
     stored_result,
 )
-from hwp_bench.report.evaluation_tables import all_tables
-from hwp_bench.report.free_view_table import free_view_tables
+from hwp_bench.report.tables import all_tables, free_view_tables
 from hwp_bench.results import CaptureResult, Results, read_results, write_results
 
 #: Folder of results that are not whole yet, inside `captures`; no capture has such an id.

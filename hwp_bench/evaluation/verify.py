@@ -33,8 +33,7 @@ from hwp_bench.metrics import METRICS, PROTOCOLS, metric_names
 from hwp_bench.metrics.lpips import load_available
 from hwp_bench.metrics.protocol import HWP_V1, Protocol
 from hwp_bench.metrics.score import Network
-from hwp_bench.report.evaluation_tables import all_tables
-from hwp_bench.report.free_view_table import free_view_tables
+from hwp_bench.report.tables import all_tables, free_view_tables
 from hwp_bench.results import (
     CaptureResult,
     FrameResult,
@@ -115,7 +114,7 @@ def verify_results(
         splits: splits by capture id; None applies the 80/10/10 rule.
 
     Raises:
-        BadInput, BadResult: the result file is find_missing or damaged.
+        BadInput, BadResult: the result file is missing or damaged.
     """
     file = file / "results.json" if file.is_dir() else file
     results = read_results(file)
@@ -489,7 +488,7 @@ def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
     absent = [name for name in results.metrics if name in _with_weights() and name not in here]
     if absent:
         notes.append(
-            f"Not recomputed, because their weights are find_missing: {', '.join(absent)}."
+            f"Not recomputed, because their weights are missing: {', '.join(absent)}."
         )
     if results.toolkit != __version__:
         notes.append(f"Made with version {results.toolkit}; this is {__version__}.")

@@ -18,13 +18,13 @@ from hwp_bench.base.files import read_json
 from hwp_bench.evaluation.capture_evaluation import RESULT, key_of
 from hwp_bench.evaluation.sentences import find_wrong_labels
 from hwp_bench.evaluation.verify import Discrepancy, copy_differences, digest_differences
-from hwp_bench.leaderboard.entries import Entry, entry_files, read_checks, read_entry
-from hwp_bench.leaderboard.names import check_names, read_names
-from hwp_bench.leaderboard.records import Check
+from hwp_bench.leaderboard.entries import Check, Entry, entry_files, read_checks, read_entry
 from hwp_bench.leaderboard.rules import (
     check_entries,
+    check_names,
     check_revisions,
     off_the_data,
+    read_names,
     source_of,
     tables_of,
 )

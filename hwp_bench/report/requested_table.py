@@ -7,16 +7,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hwp_bench.analysis.statistics.pairing import group_runs
+from hwp_bench.analysis.pairing import group_runs
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import inside, read_json
 from hwp_bench.base.tables import Table
-from hwp_bench.report.data_groups import DataGroup, data_groups, stacked
-from hwp_bench.report.evaluation_tables import all_tables, same_data
-from hwp_bench.report.free_view_table import free_view_table
-from hwp_bench.report.novelty_table import novelty_table
-from hwp_bench.report.outline_table import outline_table
-from hwp_bench.report.over_seeds import over_seeds
 from hwp_bench.report.paper_layouts import (
     DISTANCE,
     LAYOUTS,
@@ -27,22 +21,29 @@ from hwp_bench.report.paper_layouts import (
     layout_table,
     seeds_layout,
 )
-from hwp_bench.report.ranking_tables import cost_table, rank_table, winner_note
+from hwp_bench.report.pixel_tables import novelty_table, outline_table
 from hwp_bench.report.sources import (
+    DataGroup,
     ResultsSource,
+    data_groups,
     find_captures,
     open_captures_of,
     read_sources,
+    stacked,
 )
 from hwp_bench.report.study_tables import (
     LEVEL_NOTE,
     bias_rows,
     bias_table,
+    cost_table,
+    rank_table,
     refused_bias,
     robustness_table,
     seeds_table,
     severity_table,
+    winner_note,
 )
+from hwp_bench.report.tables import all_tables, free_view_table, over_seeds, same_data
 from hwp_bench.results import read_results
 from hwp_bench.results.schema import add_isolation_note
 from hwp_bench.results.store import ABLATION

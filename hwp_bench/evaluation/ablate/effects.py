@@ -10,22 +10,23 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.analysis.cost.cost_tables import seconds_table
-from hwp_bench.analysis.statistics.bootstrap import RESAMPLES, Estimate, bootstrap_mean
-from hwp_bench.analysis.statistics.compare import holm, macro_by_seed
-from hwp_bench.analysis.statistics.comparison_tables import (
+from hwp_bench.analysis.bootstrap import RESAMPLES, Estimate, bootstrap_mean
+from hwp_bench.analysis.compare import (
     ONE_CAPTURE,
     estimate_cells,
     estimate_columns,
+    holm,
+    macro_by_seed,
     scope_title,
 )
-from hwp_bench.analysis.statistics.pairing import MethodRuns, common_metrics, scopes
+from hwp_bench.analysis.cost import seconds_table
+from hwp_bench.analysis.pairing import MethodRuns, common_metrics, scopes
 from hwp_bench.base.files import write_json
 from hwp_bench.base.tables import Cell, Column, Table, to_object
 from hwp_bench.evaluation.ablate.runs import AblationEffect, AblationRuns, result_folder
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.score import Scores, aggregate
-from hwp_bench.report.evaluation_tables import HEADLINE, PAPER
+from hwp_bench.report.tables import HEADLINE, PAPER
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.schema import score_rows
 from hwp_bench.results.store import ABLATION, ABLATION_SCHEMA

@@ -8,7 +8,7 @@ from itertools import combinations, product
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.analysis.statistics.pairing import MethodRuns
+from hwp_bench.analysis.pairing import MethodRuns
 from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.capture.splits import Split
 from hwp_bench.evaluation.evaluate import (

@@ -12,11 +12,11 @@ from pathlib import Path
 import pytest
 from small_captures import results_example
 
-from hwp_bench.analysis.cost.cost_tables import machine_notes
+from hwp_bench.analysis.cost import machine_notes
 from hwp_bench.base.errors import BadInput, BadResult
 from hwp_bench.base.tables import to_markdown
 from hwp_bench.evaluation.sentences import outcome_lines
-from hwp_bench.report.evaluation_tables import all_tables
+from hwp_bench.report.tables import all_tables
 from hwp_bench.results import Results, read_results, write_results
 from hwp_bench.results.schema import add_isolation_note, environment, isolation_note, isolation_text
 
