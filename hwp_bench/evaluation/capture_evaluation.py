@@ -1,8 +1,4 @@
-"""The key of an evaluation: one digest of everything that decides its scores.
-
-A stored result of the same key is taken as it is. The key also binds a result: whoever changes the
-name, settings, seed or budget of a result by hand leaves a key that is not of its content.
-"""
+"""Evaluate one method on one capture: run it, score its predictions, store the result."""
 
 from __future__ import annotations
 
@@ -50,70 +46,6 @@ from hwp_bench.run.worker import LOG, RunFacts, checkpoint_folder
 RECIPE = 1
 #: The result of one capture, inside its folder.
 RESULT = "result.json"
-
-
-@dataclass(frozen=True)
-class EvaluationKey:
-    """Everything that decides the scores of a capture.
-
-    A stored result of the same key is taken as it is. The key also binds a result: whoever changes
-    the name, settings, seed or budget of a result by hand leaves a key that is not of its content.
-    """
-
-    #: Name and digest of the method.
-    method: tuple[str, str]
-    #: Digest of the capture, and of its split.
-    capture: str
-    split: str
-    #: The preset with its overrides.
-    settings: Mapping[str, Any]
-    #: Seed of everything random.
-    seed: int
-    #: `seconds` and `steps`, either may be None.
-    budget: Mapping[str, float | None]
-    #: The training frames that the method is given.
-    frames: str
-    #: Settings of the protocols that are scored.
-    protocols: Sequence[Mapping[str, Any]]
-    #: Backbones of LPIPS that are scored, sorted.
-    networks: Sequence[str]
-    #: Digest of further files that the method is shown; None where there are none.
-    exposed: str | None
-    #: Digest of the free-view clip; None where there is none.
-    free_view: str | None
-    #: Version of the evaluation.
-    recipe: int = RECIPE
-
-    @property
-    def digest(self) -> str:
-        """SHA-256 (hex) of all of it."""
-        content = {**vars(self), "settings": dict(self.settings), "budget": dict(self.budget)}
-        # What was added later does not change the keys of captures that have none of it.
-        for name in ("exposed", "free_view"):
-            if content[name] is None:
-                del content[name]
-        return sha256_json(content)
-
-
-def key_of(results: Results, capture: CaptureResult, clip: str | None) -> str:
-    """Return the key of one capture of a result, from the result's other fields.
-
-    `clip` is the digest of the capture's free-view clip; None where it has none.
-    """
-    scored = {name for frame in capture.frames for name in frame.scores}
-    return EvaluationKey(
-        method=(results.method.name, results.method.digest),
-        capture=capture.digest,
-        split=capture.split_digest,
-        settings=results.method.settings,
-        seed=results.seed,
-        budget=results.budget,
-        frames=results.frames,
-        protocols=list(results.protocols.values()),
-        networks=sorted({one.weights for one in METRICS if one.weights and one.name in scored}),
-        exposed=capture.exposed,
-        free_view=clip,
-    ).digest
 
 
 @dataclass(frozen=True)
@@ -189,50 +121,6 @@ class CaptureEvaluation:
         )
 
 
-def evaluate_elsewhere(
-    same: Mapping[str, Any],
-    networks: Sequence[str],
-    shipped: str | None,
-    key: str,
-    inputs: Mapping[str, Path],
-    output: Path,
-    on_progress: OnProgress,
-) -> None:
-    """Do an evaluation in another process or on another machine; see `engine.job.Work`.
-
-    Args:
-        same: the fields of the evaluation that are as they were where it was ordered.
-        networks: backbones of LPIPS that are scored.
-        shipped: place of a method that ships with the toolkit; None where the method is sent.
-        key: of the evaluation where it was ordered; it must be the same here.
-        inputs: the capture, and the method where it is sent.
-        output: folder of the result.
-        on_progress: is told (done, total) steps.
-    """
-    known = load_available() if networks else {}
-    missing = [name for name in networks if name not in known]
-    if missing:
-        raise HwpError(
-            f"the weights of LPIPS ({', '.join(missing)}) are not on this machine",
-            remedy="Put them on every node, or on none.",
-        )
-    manifest = read_manifest(inputs["method"] if shipped is None else PACKAGES / shipped)
-    evaluation = CaptureEvaluation(
-        manifest,
-        open_capture(inputs["capture"]),
-        networks={name: known[name] for name in networks},
-        method_files=method_files(manifest.root),
-        **same,
-    )
-    if evaluation.key != key:
-        raise HwpError(
-            "method, capture or protocols are different on this machine",
-            where=evaluation.capture.info.id,
-            remedy="Install the same version everywhere, and change nothing while jobs run.",
-        )
-    evaluate_capture(evaluation, output, on_progress)
-
-
 def evaluate_capture(
     evaluation: CaptureEvaluation, folder: Path, on_progress: OnProgress = ignore_progress
 ) -> CaptureResult:
@@ -303,59 +191,6 @@ def _evaluate(
     return result
 
 
-def _refuse_edited(evaluation: CaptureEvaluation) -> None:
-    """Refuse to score a run of a method whose files are not those that it began with."""
-    planned = evaluation.method_files
-    if planned is None:
-        return
-    found = method_files(evaluation.manifest.root)
-    changed = sorted(name for name in {*planned, *found} if planned.get(name) != found.get(name))
-    if changed:
-        raise BadMethod(
-            f"files changed while it ran, so that nobody could say what was scored: "
-            f"{shown(bounded(changed, 5))}",
-            where=evaluation.manifest.root,
-            remedy="Leave them alone meanwhile, and let the method write to its output folder "
-            "alone. Started again, what is finished stays.",
-        )
-
-
-def _refuse_changed(evaluation: CaptureEvaluation) -> None:
-    """Refuse a capture, or a clip in it, whose content is not that of the digests."""
-    clean = evaluation.run.frames != FRAME_CHOICES[0]
-    for capture in (evaluation.capture, evaluation.capture.free_view):
-        if capture is None:
-            continue
-        kinds = ["frames", "masks"]
-        kinds += ["true_masks"] if capture.has_true_masks else []
-        kinds += ["clean", "clean_masks"] if clean and capture.has_clean else []
-        there = [kind for kind in kinds if (capture.root / IMAGE_FOLDERS[kind]).is_dir()]
-        refuse_changed(capture, there)
-
-
-def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult | None:
-    """Return the stored result of the same key, if there is one and the method did not fail.
-
-    Where walls are required, a result that was made without them is none.
-    """
-    # Submitted predictions may change without their method.toml, so they are always scored.
-    if not (folder / RESULT).is_file() or evaluation.manifest.kind == "predictions":
-        return None
-    try:
-        result = read_result(folder)
-    except HwpError:
-        return None
-    if evaluation.confinement.mode == "required" and result.isolation != ISOLATED:
-        return None
-    return result if result.key == evaluation.key and result.failure is None else None
-
-
-def read_result(folder: Path) -> CaptureResult:
-    """Read the result that `evaluate_capture` left in a folder."""
-    path = folder / RESULT
-    return parse_record(CaptureResult, read_json(path), where=str(path))
-
-
 def _run(
     evaluation: CaptureEvaluation, output: Path, on_progress: OnProgress
 ) -> tuple[RunRecord | None, str | None]:
@@ -383,6 +218,33 @@ def _run(
             "with the same arguments: this capture is then evaluated again"
         )
     return record, None
+
+
+def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
+    """Hide what holds test frames, the capture and results next to the run, and undigested code."""
+    asked = evaluation.confinement
+    hands = hand_model_files(evaluation.capture.info.hand_model.source)
+    root = evaluation.manifest.root.resolve()
+    # What is in no digest must decide no score. Shipped methods keep their compiled modules.
+    odd = [] if ships(root) else left_out_folders(root)
+    return replace(
+        asked,
+        exposed=(*asked.exposed, *hands),
+        hidden=(*asked.hidden, *odd, evaluation.capture.root, output.parent.parent),
+    )
+
+
+def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list[CurvePoint]:
+    validation = set(evaluation.split.validation.tolist())
+    frames = [frame for frame in dict.fromkeys(facts.checkpoint_frames) if frame in validation]
+    if not frames:
+        return []
+    targets = read_targets(evaluation.capture, frames)
+    curve = []
+    for index, checkpoint in enumerate(facts.checkpoints):
+        drawn = score_frames_of(targets, checkpoint_folder(output, index), evaluation.capture.size)
+        curve.append(CurvePoint(**asdict(checkpoint), scores=mean_scores(drawn.scores)))
+    return curve
 
 
 def _lacks_images(evaluation: CaptureEvaluation, record: RunRecord, output: Path) -> bool:
@@ -415,28 +277,171 @@ def _lasting(error: HwpError, output: Path) -> str:
     return str(HwpError(error.problem, field=error.field, remedy=advice))
 
 
-def _confinement(evaluation: CaptureEvaluation, output: Path) -> Confinement:
-    """Hide what holds test frames, the capture and results next to the run, and undigested code."""
-    asked = evaluation.confinement
-    hands = hand_model_files(evaluation.capture.info.hand_model.source)
-    root = evaluation.manifest.root.resolve()
-    # What is in no digest must decide no score. Shipped methods keep their compiled modules.
-    odd = [] if ships(root) else left_out_folders(root)
-    return replace(
-        asked,
-        exposed=(*asked.exposed, *hands),
-        hidden=(*asked.hidden, *odd, evaluation.capture.root, output.parent.parent),
+def _refuse_edited(evaluation: CaptureEvaluation) -> None:
+    """Refuse to score a run of a method whose files are not those that it began with."""
+    planned = evaluation.method_files
+    if planned is None:
+        return
+    found = method_files(evaluation.manifest.root)
+    changed = sorted(name for name in {*planned, *found} if planned.get(name) != found.get(name))
+    if changed:
+        raise BadMethod(
+            f"files changed while it ran, so that nobody could say what was scored: "
+            f"{shown(bounded(changed, 5))}",
+            where=evaluation.manifest.root,
+            remedy="Leave them alone meanwhile, and let the method write to its output folder "
+            "alone. Started again, what is finished stays.",
+        )
+
+
+def _refuse_changed(evaluation: CaptureEvaluation) -> None:
+    """Refuse a capture, or a clip in it, whose content is not that of the digests."""
+    clean = evaluation.run.frames != FRAME_CHOICES[0]
+    for capture in (evaluation.capture, evaluation.capture.free_view):
+        if capture is None:
+            continue
+        kinds = ["frames", "masks"]
+        kinds += ["true_masks"] if capture.has_true_masks else []
+        kinds += ["clean", "clean_masks"] if clean and capture.has_clean else []
+        there = [kind for kind in kinds if (capture.root / IMAGE_FOLDERS[kind]).is_dir()]
+        refuse_changed(capture, there)
+
+
+# --- stored results
+
+
+def stored_result(evaluation: CaptureEvaluation, folder: Path) -> CaptureResult | None:
+    """Return the stored result of the same key, if there is one and the method did not fail.
+
+    Where walls are required, a result that was made without them is none.
+    """
+    # Submitted predictions may change without their method.toml, so they are always scored.
+    if not (folder / RESULT).is_file() or evaluation.manifest.kind == "predictions":
+        return None
+    try:
+        result = read_result(folder)
+    except HwpError:
+        return None
+    if evaluation.confinement.mode == "required" and result.isolation != ISOLATED:
+        return None
+    return result if result.key == evaluation.key and result.failure is None else None
+
+
+def read_result(folder: Path) -> CaptureResult:
+    """Read the result that `evaluate_capture` left in a folder."""
+    path = folder / RESULT
+    return parse_record(CaptureResult, read_json(path), where=str(path))
+
+
+# --- the key
+
+
+@dataclass(frozen=True)
+class EvaluationKey:
+    """Everything that decides the scores of a capture.
+
+    A stored result of the same key is taken as it is. The key also binds a result: whoever changes
+    the name, settings, seed or budget of a result by hand leaves a key that is not of its content.
+    """
+
+    #: Name and digest of the method.
+    method: tuple[str, str]
+    #: Digest of the capture, and of its split.
+    capture: str
+    split: str
+    #: The preset with its overrides.
+    settings: Mapping[str, Any]
+    #: Seed of everything random.
+    seed: int
+    #: `seconds` and `steps`, either may be None.
+    budget: Mapping[str, float | None]
+    #: The training frames that the method is given.
+    frames: str
+    #: Settings of the protocols that are scored.
+    protocols: Sequence[Mapping[str, Any]]
+    #: Backbones of LPIPS that are scored, sorted.
+    networks: Sequence[str]
+    #: Digest of further files that the method is shown; None where there are none.
+    exposed: str | None
+    #: Digest of the free-view clip; None where there is none.
+    free_view: str | None
+    #: Version of the evaluation.
+    recipe: int = RECIPE
+
+    @property
+    def digest(self) -> str:
+        """SHA-256 (hex) of all of it."""
+        content = {**vars(self), "settings": dict(self.settings), "budget": dict(self.budget)}
+        # What was added later does not change the keys of captures that have none of it.
+        for name in ("exposed", "free_view"):
+            if content[name] is None:
+                del content[name]
+        return sha256_json(content)
+
+
+def key_of(results: Results, capture: CaptureResult, clip: str | None) -> str:
+    """Return the key of one capture of a result, from the result's other fields.
+
+    `clip` is the digest of the capture's free-view clip; None where it has none.
+    """
+    scored = {name for frame in capture.frames for name in frame.scores}
+    return EvaluationKey(
+        method=(results.method.name, results.method.digest),
+        capture=capture.digest,
+        split=capture.split_digest,
+        settings=results.method.settings,
+        seed=results.seed,
+        budget=results.budget,
+        frames=results.frames,
+        protocols=list(results.protocols.values()),
+        networks=sorted({one.weights for one in METRICS if one.weights and one.name in scored}),
+        exposed=capture.exposed,
+        free_view=clip,
+    ).digest
+
+
+# --- in another process or on another machine
+
+
+def evaluate_elsewhere(
+    same: Mapping[str, Any],
+    networks: Sequence[str],
+    shipped: str | None,
+    key: str,
+    inputs: Mapping[str, Path],
+    output: Path,
+    on_progress: OnProgress,
+) -> None:
+    """Do an evaluation in another process or on another machine; see `engine.job.Work`.
+
+    Args:
+        same: the fields of the evaluation that are as they were where it was ordered.
+        networks: backbones of LPIPS that are scored.
+        shipped: place of a method that ships with the toolkit; None where the method is sent.
+        key: of the evaluation where it was ordered; it must be the same here.
+        inputs: the capture, and the method where it is sent.
+        output: folder of the result.
+        on_progress: is told (done, total) steps.
+    """
+    known = load_available() if networks else {}
+    missing = [name for name in networks if name not in known]
+    if missing:
+        raise HwpError(
+            f"the weights of LPIPS ({', '.join(missing)}) are not on this machine",
+            remedy="Put them on every node, or on none.",
+        )
+    manifest = read_manifest(inputs["method"] if shipped is None else PACKAGES / shipped)
+    evaluation = CaptureEvaluation(
+        manifest,
+        open_capture(inputs["capture"]),
+        networks={name: known[name] for name in networks},
+        method_files=method_files(manifest.root),
+        **same,
     )
-
-
-def _curve(evaluation: CaptureEvaluation, output: Path, facts: RunFacts) -> list[CurvePoint]:
-    validation = set(evaluation.split.validation.tolist())
-    frames = [frame for frame in dict.fromkeys(facts.checkpoint_frames) if frame in validation]
-    if not frames:
-        return []
-    targets = read_targets(evaluation.capture, frames)
-    curve = []
-    for index, checkpoint in enumerate(facts.checkpoints):
-        drawn = score_frames_of(targets, checkpoint_folder(output, index), evaluation.capture.size)
-        curve.append(CurvePoint(**asdict(checkpoint), scores=mean_scores(drawn.scores)))
-    return curve
+    if evaluation.key != key:
+        raise HwpError(
+            "method, capture or protocols are different on this machine",
+            where=evaluation.capture.info.id,
+            remedy="Install the same version everywhere, and change nothing while jobs run.",
+        )
+    evaluate_capture(evaluation, output, on_progress)

@@ -27,6 +27,14 @@ from hwp_bench.results import FrameResult
 
 #: Bytes of a predicted frame: the largest image that is read, four channels, not packed.
 MAX_PREDICTION_BYTES = 4 * MAX_PIXELS
+#: The sentences about a capture, inside its result folder; absent where there are none.
+WARNINGS = "warnings.json"
+#: Share of the scored values that are 255 from which an image is taken to be clipped.
+WHITE = 0.9
+#: Gain by exchanging red and blue from which the order is doubted, dB.
+EXCHANGE_GAIN = 3.0
+#: Share of the frames that must be better with them exchanged.
+EXCHANGE_FRAMES = 0.75
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,14 +202,8 @@ def predictions_digest(predictions: Sequence[Prediction]) -> str:
     return total.hexdigest()
 
 
-#: The sentences about a capture, inside its result folder; absent where there are none.
-WARNINGS = "warnings.json"
-#: Share of the scored values that are 255 from which an image is taken to be clipped.
-WHITE = 0.9
-#: Gain by exchanging red and blue from which the order is doubted, dB.
-EXCHANGE_GAIN = 3.0
-#: Share of the frames that must be better with them exchanged.
-EXCHANGE_FRAMES = 0.75
+# --- colours that cannot be meant: the scores are what they are, and these sentences tell an
+# author why they may be so low
 
 
 def colour_warnings(targets: Sequence[Target], predictions: Sequence[Prediction]) -> list[str]:

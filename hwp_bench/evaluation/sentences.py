@@ -1,4 +1,7 @@
-"""Whether a result is of the whole suite that it names, and of that suite's scenes."""
+"""A result in words: what it lacks of the suite that it names, its failures and doubts.
+
+Every bad frame is named, up to a number, with a count.
+"""
 
 from __future__ import annotations
 
@@ -12,6 +15,74 @@ from hwp_bench.results import CaptureResult, FrameResult, Results
 from hwp_bench.results.schema import isolation_text
 from hwp_bench.run.worker import LOG
 from hwp_bench.sim.produce.suites import SuiteItem, suite
+
+#: Most frames that are named of a capture; the others are counted.
+SHOWN = 12
+
+
+def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
+    """Return a line for each failure, log and doubt of an evaluation, and one for its isolation."""
+    lines = []
+    for capture in results.captures:
+        folder = out / "captures" / capture.id
+        texts = [text for text in (failure_text(capture), free_view_text(capture)) if text]
+        lines += [f"failed: {head}{text}" for text in texts]
+        if capture.failure and (folder / LOG).is_file():
+            lines.append(f"log: {folder / LOG}")
+        lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
+    facts = times_text(results, head), isolation_text(results, head)
+    return lines + [text for text in facts if text]
+
+
+def failure_text(capture: CaptureResult) -> str:
+    """Say which frames of a capture failed and why; empty where none did.
+
+    A method that failed on the whole capture has one reason; otherwise frames of the same reason
+    stand together, at most `SHOWN` of them by name.
+    """
+    if capture.failure is not None:
+        failed, count = capture.failed_frames, len(capture.frames)
+        return f"{capture.id}: {failed} of {count} frames: {capture.failure}"
+    return _frames_text(capture.id, capture.frames)
+
+
+def free_view_text(capture: CaptureResult) -> str:
+    """Say the same of the frames of the free-view clip."""
+    if capture.free_view is None or capture.failure is not None:
+        return ""
+    return _frames_text(f"{capture.id}, free view", capture.free_view.frames)
+
+
+def _frames_text(name: str, frames: Sequence[FrameResult]) -> str:
+    failed = [frame for frame in frames if frame.failure is not None]
+    if not failed:
+        return ""
+    by_reason: dict[str, list[str]] = {}
+    for frame in failed[:SHOWN]:
+        file, _, reason = (frame.failure or "").partition(": ")
+        by_reason.setdefault(reason, []).append(file)
+    parts = [", ".join(files) + f": {reason}" for reason, files in by_reason.items()]
+    if len(failed) > SHOWN:
+        parts.append(f"and {len(failed) - SHOWN} more")
+    return f"{name}: {len(failed)} of {len(frames)} frames: {'; '.join(parts)}"
+
+
+def times_text(results: Results, head: str = "") -> str:
+    """Say how long a method fitted by its own clock, and how long its processes ran by ours.
+
+    The first is what tables show, because it leaves out imports, checkpoints and test frames. It is
+    the method's word. The second is not. Empty where no process ran.
+    """
+    ran = [one for one in results.captures if one.isolation and one.fit_seconds is not None]
+    if not ran:
+        return ""
+    said = sum(one.fit_seconds or 0.0 for one in ran)
+    wall = sum(one.wall_seconds for one in ran)
+    clocks = f"{said:.1f} s of fitting, by the method's clock; processes ran {wall:.1f} s"
+    return f"times: {head}{clocks}"
+
+
+# --- the suite
 
 
 def find_missing(results: Results) -> list[str]:
@@ -84,69 +155,3 @@ def is_of_suite(info: CaptureInfo, name: str) -> bool:
         and info.source.get("scene_digest") == item.scene.digest
         for item in suite(name)
     )
-
-
-#: Most frames that are named of a capture; the others are counted.
-SHOWN = 12
-
-
-def failure_text(capture: CaptureResult) -> str:
-    """Say which frames of a capture failed and why; empty where none did.
-
-    A method that failed on the whole capture has one reason; otherwise frames of the same reason
-    stand together, at most `SHOWN` of them by name.
-    """
-    if capture.failure is not None:
-        failed, count = capture.failed_frames, len(capture.frames)
-        return f"{capture.id}: {failed} of {count} frames: {capture.failure}"
-    return _frames_text(capture.id, capture.frames)
-
-
-def free_view_text(capture: CaptureResult) -> str:
-    """Say the same of the frames of the free-view clip."""
-    if capture.free_view is None or capture.failure is not None:
-        return ""
-    return _frames_text(f"{capture.id}, free view", capture.free_view.frames)
-
-
-def outcome_lines(out: Path, results: Results, head: str = "") -> list[str]:
-    """Return a line for each failure, log and doubt of an evaluation, and one for its isolation."""
-    lines = []
-    for capture in results.captures:
-        folder = out / "captures" / capture.id
-        texts = [text for text in (failure_text(capture), free_view_text(capture)) if text]
-        lines += [f"failed: {head}{text}" for text in texts]
-        if capture.failure and (folder / LOG).is_file():
-            lines.append(f"log: {folder / LOG}")
-        lines += [f"warning: {head}{capture.id}: {text}" for text in read_warnings(folder)]
-    facts = times_text(results, head), isolation_text(results, head)
-    return lines + [text for text in facts if text]
-
-
-def times_text(results: Results, head: str = "") -> str:
-    """Say how long a method fitted by its own clock, and how long its processes ran by ours.
-
-    The first is what tables show, because it leaves out imports, checkpoints and test frames. It is
-    the method's word. The second is not. Empty where no process ran.
-    """
-    ran = [one for one in results.captures if one.isolation and one.fit_seconds is not None]
-    if not ran:
-        return ""
-    said = sum(one.fit_seconds or 0.0 for one in ran)
-    wall = sum(one.wall_seconds for one in ran)
-    clocks = f"{said:.1f} s of fitting, by the method's clock; processes ran {wall:.1f} s"
-    return f"times: {head}{clocks}"
-
-
-def _frames_text(name: str, frames: Sequence[FrameResult]) -> str:
-    failed = [frame for frame in frames if frame.failure is not None]
-    if not failed:
-        return ""
-    by_reason: dict[str, list[str]] = {}
-    for frame in failed[:SHOWN]:
-        file, _, reason = (frame.failure or "").partition(": ")
-        by_reason.setdefault(reason, []).append(file)
-    parts = [", ".join(files) + f": {reason}" for reason, files in by_reason.items()]
-    if len(failed) > SHOWN:
-        parts.append(f"and {len(failed) - SHOWN} more")
-    return f"{name}: {len(failed)} of {len(frames)} frames: {'; '.join(parts)}"

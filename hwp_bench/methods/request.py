@@ -1,8 +1,13 @@
-"""The frames, masks and hands that a method is given of a capture: its own, or an oracle's.
+"""The folder that a method is given: everything it may see of a capture, and nothing more.
 
-Oracles bound what a method can reach on a simulated capture. `clean` gives the clean version of
-every frame, `unperturbed-only` just those frames that nothing perturbs. `true:NAMES` replaces
-single estimates by the truth, so that an error budget can tell what each of them costs.
+A request holds the training and validation frames with their masks, and for every frame,
+test frames included, the estimated hand parameters and the cameras. It holds no test pixel, no
+truth and no word about the perturbations. Of the free-view clip it holds parameters and cameras.
+
+The frames, masks and hands are the capture's own, or an oracle's choice, which bounds what a
+method can reach on a simulated capture: `clean` gives the clean version of every frame,
+`unperturbed-only` just those frames that nothing perturbs, and `true:NAMES` replaces single
+estimates by the truth, so that an error budget can tell what each of them costs.
 """
 
 from __future__ import annotations
@@ -45,7 +50,6 @@ from hwp_bench.methods.contract import (
 if TYPE_CHECKING:
     from hwp_bench.capture import Capture
 
-
 #: The estimates that the truth can replace, by name, in the order of tables.
 ORACLE_INPUTS: Mapping[str, str] = MappingProxyType(
     {
@@ -58,6 +62,78 @@ ORACLE_INPUTS: Mapping[str, str] = MappingProxyType(
     }
 )
 _PREFIX = "true:"
+#: Version of the request folder.
+SCHEMA = "hwp-request/1"
+
+
+def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) -> Path:
+    """Write the part of a capture that a method may see into a folder of its own.
+
+    Images are copied, not linked: a link would lead to the capture, and so to its test frames.
+
+    Raises:
+        BadImage: a training or validation image is missing or damaged.
+        UsageError: the capture does not know what `run.frames` asks for.
+    """
+    info = capture.info
+    material = choose_training_inputs(capture, split, run.frames)
+    with atomic_folder(path, overwrite=True) as root:
+        for frame in [*material.train.tolist(), *split.validation.tolist()]:
+            for kind, source_kind, read in (
+                ("frames", material.frames, read_rgb),
+                ("masks", material.masks, read_gray),
+            ):
+                source = image_path(capture.root, source_kind, frame)
+                # Reading first names a damaged image here, before a method stumbles over it.
+                read(source, capture.size)
+                target = image_path(root, kind, frame)
+                target.parent.mkdir(parents=True, exist_ok=True)
+                shutil.copyfile(source, target)
+        write_hands(root / HANDS, material.hands)
+        write_cameras(root / CAMERAS, capture.cameras)
+        mesh = replaces_mesh(run.frames)
+        if mesh:
+            own = {side: capture.true_template(side) for side in info.sides}
+            write_subject_mesh(root / TEMPLATE, own)
+        clip = capture.free_view
+        if clip is not None:
+            (root / FREE_VIEW).mkdir()
+            write_hands(root / FREE_VIEW / HANDS, choose_free_view_hands(clip, run.frames))
+            write_cameras(root / FREE_VIEW / CAMERAS, clip.cameras)
+        description = {
+            "schema": SCHEMA,
+            "id": info.id,
+            "hands": info.hands,
+            "width": info.width,
+            "height": info.height,
+            "fps": info.fps,
+            "hand_model": info.to_json()["hand_model"],
+            "split": split.to_json(),
+            "settings": dict(run.settings),
+            "seed": run.seed,
+            "budget": {"seconds": run.budget.seconds, "steps": run.budget.steps},
+            "frames": run.frames,
+            "train": material.train.tolist(),
+            **({"free_view": len(clip)} if clip is not None else {}),
+            **({"own_template": True} if mesh else {}),
+        }
+        write_json(root / REQUEST, description)
+    return path
+
+
+def open_request(path: str | os.PathLike[str]) -> TrainingCapture:
+    """Open a request folder.
+
+    Raises:
+        BadInput: it is not a request of this version, or damaged.
+    """
+    root = Path(path)
+    where = root / REQUEST
+    value = without_schema(read_json(where), SCHEMA, where=where, error=BadInput)
+    return TrainingCapture(root, parse_record(RequestRecord, value, where=where, error=BadInput))
+
+
+# --- the choice of frames, masks and hands
 
 
 @dataclass(frozen=True, eq=False)
@@ -192,74 +268,3 @@ def _replaced(estimate: HandParameters, truth: HandParameters, rows: np.ndarray)
         transl=np.where(rows[:, None], truth.transl, estimate.transl),
         valid=estimate.valid | (rows & truth.valid),
     )
-
-
-#: Version of the request folder.
-SCHEMA = "hwp-request/1"
-
-
-def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) -> Path:
-    """Write the part of a capture that a method may see into a folder of its own.
-
-    Images are copied, not linked: a link would lead to the capture, and so to its test frames.
-
-    Raises:
-        BadImage: a training or validation image is missing or damaged.
-        UsageError: the capture does not know what `run.frames` asks for.
-    """
-    info = capture.info
-    material = choose_training_inputs(capture, split, run.frames)
-    with atomic_folder(path, overwrite=True) as root:
-        for frame in [*material.train.tolist(), *split.validation.tolist()]:
-            for kind, source_kind, read in (
-                ("frames", material.frames, read_rgb),
-                ("masks", material.masks, read_gray),
-            ):
-                source = image_path(capture.root, source_kind, frame)
-                # Reading first names a damaged image here, before a method stumbles over it.
-                read(source, capture.size)
-                target = image_path(root, kind, frame)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                shutil.copyfile(source, target)
-        write_hands(root / HANDS, material.hands)
-        write_cameras(root / CAMERAS, capture.cameras)
-        mesh = replaces_mesh(run.frames)
-        if mesh:
-            own = {side: capture.true_template(side) for side in info.sides}
-            write_subject_mesh(root / TEMPLATE, own)
-        clip = capture.free_view
-        if clip is not None:
-            (root / FREE_VIEW).mkdir()
-            write_hands(root / FREE_VIEW / HANDS, choose_free_view_hands(clip, run.frames))
-            write_cameras(root / FREE_VIEW / CAMERAS, clip.cameras)
-        description = {
-            "schema": SCHEMA,
-            "id": info.id,
-            "hands": info.hands,
-            "width": info.width,
-            "height": info.height,
-            "fps": info.fps,
-            "hand_model": info.to_json()["hand_model"],
-            "split": split.to_json(),
-            "settings": dict(run.settings),
-            "seed": run.seed,
-            "budget": {"seconds": run.budget.seconds, "steps": run.budget.steps},
-            "frames": run.frames,
-            "train": material.train.tolist(),
-            **({"free_view": len(clip)} if clip is not None else {}),
-            **({"own_template": True} if mesh else {}),
-        }
-        write_json(root / REQUEST, description)
-    return path
-
-
-def open_request(path: str | os.PathLike[str]) -> TrainingCapture:
-    """Open a request folder.
-
-    Raises:
-        BadInput: it is not a request of this version, or damaged.
-    """
-    root = Path(path)
-    where = root / REQUEST
-    value = without_schema(read_json(where), SCHEMA, where=where, error=BadInput)
-    return TrainingCapture(root, parse_record(RequestRecord, value, where=where, error=BadInput))

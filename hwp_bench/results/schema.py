@@ -1,4 +1,7 @@
-"""How much a result may hold: sizes, and the range of each number, checked before it is used."""
+"""The records of a result file, their bounds, and what is read off them.
+
+A field that was added within a version has a default, which says what files without it mean.
+"""
 
 from __future__ import annotations
 
@@ -33,7 +36,6 @@ MAX_TABLE = 500_000
 SHORTEST = 1e-9
 # By how much a score may leave the range of its metric: sums are rounded.
 _ROUNDING = 1e-9
-
 #: Scores by metric; a metric that the toolkit knows has its own range, which is narrower.
 ScoreTable = Annotated[
     dict[Line, Annotated[float, Meta(ge=-1e6, le=1e6)]], Meta(max_length=MAX_METRICS)
@@ -43,34 +45,26 @@ _Limit = Annotated[str, Meta(pattern=r"\A(?:seconds|steps)\Z", description="seco
 Limits = dict[_Limit, Count | Seconds | None]
 #: A table of any values; `check_table` bounds all of it.
 FreeTable = dict[Line, Any]
-
-
-def check_scores(scores: Mapping[str, float]) -> None:
-    """Refuse scores that their metric cannot have."""
-    for facts in METRICS:
-        value = scores.get(facts.name)
-        low, high = facts.range
-        high = math.inf if high is None else high
-        if value is not None and not low - _ROUNDING <= value <= high + _ROUNDING:
-            limits = f"from {low:g} to {high:g}" if high < math.inf else f"at least {low:g}"
-            raise UsageError(
-                f"is {value:g}, but {facts.label} is {limits}", field=f"scores.{facts.name}"
-            )
-
-
-def check_table(value: Mapping[str, Any], name: str) -> None:
-    """Refuse a table of any values that is too large to be shown."""
-    if len(json.dumps(value)) > MAX_TABLE:
-        raise UsageError(f"holds more than {MAX_TABLE:,} characters", field=name)
-
-
-def per_second(count: int, seconds: float | None) -> float | None:
-    """Return a rate; None where no time was measured, or one too short to divide by."""
-    return None if seconds is None or seconds < SHORTEST else count / seconds
-
-
 # Longest text of a setting's value.
 _SHOWN = 40
+#: What `CaptureResult.isolation` says of a run inside the walls.
+ISOLATED = "namespaces"
+#: What `Results.environment` says under `caches`: a run finds nothing that a method wrote before.
+NEW_CACHES = "new for each run"
+#: Packages whose version can move a number.
+PACKAGES = (
+    "numpy",
+    "torch",
+    "numba",
+    "opencv-contrib-python-headless",
+    "scikit-image",
+    "OpenImageIO",
+    "scipy",
+    "trimesh",
+    "embreex",
+    "gsplat",
+    "lpips",
+)
 
 
 @dataclass(frozen=True)
@@ -269,6 +263,36 @@ class Results:
         return []
 
 
+# --- bounds, checked before a number is used
+
+
+def check_scores(scores: Mapping[str, float]) -> None:
+    """Refuse scores that their metric cannot have."""
+    for facts in METRICS:
+        value = scores.get(facts.name)
+        low, high = facts.range
+        high = math.inf if high is None else high
+        if value is not None and not low - _ROUNDING <= value <= high + _ROUNDING:
+            limits = f"from {low:g} to {high:g}" if high < math.inf else f"at least {low:g}"
+            raise UsageError(
+                f"is {value:g}, but {facts.label} is {limits}", field=f"scores.{facts.name}"
+            )
+
+
+def check_table(value: Mapping[str, Any], name: str) -> None:
+    """Refuse a table of any values that is too large to be shown."""
+    if len(json.dumps(value)) > MAX_TABLE:
+        raise UsageError(f"holds more than {MAX_TABLE:,} characters", field=name)
+
+
+def per_second(count: int, seconds: float | None) -> float | None:
+    """Return a rate; None where no time was measured, or one too short to divide by."""
+    return None if seconds is None or seconds < SHORTEST else count / seconds
+
+
+# --- what is read off results
+
+
 def score_rows(results: Results) -> list[CaptureScores]:
     """Return the captures as `hwp_bench.metrics.score` takes them."""
     return [
@@ -314,10 +338,7 @@ def differing_settings(results: Sequence[Results]) -> list[str]:
     return told
 
 
-#: What `CaptureResult.isolation` says of a run inside the walls.
-ISOLATED = "namespaces"
-#: What `Results.environment` says under `caches`: a run finds nothing that a method wrote before.
-NEW_CACHES = "new for each run"
+# --- how the method's processes were isolated
 
 
 def unisolated_captures(results: Results) -> dict[str, list[str]]:
@@ -366,20 +387,7 @@ def add_isolation_note(table: Table, results: Sequence[Results]) -> Table:
     return replace(table, notes=(*table.notes, note))
 
 
-#: Packages whose version can move a number.
-PACKAGES = (
-    "numpy",
-    "torch",
-    "numba",
-    "opencv-contrib-python-headless",
-    "scikit-image",
-    "OpenImageIO",
-    "scipy",
-    "trimesh",
-    "embreex",
-    "gsplat",
-    "lpips",
-)
+# --- the environment of a result
 
 
 def environment() -> dict[str, Any]:

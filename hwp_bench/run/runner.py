@@ -1,8 +1,4 @@
-"""Whether the disc of a run's output had room for images while a method ran.
-
-Many programs do not notice a full disc: OpenCV's `imwrite` leaves an empty file and returns, and
-the program ends well. Such a loss is the disc's fault and not the method's.
-"""
+"""Run a method on one capture in a process of its own, away from the test frames."""
 
 from __future__ import annotations
 
@@ -56,53 +52,10 @@ from hwp_bench.run.worker import (
 LOW_SPACE = 4 << 20
 # Bytes that are written to find out whether a quota still allows any.
 _PROBE = 64 << 10
-
-
-class SpaceWatch:
-    """Looks at the free space of a folder's disc again and again, and keeps the least.
-
-    A disc that is full for less time than lies between two looks goes unnoticed.
-    """
-
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._least: int | None = None
-
-    def look(self) -> None:
-        """Look once."""
-        with contextlib.suppress(OSError):
-            free = shutil.disk_usage(self._folder).free
-            self._least = free if self._least is None else min(self._least, free)
-
-    def finish(self, log_problem: str | None = None) -> str | None:
-        """Look a last time, and say what the run lacked."""
-        self.look()
-        problem = log_problem or self._refusal()
-        if problem is not None:
-            return f"the disc of its output could not be written while it ran ({problem})"
-        if self._least is not None and self._least < LOW_SPACE:
-            return f"the disc of its output was full while it ran ({self._least:,} bytes left)"
-        return None
-
-    def _refusal(self) -> str | None:
-        """Why nothing can be written now, where free bytes do not tell it: quotas, inodes."""
-        probe = temporary_name(self._folder / "probe")
-        try:
-            probe.write_bytes(bytes(_PROBE))
-        except OSError as error:
-            return error.strerror or type(error).__name__
-        finally:
-            with contextlib.suppress(OSError):
-                probe.unlink(missing_ok=True)
-        return None
-
-
 #: Seconds a method may take on one capture unless told otherwise.
 DEFAULT_TIME_LIMIT = 3600.0
-
 #: Lines of a method's output that are repeated when it cannot be made.
 LAST = 8
-
 _REMEDIES = {
     "time": "Raise --time-limit, or give the method a --budget.",
     "memory": "Raise --memory-limit, or make the method smaller.",
@@ -243,37 +196,6 @@ def rehearse_method(
             )
 
 
-def _look_for_program(manifest: MethodManifest) -> None:
-    """Refuse a command whose program is not there, or may not be run."""
-    word = (manifest.entry.command or [""])[0]
-    program = word.replace("{method}", str(manifest.root.resolve()))
-    if "{" in program or (os.sep in program and not os.path.isabs(program)):
-        return
-    problem = ""
-    if shutil.which(program) is None:
-        problem = f"there is no program {word!r}"
-        if os.path.isfile(program):
-            problem = f"the program {word!r} is not executable"
-    if problem:
-        raise BadMethod(
-            problem,
-            where=manifest.root,
-            field="entry.command",
-            remedy="Install it, or correct the command; chmod +x makes a script executable.",
-        )
-
-
-def _last_lines(log: Path) -> list[str]:
-    """Return the last lines that a method printed, such as the end of its traceback."""
-    try:
-        with open(log, "rb") as stream:
-            stream.seek(max(0, log.stat().st_size - 8192))
-            text = stream.read(8192).decode(errors="replace")
-    except OSError:
-        return []
-    return [one_line(line.rstrip(), 500) for line in text.splitlines() if line.strip()][-LAST:]
-
-
 def _run(
     manifest: MethodManifest,
     request: Path,
@@ -338,15 +260,6 @@ def _command(manifest: MethodManifest, request: Path, output: Path) -> list[str]
     return words
 
 
-def _broken(limit: str, when: str, limits: Limits) -> str:
-    return {
-        "time": f"ran out of time {when} after {limits.seconds:g} s",
-        "memory": f"took more than {limits.memory / 1e9:.3g} GB of memory {when}",
-        "processes": f"ran more than {MAX_PROCESSES} processes at once {when}",
-        "machine": f"was stopped {when} because the machine's memory ran out",
-    }[limit]
-
-
 def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
     # A link may lead to a file that only the toolkit can read.
     if path.is_symlink():
@@ -354,6 +267,15 @@ def _show_progress(path: Path, on_progress: Callable[[int, int], None]) -> None:
     with contextlib.suppress(BadInput, KeyError, TypeError, ValueError):
         value = read_json(path, max_bytes=10_000)
         on_progress(int(value["done"]), int(value["total"]))
+
+
+def _broken(limit: str, when: str, limits: Limits) -> str:
+    return {
+        "time": f"ran out of time {when} after {limits.seconds:g} s",
+        "memory": f"took more than {limits.memory / 1e9:.3g} GB of memory {when}",
+        "processes": f"ran more than {MAX_PROCESSES} processes at once {when}",
+        "machine": f"was stopped {when} because the machine's memory ran out",
+    }[limit]
 
 
 def _reason(output: Path, status: int | None) -> str:
@@ -366,3 +288,78 @@ def _reason(output: Path, status: int | None) -> str:
         with contextlib.suppress(ValueError):
             return f"killed by {signal.Signals(-status).name}"
     return f"exit status {status}"
+
+
+def _last_lines(log: Path) -> list[str]:
+    """Return the last lines that a method printed, such as the end of its traceback."""
+    try:
+        with open(log, "rb") as stream:
+            stream.seek(max(0, log.stat().st_size - 8192))
+            text = stream.read(8192).decode(errors="replace")
+    except OSError:
+        return []
+    return [one_line(line.rstrip(), 500) for line in text.splitlines() if line.strip()][-LAST:]
+
+
+def _look_for_program(manifest: MethodManifest) -> None:
+    """Refuse a command whose program is not there, or may not be run."""
+    word = (manifest.entry.command or [""])[0]
+    program = word.replace("{method}", str(manifest.root.resolve()))
+    if "{" in program or (os.sep in program and not os.path.isabs(program)):
+        return
+    problem = ""
+    if shutil.which(program) is None:
+        problem = f"there is no program {word!r}"
+        if os.path.isfile(program):
+            problem = f"the program {word!r} is not executable"
+    if problem:
+        raise BadMethod(
+            problem,
+            where=manifest.root,
+            field="entry.command",
+            remedy="Install it, or correct the command; chmod +x makes a script executable.",
+        )
+
+
+# --- whether the disc of the output had room for images meanwhile
+
+
+class SpaceWatch:
+    """Looks at the free space of a folder's disc again and again, and keeps the least.
+
+    Many programs do not notice a full disc: OpenCV's `imwrite` leaves an empty file and returns,
+    and the program ends well. Such a loss is the disc's fault and not the method's. A disc that is
+    full for less time than lies between two looks goes unnoticed.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._least: int | None = None
+
+    def look(self) -> None:
+        """Look once."""
+        with contextlib.suppress(OSError):
+            free = shutil.disk_usage(self._folder).free
+            self._least = free if self._least is None else min(self._least, free)
+
+    def finish(self, log_problem: str | None = None) -> str | None:
+        """Look a last time, and say what the run lacked."""
+        self.look()
+        problem = log_problem or self._refusal()
+        if problem is not None:
+            return f"the disc of its output could not be written while it ran ({problem})"
+        if self._least is not None and self._least < LOW_SPACE:
+            return f"the disc of its output was full while it ran ({self._least:,} bytes left)"
+        return None
+
+    def _refusal(self) -> str | None:
+        """Why nothing can be written now, where free bytes do not tell it: quotas, inodes."""
+        probe = temporary_name(self._folder / "probe")
+        try:
+            probe.write_bytes(bytes(_PROBE))
+        except OSError as error:
+            return error.strerror or type(error).__name__
+        finally:
+            with contextlib.suppress(OSError):
+                probe.unlink(missing_ok=True)
+        return None

@@ -1,6 +1,7 @@
-"""The output folder of a run: the names in it, and the facts that `run.json` holds.
+"""The process that a Python method runs in, and what it leaves in its output folder.
 
-The worker writes it for a Python method; a command may write the same files.
+It is given a request folder and an output folder, and does not know where the capture is. It is
+started by `hwp_bench.run.start`. A command may write the same files.
 """
 
 from __future__ import annotations
@@ -52,62 +53,6 @@ REHEARSAL = "rehearsal.json"
 #: Largest `run.json` that is read, bytes; most frames and checkpoints in it.
 MAX_BYTES = 1024 * 1024
 MAX_FRAMES, MAX_CHECKPOINTS = 64, 1000
-
-
-@dataclass(frozen=True)
-class Checkpoint:
-    """One recorded moment of a fit."""
-
-    #: Optimizer steps done.
-    step: Count
-    #: Seconds on the method's clock.
-    seconds: Seconds
-    #: Peak memory of the process until then, bytes.
-    peak_memory: Count
-
-
-@dataclass(frozen=True)
-class RunFacts:
-    """Time, steps and memory of a run; None where the method does not say."""
-
-    #: Seconds on the method's clock.
-    fit_seconds: Seconds | None = None
-    #: CPU seconds of the process and its children on that clock, all threads added up.
-    cpu_seconds: Seconds | None = None
-    #: Seconds before that clock started, in which the method was made: what it compiles or loads.
-    ready_seconds: Seconds | None = None
-    #: Seconds to render the test frames.
-    render_seconds: Seconds | None = None
-    #: Seconds spent on checkpoints, outside the method's clock.
-    curve_seconds: Seconds | None = None
-    #: Optimizer steps.
-    steps: Count | None = None
-    #: Peak memory of the process, bytes.
-    peak_memory: Count | None = None
-    #: Device that the method ran on.
-    device: Line | None = None
-    #: Validation frames that were rendered for every checkpoint.
-    checkpoint_frames: Annotated[list[Count], Meta(max_length=MAX_FRAMES)] = field(
-        default_factory=list
-    )
-    #: The checkpoints, in time order; the last is the finished fit.
-    checkpoints: Annotated[list[Checkpoint], Meta(max_length=MAX_CHECKPOINTS)] = field(
-        default_factory=list
-    )
-
-
-def checkpoint_folder(output: Path, index: int) -> Path:
-    """Return the folder of the validation frames of a checkpoint."""
-    return output / CHECKPOINTS / f"{index:03d}"
-
-
-def read_facts(path: Path) -> RunFacts:
-    """Read `run.json`; a run need not write one."""
-    if not path.is_file():
-        return RunFacts()
-    return parse_record(RunFacts, read_json(path, max_bytes=MAX_BYTES), where=str(path))
-
-
 #: Most validation frames that are rendered for a checkpoint.
 CHECKPOINT_FRAMES = 8
 #: Seconds between two writes of the progress file.
@@ -269,17 +214,7 @@ def device_name(avatar: Avatar) -> str:
     return str(getattr(avatar, "device", "cpu"))[:100]
 
 
-def checkpoint_times(budget: Budget) -> list[float]:
-    """Return the seconds at which checkpoints are due: dense at the start, then regular.
-
-    1, 2, 4, 8, ... s, and every tenth of a budget in seconds. (`ReportClock` adds the first offer
-    of a method, and every tenth of a budget in steps.)
-    """
-    horizon = budget.seconds or 24 * 3600.0
-    due = {float(2**power) for power in range(18) if 2**power <= horizon}
-    if budget.seconds:
-        due |= {budget.seconds * tenth / 10 for tenth in range(1, 10)}
-    return sorted(due)
+# --- the clock and its checkpoints
 
 
 class ReportClock:
@@ -343,6 +278,19 @@ class ReportClock:
             self._paused += time.perf_counter() - now
 
 
+def checkpoint_times(budget: Budget) -> list[float]:
+    """Return the seconds at which checkpoints are due: dense at the start, then regular.
+
+    1, 2, 4, 8, ... s, and every tenth of a budget in seconds. (`ReportClock` adds the first offer
+    of a method, and every tenth of a budget in steps.)
+    """
+    horizon = budget.seconds or 24 * 3600.0
+    due = {float(2**power) for power in range(18) if 2**power <= horizon}
+    if budget.seconds:
+        due |= {budget.seconds * tenth / 10 for tenth in range(1, 10)}
+    return sorted(due)
+
+
 def cpu_seconds() -> float:
     """Return the CPU seconds of this process, all threads, and of its children that have ended."""
     spent = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
@@ -354,3 +302,60 @@ def peak_memory() -> int:
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     # Linux counts in KiB, macOS in bytes.
     return peak if sys.platform == "darwin" else peak * 1024
+
+
+# --- the facts that `run.json` holds
+
+
+@dataclass(frozen=True)
+class Checkpoint:
+    """One recorded moment of a fit."""
+
+    #: Optimizer steps done.
+    step: Count
+    #: Seconds on the method's clock.
+    seconds: Seconds
+    #: Peak memory of the process until then, bytes.
+    peak_memory: Count
+
+
+@dataclass(frozen=True)
+class RunFacts:
+    """Time, steps and memory of a run; None where the method does not say."""
+
+    #: Seconds on the method's clock.
+    fit_seconds: Seconds | None = None
+    #: CPU seconds of the process and its children on that clock, all threads added up.
+    cpu_seconds: Seconds | None = None
+    #: Seconds before that clock started, in which the method was made: what it compiles or loads.
+    ready_seconds: Seconds | None = None
+    #: Seconds to render the test frames.
+    render_seconds: Seconds | None = None
+    #: Seconds spent on checkpoints, outside the method's clock.
+    curve_seconds: Seconds | None = None
+    #: Optimizer steps.
+    steps: Count | None = None
+    #: Peak memory of the process, bytes.
+    peak_memory: Count | None = None
+    #: Device that the method ran on.
+    device: Line | None = None
+    #: Validation frames that were rendered for every checkpoint.
+    checkpoint_frames: Annotated[list[Count], Meta(max_length=MAX_FRAMES)] = field(
+        default_factory=list
+    )
+    #: The checkpoints, in time order; the last is the finished fit.
+    checkpoints: Annotated[list[Checkpoint], Meta(max_length=MAX_CHECKPOINTS)] = field(
+        default_factory=list
+    )
+
+
+def checkpoint_folder(output: Path, index: int) -> Path:
+    """Return the folder of the validation frames of a checkpoint."""
+    return output / CHECKPOINTS / f"{index:03d}"
+
+
+def read_facts(path: Path) -> RunFacts:
+    """Read `run.json`; a run need not write one."""
+    if not path.is_file():
+        return RunFacts()
+    return parse_record(RunFacts, read_json(path, max_bytes=MAX_BYTES), where=str(path))

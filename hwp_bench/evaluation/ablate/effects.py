@@ -1,4 +1,4 @@
-"""The effect of components on scores and seconds, paired by capture, seed and frame."""
+"""The effect of components on scores and seconds, paired by capture, seed and frame; its tables."""
 
 from __future__ import annotations
 
@@ -31,6 +31,13 @@ from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.schema import score_rows
 from hwp_bench.results.store import ABLATION, ABLATION_SCHEMA
 from hwp_bench.taxonomy import PERTURBATIONS
+
+#: Names of the times that are compared.
+QUANTITIES = ("step", "fit", "render")
+#: Scopes of the effects table; perturbations have one of their own.
+OVERALL = ("macro", "single", "interacting")
+_YES, _NO = "yes", "–"
+_GROUPS = {"single": "Single", "interacting": "Interacting", "macro": "Macro"}
 
 
 @dataclass(frozen=True)
@@ -134,10 +141,6 @@ def _adjusted(rows: list[ScoreEffect]) -> list[ScoreEffect]:
     return rows
 
 
-#: Names of the times that are compared.
-QUANTITIES = ("step", "fit", "render")
-
-
 def seconds(capture: CaptureResult, quantity: str) -> float | None:
     """Return a time of one capture in seconds; None where the method does not say."""
     spent, units = {
@@ -219,11 +222,7 @@ def _logs(run: MethodRuns, capture: str, quantity: str) -> np.ndarray | None:
     return np.log(known) if len(known) == len(spent) else None
 
 
-#: Scopes of the effects table; perturbations have one of their own.
-OVERALL = ("macro", "single", "interacting")
-
-_YES, _NO = "yes", "–"
-_GROUPS = {"single": "Single", "interacting": "Interacting", "macro": "Macro"}
+# --- tables, and the record `ablation.json`
 
 
 def ablation_tables(

@@ -1,4 +1,4 @@
-"""The evaluations that an error budget is made of: a method with one truth after another."""
+"""The error budget: what each truth and each correction would gain, in dB; runs and pictures."""
 
 from __future__ import annotations
 
@@ -30,6 +30,12 @@ from hwp_bench.sim.produce.truth import add_subject_mesh
 
 #: Name of the evaluation in which nothing is replaced, and of that in which everything is.
 GIVEN, ALL = "as given", "all of them"
+#: Version of the budget file.
+SCHEMA = "hwp-budget/1"
+# Rows that contain others.
+_SUMS = (ALL, "motion+light", "gain map")
+# Larger side of a tile, px, and pixels around the hand.
+_EDGE, _MARGIN = 176, 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,8 +124,7 @@ def plan_variants(
     return variants
 
 
-#: Version of the budget file.
-SCHEMA = "hwp-budget/1"
+# --- the budget
 
 
 @dataclass(frozen=True)
@@ -220,8 +225,7 @@ def next_work(budget: ErrorBudget) -> str:
     return f"Most is lost {'; '.join(parts)}."
 
 
-# Rows that contain others.
-_SUMS = (ALL, "motion+light", "gain map")
+# --- tables
 
 
 def budget_tables(budget: ErrorBudget) -> dict[str, Table]:
@@ -283,8 +287,7 @@ def _psnr(capture: CaptureResult) -> float:
     return float(np.mean([min(frame.scores["psnr"], PSNR_CAP) for frame in capture.frames]))
 
 
-# Larger side of a tile, px, and pixels around the hand.
-_EDGE, _MARGIN = 176, 4
+# --- the picture: a test frame of each capture with every truth and correction
 
 
 def budget_sheet(runs: BudgetRuns, budget: ErrorBudget) -> np.ndarray:

@@ -1,4 +1,10 @@
-"""Gauss-Newton steps on a squared error."""
+"""Corrections of a predicted frame that only its truth can tell: oracles at test time.
+
+Each takes away one kind of error as far as a few numbers can: light as a gain of linear light,
+place as a motion of the image, pose as a motion of the posed surface. What a correction gains is
+what that kind of error costs. The parameters are found by Gauss-Newton steps on the squared error
+in sRGB, which PSNR counts.
+"""
 
 from __future__ import annotations
 
@@ -18,45 +24,18 @@ _STEPS = 10
 _HALVINGS = 4
 # Weight that draws parameters to no correction, as a share of the mean squared derivative.
 _RIDGE = 1e-4
-
-
-def least_error(
-    error: Callable[[np.ndarray], float],
-    step: Callable[[np.ndarray], np.ndarray],
-    start: np.ndarray,
-) -> np.ndarray:
-    """Parameters (K,) of a small error, by steps that are halved until the error falls."""
-    best, least = start, error(start)
-    for _ in range(_STEPS):
-        way = step(best)
-        for _ in range(_HALVINGS):
-            found = error(best + way)
-            if found < least:
-                best, least = best + way, found
-                break
-            way = 0.5 * way
-        else:
-            break
-    return best
-
-
-def least_squares(derivatives: np.ndarray, rest: np.ndarray) -> np.ndarray:
-    """The least squares step: (K,) from derivatives (..., K) and what is missing (...)."""
-    flat = derivatives.reshape(-1, derivatives.shape[-1])
-    normal = flat.T @ flat
-    ridge = _RIDGE * max(float(np.trace(normal)) / len(normal), 1e-12)
-    solution: np.ndarray = np.linalg.solve(
-        normal + ridge * np.eye(len(normal)), flat.T @ rest.reshape(-1)
-    )
-    return solution
-
-
 # Largest logarithm of a gain: a factor of 20.
 _LARGEST = 3.0
 # Cells along each edge of the finest gain.
 _CELLS = 12
 # Derivative of sRGB is taken at this light and above; it grows without bound towards black.
 _DARK = 2e-3
+# Squared error, as a share of what there is, that a parameter must take away before it moves by
+# its own scale. See `pose`.
+_PRICE = 0.01
+
+
+# --- light
 
 
 def gain(pair: Pair) -> np.ndarray:
@@ -116,9 +95,7 @@ def _slope(light: np.ndarray) -> np.ndarray:
     return np.where(light >= 1.0, 0.0, curved)
 
 
-# Squared error, as a share of what there is, that a parameter must take away before it moves by
-# its own scale. See `pose`.
-_PRICE = 0.01
+# --- place and pose
 
 
 def motion(pair: Pair) -> np.ndarray:
@@ -197,6 +174,40 @@ def pose(pair: Pair) -> np.ndarray:
 def motion_and_light(pair: Pair) -> np.ndarray:
     """A motion, and then another light."""
     return light(replace(pair, prediction=motion(pair)))
+
+
+# --- Gauss-Newton steps
+
+
+def least_error(
+    error: Callable[[np.ndarray], float],
+    step: Callable[[np.ndarray], np.ndarray],
+    start: np.ndarray,
+) -> np.ndarray:
+    """Parameters (K,) of a small error, by steps that are halved until the error falls."""
+    best, least = start, error(start)
+    for _ in range(_STEPS):
+        way = step(best)
+        for _ in range(_HALVINGS):
+            found = error(best + way)
+            if found < least:
+                best, least = best + way, found
+                break
+            way = 0.5 * way
+        else:
+            break
+    return best
+
+
+def least_squares(derivatives: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """The least squares step: (K,) from derivatives (..., K) and what is missing (...)."""
+    flat = derivatives.reshape(-1, derivatives.shape[-1])
+    normal = flat.T @ flat
+    ridge = _RIDGE * max(float(np.trace(normal)) / len(normal), 1e-12)
+    solution: np.ndarray = np.linalg.solve(
+        normal + ridge * np.eye(len(normal)), flat.T @ rest.reshape(-1)
+    )
+    return solution
 
 
 #: The corrections by name, with what each of them takes away.

@@ -1,4 +1,4 @@
-"""The surface of posed hands, and how their pixels move when the pose changes."""
+"""Predicted frames next to their truth, and the posed surface that moves their pixels."""
 
 from __future__ import annotations
 
@@ -32,6 +32,77 @@ _COUNT = _TURNS + 3
 _TURN, _SHIFT = 0.1, 0.01
 # Step of the differences that give slopes, as a share of the scale: 1e-4 rad.
 _STEP = 1e-3
+# Edge of the cells of the surface, m; normals do not depend on it.
+_PATCH = 0.004
+#: Name of its row, and what it is.
+NAME = "true colours"
+TEXT = "the true frame moved to the given poses: an avatar without an error of its own"
+
+
+@dataclass(frozen=True, eq=False)
+class Pair:
+    """A predicted frame and its truth; P pixels are scored."""
+
+    #: (H, W, 3) float in [0, 1], sRGB over black.
+    prediction: np.ndarray
+    #: (H, W, 3) float in [0, 1], sRGB.
+    target: np.ndarray
+    #: (H, W) bool.
+    region: np.ndarray
+    #: (H, W, 3) unit normals of the posed hand in world axes; zeros where the hand is not drawn.
+    normals: np.ndarray
+    #: How the estimated hands' surface moves the pixels; None where no hand is known.
+    surface: MovingSurface | None = None
+
+    @property
+    def error(self) -> float:
+        """Mean squared error over the scored pixels."""
+        return error_of(self.prediction, self)
+
+
+def error_of(image: np.ndarray, pair: Pair) -> float:
+    """Mean squared error of an image (H, W, 3) in place of the prediction."""
+    return float(squared_error(image, pair.target)[pair.region].mean())
+
+
+def pairs_of(
+    capture: Capture, predictions: Path, frames: list[int]
+) -> Iterator[tuple[int, Pair | None]]:
+    """Read the predictions of some test frames next to their truth."""
+    templates = {side: capture.template(side) for side in capture.info.sides}
+    surfaces = HandSurfaces(templates, _PATCH)
+    drawn = surfaces.footprints(
+        capture.true_hands or capture.hands,
+        capture.cameras.Ks,
+        capture.cameras.viewmats,
+        np.array(frames),
+        capture.size,
+    )
+    for frame, footprint in zip(frames, drawn, strict=True):
+        found = read_prediction(predictions, frame, capture.size)
+        if found.pixels is None:
+            yield frame, None
+            continue
+        mask, exact = capture.scoring_mask(frame)
+        normals = np.zeros((*capture.size, 3))
+        normals.reshape(-1, 3)[footprint.pixels] = footprint.normals
+        shown = {
+            side: hand.at(frame, side) for side, hand in capture.hands.items() if hand.valid[frame]
+        }
+        camera = capture.cameras.camera(frame, capture.info.width, capture.info.height)
+        yield (
+            frame,
+            Pair(
+                prediction=found.pixels / 255.0,
+                target=capture.frame(frame) / 255.0,
+                region=scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact),
+                normals=normals,
+                surface=MovingSurface(templates, shown, camera) if shown else None,
+            ),
+        )
+
+
+# --- how the pixels of posed hands move when the pose changes
 
 
 class MovingSurface:
@@ -145,76 +216,7 @@ def _posed(tensors: TemplateTensors, hand: HandPose, changes: np.ndarray) -> tor
     return pose_hand(tensors, pose, torch.as_tensor(hand.betas), transl).vertices
 
 
-@dataclass(frozen=True, eq=False)
-class Pair:
-    """A predicted frame and its truth; P pixels are scored."""
-
-    #: (H, W, 3) float in [0, 1], sRGB over black.
-    prediction: np.ndarray
-    #: (H, W, 3) float in [0, 1], sRGB.
-    target: np.ndarray
-    #: (H, W) bool.
-    region: np.ndarray
-    #: (H, W, 3) unit normals of the posed hand in world axes; zeros where the hand is not drawn.
-    normals: np.ndarray
-    #: How the estimated hands' surface moves the pixels; None where no hand is known.
-    surface: MovingSurface | None = None
-
-    @property
-    def error(self) -> float:
-        """Mean squared error over the scored pixels."""
-        return error_of(self.prediction, self)
-
-
-def error_of(image: np.ndarray, pair: Pair) -> float:
-    """Mean squared error of an image (H, W, 3) in place of the prediction."""
-    return float(squared_error(image, pair.target)[pair.region].mean())
-
-
-# Edge of the cells of the surface, m; normals do not depend on it.
-_PATCH = 0.004
-
-
-def pairs_of(
-    capture: Capture, predictions: Path, frames: list[int]
-) -> Iterator[tuple[int, Pair | None]]:
-    """Read the predictions of some test frames next to their truth."""
-    templates = {side: capture.template(side) for side in capture.info.sides}
-    surfaces = HandSurfaces(templates, _PATCH)
-    drawn = surfaces.footprints(
-        capture.true_hands or capture.hands,
-        capture.cameras.Ks,
-        capture.cameras.viewmats,
-        np.array(frames),
-        capture.size,
-    )
-    for frame, footprint in zip(frames, drawn, strict=True):
-        found = read_prediction(predictions, frame, capture.size)
-        if found.pixels is None:
-            yield frame, None
-            continue
-        mask, exact = capture.scoring_mask(frame)
-        normals = np.zeros((*capture.size, 3))
-        normals.reshape(-1, 3)[footprint.pixels] = footprint.normals
-        shown = {
-            side: hand.at(frame, side) for side, hand in capture.hands.items() if hand.valid[frame]
-        }
-        camera = capture.cameras.camera(frame, capture.info.width, capture.info.height)
-        yield (
-            frame,
-            Pair(
-                prediction=found.pixels / 255.0,
-                target=capture.frame(frame) / 255.0,
-                region=scored_pixels(mask, erosion=HWP_V1.mask_erosion, coverage=exact),
-                normals=normals,
-                surface=MovingSurface(templates, shown, camera) if shown else None,
-            ),
-        )
-
-
-#: Name of its row, and what it is.
-NAME = "true colours"
-TEXT = "the true frame moved to the given poses: an avatar without an error of its own"
+# --- the score of an avatar without an error of its own at the given poses
 
 
 def surfaces_of(capture: Capture) -> dict[str, HandTemplate]:

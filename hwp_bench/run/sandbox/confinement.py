@@ -1,6 +1,7 @@
-"""The folders of Python that a sandbox shows: the interpreter, its packages, the toolkit.
+"""How far a method's process is confined, and what it finds: environment variables and files.
 
-The list is fixed: another interpreter is shown only where a person names it (`--expose`).
+The list of what is shown is fixed: another interpreter, for example, is shown only where a person
+names it (`--expose`).
 """
 
 from __future__ import annotations
@@ -24,110 +25,14 @@ from hwp_bench.run.sandbox.supervise import SCRATCH, SCRATCH_BYTES, default_limi
 
 #: Files that a project has at its top, next to what nobody needs who imports it.
 _PROJECT_MARKS = ("pyproject.toml", "setup.py", "setup.cfg", ".git")
-
-
-def python_places() -> list[str]:
-    """Return the folders of this interpreter, its packages and the toolkit."""
-    sites = _sites()
-    linked = [path for folder in _linked(sites) for path in package_paths(folder)]
-    return [sys.prefix, sys.base_prefix, *package_paths(os.fspath(PACKAGES)), *sites, *linked]
-
-
-def _sites() -> list[str]:
-    return [*site.getsitepackages(), site.getusersitepackages()]
-
-
-def package_paths(folder: str) -> list[str]:
-    """Return what is shown of a folder on the path: of a project, its packages and modules.
-
-    Methods need nothing else of it, such as tests, runs, history and files with secrets.
-    """
-    real = os.path.realpath(folder)
-    if not any(os.path.exists(os.path.join(real, mark)) for mark in _PROJECT_MARKS):
-        return [folder]
-    packages = [os.path.dirname(path) for path in glob(f"{escape(real)}/*/__init__.py")]
-    modules = [path for end in ("py", "so") for path in glob(f"{escape(real)}/*.{end}")]
-    return packages if _is_checkout(real) else [*packages, *modules]
-
-
-def toolkit_checkout() -> list[str]:
-    """Return the toolkit's checkout, to be hidden where it lies in a folder that is shown."""
-    root = os.path.realpath(PACKAGES)
-    return [root] if _is_checkout(root) else []
-
-
-def _is_checkout(folder: str) -> bool:
-    files = ("hwp_bench/__init__.py", "pyproject.toml")
-    return all(os.path.isfile(os.path.join(folder, file)) for file in files)
-
-
-def _linked(sites: Iterable[str]) -> list[str]:
-    """Return the folders that `.pth` files add, as editable installs do."""
-    files = [path for folder in sites for path in glob(f"{folder}/*.pth")]
-    lines = [line for path in files for line in Path(path).read_text(errors="replace").splitlines()]
-    return [line.strip() for line in lines if os.path.isabs(line) and os.path.isdir(line.strip())]
-
-
 #: Parts of `hwp_bench` that a method may import: all that methods which ship are built from. Any
 #: other stays out of sight; those render, seal, score or rank test frames.
 VISIBLE_PACKAGES = frozenset(
     {"_data", "analysis", "base", "capture", "cli", "hands", "importers", "methods", "metrics"}
-    | {"report", "results", "run", "taxonomy", "tracking"}
+    | {"report", "results", "run", "tracking"}
 )
-
 #: Most folders of a method that are looked into.
 MAX_FOLDERS = 20_000
-
-
-def hidden_packages(folders: Iterable[str]) -> list[str]:
-    """Return the parts of every installed `hwp_bench` that methods do not see."""
-    found = []
-    for folder in folders:
-        above = [
-            folder,
-            os.path.dirname(folder),
-            *glob(f"{escape(folder)}/lib*/python*/*-packages"),
-        ]
-        for place in above:
-            package = os.path.join(place, "hwp_bench")
-            # A name alone would hide somebody else's folder of that name.
-            if os.path.isfile(os.path.join(package, "__init__.py")):
-                found += _parts(package)
-    return list(dict.fromkeys(found))
-
-
-def _parts(package: str) -> list[str]:
-    with os.scandir(package) as entries:
-        return [
-            entry.path
-            for entry in entries
-            # A link would have another place hidden.
-            if entry.is_dir(follow_symlinks=False)
-            and entry.name not in VISIBLE_PACKAGES | {"__pycache__"}
-        ]
-
-
-def foreign_folders(method: Path) -> list[str]:
-    """Return the folders below a method's that do not belong to it: captures and outputs of runs.
-
-    `is_foreign` knows them, as the digest of a method does. Links are not followed; inside walls
-    they lead nowhere.
-    """
-    found = []
-    for seen, (folder, folders, files) in enumerate(os.walk(method)):
-        if seen == MAX_FOLDERS:
-            raise UsageError(
-                f"holds more than {MAX_FOLDERS} folders, too many to tell what is the method's",
-                where=method,
-                remedy="Keep the method in a folder of its own.",
-            )
-        own = folder == os.fspath(method)
-        if not own and is_foreign(folder, files):
-            found.append(folder)
-            folders.clear()
-    return found
-
-
 #: `auto` takes namespaces where the system allows them and says so where it does not; `required`
 #: refuses to run without; `none` leaves the program its user's files and network.
 MODES = ("auto", "required", "none")
@@ -154,7 +59,6 @@ INHERITED_FOLDERS = (
     "TORCH_HOME",
     "XDG_CACHE_HOME",
 )
-
 # Programs and libraries. /usr/local and CUDA's usual places are inside.
 _SYSTEM = ("usr", "bin", "sbin", "lib", "lib32", "lib64", "libx32", "opt", "nix/store", "gnu/store")
 # Of /etc only what programs look up; not, for example, /etc/shadow.
@@ -342,6 +246,9 @@ def _ships(method: Path) -> bool:
     return any(map(real.is_relative_to, (data_folder("baselines"), PACKAGES / "wildghand")))
 
 
+# --- the file system
+
+
 def visible_places(
     *,
     read: Iterable[Path],
@@ -398,3 +305,104 @@ def _resolved(path: str) -> tuple[list[tuple[str, str]], str]:
         else:
             current = candidate
     return links, current
+
+
+# --- the interpreter, its packages, the toolkit
+
+
+def python_places() -> list[str]:
+    """Return the folders of this interpreter, its packages and the toolkit."""
+    sites = _sites()
+    linked = [path for folder in _linked(sites) for path in package_paths(folder)]
+    return [sys.prefix, sys.base_prefix, *package_paths(os.fspath(PACKAGES)), *sites, *linked]
+
+
+def _sites() -> list[str]:
+    return [*site.getsitepackages(), site.getusersitepackages()]
+
+
+def package_paths(folder: str) -> list[str]:
+    """Return what is shown of a folder on the path: of a project, its packages and modules.
+
+    Methods need nothing else of it, such as tests, runs, history and files with secrets.
+    """
+    real = os.path.realpath(folder)
+    if not any(os.path.exists(os.path.join(real, mark)) for mark in _PROJECT_MARKS):
+        return [folder]
+    packages = [os.path.dirname(path) for path in glob(f"{escape(real)}/*/__init__.py")]
+    modules = [path for end in ("py", "so") for path in glob(f"{escape(real)}/*.{end}")]
+    return packages if _is_checkout(real) else [*packages, *modules]
+
+
+def toolkit_checkout() -> list[str]:
+    """Return the toolkit's checkout, to be hidden where it lies in a folder that is shown."""
+    root = os.path.realpath(PACKAGES)
+    return [root] if _is_checkout(root) else []
+
+
+def _is_checkout(folder: str) -> bool:
+    files = ("hwp_bench/__init__.py", "pyproject.toml")
+    return all(os.path.isfile(os.path.join(folder, file)) for file in files)
+
+
+def _linked(sites: Iterable[str]) -> list[str]:
+    """Return the folders that `.pth` files add, as editable installs do."""
+    files = [path for folder in sites for path in glob(f"{folder}/*.pth")]
+    lines = [line for path in files for line in Path(path).read_text(errors="replace").splitlines()]
+    return [line.strip() for line in lines if os.path.isabs(line) and os.path.isdir(line.strip())]
+
+
+# --- what stays out of sight although it lies in a folder that is shown
+
+
+def hidden_packages(folders: Iterable[str]) -> list[str]:
+    """Return the parts of every installed `hwp_bench` that methods do not see.
+
+    The simulator, the scenes and the seeds of the suites are public, so a method that could import
+    them would render the test frames again.
+    """
+    found = []
+    for folder in folders:
+        above = [
+            folder,
+            os.path.dirname(folder),
+            *glob(f"{escape(folder)}/lib*/python*/*-packages"),
+        ]
+        for place in above:
+            package = os.path.join(place, "hwp_bench")
+            # A name alone would hide somebody else's folder of that name.
+            if os.path.isfile(os.path.join(package, "__init__.py")):
+                found += _parts(package)
+    return list(dict.fromkeys(found))
+
+
+def _parts(package: str) -> list[str]:
+    with os.scandir(package) as entries:
+        return [
+            entry.path
+            for entry in entries
+            # A link would have another place hidden.
+            if entry.is_dir(follow_symlinks=False)
+            and entry.name not in VISIBLE_PACKAGES | {"__pycache__"}
+        ]
+
+
+def foreign_folders(method: Path) -> list[str]:
+    """Return the folders below a method's that do not belong to it: captures and outputs of runs.
+
+    They hold true frames. `is_foreign` knows them, as the digest of a method does. Links are not
+    followed; inside walls they lead nowhere.
+    """
+    found = []
+    for seen, (folder, folders, files) in enumerate(os.walk(method)):
+        if seen == MAX_FOLDERS:
+            raise UsageError(
+                f"holds more than {MAX_FOLDERS} folders, too many to tell what is the method's",
+                where=method,
+                remedy="Keep the method in a folder of its own.",
+            )
+        own = folder == os.fspath(method)
+        if not own and is_foreign(folder, files):
+            found.append(folder)
+            folders.clear()
+    return found

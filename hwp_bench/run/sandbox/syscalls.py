@@ -1,6 +1,9 @@
-"""The Linux calls behind a sandbox, through ctypes: namespaces, mounts, capabilities.
+"""The Linux calls behind a sandbox, and those that a program inside it may not make (seccomp).
 
-It imports only the standard library, because every run of a method passes through here.
+Namespaces hide files, processes and the network. What they do not cover is refused by number and
+argument: keys, memory that belongs to no process, set-user-id files, namespaces and mounts of its
+own, sockets of other worlds, and ways around this very list. Only the standard library is
+imported, because every run of a method passes through here.
 """
 
 from __future__ import annotations
@@ -17,18 +20,14 @@ CLONE_NEWIPC = 0x08000000
 CLONE_NEWUSER = 0x10000000
 CLONE_NEWPID = 0x20000000
 CLONE_NEWNET = 0x40000000
-
 MS_NOSUID = 0x2
 MS_NODEV = 0x4
 MS_BIND = 0x1000
 MS_REC = 0x4000
 MS_SLAVE = 0x80000
-
 PR_SET_DUMPABLE = 4
-
 MOUNT_ATTR_RDONLY = 0x1
 MOUNT_ATTR_NOSUID = 0x2
-
 _MNT_DETACH = 2
 _AT_FDCWD = -100
 _AT_RECURSIVE = 0x8000
@@ -44,6 +43,118 @@ _PR_CAPBSET_DROP = 24
 _PR_SET_CHILD_SUBREAPER = 36
 _PR_SET_NO_NEW_PRIVS = 38
 _CAPABILITY_VERSION_3 = 0x20080522
+# Numbers of <asm/unistd.h>: x86_64, and the table that newer architectures share.
+_X86 = {
+    "open": 2,
+    "shmget": 29,
+    "socket": 41,
+    "socketpair": 53,
+    "clone": 56,
+    "msgget": 68,
+    "creat": 85,
+    "chmod": 90,
+    "fchmod": 91,
+    "syslog": 103,
+    "mknod": 133,
+    "sched_setscheduler": 144,
+    "pivot_root": 155,
+    "prctl": 157,
+    "mount": 165,
+    "umount2": 166,
+    "add_key": 248,
+    "request_key": 249,
+    "keyctl": 250,
+    "openat": 257,
+    "mknodat": 259,
+    "fchmodat": 268,
+    "unshare": 272,
+    "perf_event_open": 298,
+    "open_by_handle_at": 304,
+    "setns": 308,
+    "sched_setattr": 314,
+    "memfd_create": 319,
+    "bpf": 321,
+    "userfaultfd": 323,
+}
+_SHARED = {
+    "mknodat": 33,
+    "umount2": 39,
+    "mount": 40,
+    "pivot_root": 41,
+    "fchmod": 52,
+    "fchmodat": 53,
+    "openat": 56,
+    "unshare": 97,
+    "syslog": 116,
+    "sched_setscheduler": 119,
+    "prctl": 167,
+    "msgget": 186,
+    "shmget": 194,
+    "socket": 198,
+    "socketpair": 199,
+    "add_key": 217,
+    "request_key": 218,
+    "keyctl": 219,
+    "clone": 220,
+    "perf_event_open": 241,
+    "open_by_handle_at": 265,
+    "setns": 268,
+    "sched_setattr": 274,
+    "memfd_create": 279,
+    "bpf": 280,
+    "userfaultfd": 282,
+}
+# The same everywhere.
+_NEWER = {
+    "io_uring_setup": 425,
+    "io_uring_enter": 426,
+    "io_uring_register": 427,
+    "open_tree": 428,
+    "move_mount": 429,
+    "fsopen": 430,
+    "fsconfig": 431,
+    "fsmount": 432,
+    "fspick": 433,
+    "clone3": 435,
+    "openat2": 437,
+    "mount_setattr": 442,
+    "memfd_secret": 447,
+    "fchmodat2": 452,
+    "open_tree_attr": 467,
+}
+# <linux/audit.h>, and numbers above which x86_64 has a second table (x32).
+_ARCHITECTURES = {
+    "x86_64": (0xC000003E, _X86),
+    "aarch64": (0xC00000B7, _SHARED),
+    "riscv64": (0xC00000F3, _SHARED),
+}
+_X32 = 0x40000000
+#: Refused whole, as on a kernel that is older, so that programs take another way: keys of the
+#: caller, because namespaces do not cover the session's; memory that stays when no process holds
+#: it; what takes a structure, which a filter cannot look into; rarely used parts of the kernel.
+_NOT_THERE = (
+    *("add_key", "request_key", "keyctl"),
+    *("shmget", "msgget", "memfd_secret"),
+    *("clone3", "openat2", "io_uring_setup", "io_uring_enter", "io_uring_register"),
+    *("userfaultfd", "bpf", "perf_event_open"),
+)
+#: Refused whole: what would change the walls, or take the processor from everything else.
+_FORBIDDEN = (
+    *("mount", "umount2", "pivot_root", "open_tree", "open_tree_attr", "move_mount"),
+    *("fsopen", "fsconfig", "fsmount", "fspick", "mount_setattr"),
+    *("setns", "open_by_handle_at", "syslog"),
+    *("sched_setscheduler", "sched_setattr"),
+)
+_SET_ID = 0o6000
+#: `O_CREAT`, `O_TMPFILE`.
+_CREATES = 0x40 | 0x400000
+#: AF_UNIX, AF_INET, AF_INET6, AF_NETLINK. Others (vsock leads to the host of a virtual machine)
+#: know no network namespaces, or are rarely used parts of the kernel.
+_FAMILIES = (1, 2, 10, 16)
+# Instructions of classic BPF, <linux/bpf_common.h>.
+_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
+_ALLOW, _ERROR = 0x7FFF0000, 0x00050000
+_NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
 
 
 class Refused(OSError):
@@ -163,120 +274,7 @@ def set_filter(program: bytes) -> None:
     _checked(done, "filter of system calls")
 
 
-# Numbers of <asm/unistd.h>: x86_64, and the table that newer architectures share.
-_X86 = {
-    "open": 2,
-    "shmget": 29,
-    "socket": 41,
-    "socketpair": 53,
-    "clone": 56,
-    "msgget": 68,
-    "creat": 85,
-    "chmod": 90,
-    "fchmod": 91,
-    "syslog": 103,
-    "mknod": 133,
-    "sched_setscheduler": 144,
-    "pivot_root": 155,
-    "prctl": 157,
-    "mount": 165,
-    "umount2": 166,
-    "add_key": 248,
-    "request_key": 249,
-    "keyctl": 250,
-    "openat": 257,
-    "mknodat": 259,
-    "fchmodat": 268,
-    "unshare": 272,
-    "perf_event_open": 298,
-    "open_by_handle_at": 304,
-    "setns": 308,
-    "sched_setattr": 314,
-    "memfd_create": 319,
-    "bpf": 321,
-    "userfaultfd": 323,
-}
-_SHARED = {
-    "mknodat": 33,
-    "umount2": 39,
-    "mount": 40,
-    "pivot_root": 41,
-    "fchmod": 52,
-    "fchmodat": 53,
-    "openat": 56,
-    "unshare": 97,
-    "syslog": 116,
-    "sched_setscheduler": 119,
-    "prctl": 167,
-    "msgget": 186,
-    "shmget": 194,
-    "socket": 198,
-    "socketpair": 199,
-    "add_key": 217,
-    "request_key": 218,
-    "keyctl": 219,
-    "clone": 220,
-    "perf_event_open": 241,
-    "open_by_handle_at": 265,
-    "setns": 268,
-    "sched_setattr": 274,
-    "memfd_create": 279,
-    "bpf": 280,
-    "userfaultfd": 282,
-}
-# The same everywhere.
-_NEWER = {
-    "io_uring_setup": 425,
-    "io_uring_enter": 426,
-    "io_uring_register": 427,
-    "open_tree": 428,
-    "move_mount": 429,
-    "fsopen": 430,
-    "fsconfig": 431,
-    "fsmount": 432,
-    "fspick": 433,
-    "clone3": 435,
-    "openat2": 437,
-    "mount_setattr": 442,
-    "memfd_secret": 447,
-    "fchmodat2": 452,
-    "open_tree_attr": 467,
-}
-# <linux/audit.h>, and numbers above which x86_64 has a second table (x32).
-_ARCHITECTURES = {
-    "x86_64": (0xC000003E, _X86),
-    "aarch64": (0xC00000B7, _SHARED),
-    "riscv64": (0xC00000F3, _SHARED),
-}
-_X32 = 0x40000000
-
-#: Refused whole, as on a kernel that is older, so that programs take another way: keys of the
-#: caller, because namespaces do not cover the session's; memory that stays when no process holds
-#: it; what takes a structure, which a filter cannot look into; rarely used parts of the kernel.
-_NOT_THERE = (
-    *("add_key", "request_key", "keyctl"),
-    *("shmget", "msgget", "memfd_secret"),
-    *("clone3", "openat2", "io_uring_setup", "io_uring_enter", "io_uring_register"),
-    *("userfaultfd", "bpf", "perf_event_open"),
-)
-#: Refused whole: what would change the walls, or take the processor from everything else.
-_FORBIDDEN = (
-    *("mount", "umount2", "pivot_root", "open_tree", "open_tree_attr", "move_mount"),
-    *("fsopen", "fsconfig", "fsmount", "fspick", "mount_setattr"),
-    *("setns", "open_by_handle_at", "syslog"),
-    *("sched_setscheduler", "sched_setattr"),
-)
-_SET_ID = 0o6000
-#: `O_CREAT`, `O_TMPFILE`.
-_CREATES = 0x40 | 0x400000
-#: AF_UNIX, AF_INET, AF_INET6, AF_NETLINK. Others (vsock leads to the host of a virtual machine)
-#: know no network namespaces, or are rarely used parts of the kernel.
-_FAMILIES = (1, 2, 10, 16)
-
-# Instructions of classic BPF, <linux/bpf_common.h>.
-_LOAD, _EQUAL, _AT_LEAST, _ANY_BIT, _RETURN = 0x20, 0x15, 0x35, 0x45, 0x06
-_ALLOW, _ERROR = 0x7FFF0000, 0x00050000
-_NUMBER_AT, _ARCHITECTURE_AT, _ARGUMENTS_AT = 0, 4, 16
+# --- the filter of system calls
 
 
 @dataclass(frozen=True)
