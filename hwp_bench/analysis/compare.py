@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.analysis.bootstrap import RESAMPLES, Estimate, bootstrap_mean
-from hwp_bench.analysis.columns import score_column, table_of
+from hwp_bench.analysis.columns import Filled, score_column, table_of
 from hwp_bench.analysis.pairing import (
     MACRO,
     MethodRuns,
@@ -414,7 +414,7 @@ def estimate_cells(estimate: Estimate) -> tuple[float | None, ...]:
 def standings_table(metric: str, found: Sequence[Standing]) -> Table:
     """Return one row a method, best first."""
     facts = metric_facts(metric)
-    columns = [
+    columns: list[Filled] = [
         (Column("Method"), [one.label for one in found]),
         (score_column(metric), [one.mean for one in found]),
         (Column("Ties"), [one.ties for one in found]),
@@ -432,7 +432,7 @@ def differences_table(metric: str, found: Sequence[Difference]) -> Table:
     """Return one row a pair and scope."""
     facts = metric_facts(metric)
     estimates = [item.estimate for item in found]
-    columns = [
+    columns: list[Filled] = [
         (Column("First"), [item.first for item in found]),
         (Column("Second"), [item.second for item in found]),
         (Column("Scope"), [scope_title(item.scope) for item in found]),

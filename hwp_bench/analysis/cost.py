@@ -277,12 +277,12 @@ def _cost_table(
         columns.append((head, [cost.area for cost in costs]))
     if reference is not None:
         reach = [cost.to_reference for cost in costs]
-        seconds = [one and one.seconds for one in reach]
+        seconds = [one.seconds if one else None for one in reach]
         columns += [
             (Column(f"To final of {reference}", 1, False, "Seconds"), seconds),
             (
                 Column("Fits that get there"),
-                [one and f"{one.reached} of {one.fits}" for one in reach],
+                [f"{one.reached} of {one.fits}" if one else None for one in reach],
             ),
         ]
     for step in costs[0].to_own:
@@ -302,7 +302,7 @@ def _cost_table(
 
 
 def _times_table(costs: Sequence[MethodCost]) -> Table:
-    columns = [
+    columns: list[Filled] = [
         (Column("Method"), [cost.label for cost in costs]),
         (Column("Fit [s]", 1), [cost.fit_seconds for cost in costs]),
         (Column("On one core [s]", 1), [cost.cpu_seconds for cost in costs]),
@@ -324,7 +324,7 @@ def _times_table(costs: Sequence[MethodCost]) -> Table:
 
 def _front_table(front: Sequence[FrontPart], metric: str) -> Table:
     digits, score = metric_facts(metric).digits, score_title(metric)
-    columns = [
+    columns: list[Filled] = [
         (Column("Best so far"), [part.label for part in front]),
         (Column("From [s]", 1), [part.start for part in front]),
         (Column("To [s]", 1), [part.stop for part in front]),
@@ -382,7 +382,7 @@ def seconds_table(runs: Sequence[MethodRuns]) -> Table | None:
         return None
     sums = [sum(parts[name] for parts in known) for name in PARTS]
     spent = [*sums, whole]
-    columns = [
+    columns: list[Filled] = [
         (Column("Part"), [*PARTS, "sum"]),
         (Column("Mean of a run [s]", 2), [seconds / len(known) for seconds in spent]),
         (Column("All runs [s]", 1), spent),

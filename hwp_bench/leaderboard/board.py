@@ -9,7 +9,7 @@ from typing import Any
 
 from markupsafe import Markup
 
-from hwp_bench.analysis.columns import score_column, table_of
+from hwp_bench.analysis.columns import Filled, score_column, table_of
 from hwp_bench.analysis.compare import Rank, compare, rank_methods, verdict
 from hwp_bench.analysis.cost import analyse_cost
 from hwp_bench.analysis.pairing import MACRO, group_runs, same_but_seed
@@ -383,10 +383,10 @@ def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
         ),
     )
     found = [ranks.get(row.name) for row in order]
-    columns = [
+    columns: list[Filled] = [
         (Column("Method"), [row.title for row in order]),
-        (Column("Rank", 0, group="Rank"), [rank and rank.rank for rank in found]),
-        (Column("95 %", group="Rank"), [rank and rank.interval for rank in found]),
+        (Column("Rank", 0, group="Rank"), [rank.rank if rank else None for rank in found]),
+        (Column("95 %", group="Rank"), [rank.interval if rank else None for rank in found]),
         *((score_column(name), [row.scores[name] for row in order]) for name in HEADLINE),
         (Column("Fit [s]", 1), [row.fit_seconds for row in order]),
         (Column("Seeds", 0), [len(row.seeds) for row in order]),

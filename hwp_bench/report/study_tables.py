@@ -35,14 +35,20 @@ def rank_table(runs: Sequence[MethodRuns]) -> Table:
     ranks = ranking.ranks
     behind = [item.behind for item in ranks]
     less = "Less the first"
-    columns = [
+    columns: list[Filled] = [
         (Column("Method"), [item.standing.label for item in ranks]),
         (Column("Rank", 0, group="Rank"), [item.rank for item in ranks]),
         (Column("95 %", group="Rank"), [item.interval for item in ranks]),
         (score_column(METRIC), [item.standing.mean for item in ranks]),
-        (Column("Difference", facts.digits, group=less), [lead and lead.value for lead in behind]),
-        (Column("Low", facts.digits, group=less), [lead and lead.low for lead in behind]),
-        (Column("High", facts.digits, group=less), [lead and lead.high for lead in behind]),
+        (
+            Column("Difference", facts.digits, group=less),
+            [b.value if b else None for b in behind],
+        ),
+        (Column("Low", facts.digits, group=less), [b.low if b else None for b in behind]),
+        (
+            Column("High", facts.digits, group=less),
+            [b.high if b else None for b in behind],
+        ),
         (Column("Ties"), [item.standing.ties for item in ranks]),
     ]
     for name in others:
@@ -236,8 +242,8 @@ def severity_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capt
         (Column("Method"), [title for _, _, title, _ in shown]),
     ]
     for place, name in enumerate(names):
-        means = [float(np.mean(scores, axis=0)[place]) for _, _, _, scores in shown]
-        columns.append((score_column(name), means))
+        over = [float(np.mean(scores, axis=0)[place]) for _, _, _, scores in shown]
+        columns.append((score_column(name), over))
     note = (
         "Severity: mean over the frames to learn from that show the perturbation, rounded. The "
         "test frames that are scored show none."

@@ -63,7 +63,7 @@ def overall_table(
         metrics: which metrics; those that an evaluation lacks are left out.
     """
     table = mean_table(results, groups, metrics)
-    costs = [
+    costs: list[Filled] = [
         (Column("Fit [s]", 1, group="Cost"), [_fit_seconds(result) for result in results]),
         (
             Column("Render [frames/s]", 1, group="Cost"),
