@@ -23,8 +23,7 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.results import CaptureResult, Results
-from hwp_bench.results.bounds import per_second
-from hwp_bench.results.walls import walls_note
+from hwp_bench.results.schema import isolation_note, per_second
 
 #: Fixed budgets, s.
 BUDGETS = (5.0, 15.0, 60.0, 300.0)
@@ -346,7 +345,7 @@ def machine_notes(results: Sequence[Results]) -> list[str]:
     notes = [f"Machine: {'; '.join(sorted(machines))}."]
     if len(machines) > 1 or len(devices - {None}) > 1:
         notes.append("Taken on different machines or devices: the seconds do not compare.")
-    walls = walls_note(results)
+    walls = isolation_note(results)
     return [*notes, walls] if walls else notes
 
 

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from hwp_bench.base.console import JobsView
     from hwp_bench.capture.splits import Split
     from hwp_bench.evaluation.ablate.runs import AblationRuns
-    from hwp_bench.evaluation.budget.runs import BudgetRuns
+    from hwp_bench.evaluation.budget.budget import BudgetRuns
     from hwp_bench.evaluation.evaluate import EvaluationSettings, OnCapture
     from hwp_bench.methods.manifest import MethodManifest
     from hwp_bench.publish import SealedPart
@@ -177,7 +177,7 @@ def _running(
     Whatever is wrong with the call is reported before a suite is rendered for it.
     """
     from hwp_bench.base.console import JobsView
-    from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
+    from hwp_bench.evaluation.evaluate import check_call, check_results_place, check_suite
     from hwp_bench.run.engine.options import engine_for, needs_of
     from hwp_bench.sim import ensure_suite
 
@@ -226,7 +226,7 @@ def _sealed_part(args: argparse.Namespace) -> SealedPart | None:
 def report_outcome(out: Path, results: Results) -> int:
     """Print where the results are and which frames failed; returns the exit status."""
     from hwp_bench.base.console import notice
-    from hwp_bench.evaluation.outcome import outcome_lines
+    from hwp_bench.evaluation.sentences import outcome_lines
 
     for line in outcome_lines(out, results):
         notice(line)
@@ -339,10 +339,8 @@ def do_ablate(args: argparse.Namespace) -> int:
     """Run `ablate`."""
     from hwp_bench.base.console import notice
     from hwp_bench.base.errors import UsageError
-    from hwp_bench.evaluation.ablate.design import make_design
-    from hwp_bench.evaluation.ablate.runs import run_ablation
-    from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.methods.setting_files import check_settings
+    from hwp_bench.evaluation.ablate.runs import make_design, run_ablation
+    from hwp_bench.methods.manifest import check_settings, find_method, read_manifest
 
     if not 1 <= args.seeds <= 100:
         raise UsageError(f"{args.seeds} is not between 1 and 100", field="--seeds")
@@ -374,22 +372,23 @@ def _report_ablate(ablation: AblationRuns, out: Path, *, as_json: bool) -> int:
     from hwp_bench.analysis.pairing import common_metrics
     from hwp_bench.base.console import notice
     from hwp_bench.base.tables import print_table, write_tables
-    from hwp_bench.evaluation.ablate.ablation_tables import (
+    from hwp_bench.evaluation.ablate.effects import (
         ablation_record,
         ablation_tables,
+        cost_effects,
+        score_effects,
         write_record,
     )
-    from hwp_bench.evaluation.ablate.effects import cost_effects, score_effects
     from hwp_bench.evaluation.ablate.runs import result_folder
-    from hwp_bench.evaluation.outcome import outcome_lines
+    from hwp_bench.evaluation.sentences import outcome_lines
     from hwp_bench.report.tables import HEADLINE
-    from hwp_bench.results.walls import noted
+    from hwp_bench.results.schema import add_isolation_note
 
     metrics = common_metrics(list(ablation.runs.values()), HEADLINE)
     effects = score_effects(ablation, metrics)
     costs = cost_effects(ablation)
     found = ablation_tables(ablation, effects, costs)
-    tables = {name: noted(table, ablation.results) for name, table in found.items()}
+    tables = {name: add_isolation_note(table, ablation.results) for name, table in found.items()}
     record = ablation_record(ablation, effects, costs, tables)
     write_tables(out / "tables", tables)
     if as_json:
@@ -458,14 +457,14 @@ def add_budget(parser: argparse.ArgumentParser) -> None:
 def do_budget(args: argparse.Namespace) -> int:
     """Run `budget`."""
     from hwp_bench.base.console import notice
-    from hwp_bench.evaluation.budget.runs import check_truths, run_budget
+    from hwp_bench.evaluation.budget.budget import check_oracle_inputs, run_budget
     from hwp_bench.methods.manifest import find_method, read_manifest
-    from hwp_bench.methods.material import TRUTHS
+    from hwp_bench.methods.request import ORACLE_INPUTS
 
     settings = evaluation_settings(args)
     manifest = read_manifest(find_method(args.method))
-    truths = tuple(TRUTHS) if args.truths is None else args.truths
-    check_truths(truths, settings)
+    truths = tuple(ORACLE_INPUTS) if args.truths is None else args.truths
+    check_oracle_inputs(truths, settings)
     out = Path(args.out or f"runs/budget-{manifest.name}-{settings.suite}")
     splits = splits_of(args)
     with _running(args, manifest, settings, out, splits) as (captures, jobs, options):
@@ -483,14 +482,21 @@ def _report_budget(runs: BudgetRuns, out: Path, *, as_json: bool) -> int:
     from hwp_bench.base.files import write_json
     from hwp_bench.base.images import write_image
     from hwp_bench.base.tables import print_table, write_tables
-    from hwp_bench.evaluation.budget.budget import budget_tables, make_budget, next_work
-    from hwp_bench.evaluation.budget.picture import budget_sheet
-    from hwp_bench.evaluation.outcome import outcome_lines
-    from hwp_bench.results.walls import noted
+    from hwp_bench.evaluation.budget.budget import (
+        budget_sheet,
+        budget_tables,
+        make_budget,
+        next_work,
+    )
+    from hwp_bench.evaluation.sentences import outcome_lines
+    from hwp_bench.results.schema import add_isolation_note
 
     budget = make_budget(runs)
     evaluations = list(runs.results.values())
-    tables = {name: noted(table, evaluations) for name, table in budget_tables(budget).items()}
+    tables = {
+        name: add_isolation_note(table, evaluations)
+        for name, table in budget_tables(budget).items()
+    }
     write_tables(out / "tables", tables)
     record = write_json(out / "budget.json", budget.to_json())
     picture = write_image(out / "budget.png", budget_sheet(runs, budget))
@@ -543,9 +549,14 @@ def do_demo(args: argparse.Namespace) -> int:
     from hwp_bench.base.console import JobsView, notice
     from hwp_bench.base.tables import Column, Table, print_table, write_tables
     from hwp_bench.capture import open_capture
-    from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
-    from hwp_bench.evaluation.foresight import check_call, check_results_place, check_suite
-    from hwp_bench.evaluation.side_by_side import write_side_by_side
+    from hwp_bench.evaluation.artifacts import write_side_by_side
+    from hwp_bench.evaluation.evaluate import (
+        EvaluationSettings,
+        check_call,
+        check_results_place,
+        check_suite,
+        evaluate,
+    )
     from hwp_bench.methods import find_method, read_manifest
     from hwp_bench.report.sources import ResultsSource
     from hwp_bench.report.tables import all_tables

@@ -156,7 +156,7 @@ def do_compare(args: argparse.Namespace) -> int:
     from hwp_bench.base.tables import format_table, print_table
     from hwp_bench.report.tables import HEADLINE
     from hwp_bench.results import read_all
-    from hwp_bench.results.walls import noted
+    from hwp_bench.results.schema import add_isolation_note
 
     results = read_all(args.results)
     comparison = compare_results(
@@ -170,7 +170,7 @@ def do_compare(args: argparse.Namespace) -> int:
         print_json(comparison.as_dict())
         return 0
     for plain in comparison.tables():
-        table = noted(plain, results)
+        table = add_isolation_note(plain, results)
         if args.format == "terminal":
             print_table(table)
         else:

@@ -16,7 +16,7 @@ from hwp_bench.analysis.pairing import MACRO, group_runs, same_but_seed
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.tables import Column, Table
 from hwp_bench.capture.splits import split_for
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.entries import BADGES, LEVELS, Entry
 from hwp_bench.leaderboard.rules import HEADLINE, current, source_of, tables_of, takes_over
 from hwp_bench.leaderboard.suite_data import on_current_data
@@ -94,7 +94,7 @@ class BoardRow:
     @property
     def whole(self) -> bool:
         """Whether no capture or test frame of the suite is missing."""
-        return not missing(self.first)
+        return not find_missing(self.first)
 
     @property
     def scores(self) -> Mapping[str, float]:
@@ -142,7 +142,7 @@ class BoardRow:
                 return f"replaced: {other.submission.reason}"
         if LEVELS.index(entry.level) < LEVELS.index(self.level):
             return "checked less far than the row"
-        return "lacks a part of the suite" if missing(entry.results) else "older than the row"
+        return "lacks a part of the suite" if find_missing(entry.results) else "older than the row"
 
 
 def board_rows(entries: Iterable[Entry]) -> list[BoardRow]:
@@ -156,7 +156,7 @@ def board_rows(entries: Iterable[Entry]) -> list[BoardRow]:
     for entry in entries:
         key: object = (same_but_seed(entry.results), entry.submission.by, entry.level)
         seeds = {other.results.seed for other in groups.get(key, [])}
-        if missing(entry.results) or entry.results.seed in seeds:
+        if find_missing(entry.results) or entry.results.seed in seeds:
             key = entry.name
         groups.setdefault(key, []).append(entry)
     return [

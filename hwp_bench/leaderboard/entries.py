@@ -16,7 +16,7 @@ from hwp_bench.base.files import atomic_write, read_json, sha256_json
 from hwp_bench.base.packages import PACKAGES
 from hwp_bench.base.records import Count, Digest, Line, number, parse_record, without_schema
 from hwp_bench.results import Results
-from hwp_bench.results.bounds import MAX_CAPTURES, ScoreTable, check_scores
+from hwp_bench.results.schema import MAX_CAPTURES, ScoreTable, check_scores
 
 #: Version of the entry files. `submission` was added within it and may be missing.
 ENTRY_SCHEMA = "hwp-leaderboard-entry/1"

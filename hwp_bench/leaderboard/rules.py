@@ -16,7 +16,7 @@ from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.files import read_json, write_json
 from hwp_bench.base.packages import data_folder
 from hwp_bench.base.records import Digest, Line, parse_record, without_schema
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.entries import LEVELS, Entry
 from hwp_bench.leaderboard.suite_data import on_current_data
 from hwp_bench.methods.manifest import shipped_methods
@@ -98,7 +98,7 @@ def history(entry: Entry, entries: Sequence[Entry]) -> list[Entry]:
 
 def check_complete(entry: Entry) -> None:
     """Refuse an entry that lacks a part of its suite."""
-    if problems := missing(entry.results):
+    if problems := find_missing(entry.results):
         raise BadResult(
             "; ".join(problems),
             where=entry.name,
@@ -173,7 +173,7 @@ def off_the_data(entries: Sequence[Entry]) -> list[tuple[Entry, str]]:
     whole suite; among these, of the most entries; among these, of the first. So an entry that
     nobody checked does not push out those that stand.
     """
-    whole = {entry.name: not missing(entry.results) for entry in entries}
+    whole = {entry.name: not find_missing(entry.results) for entry in entries}
     votes: dict[str, dict[tuple[Any, ...], list[Entry]]] = {}
     for entry in entries:
         for c in on_current_data(entry.results).captures:

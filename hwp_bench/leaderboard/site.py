@@ -18,8 +18,8 @@ from hwp_bench.base.drawing import error_map, fitted
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, canonical_json, sha256_json
 from hwp_bench.capture import Capture
+from hwp_bench.evaluation.artifacts import square_around
 from hwp_bench.evaluation.scoring import read_prediction
-from hwp_bench.evaluation.side_by_side import square_around
 from hwp_bench.leaderboard.board import (
     SCOPES,
     BoardRow,

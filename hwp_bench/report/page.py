@@ -59,7 +59,7 @@ from hwp_bench.report.study_tables import (
 )
 from hwp_bench.report.tables import all_tables, free_view_table, same_data
 from hwp_bench.results import Results
-from hwp_bench.results.walls import noted
+from hwp_bench.results.schema import add_isolation_note
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 if TYPE_CHECKING:
@@ -400,11 +400,13 @@ def gather_report(
     return ReportPage(
         summary=summary_sentence(runs),
         methods=list(order),
-        tables=[noted(table, results) for table in shown if len(table.columns) > 1],
+        tables=[add_isolation_note(table, results) for table in shown if len(table.columns) > 1],
         pareto=_pareto(cost, order) if cost else None,
-        cost_tables=[noted(table, results) for table in cost.tables.values()] if cost else [],
+        cost_tables=[add_isolation_note(table, results) for table in cost.tables.values()]
+        if cost
+        else [],
         bars=_bars(runs),
-        differences=[noted(table, results) for table in _differences(runs)],
+        differences=[add_isolation_note(table, results) for table in _differences(runs)],
         captures=_captures(
             chosen, runs, infos, album, _by_label(avatar_pages or {}, sources, runs)
         ),

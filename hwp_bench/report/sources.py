@@ -21,7 +21,7 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.reader import digest_at
 from hwp_bench.capture.schema import CaptureInfo, frame_name
 from hwp_bench.results import CaptureResult, Results, results_among
-from hwp_bench.results.bounds import MAX_FRAMES
+from hwp_bench.results.schema import MAX_FRAMES
 from hwp_bench.results.store import read_unchanged
 
 #: Largest file of temporal weights that is read, bytes.

@@ -15,9 +15,13 @@ from hwp_bench.base.tables import Cell, Column, Table
 from hwp_bench.metrics import HWP_V1, METRICS, Protocol
 from hwp_bench.metrics.score import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import CaptureResult, FreeViewResult, Results
-from hwp_bench.results.bounds import per_second
-from hwp_bench.results.schema import differing_makers, differing_settings, score_rows
-from hwp_bench.results.walls import noted
+from hwp_bench.results.schema import (
+    add_isolation_note,
+    differing_makers,
+    differing_settings,
+    per_second,
+    score_rows,
+)
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: Metrics of the headline tables, where an evaluation has them.
@@ -51,7 +55,7 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
         "micro": mean_table(results, {"All frames": [m.overall.micro for m in means]}, HEADLINE),
         "paper": mean_table(results, groups, PAPER, _PAPER_NOTE),
     }
-    return {name: noted(table, results) for name, table in tables.items()}
+    return {name: add_isolation_note(table, results) for name, table in tables.items()}
 
 
 def overall_table(
@@ -323,7 +327,7 @@ _RESAMPLES = 2000
 def free_view_tables(results: Sequence[Results]) -> dict[str, Table]:
     """Return the table by its name; empty where no result has scores of a clip."""
     scored = any(item.free_view for result in results for item in result.captures)
-    return {NAME: noted(free_view_table(results), results)} if scored else {}
+    return {NAME: add_isolation_note(free_view_table(results), results)} if scored else {}
 
 
 def free_view_table(results: Sequence[Results]) -> Table:

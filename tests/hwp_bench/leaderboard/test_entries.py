@@ -16,7 +16,7 @@ from made_entries import OTHER_SCORES, complete_results, with_keys
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.packages import data_folder
 from hwp_bench.cli.main import main
-from hwp_bench.evaluation.completeness import missing
+from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.entries import (
     BADGES,
     LEVELS,
@@ -331,7 +331,7 @@ def test_no_entry_differs_from_the_branch_that_a_pull_request_goes_to(tmp_path: 
 def test_an_incomplete_row_is_found() -> None:
     """Oracle: what was taken away."""
     whole = complete_results()
-    assert missing(whole) == []
+    assert find_missing(whole) == []
     first, second = whole.captures
     few = replace(first, frames=first.frames[1:])
     alien = replace(second, id="capture99")
