@@ -228,6 +228,7 @@ def write_method_pages(
             avatars=_avatars(folder, page),
             facts=[_made_with(row) for row in page.rows],
             budget_text=budget_text,
+            why_older=BoardRow.why_older,
         )
         (folder / page.path).write_text(html, encoding="utf-8")
 

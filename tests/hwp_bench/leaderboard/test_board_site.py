@@ -348,7 +348,7 @@ def test_each_row_is_shown_once_and_each_suite_has_its_own_captures(
     captures = {sha256_json(one.info.to_json()): one for one in (small, large)}
     monkeypatch.setattr("hwp_bench.leaderboard.site.open_captures_of", lambda results: captures)
     # One capture is a whole suite here.
-    monkeypatch.setattr("hwp_bench.leaderboard.board.missing", lambda results: [])
+    monkeypatch.setattr("hwp_bench.leaderboard.board.find_missing", lambda results: [])
     sources = [
         entry_of(tmp_path / "better", small, "Mine", gain=0.9, seed=1),
         entry_of(tmp_path / "first", small, "Mine", gain=0.9, seed=0),
