@@ -137,15 +137,7 @@ def _draws(
 
 
 def _read(value: float, error: float, freedom: float, skew: float, captures: int) -> Estimate:
-    """Read the value and the standard deviation of the resamples.
-
-    Args:
-        value: the mean.
-        error: standard deviation of the resamples.
-        freedom: degrees of freedom behind it.
-        skew: skewness of the mean.
-        captures: how many it rests on.
-    """
+    """Read the value and the standard deviation of the resamples."""
     # What `scipy.stats.t` calls, without its checks, which take a hundred times as long.
     from scipy.special import stdtr, stdtrit
 

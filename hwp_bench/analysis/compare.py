@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from hwp_bench.analysis.bootstrap import RESAMPLES, Estimate, bootstrap_mean
+from hwp_bench.analysis.columns import Filled, score_column, table_of
 from hwp_bench.analysis.pairing import (
     MACRO,
     MethodRuns,
@@ -80,13 +81,7 @@ def compare(
 
     Args:
         runs: at least two methods.
-        metric: a metric that all have.
-        resamples: of each interval.
-        seed: of the resampling.
         scope: the only scope that is wanted; None takes all.
-
-    Raises:
-        UsageError: two methods have no seed in common.
     """
     differences: list[Difference] = []
     for first, second in combinations(runs, 2):
@@ -139,8 +134,6 @@ def standings(
     """Return the methods, best first, with their tie groups.
 
     Args:
-        runs: the methods.
-        metric: the metric of `differences`.
         differences: what `compare` found; pairs with an adjusted p below `ALPHA` in the macro
             scope differ significantly.
     """
@@ -175,6 +168,11 @@ def macro_by_seed(run: MethodRuns, metric: str) -> np.ndarray:
         for capture, weight in weights.items()
     ]
     return np.sum(means, axis=0) / total
+
+
+def macro_mean(run: MethodRuns, metric: str) -> float:
+    """Return the macro mean, averaged over seeds."""
+    return float(macro_by_seed(run, metric).mean())
 
 
 def holm(p_values: Sequence[float]) -> list[float]:
@@ -251,6 +249,11 @@ class Rank:
     #: This method less the leader; None for the leader itself.
     behind: Estimate | None
 
+    @property
+    def interval(self) -> str:
+        """The ranks that the data allow in words: `1`, or `1 to 3`."""
+        return f"{self.best}" if self.best == self.worst else f"{self.best} to {self.worst}"
+
 
 @dataclass(frozen=True)
 class Ranking:
@@ -276,19 +279,6 @@ def rank_methods(
     chose it. (A wrong claim needs that some method beats the truly best one in a test at
     `ALPHA` / (m - 1); there are m - 1 such tests.) The tie groups speak of all pairs at once and
     claim less.
-
-    Args:
-        runs: the methods, which must have passed `statistics.pairing.refuse_unlike`.
-        metric: a metric that all have.
-        resamples: of each interval.
-        seed: of the resampling.
-
-    Raises:
-        UsageError: two methods have no seed in common.
-
-    Source: Mogstad, Romano, Shaikh and Wilhelm, Inference for ranks with applications to mobility
-    across neighbourhoods and academic achievement across countries, Review of Economic Studies
-    91(1), 2024 (marginal confidence sets: the pairs of one population), in a single step.
     """
     differences = compare(runs, metric, resamples=resamples, seed=seed, scope=MACRO)
     order = standings(runs, metric, differences)
@@ -424,50 +414,38 @@ def estimate_cells(estimate: Estimate) -> tuple[float | None, ...]:
 def standings_table(metric: str, found: Sequence[Standing]) -> Table:
     """Return one row a method, best first."""
     facts = metric_facts(metric)
-    title = f"{facts.label} [{facts.unit}]" if facts.unit else facts.label
-    columns = (
-        Column("Method"),
-        Column(title, facts.digits, facts.higher_is_better),
-        Column("Ties"),
-        Column("Seeds", 0),
-        Column("Spread over seeds", facts.digits + 1),
-    )
-    rows = tuple((s.label, s.mean, s.ties, s.seeds, s.seed_deviation) for s in found)
+    columns: list[Filled] = [
+        (Column("Method"), [one.label for one in found]),
+        (score_column(metric), [one.mean for one in found]),
+        (Column("Ties"), [one.ties for one in found]),
+        (Column("Seeds", 0), [one.seeds for one in found]),
+        (Column("Spread over seeds", facts.digits + 1), [one.seed_deviation for one in found]),
+    ]
     note = (
         "Macro mean. Methods that share a letter do not differ significantly (Holm over the "
         "pairs, 5 %); the spread is the standard deviation of the mean over seeds."
     )
-    return Table(f"{facts.label}: methods", columns, rows, (note,))
+    return table_of(f"{facts.label}: methods", columns, [note])
 
 
 def differences_table(metric: str, found: Sequence[Difference]) -> Table:
     """Return one row a pair and scope."""
     facts = metric_facts(metric)
-    columns = (
-        Column("First"),
-        Column("Second"),
-        Column("Scope"),
-        Column("Captures", 0),
-        *estimate_columns(metric),
-        Column("P(first better)", 3),
-        Column("p", 4),
-        Column("p (Holm)", 4),
-        Column("Detectable", facts.digits),
-    )
-    rows = tuple(
-        (
-            item.first,
-            item.second,
-            scope_title(item.scope),
-            item.estimate.captures,
-            *estimate_cells(item.estimate),
-            item.better,
-            item.estimate.p,
-            item.p_adjusted,
-            item.estimate.detectable,
-        )
-        for item in found
-    )
+    estimates = [item.estimate for item in found]
+    columns: list[Filled] = [
+        (Column("First"), [item.first for item in found]),
+        (Column("Second"), [item.second for item in found]),
+        (Column("Scope"), [scope_title(item.scope) for item in found]),
+        (Column("Captures", 0), [one.captures for one in estimates]),
+        *(
+            (head, [estimate_cells(one)[place] for one in estimates])
+            for place, head in enumerate(estimate_columns(metric))
+        ),
+        (Column("P(first better)", 3), [item.better for item in found]),
+        (Column("p", 4), [one.p for one in estimates]),
+        (Column("p (Holm)", 4), [item.p_adjusted for item in found]),
+        (Column("Detectable", facts.digits), [one.detectable for one in estimates]),
+    ]
     direction = "above" if facts.higher_is_better else "below"
     notes = [
         f"First less second; {direction} 0 the first is better. {_INTERVAL}",
@@ -476,7 +454,7 @@ def differences_table(metric: str, found: Sequence[Difference]) -> Table:
     ]
     if any(item.estimate.captures == 1 for item in found):
         notes.append(ONE_CAPTURE)
-    return Table(f"{facts.label}: differences", columns, rows, tuple(notes))
+    return table_of(f"{facts.label}: differences", columns, notes)
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from hwp_bench.analysis.columns import Filled, score_title, table_of
 from hwp_bench.analysis.curves import (
     Curve,
     FrontPart,
@@ -19,7 +20,7 @@ from hwp_bench.analysis.curves import (
 )
 from hwp_bench.analysis.pairing import MethodRuns, refuse_unlike
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.tables import Cell, Column, Table
+from hwp_bench.base.tables import Column, Table
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.schema import isolation_note, per_second
@@ -85,6 +86,21 @@ class MethodCost:
     def frames_per_second(self) -> float | None:
         """Frames rendered in a second."""
         return per_second(1, self.render_seconds)
+
+    @property
+    def render_ms(self) -> float | None:
+        """Milliseconds to render one frame."""
+        return 1000 * self.render_seconds if self.render_seconds else None
+
+    @property
+    def step_ms(self) -> float | None:
+        """Milliseconds of a step."""
+        return 1000 * self.fit_seconds / self.steps if self.fit_seconds and self.steps else None
+
+    @property
+    def peak_gb(self) -> float | None:
+        """Largest peak memory, GB."""
+        return self.peak_memory / 1e9 if self.peak_memory else None
 
 
 def method_curves(run: MethodRuns, metric: str) -> dict[str, list[Curve]]:
@@ -218,8 +234,6 @@ PARTS: Mapping[str, str] = {
     "score": "the benchmark copies the request, checks, scores, draws images",
 }
 
-_GB = 1e9
-
 
 def cost_tables(
     costs: Sequence[MethodCost],
@@ -233,12 +247,7 @@ def cost_tables(
     """Return the tables by name: `cost`, `times`, `front`.
 
     Args:
-        costs: what `method_costs` returned.
-        front: what `pareto_front` returned.
-        metric: the metric of the scores.
         reference: label of the method whose final score is a target; None without one.
-        stretch: what `window` returned.
-        notes: further lines under the first table.
     """
     return {
         "cost": _cost_table(costs, metric, reference, stretch, notes),
@@ -256,29 +265,28 @@ def _cost_table(
 ) -> Table:
     facts = metric_facts(metric)
     better = facts.higher_is_better
-    score = f"{facts.label} [{facts.unit}]" if facts.unit else facts.label
-    columns = [Column("Method")]
-    budgets = list(costs[0].at)
-    columns += [
-        Column(f"{budget:g} s", facts.digits, better, f"{score} after") for budget in budgets
-    ]
-    columns += [Column("Final", facts.digits, better, score)]
+    score = score_title(metric)
+    columns: list[Filled] = [(Column("Method"), [cost.label for cost in costs])]
+    for budget in costs[0].at:
+        head = Column(f"{budget:g} s", facts.digits, better, f"{score} after")
+        columns.append((head, [cost.at[budget] for cost in costs]))
+    columns.append((Column("Final", facts.digits, better, score), [cost.final for cost in costs]))
     if stretch:
-        columns.append(Column("Mean over log time", facts.digits, better, score))
+        head = Column("Mean over log time", facts.digits, better, score)
+        columns.append((head, [cost.area for cost in costs]))
     if reference is not None:
-        columns.append(Column(f"To final of {reference}", 1, False, "Seconds"))
-        columns.append(Column("Fits that get there"))
-    near = list(costs[0].to_own)
-    columns += [Column(f"To own final within {step:g} dB", 1, False, "Seconds") for step in near]
-    rows = []
-    for cost in costs:
-        row: list[Cell] = [cost.label, *(cost.at[budget] for budget in budgets), cost.final]
-        if stretch:
-            row.append(cost.area)
-        if reference is not None:
-            row += _reach_cells(cost.to_reference)
-        row += [cost.to_own[step].seconds for step in near]
-        rows.append(tuple(row))
+        reach = [cost.to_reference for cost in costs]
+        seconds = [one.seconds if one else None for one in reach]
+        columns += [
+            (Column(f"To final of {reference}", 1, False, "Seconds"), seconds),
+            (
+                Column("Fits that get there"),
+                [f"{one.reached} of {one.fits}" if one else None for one in reach],
+            ),
+        ]
+    for step in costs[0].to_own:
+        head = Column(f"To own final within {step:g} dB", 1, False, "Seconds")
+        columns.append((head, [cost.to_own[step].seconds for cost in costs]))
     text = [
         "Scores on validation frames, outside the method's clock; means over captures and seeds, "
         "linear in the log of time between checkpoints. A fit that has ended keeps its score.",
@@ -289,62 +297,41 @@ def _cost_table(
     lost = [f"{cost.label}: {cost.fits - cost.curves}" for cost in costs if cost.curves < cost.fits]
     if lost:
         text.append(f"Fits without a curve, left out: {'; '.join(lost)}.")
-    return Table("Accuracy against time", tuple(columns), tuple(rows), (*text, *notes))
-
-
-def _reach_cells(reach: Reach | None) -> list[Cell]:
-    return [None, None] if reach is None else [reach.seconds, f"{reach.reached} of {reach.fits}"]
+    return table_of("Accuracy against time", columns, [*text, *notes])
 
 
 def _times_table(costs: Sequence[MethodCost]) -> Table:
-    columns = (
-        Column("Method"),
-        Column("Fit [s]", 1),
-        Column("On one core [s]", 1),
-        Column("Steps", 0),
-        Column("Step [ms]", 1),
-        Column("Render [ms/frame]", 1),
-        Column("Render [frames/s]", 1),
-        Column("Score [ms/frame]", 1),
-        Column("Whole process [s]", 1),
-        Column("Peak memory [GB]", 2),
-        Column("Device"),
-    )
-    rows = tuple(
-        (
-            cost.label,
-            cost.fit_seconds,
-            cost.cpu_seconds,
-            cost.steps,
-            1000 * cost.fit_seconds / cost.steps if cost.fit_seconds and cost.steps else None,
-            1000 * cost.render_seconds if cost.render_seconds else None,
-            cost.frames_per_second,
-            1000 * cost.score_seconds,
-            cost.wall_seconds,
-            cost.peak_memory / _GB if cost.peak_memory else None,
-            ", ".join(cost.devices) or None,
-        )
-        for cost in costs
-    )
+    columns: list[Filled] = [
+        (Column("Method"), [cost.label for cost in costs]),
+        (Column("Fit [s]", 1), [cost.fit_seconds for cost in costs]),
+        (Column("On one core [s]", 1), [cost.cpu_seconds for cost in costs]),
+        (Column("Steps", 0), [cost.steps for cost in costs]),
+        (Column("Step [ms]", 1), [cost.step_ms for cost in costs]),
+        (Column("Render [ms/frame]", 1), [cost.render_ms for cost in costs]),
+        (Column("Render [frames/s]", 1), [cost.frames_per_second for cost in costs]),
+        (Column("Score [ms/frame]", 1), [1000 * cost.score_seconds for cost in costs]),
+        (Column("Whole process [s]", 1), [cost.wall_seconds for cost in costs]),
+        (Column("Peak memory [GB]", 2), [cost.peak_gb for cost in costs]),
+        (Column("Device"), [", ".join(cost.devices) or None for cost in costs]),
+    ]
     note = (
         "Means over captures and seeds; peak memory is the largest. Whole process: start-up, "
         "checkpoints and rendering included. On one core: CPU seconds of the fit, all threads."
     )
-    return Table("Times and memory", columns, rows, (note,))
+    return table_of("Times and memory", columns, [note])
 
 
 def _front_table(front: Sequence[FrontPart], metric: str) -> Table:
-    facts = metric_facts(metric)
-    score = f"{facts.label} [{facts.unit}]" if facts.unit else facts.label
-    columns = (
-        Column("Best so far"),
-        Column("From [s]", 1),
-        Column("To [s]", 1),
-        Column("From", facts.digits, group=score),
-        Column("To", facts.digits, group=score),
-    )
-    rows = tuple((p.label, p.start, p.stop, p.first_score, p.last_score) for p in front)
-    return Table("Pareto front", columns, rows, ("No method has as good a score in less time.",))
+    digits, score = metric_facts(metric).digits, score_title(metric)
+    columns: list[Filled] = [
+        (Column("Best so far"), [part.label for part in front]),
+        (Column("From [s]", 1), [part.start for part in front]),
+        (Column("To [s]", 1), [part.stop for part in front]),
+        (Column("From", digits, group=score), [part.first_score for part in front]),
+        (Column("To", digits, group=score), [part.last_score for part in front]),
+    ]
+    note = "No method has as good a score in less time."
+    return table_of("Pareto front", columns, [note])
 
 
 def machine_notes(results: Sequence[Results]) -> list[str]:
@@ -364,9 +351,6 @@ def machine_notes(results: Sequence[Results]) -> list[str]:
 
 def run_seconds(capture: CaptureResult) -> dict[str, float] | None:
     """Return the seconds of one run by part; None where they were not put on record.
-
-    Args:
-        capture: the result of the run.
 
     Returns:
         Keys are those of `PARTS`. What a method does not say of itself is part of its start.
@@ -395,23 +379,19 @@ def seconds_table(runs: Sequence[MethodRuns]) -> Table | None:
     whole = sum(sum(parts.values()) for parts in known)
     if not whole:
         return None
-    columns = (
-        Column("Part"),
-        Column("Mean of a run [s]", 2),
-        Column("All runs [s]", 1),
-        Column("Share [%]", 1),
-        Column("What it is"),
-    )
-    sums = {name: sum(parts[name] for parts in known) for name in PARTS}
-    rows = [
-        (name, spent / len(known), spent, 100 * spent / whole, PARTS[name])
-        for name, spent in sums.items()
+    sums = [sum(parts[name] for parts in known) for name in PARTS]
+    spent = [*sums, whole]
+    columns: list[Filled] = [
+        (Column("Part"), [*PARTS, "sum"]),
+        (Column("Mean of a run [s]", 2), [seconds / len(known) for seconds in spent]),
+        (Column("All runs [s]", 1), spent),
+        (Column("Share [%]", 1), [100 * seconds / whole for seconds in spent]),
+        (Column("What it is"), [*PARTS.values(), f"{len(known)} runs"]),
     ]
-    rows.append(("sum", whole / len(known), whole, 100.0, f"{len(known)} runs"))
     notes = ["A run is one fit of one capture; runs that go side by side are added up."]
     if len(known) < len(every):
         notes.append(f"{len(every) - len(known)} of {len(every)} runs do not record it.")
-    return Table("Where the seconds go", columns, tuple(rows), tuple(notes), breaks=(len(PARTS),))
+    return table_of("Where the seconds go", columns, notes, breaks=(len(PARTS),))
 
 
 #: Name of the plain baseline, the reference where it is among the methods.
@@ -466,14 +446,8 @@ def analyse_cost(
 
     Args:
         runs: the methods; at least one.
-        metric: a metric of the curves.
-        budgets: seconds at which scores are read.
         reference: the method whose final score is a target; None takes the plain baseline where
             it is among `runs`.
-
-    Raises:
-        UsageError: the runs (the reference's included) are on different data, splits, protocols
-            or training frames; or none left a curve in this metric.
     """
     if reference is None:
         plain = [run for run in runs if run.first.method.name == PLAIN]

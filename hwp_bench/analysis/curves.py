@@ -132,10 +132,6 @@ class FrontPart:
 def mean_curve(label: str, curves: Mapping[str, Sequence[Curve]]) -> MeanCurve | None:
     """Return the mean curve of a method.
 
-    Args:
-        label: its label.
-        curves: the curves of every seed, by capture.
-
     Returns:
         The mean from the first moment at which every fit has had a checkpoint to the end of the
         longest fit, and Student's interval over captures; None without curves.

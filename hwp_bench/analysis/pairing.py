@@ -32,11 +32,7 @@ class MethodRuns:
         return self.seeds[min(self.seeds)]
 
     def values(self, capture: str, metric: str, seeds: Sequence[int]) -> np.ndarray:
-        """Return the scores of one capture: (S, F) float, frames in the split's order.
-
-        Raises:
-            UsageError: a frame lacks the metric, which others of the result have.
-        """
+        """Return the scores of one capture: (S, F) float, frames in the split's order."""
         rows = [[f.scores for f in _capture(self.seeds[seed], capture).frames] for seed in seeds]
         if any(metric not in scores for row in rows for scores in row):
             raise UsageError(f"has frames without {metric}", where=self.label, field=capture)
@@ -59,11 +55,7 @@ def same_but_seed(result: Results) -> str:
 
 
 def group_runs(results: Sequence[Results]) -> list[MethodRuns]:
-    """Put evaluations that differ in nothing but the seed together, in the order given.
-
-    Raises:
-        UsageError: two evaluations are of the same method, settings, budget and seed.
-    """
+    """Put evaluations that differ in nothing but the seed together, in the order given."""
     groups: dict[str, dict[int, Results]] = {}
     for result in results:
         seeds = groups.setdefault(same_but_seed(result), {})
@@ -117,12 +109,7 @@ def _state(result: Results) -> str:
 
 
 def refuse_unlike(runs: Sequence[MethodRuns]) -> None:
-    """Refuse results whose difference would not be that of the methods.
-
-    Raises:
-        UsageError: protocols, captures, capture or split digests, the masks that are scored, or the
-            choice of training frames differ; the message says which.
-    """
+    """Refuse results whose difference would not be that of the methods."""
     everything = [(run.label, result) for run in runs for result in run.seeds.values()]
     label, reference = everything[0]
     for other_label, other in everything[1:]:
@@ -180,11 +167,7 @@ def _same_captures(between: str, reference: Results, other: Results) -> None:
 
 
 def common_seeds(first: MethodRuns, second: MethodRuns) -> list[int]:
-    """Return the seeds that both have.
-
-    Raises:
-        UsageError: there is none.
-    """
+    """Return the seeds that both have."""
     seeds = sorted(first.seeds.keys() & second.seeds.keys())
     if not seeds:
         raise UsageError(
@@ -197,9 +180,6 @@ def common_seeds(first: MethodRuns, second: MethodRuns) -> list[int]:
 
 def scopes(results: Results) -> dict[str, dict[str, float]]:
     """Return the sets of captures that are averaged, with the weight of each capture.
-
-    Args:
-        results: an evaluation.
 
     Returns:
         By scope, in the order of tables: `macro` (weights as in the mean over perturbations; all

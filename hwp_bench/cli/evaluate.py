@@ -175,9 +175,6 @@ def _running(
     """Check a call, then give captures, a view of the jobs, and the options of what runs them.
 
     Whatever is wrong with the call is reported before a suite is rendered for it.
-
-    Raises:
-        HwpError: as `check_results_place`, `check_call` and `check_suite`.
     """
     from hwp_bench.base.console import JobsView
     from hwp_bench.evaluation.evaluate import check_call, check_results_place, check_suite
@@ -242,11 +239,7 @@ def report_outcome(out: Path, results: Results) -> int:
 
 
 def evaluation_settings(args: argparse.Namespace) -> EvaluationSettings:
-    """Return the settings that `add_evaluation_arguments` and `--seed` gave.
-
-    Raises:
-        UsageError: a limit is not above 0, or an override is not NAME=VALUE.
-    """
+    """Return the settings that `add_evaluation_arguments` and `--seed` gave."""
     from hwp_bench.base.errors import UsageError
     from hwp_bench.evaluation.evaluate import EvaluationSettings
     from hwp_bench.methods.contract import Budget, RunSettings

@@ -92,10 +92,6 @@ def captures_of(places: Sequence[str] | None, file: Path) -> list[Path]:
     Args:
         places: captures or folders of captures; None takes the result's suite, rendered where
             it is not in the cache.
-        file: the result file.
-
-    Raises:
-        UsageError: the places hold no capture, or the result is of no suite.
     """
     from hwp_bench.evaluation.verify import capture_folders
     from hwp_bench.results import read_results

@@ -53,8 +53,6 @@ def run_program(program: str, tree: Command, arguments: Sequence[str] | None = N
     """Run one command of a program.
 
     Args:
-        program: its name, for help and messages.
-        tree: its commands.
         arguments: the words after the program's name; None takes the process's.
 
     Returns:
@@ -212,13 +210,7 @@ def add_shell_argument(parser: argparse.ArgumentParser, program: str) -> None:
 
 
 def completion_script(program: str, tree: Command, shell: str) -> str:
-    """Return the script that completes a program's command line in a shell.
-
-    Args:
-        program: its name.
-        tree: its commands.
-        shell: one of `SHELLS`.
-    """
+    """Return the script that completes a program's command line in a shell."""
     import shtab
 
     parser = whole_parser(program, tree)

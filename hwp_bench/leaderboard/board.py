@@ -4,16 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import cache
+from functools import cache, cached_property
 from typing import Any
 
 from markupsafe import Markup
 
+from hwp_bench.analysis.columns import Filled, score_column, table_of
 from hwp_bench.analysis.compare import Rank, compare, rank_methods, verdict
 from hwp_bench.analysis.cost import analyse_cost
 from hwp_bench.analysis.pairing import MACRO, group_runs, same_but_seed
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.tables import Cell, Column, Table
+from hwp_bench.base.tables import Column, Table
 from hwp_bench.capture.splits import split_for
 from hwp_bench.evaluation.sentences import find_missing
 from hwp_bench.leaderboard.entries import BADGES, LEVELS, Entry
@@ -24,8 +25,7 @@ from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.score import CaptureScores, aggregate
 from hwp_bench.report.figures import draw_pareto, inline_svg
 from hwp_bench.report.study_tables import METRIC
-from hwp_bench.report.tables import score_column
-from hwp_bench.results import Results
+from hwp_bench.results import CaptureResult, Results
 from hwp_bench.results.schema import score_rows
 from hwp_bench.sim.produce.suites import suite
 from hwp_bench.sim.scene.motion import moments, severity
@@ -41,6 +41,20 @@ class BoardRow:
 
     #: Its entries, the lowest seed first. Not empty.
     entries: tuple[Entry, ...]
+    #: What the board calls the method: its title, with who stands for it where two have one title.
+    label: str = ""
+    #: Entries of the method on the suite that are not in the row, the newest first.
+    older: tuple[Entry, ...] = ()
+
+    @property
+    def name(self) -> str:
+        """Name of its first entry, which stands for the row."""
+        return self.entries[0].name
+
+    @property
+    def title(self) -> str:
+        """The label, or the method's own title."""
+        return self.label or self.first.method.title
 
     @property
     def first(self) -> Results:
@@ -53,9 +67,29 @@ class BoardRow:
         return [on_current_data(entry.results) for entry in self.entries]
 
     @property
+    def captures(self) -> list[CaptureResult]:
+        """The captures of every seed."""
+        return [capture for entry in self.entries for capture in entry.results.captures]
+
+    @property
     def seeds(self) -> tuple[int, ...]:
         """The seeds, rising."""
         return tuple(entry.results.seed for entry in self.entries)
+
+    @property
+    def suite(self) -> str:
+        """Its suite."""
+        return self.first.suite
+
+    @property
+    def budget(self) -> str:
+        """Its budget in words."""
+        return budget_text(self.first.budget)
+
+    @property
+    def date(self) -> str:
+        """Day of the latest evaluation, ISO 8601."""
+        return max(entry.results.started for entry in self.entries)[:10]
 
     @property
     def whole(self) -> bool:
@@ -68,38 +102,47 @@ class BoardRow:
         found = [entry.results.scores for entry in self.entries]
         return {name: sum(one[name] for one in found) / len(found) for name in found[0]}
 
+    @cached_property
+    def scopes(self) -> Mapping[str, Mapping[str, float | None]]:
+        """Scores by scope and metric, means over seeds; None where the suite has no such capture.
+
+        `motion_blur@3` is the scope of captures whose motion blur is of severity 3.
+        """
+        found = [_scopes(entry) for entry in self.entries]
+        return {
+            scope: {name: _mean([one[scope].get(name) for one in found]) for name in HEADLINE}
+            for scope in found[0]
+        }
+
     @property
     def fit_seconds(self) -> float | None:
         """Mean seconds of a fit over captures and seeds; None where the method says none."""
-        fits = [
-            capture.fit_seconds
-            for entry in self.entries
-            for capture in entry.results.captures
-            if capture.fit_seconds is not None
-        ]
-        return sum(fits) / len(fits) if fits else None
+        return _mean([capture.fit_seconds for capture in self.captures])
+
+    @property
+    def failed(self) -> int:
+        """Frames that failed, over all seeds."""
+        return sum(capture.failed_frames for capture in self.captures)
 
     @property
     def level(self) -> str:
-        """How far every one of its entries was checked, one of `records.LEVELS`."""
+        """How far every one of its entries was checked, one of `LEVELS`."""
         return min((entry.level for entry in self.entries), key=LEVELS.index)
 
     @property
     def badge(self) -> str:
-        """The least that the badge of one of its entries says, one of `records.BADGES`."""
+        """The least that the badge of one of its entries says, one of `BADGES`."""
         return min((entry.badge for entry in self.entries), key=_LEAST.index)
 
-
-@dataclass(frozen=True)
-class MethodRow:
-    """A method on one suite: the row that stands for it, and all that it had there before."""
-
-    #: Its newest row among those that were checked furthest.
-    row: BoardRow
-    #: What the board calls it: its title, with who stands for it where a title is there twice.
-    label: str
-    #: Entries of the method on the suite that are not in the row, the newest first.
-    older: tuple[Entry, ...] = ()
+    def why_older(self, entry: Entry) -> str:
+        """Say in a few words why one of its older entries is not the row."""
+        known = [*self.entries, *self.older]
+        for other in known:
+            if other.submission.revises == entry.name and takes_over(other, entry):
+                return f"replaced: {other.submission.reason}"
+        if LEVELS.index(entry.level) < LEVELS.index(self.level):
+            return "checked less far than the row"
+        return "lacks a part of the suite" if find_missing(entry.results) else "older than the row"
 
 
 def board_rows(entries: Iterable[Entry]) -> list[BoardRow]:
@@ -108,9 +151,6 @@ def board_rows(entries: Iterable[Entry]) -> list[BoardRow]:
     Entries of two submitters, or that were checked differently far, are never one row: nobody
     moves a row by another seed of it. An entry that lacks a part of its suite, and a second one of
     the same seed, has a row to itself.
-
-    Args:
-        entries: of one suite and one version of the protocol.
     """
     groups: dict[object, list[Entry]] = {}
     for entry in entries:
@@ -125,27 +165,24 @@ def board_rows(entries: Iterable[Entry]) -> list[BoardRow]:
     ]
 
 
-def method_rows(entries: Sequence[Entry]) -> list[MethodRow]:
+def method_rows(entries: Sequence[Entry]) -> list[BoardRow]:
     """Return one row for each method, in the order in which the methods come.
 
     The row of a method is whole where one is, checked as far as one is, and of these the newest.
-
-    Args:
-        entries: all of one suite and one version of the protocol, those that others revise too.
     """
     methods: dict[object, list[Entry]] = {}
     for entry in entries:
         methods.setdefault(source_of(entry), []).append(entry)
     chosen = [max(board_rows(current(own)), key=_standing) for own in methods.values()]
     return [
-        MethodRow(row, label, _older(row, own))
+        replace(row, label=label, older=_older(row, own))
         for row, label, own in zip(chosen, _labels(chosen), methods.values(), strict=True)
     ]
 
 
 def _standing(row: BoardRow) -> tuple[bool, int, str, str]:
     newest = max(entry.results.started for entry in row.entries)
-    return row.whole, LEVELS.index(row.level), newest, row.entries[0].name
+    return row.whole, LEVELS.index(row.level), newest, row.name
 
 
 def _older(row: BoardRow, own: Iterable[Entry]) -> tuple[Entry, ...]:
@@ -156,12 +193,12 @@ def _older(row: BoardRow, own: Iterable[Entry]) -> tuple[Entry, ...]:
 
 def _labels(rows: Sequence[BoardRow]) -> list[str]:
     """Titles, with the submitter and at last the entry where they do not tell rows apart."""
-    titles = [row.first.method.title for row in rows]
+    titles = [row.title for row in rows]
     named = [
         f"{title} (by {row.entries[0].submission.by or 'somebody who is not named'})"
         for title, row in zip(titles, rows, strict=True)
     ]
-    entries = [f"{title} ({row.entries[0].name})" for title, row in zip(titles, rows, strict=True)]
+    entries = [f"{title} ({row.name})" for title, row in zip(titles, rows, strict=True)]
     labels = []
     for place, title in enumerate(titles):
         texts = ((title, titles), (named[place], named), (entries[place], entries))
@@ -180,12 +217,6 @@ def suite_severities(name: str) -> Severities:
     It is read from the scenes, so that no capture has to be on this machine: the mean over the
     frames to learn from that show the perturbation, rounded, as `hwp-bench table --by severity`
     takes it from captures.
-
-    Args:
-        name: a suite.
-
-    Raises:
-        UsageError: there is no such suite.
     """
     found: dict[str, dict[str, int]] = {}
     for item in suite(name):
@@ -207,11 +238,6 @@ def at_severity(
 ) -> list[CaptureScores]:
     """Return the captures that have a perturbation of one severity, with these perturbations only.
 
-    Args:
-        captures: scores of captures of the suite.
-        severities: what `suite_severities` returned for it.
-        level: 1 to 5.
-
     Returns:
         Fewer captures; empty where none has a perturbation of that severity.
     """
@@ -224,8 +250,6 @@ def at_severity(
     return found
 
 
-#: Metrics of the board.
-METRICS = ("psnr", "ssim", "oriented_distance")
 #: Scopes that can be chosen, with their headings.
 SCOPES = {
     "macro": "All perturbations (macro mean)",
@@ -235,112 +259,6 @@ SCOPES = {
 }
 #: Severities that can be chosen.
 SEVERITIES = (1, 2, 3, 4, 5)
-
-
-@dataclass(frozen=True)
-class OlderRun:
-    """An entry of a method that does not stand for it any more, or not yet."""
-
-    #: Name of the entry.
-    name: str
-    #: Day of the evaluation, ISO 8601.
-    date: str
-    #: Its budget in words.
-    budget: str
-    #: The seed.
-    seed: int
-    #: PSNR, macro mean, dB.
-    psnr: float
-    #: How far it was checked, one of `records.LEVELS`.
-    level: str
-    #: Why it is not the row, in a few words.
-    why: str
-
-
-@dataclass(frozen=True)
-class Row:
-    """One measured row: a method with one budget on one suite, over its seeds."""
-
-    #: Name of its first entry, which stands for the row.
-    name: str
-    #: What the board calls the method.
-    title: str
-    #: Its suite.
-    suite: str
-    #: Its budget in words.
-    budget: str
-    #: Device that the method says it ran on.
-    device: str
-    #: Names of its entries by seed, the lowest first.
-    seeds: Mapping[int, str]
-    #: Day of the latest evaluation, ISO 8601.
-    date: str
-    #: Scores by scope and metric, means over seeds; None where the suite has no such capture.
-    #: `motion_blur@3` is the scope of captures whose motion blur is of severity 3.
-    scores: Mapping[str, Mapping[str, float | None]]
-    #: Mean seconds of a fit.
-    fit: float | None
-    #: Frames that failed, over all seeds.
-    failed: int
-    #: How far all of it was checked, one of `records.LEVELS`.
-    level: str
-    #: Its reproducibility badge, one of `records.BADGES`.
-    badge: str
-    #: What the method had on the suite before, the newest first.
-    older: Sequence[OlderRun] = ()
-
-
-def make_row(row: BoardRow, label: str = "", older: Sequence[Entry] = ()) -> Row:
-    """Return a row as the page shows it.
-
-    Args:
-        row: the row.
-        label: what the board calls the method; empty takes its title.
-        older: other entries of the method on the suite.
-    """
-    found = [_scopes(entry) for entry in row.entries]
-    captures = [capture for entry in row.entries for capture in entry.results.captures]
-    return Row(
-        name=row.entries[0].name,
-        title=label or row.first.method.title,
-        suite=row.first.suite,
-        budget=budget_text(row.first.budget),
-        device=", ".join(sorted({one.device for one in captures if one.device})) or "not said",
-        seeds={entry.results.seed: entry.name for entry in row.entries},
-        date=max(entry.results.started for entry in row.entries)[:10],
-        scores={
-            scope: {name: _mean([one[scope].get(name) for one in found]) for name in METRICS}
-            for scope in found[0]
-        },
-        fit=row.fit_seconds,
-        failed=sum(capture.failed_frames for capture in captures),
-        level=row.level,
-        badge=row.badge,
-        older=[_older_run(entry, row, older) for entry in older],
-    )
-
-
-def _older_run(entry: Entry, row: BoardRow, older: Sequence[Entry]) -> OlderRun:
-    known = [*row.entries, *older]
-    corrections = [e for e in known if e.submission.revises == entry.name and takes_over(e, entry)]
-    if corrections:
-        why = f"replaced: {corrections[0].submission.reason}"
-    elif LEVELS.index(entry.level) < LEVELS.index(row.level):
-        why = "checked less far than the row"
-    elif find_missing(entry.results):
-        why = "lacks a part of the suite"
-    else:
-        why = "older than the row"
-    results = entry.results
-    return OlderRun(
-        name=entry.name,
-        date=results.started[:10],
-        budget=budget_text(results.budget),
-        seed=results.seed,
-        psnr=results.scores["psnr"],
-        level=entry.level,
-        why=why,
-    )
 
 
 def _scopes(entry: Entry) -> dict[str, Mapping[str, float]]:
@@ -365,9 +283,9 @@ def _means(captures: Sequence[CaptureScores]) -> dict[str, Mapping[str, float]]:
     }
 
 
-def severities_of(rows: Sequence[Row]) -> list[int]:
+def severities_of(rows: Sequence[BoardRow]) -> list[int]:
     """Return the severities that captures of the rows have, rising."""
-    scopes = {scope for row in rows for scope in row.scores}
+    scopes = {scope for row in rows for scope in row.scopes}
     return [level for level in SEVERITIES if f"macro@{level}" in scopes]
 
 
@@ -393,9 +311,6 @@ def rankable(rows: Sequence[BoardRow]) -> tuple[list[BoardRow], str]:
       name;
     - rows without a seed that others have: rows with the seed that most rows have stay (of several
       the smallest), and of the others those that share a seed with every row that stays.
-
-    Args:
-        rows: of one suite and one version of the protocol.
 
     Returns:
         Those that stay, in the order given, and a sentence that names the whole rows that do not;
@@ -425,7 +340,7 @@ def rankable(rows: Sequence[BoardRow]) -> tuple[list[BoardRow], str]:
 
 def _one_of_each_run(rows: Sequence[BoardRow]) -> list[BoardRow]:
     """Leave out rows that have a run (a state of a method and a seed) of a row before them."""
-    order = sorted(rows, key=lambda row: (-LEVELS.index(row.level), row.entries[0].name))
+    order = sorted(rows, key=lambda row: (-LEVELS.index(row.level), row.name))
     seen: set[tuple[str, int]] = set()
     kept = []
     for row in order:
@@ -442,7 +357,7 @@ def _most_common_seed(rows: Sequence[BoardRow]) -> int:
 
 
 def _names(rows: Sequence[BoardRow]) -> str:
-    return ", ".join(row.entries[0].name for row in rows)
+    return ", ".join(row.name for row in rows)
 
 
 def board_tables(entries: Sequence[Entry]) -> list[Table]:
@@ -450,95 +365,59 @@ def board_tables(entries: Sequence[Entry]) -> list[Table]:
 
     Each method has one row, of its newest entries that were checked furthest; its older ones are
     left out. A row that lacks a part of its suite is shown without a rank.
-
-    Args:
-        entries: entries that `rules.check_entries` has passed.
     """
     found = tables_of(entries)
     return [_table(suite, protocol, rows) for (suite, protocol), rows in found.items()]
 
 
 def _table(suite: str, protocol: str, entries: Sequence[Entry]) -> Table:
-    methods = method_rows(entries)
-    rows = [method.row for method in methods]
-    ranks, sentence = ranks_of(methods)
-    titles = {method.row.entries[0].name: method.label for method in methods}
+    rows = method_rows(entries)
+    ranks, sentence = ranks_of(rows)
     order = sorted(
         rows,
         key=lambda row: (
             not row.whole,
-            ranks[row.entries[0].name].rank if row.entries[0].name in ranks else len(rows),
+            ranks[row.name].rank if row.name in ranks else len(rows),
             -row.scores[METRIC],
-            row.entries[0].name,
+            row.name,
         ),
     )
-    columns = (
-        Column("Method"),
-        Column("Rank", 0, group="Rank"),
-        Column("95 %", group="Rank"),
-        *(score_column(name) for name in HEADLINE),
-        Column("Fit [s]", 1),
-        Column("Seeds", 0),
-        Column("Level"),
-        Column("Badge"),
-        Column("Entry"),
-    )
-    cells: list[tuple[Cell, ...]] = []
-    for row in order:
-        first = row.entries[0].name
-        rank = ranks.get(first)
-        cells.append(
-            (
-                titles[first],
-                rank.rank if rank else None,
-                rank_interval(rank) if rank else None,
-                *(row.scores[name] for name in HEADLINE),
-                row.fit_seconds,
-                len(row.seeds),
-                row.level,
-                row.badge,
-                first if len(row.seeds) == 1 else f"{first} and {len(row.seeds) - 1} more",
-            )
-        )
+    found = [ranks.get(row.name) for row in order]
+    columns: list[Filled] = [
+        (Column("Method"), [row.title for row in order]),
+        (Column("Rank", 0, group="Rank"), [rank.rank if rank else None for rank in found]),
+        (Column("95 %", group="Rank"), [rank.interval if rank else None for rank in found]),
+        *((score_column(name), [row.scores[name] for row in order]) for name in HEADLINE),
+        (Column("Fit [s]", 1), [row.fit_seconds for row in order]),
+        (Column("Seeds", 0), [len(row.seeds) for row in order]),
+        (Column("Level"), [row.level for row in order]),
+        (Column("Badge"), [row.badge for row in order]),
+        (Column("Entry"), [_entry_text(row) for row in order]),
+    ]
     notes = [sentence] if sentence else []
     lacking = frozenset(place for place, row in enumerate(order) if not row.whole)
     if lacking:
         notes.append("Rows that lack captures or test frames of the suite have no rank.")
     if protocol != HWP_V1.name:
         notes.append(f"Scored by {protocol}; rows of {HWP_V1.name} stand in another table.")
-    if older := sum(len(method.older) for method in methods):
+    if older := sum(len(row.older) for row in rows):
         notes.append(f"{older} older or less checked entries of these methods are not shown.")
-    return Table(
-        f"Suite {suite}, protocol {protocol}",
-        columns,
-        tuple(cells),
-        tuple(notes),
-        unranked=lacking,
-    )
+    return table_of(f"Suite {suite}, protocol {protocol}", columns, notes, unranked=lacking)
 
 
-def _called(results: Results, label: str) -> Results:
-    return replace(results, method=replace(results.method, title=label))
+def _entry_text(row: BoardRow) -> str:
+    return row.name if len(row.seeds) == 1 else f"{row.name} and {len(row.seeds) - 1} more"
 
 
-def rank_interval(rank: Rank) -> str:
-    """Return the ranks that the data allow in words: `1`, or `1 to 3`."""
-    return f"{rank.best}" if rank.best == rank.worst else f"{rank.best} to {rank.worst}"
-
-
-def ranks_of(methods: Sequence[MethodRow]) -> tuple[dict[str, Rank], str]:
-    """Return ranks by the name of a row's first entry, and the sentence that says who wins.
-
-    Args:
-        methods: of one suite and one version of the protocol. Those that `rankable` leaves out get
-            no rank, and the sentence names them.
-    """
-    ranked, left_out = rankable([method.row for method in methods])
+def ranks_of(rows: Sequence[BoardRow]) -> tuple[dict[str, Rank], str]:
+    """Return ranks by the name of a row, and the sentence that says who wins."""
+    ranked, left_out = rankable(rows)
     if not ranked:
         return {}, ""
-    labels = {method.row.entries[0].name: method.label for method in methods}
     compared = {
-        row.entries[0].name: [_called(one, labels[row.entries[0].name]) for one in row.compared]
+        row.name: [
+            replace(one, method=replace(one.method, title=row.title)) for one in row.compared
+        ]
         for row in ranked
     }
     runs = group_runs([one for results in compared.values() for one in results])

@@ -255,7 +255,6 @@ def entry_name(results: Results, content: str | None = None) -> str:
     """Return the name of an entry: method, suite, budget, seed, and part of its digest.
 
     Args:
-        results: the results.
         content: the digest of the entry; None takes that of the results.
     """
     parts = [results.method.name, results.suite]
@@ -280,11 +279,7 @@ def make_entry(results: Results, submission: Submission | None = None) -> Entry:
 
 
 def write_entry(folder: Path, entry: Entry) -> Path:
-    """Write an entry that `make_entry` made; returns its file.
-
-    Raises:
-        UsageError: the folder belongs to an installed package.
-    """
+    """Write an entry that `make_entry` made; returns its file."""
     refuse_installed(folder)
     value: dict[str, Any] = {"schema": ENTRY_SCHEMA, "digest": entry.digest}
     if entry.submission != Submission():
@@ -309,11 +304,7 @@ def _file_text(value: dict[str, Any]) -> str:
 
 
 def refuse_installed(folder: Path) -> None:
-    """Refuse to write into a package that is installed.
-
-    Raises:
-        UsageError: the folder lies in one.
-    """
+    """Refuse to write into a package that is installed."""
     place = folder.resolve()
     packages = {"site-packages", "dist-packages"} & set(place.parts)
     if packages or place.is_relative_to(PACKAGES / "hwp_bench"):
@@ -325,13 +316,7 @@ def refuse_installed(folder: Path) -> None:
 
 
 def read_entries(folder: Path) -> list[Entry]:
-    """Read every entry of a folder with its checks, by name.
-
-    Raises:
-        BadInput: a file is damaged.
-        BadResult: a file breaks the schema, its digest is not that of its content, or a check is
-            of no entry that is there.
-    """
+    """Read every entry of a folder with its checks, by name."""
     checks = []
     for check, fault in read_checks(folder):
         if fault is not None:
@@ -365,15 +350,7 @@ def read_checks(folder: Path) -> Iterator[tuple[Check | None, HwpError | None]]:
 
 
 def read_entry(file: Path, checks: Sequence[Check]) -> Entry:
-    """Read one entry.
-
-    Args:
-        file: the file.
-        checks: checks of any entries.
-
-    Raises:
-        BadInput, BadResult: as `read_entries`.
-    """
+    """Read one entry."""
     value = without_schema(read_json(file, max_bytes=MAX_ENTRY_BYTES), ENTRY_SCHEMA, where=file)
     entry = parse_record(_File, value, where=file)
     results = entry.results
@@ -398,11 +375,7 @@ def check_name(check: Check) -> str:
 
 
 def write_check(folder: Path, check: Check) -> Path:
-    """Write a check below a folder of entries; returns its file.
-
-    Raises:
-        UsageError: the folder belongs to an installed package.
-    """
+    """Write a check below a folder of entries; returns its file."""
     refuse_installed(folder)
     value = {"digest": check.digest, "check": check.content}
     text = json.dumps({"schema": CHECK_SCHEMA, **value}, indent=1, allow_nan=False)

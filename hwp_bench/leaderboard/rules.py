@@ -32,14 +32,7 @@ HEADLINE = ("psnr", "ssim", "oriented_distance")
 
 
 def check_entries(entries: Iterable[Entry]) -> list[Entry]:
-    """Check that entries are fit to be ranked against each other; returns them.
-
-    Raises:
-        UsageError: an entry is of no suite, of clean frames, of settings that are not its
-            protocol's, or of other data, splits or test frames than the entries of the same
-            suite and protocol; or a revision is of no entry that can be revised.
-        BadResult: scores are missing or impossible.
-    """
+    """Check that entries are fit to be ranked against each other; returns them."""
     listed = list(entries)
     for entry in listed:
         _check_one(entry)
@@ -104,11 +97,7 @@ def history(entry: Entry, entries: Sequence[Entry]) -> list[Entry]:
 
 
 def check_complete(entry: Entry) -> None:
-    """Refuse an entry that lacks a part of its suite.
-
-    Raises:
-        BadResult: captures or test frames are missing, or are not the suite's.
-    """
+    """Refuse an entry that lacks a part of its suite."""
     if problems := find_missing(entry.results):
         raise BadResult(
             "; ".join(problems),
@@ -119,11 +108,7 @@ def check_complete(entry: Entry) -> None:
 
 
 def check_current(entry: Entry) -> None:
-    """Refuse an entry of other protocols than this version's.
-
-    Raises:
-        UsageError: the settings of a protocol differ.
-    """
+    """Refuse an entry of other protocols than this version's."""
     ours = _as_stored({protocol.name: protocol.as_dict() for protocol in PROTOCOLS})
     if ours != _as_stored(entry.results.protocols):
         raise _other_protocols(entry)
@@ -211,11 +196,7 @@ def off_the_data(entries: Sequence[Entry]) -> list[tuple[Entry, str]]:
 
 
 def check_revisions(entries: Sequence[Entry]) -> None:
-    """Check that every revision is of an entry that it can revise, and the only one of it.
-
-    Raises:
-        UsageError: one is not; it is named.
-    """
+    """Check that every revision is of an entry that it can revise, and the only one of it."""
     named = {entry.name: entry for entry in entries}
     revised: dict[str, str] = {}
     for entry in entries:
@@ -248,16 +229,8 @@ def check_revisions(entries: Sequence[Entry]) -> None:
 def check_unchanged(folder: Path, base: Path) -> int:
     """Check that every entry and check of an earlier state is still there, byte by byte.
 
-    Args:
-        folder: the entries.
-        base: the entries before, such as those of the branch that a pull request goes to.
-
     Returns:
         How many files are new.
-
-    Raises:
-        UsageError: the earlier folder does not exist.
-        BadResult: a file was changed or removed: entries never change, a correction is a revision.
     """
     if not base.is_dir():
         raise UsageError("does not exist", where=base, field="--against")
@@ -292,11 +265,7 @@ class Names:
 
 
 def read_names(folder: Path) -> frozenset[str]:
-    """Return the digests that are listed for a folder of entries: there, and where the toolkit is.
-
-    Raises:
-        BadInput, BadResult: a file is damaged.
-    """
+    """Return the digests listed for a folder of entries: there, and where the toolkit is."""
     found: set[str] = set()
     for file in {folder.parent / NAME, data_folder("leaderboard") / NAME}:
         if file.is_file():
@@ -322,11 +291,7 @@ def register(folder: Path, entries: Iterable[Entry]) -> list[Entry]:
 
 
 def check_names(entries: Iterable[Entry], listed: frozenset[str]) -> None:
-    """Refuse an entry under the name or title of a method that ships, unless it is listed.
-
-    Raises:
-        UsageError: an entry carries, or seems to carry, the name of a method that ships.
-    """
+    """Refuse an entry under the name or title of a method that ships, unless it is listed."""
     for entry in entries:
         name = _taken(entry)
         if name is not None and entry.digest not in listed:

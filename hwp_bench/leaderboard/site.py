@@ -21,22 +21,17 @@ from hwp_bench.capture import Capture
 from hwp_bench.evaluation.artifacts import square_around
 from hwp_bench.evaluation.scoring import read_prediction
 from hwp_bench.leaderboard.board import (
-    METRICS,
     SCOPES,
     BoardRow,
-    MethodRow,
-    Row,
     budget_text,
     curve_plot,
-    make_row,
     method_rows,
-    rank_interval,
     ranks_of,
     reference_lead,
     severities_of,
 )
 from hwp_bench.leaderboard.entries import BADGES, LEVEL_TEXTS, Entry, digest
-from hwp_bench.leaderboard.rules import SUITES, check_entries, source_of, tables_of
+from hwp_bench.leaderboard.rules import HEADLINE, SUITES, check_entries, source_of, tables_of
 from hwp_bench.methods.manifest import shipped_methods
 from hwp_bench.metrics import HWP_V1
 from hwp_bench.metrics import metric as metric_facts
@@ -95,9 +90,7 @@ def write_gallery(
 
     Args:
         folder: of the site; pictures go into `pictures` within.
-        sources: entries with the folders of their results.
         captures: by digest; others have no truth to show and are left out.
-        titles: how a method is called in lists, by the name of its entry.
 
     Returns:
         `Scene`s as JSON values, in the order of the suites, the captures and frames.
@@ -192,24 +185,19 @@ class MethodPage:
     #: Name and title of the method.
     name: str
     title: str
-    #: The method's rows, each with what the board shows of it.
-    rows: Sequence[tuple[BoardRow, Row]]
+    #: The method's rows.
+    rows: Sequence[BoardRow]
 
 
-def method_pages(rows: Sequence[tuple[BoardRow, Row]]) -> list[MethodPage]:
-    """Return a page for each method: rows of one name and of one who stands for it.
-
-    Args:
-        rows: rows of the board with what it shows of them.
-    """
-    found: dict[tuple[str, str], list[tuple[BoardRow, Row]]] = {}
-    for row, shown in rows:
-        method = row.first.method
+def method_pages(rows: Sequence[BoardRow]) -> list[MethodPage]:
+    """Return a page for each method: rows of one name and of one who stands for it."""
+    found: dict[tuple[str, str], list[BoardRow]] = {}
+    for row in rows:
         _, by = source_of(row.entries[0])
-        found.setdefault((method.name, by), []).append((row, shown))
+        found.setdefault((row.first.method.name, by), []).append(row)
     # Names come from outside: the number keeps two of them apart, whatever is left of them.
     return [
-        MethodPage(f"methods/{number}-{_slug(name)}.html", name, own[0][1].title, own)
+        MethodPage(f"methods/{number}-{_slug(name)}.html", name, own[0].title, own)
         for number, ((name, _), own) in enumerate(sorted(found.items(), key=lambda x: x[0]))
     ]
 
@@ -221,8 +209,6 @@ def write_method_pages(
 
     Args:
         folder: of the site; its reports are there already.
-        pages: what `method_pages` returned.
-        scenes: what `gallery.write_gallery` returned, for pictures.
     """
     (folder / "methods").mkdir()
     shipped = {manifest.name: manifest for manifest in shipped_methods()}
@@ -236,11 +222,13 @@ def write_method_pages(
             page=page,
             description=manifest.description if manifest else "",
             text=_formatted(readme.read_text("utf-8")) if readme and readme.is_file() else "",
-            metrics=[metric_facts(name) for name in METRICS],
+            metrics=[metric_facts(name) for name in HEADLINE],
             scopes=SCOPES,
             pictures=_pictures(page, scenes),
             avatars=_avatars(folder, page),
-            facts=[_made_with(row) for row, _ in page.rows],
+            facts=[_made_with(row) for row in page.rows],
+            budget_text=budget_text,
+            why_older=BoardRow.why_older,
         )
         (folder / page.path).write_text(html, encoding="utf-8")
 
@@ -266,7 +254,7 @@ def _formatted(text: str) -> Markup:
 
 def _pictures(page: MethodPage, scenes: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """The first frame of each capture that the gallery shows of the method."""
-    names = {entry.name for row, _ in page.rows for entry in row.entries}
+    names = {entry.name for row in page.rows for entry in row.entries}
     found: dict[str, dict[str, Any]] = {}
     for scene in scenes:
         for shot in scene["shots"]:
@@ -278,7 +266,7 @@ def _pictures(page: MethodPage, scenes: Sequence[Mapping[str, Any]]) -> list[dic
 def _avatars(folder: Path, page: MethodPage) -> dict[str, str]:
     """Addresses of avatars by capture, of the first entry of each that has one."""
     found: dict[str, str] = {}
-    for row, _ in page.rows:
+    for row in page.rows:
         for entry in row.entries:
             for number, capture in enumerate(entry.results.captures):
                 address = f"reports/{entry.name}/avatars/0-{number}.html"
@@ -359,7 +347,7 @@ def build_site(
         rows = shown_rows(entries)
         shown = [
             (entry, ResultsSource(entry.results, folders[digest(entry.results)]))
-            for entry in _first_seeds([row for row, _ in rows], folders)
+            for entry in _first_seeds(rows, folders)
         ]
         titles = _titles([entry for entry, _ in shown])
         scenes = write_gallery(temporary, shown, captures, titles)
@@ -413,50 +401,44 @@ def _title_budget_digest(results: Results) -> str:
     return f"{_title(results)} ({budget_text(results.budget)}, {results.method.digest[:8]})"
 
 
-def shown_rows(entries: Sequence[Entry]) -> list[tuple[BoardRow, Row]]:
+def shown_rows(entries: Sequence[Entry]) -> list[BoardRow]:
     """Return the rows of this version's protocol with what the page shows of them, best first."""
     found = [
-        (method.row, make_row(method.row, method.label, method.older))
-        for (_, protocol), rows in tables_of(entries).items()
+        row
+        for (_, protocol), own in tables_of(entries).items()
         if protocol == HWP_V1.name
-        for method in method_rows(rows)
+        for row in method_rows(own)
     ]
     return sorted(
         found,
-        key=lambda pair: (
-            SUITES.index(pair[1].suite),
-            not pair[0].whole,
-            -(pair[1].scores["macro"]["psnr"] or 0.0),
-            pair[1].name,
+        key=lambda row: (
+            SUITES.index(row.suite),
+            not row.whole,
+            -(row.scopes["macro"]["psnr"] or 0.0),
+            row.name,
         ),
     )
 
 
 def _addresses(pages: Sequence[MethodPage]) -> dict[str, str]:
     """The page of the method of each row, by the row's name."""
-    return {shown.name: page.path for page in pages for _, shown in page.rows}
+    return {row.name: page.path for page in pages for row in page.rows}
 
 
-def board_page(
-    found: Sequence[tuple[BoardRow, Row]], *, pictures: bool, pages: Mapping[str, str]
-) -> str:
+def board_page(rows: Sequence[BoardRow], *, pictures: bool, pages: Mapping[str, str]) -> str:
     """Return the page of the board.
 
     Args:
-        found: what `shown_rows` returned.
-        pictures: whether the viewer's pictures lie next to the page.
         pages: addresses of the methods' pages by the row's name; rows without one lead to a report.
     """
-    rows = [shown for _, shown in found]
     suites = list(dict.fromkeys(row.suite for row in rows))
     ranks: dict[str, tuple[int, str]] = {}
     leads, verdicts = [], {}
     plots = {}
     for suite in suites:
-        table = [row for row, shown in found if shown.suite == suite]
-        named = [MethodRow(row, shown.title) for row, shown in found if shown.suite == suite]
-        placed, verdicts[suite] = ranks_of(named)
-        ranks |= {name: (rank.rank, rank_interval(rank)) for name, rank in placed.items()}
+        table = [row for row in rows if row.suite == suite]
+        placed, verdicts[suite] = ranks_of(table)
+        ranks |= {name: (rank.rank, rank.interval) for name, rank in placed.items()}
         leads.append(reference_lead(table))
         plots[suite] = curve_plot(table)
     return render_template(
@@ -472,7 +454,7 @@ def board_page(
         pages=pages,
         scopes=SCOPES,
         severities=severities_of(rows),
-        metrics=[metric_facts(name) for name in METRICS],
+        metrics=[metric_facts(name) for name in HEADLINE],
         suites=suites,
         budgets=list(dict.fromkeys(row.budget for row in rows)),
         published=_published(),
@@ -484,9 +466,9 @@ def board_page(
     )
 
 
-def _scores_json(row: Row, metric: str) -> str:
+def _scores_json(row: BoardRow, metric: str) -> str:
     """Return the scores of a row in every scope that it has, for the page's script."""
-    scores = {scope: values[metric] for scope, values in row.scores.items()}
+    scores = {scope: values[metric] for scope, values in row.scopes.items()}
     return canonical_json({scope: score for scope, score in scores.items() if score is not None})
 
 

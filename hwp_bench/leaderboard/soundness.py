@@ -46,9 +46,6 @@ def check_bound(entry: Entry) -> None:
 
     Entries of other protocols than this version's are of other versions of the suites, of which
     nothing is known here; they pass.
-
-    Raises:
-        BadResult: something was changed, or is not the suite's; field and capture are named.
     """
     if entry.protocol != HWP_V1.name:
         return
@@ -68,11 +65,7 @@ def check_dates(entry: Entry, now: datetime | None = None) -> None:
     """Refuse an entry or a check of it that is dated after now, or a check before its entry.
 
     Args:
-        entry: the entry.
         now: the time, UTC; None asks the clock.
-
-    Raises:
-        BadResult: a date is false; it is named.
     """
     latest = (now or datetime.now(UTC)) + _SKEW
     started = datetime.fromisoformat(entry.results.started)
@@ -200,13 +193,7 @@ def _wrong(entry: Entry, field: str, problem: str) -> BadResult:
 
 
 def check_source(file: Path) -> None:
-    """Refuse a result file that was changed by hand, before an entry is made of it.
-
-    Raises:
-        BadInput: it cannot be read.
-        BadResult: it is not of the digest that it states, or a capture is not as the copy next to
-            its predictions.
-    """
+    """Refuse a result file that was changed by hand, before an entry is made of it."""
     value = read_json(file, max_bytes=MAX_BYTES)
     found: list[Discrepancy] = [
         *copy_differences(file.parent, value, RESULT),

@@ -58,10 +58,6 @@ def add_entry(folder: Path, results: Results) -> Path:
     """Write an entry of results without a submission; returns its file.
 
     An entry under the name of a method that ships is registered: see `names`.
-
-    Raises:
-        BadResult, UsageError: the results are not fit for the leaderboard, or do not go together
-            with the sound entries that are there.
     """
     entry = make_entry(results)
     check_current(entry)
@@ -148,15 +144,7 @@ def _check_predictions(source: ResultsSource) -> int:
 
 
 def avatar_digests(folder: Path, captures: Sequence[str]) -> dict[str, str]:
-    """Return the SHA-256 of the avatar of each capture: of a file, or of a folder's files.
-
-    Args:
-        folder: holds `ID`, or one `ID.something`, for each capture.
-        captures: their ids.
-
-    Raises:
-        BadResult: the avatar of a capture is missing, or two fit.
-    """
+    """Return the SHA-256 of the avatar of each capture: of a file, or of a folder's files."""
     found = {}
     for name in captures:
         places = [place for place in sorted(folder.glob("*")) if _is_avatar_of(place, name)]
@@ -323,11 +311,7 @@ def _overruled(entry: Entry, named: Sequence[str]) -> list[str]:
 
 
 def entry_of(entries: Sequence[Entry], results: Results, name: str | None) -> Entry:
-    """Return the entry of that name, or the only one that the results are of or repeat.
-
-    Raises:
-        UsageError: no entry fits, or several do.
-    """
+    """Return the entry of that name, or the only one that the results are of or repeat."""
     fitting = [entry for entry in entries if entry.results == results]
     fitting = fitting or [entry for entry in entries if _repeats(entry.results, results)]
     if name is None and len(fitting) > 1:

@@ -103,11 +103,7 @@ def on_current_data(results: Results) -> Results:
 
 
 def rendered_data(cache: Path) -> SuiteData:
-    """Return the data of the suites' captures that this version rendered into a folder.
-
-    Args:
-        cache: the folder of capture folders, `sim/captures` of the toolkit's cache.
-    """
+    """Return the data of the suites' captures that this version rendered into a folder."""
     found: dict[str, dict[str, CaptureData]] = {}
     for file in sorted(cache.glob("*/capture.json")):
         capture = open_capture(file.parent)
@@ -122,13 +118,7 @@ def rendered_data(cache: Path) -> SuiteData:
 
 
 def joined_data(known: SuiteData, rendered: SuiteData, *, rounding: bool = False) -> SuiteData:
-    """Return all captures of both, as rendered where a capture is in both.
-
-    Args:
-        known: the data so far. Those of another version of the renderer are dropped.
-        rendered: the data of captures in a cache, which need not hold every suite.
-        rounding: keep data of another version as former ones: it differs in rounding alone.
-    """
+    """Return all captures of both, as rendered where a capture is in both."""
     kept = known.suites
     if known.renderer != rendered.renderer:
         kept = {

@@ -166,8 +166,6 @@ def draw_pareto(
 
     Args:
         curves: the methods' mean curves, at least one.
-        front: what `pareto_front` returned for them.
-        metric: the metric of the scores.
         order: number of each method by label, for its colour; None numbers them here and adds
             a legend.
     """
@@ -264,7 +262,6 @@ def draw_bars(groups: Mapping[str, Sequence[Bar]], metric: str) -> Figure:
 
     Args:
         groups: by heading; at least one bar in all.
-        metric: of the estimates.
     """
     digits = metric_facts(metric).digits
     values = [bar.estimate.value for bars in groups.values() for bar in bars]
@@ -313,13 +310,7 @@ def write_cost(folder: Path, analysis: CostAnalysis) -> list[Path]:
 
 
 def write_figure(folder: Path, name: str, figure: Figure) -> list[Path]:
-    """Write a figure on white as PNG and SVG; the same figure gives the same bytes.
-
-    Args:
-        folder: where to.
-        name: of the files, without ending.
-        figure: the figure.
-    """
+    """Write a figure on white as PNG and SVG; the same figure gives the same bytes."""
     written = []
     with figure_style(**{"svg.fonttype": "path"}):
         for ending in ENDINGS:
@@ -331,12 +322,7 @@ def write_figure(folder: Path, name: str, figure: Figure) -> list[Path]:
 
 
 def inline_svg(figure: Figure, title: str) -> Markup:
-    """Return a figure as an SVG element for a page: words stay words, colours are variables.
-
-    Args:
-        figure: the figure.
-        title: what it shows, for people who cannot see it.
-    """
+    """Return a figure as an SVG element for a page: words stay words, colours are variables."""
     stream = io.StringIO()
     nothing = dict.fromkeys(("Creator", "Date", "Format", "Type"))
     with figure_style(**{"svg.fonttype": "none"}):
@@ -420,7 +406,6 @@ def strip_plot(methods: Sequence[StripMethod], info: CaptureInfo | None, metric:
     Args:
         methods: at least one; all with the same test frames.
         info: the capture; None leaves severities out.
-        metric: of the scores.
     """
     frames = [frame.frame for frame in methods[0].result.frames]
     weights = [(method, side) for method in methods for side in method.weights]

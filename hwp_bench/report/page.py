@@ -76,13 +76,7 @@ def style_sheet() -> Markup:
 
 
 def render_template(package: str, name: str, **values: Any) -> str:
-    """Return a filled template; every value that is not `Markup` is escaped.
-
-    Args:
-        package: package with a folder `templates`.
-        name: the template in it.
-        values: what it shows.
-    """
+    """Return a filled template; every value that is not `Markup` is escaped."""
     return template_environment(package).get_template(name).render(values)
 
 
@@ -193,13 +187,9 @@ def copy_avatar_pages(folder: Path, sources: Sequence[ResultsSource]) -> AvatarP
 
     Args:
         folder: of the report; pages go into `avatars/`, under numbers.
-        sources: the evaluations.
 
     Returns:
         Addresses within `folder`; results without pages have none.
-
-    Raises:
-        BadResult: a file in this place is too large, a link, or something else than a page.
     """
     found: AvatarPages = {}
     for index, source in enumerate(sources):
@@ -379,14 +369,9 @@ def gather_report(
 
     Args:
         sources: the evaluations; those on clean frames only enter the robustness table.
-        capture_folders: capture folders, for severities.
         base: name of the method that shares of the gap are counted from; None takes the plain
             baseline where it is among them.
         image_bytes: budget of the images; None takes the default.
-        avatar_pages: what `copy_avatar_pages` returned of `sources`.
-
-    Raises:
-        UsageError: there are no results, or they are of different data or protocols.
     """
     if not sources:
         raise UsageError("results are needed", field="RESULTS")
@@ -597,17 +582,11 @@ def write_reports(
     Args:
         folder: where `index.html` goes; with results on several data it leads to `A/index.html`,
             `B/index.html`, and so on.
-        sources: the evaluations.
-        captures: capture folders, for severities.
         base: method that shares of the gap are counted from; data without it have no shares.
         title: heading; None takes the methods' titles.
-        avatar_pages: as of `write_report`.
 
     Returns:
         The pages, the first one to open first.
-
-    Raises:
-        UsageError: there are no results, or no group has the base.
     """
     groups = data_groups(sources, oracles=True)
     if len(groups) < 2:

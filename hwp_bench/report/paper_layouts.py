@@ -110,9 +110,7 @@ def layout_table(
     LPIPS weights the oriented distance is added, in a column under its own name.
 
     Args:
-        layout: which.
         runs: the methods or variants; may be empty where `published` is set.
-        published: append the paper's numbers, marked.
         marks: the components of each variant; None shows labels only.
     """
     shown = {
@@ -261,16 +259,7 @@ def _plus_minus(mean: float, deviation: float | None) -> str:
 def bias_layout(
     measured: Sequence[tuple[Cell, ...]], metrics: Sequence[str], published: bool = False
 ) -> Table:
-    """Return the layout of table 9.
-
-    Args:
-        measured: rows of `study_tables.bias_rows`.
-        metrics: the metrics of those rows.
-        published: append the paper's rows, marked.
-
-    Raises:
-        UsageError: there is nothing to show.
-    """
+    """Return the layout of table 9."""
     names = {value: key for key, value in METRIC_OF.items()}
     heads = [Column("Capture"), Column("Disturbance")]
     for name in metrics:

@@ -219,13 +219,6 @@ def novelty_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
 
     Errors are pooled over the scored pixels of all frames of all captures. Frames without a
     sound prediction are left out.
-
-    Args:
-        sources: evaluations with their predictions.
-        captures: by digest.
-
-    Raises:
-        UsageError: no capture or no prediction is at hand, or a split is not the usual one.
     """
     totals = _pooled(sources, captures)
     if not any(pixels.any() for pixels, _ in totals):
@@ -319,7 +312,6 @@ def classes_of(novelty: Novelty, region: np.ndarray) -> tuple[np.ndarray, np.nda
     """Positions in `CLASSES` of the pixels of a region, (P,) by angle and (P,) by share.
 
     Args:
-        novelty: of the frame.
         region: (H, W) bool, P pixels.
     """
     angle, seen = novelty.angle[region], novelty.seen[region]
@@ -348,13 +340,6 @@ def outline_table(sources: Sequence[ResultsSource], captures: Mapping[str, Captu
 
     Frames without a sound prediction are left out, and captures that are not at hand for every
     method.
-
-    Args:
-        sources: evaluations with their predictions.
-        captures: by digest.
-
-    Raises:
-        UsageError: no capture, or not every method's predictions of it, is at hand.
     """
     found: list[list[OutlineScores]] = [[] for _ in sources]
     for digest, capture in track(captures.items(), "Outlines", len(captures)):

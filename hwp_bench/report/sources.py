@@ -42,11 +42,7 @@ class ResultsSource:
         return [item for item in self.results.captures if item.digest == digest]
 
     def place(self, capture: str, *parts: str) -> Path | None:
-        """Return a path inside the folder of a capture; None where the folder is not known.
-
-        Raises:
-            BadInput: the capture's name leads out of the results folder.
-        """
+        """Return a path inside the folder of a capture; None where the folder is not known."""
         if self.folder is None:
             return None
         return inside(self.folder, os.path.join("captures", capture, *parts))
@@ -94,12 +90,7 @@ def source_folders(sources: Iterable[ResultsSource]) -> list[Path]:
 
 
 def stored_predictions(source: ResultsSource, item: CaptureResult) -> dict[int, Path]:
-    """The predictions of the frames that were scored, by frame; empty where none are kept.
-
-    Args:
-        source: the evaluation.
-        item: its result on a capture.
-    """
+    """The predictions of the frames that were scored, by frame; empty where none are kept."""
     folder = source.place(item.id, "predictions")
     if folder is None:
         return {}
@@ -118,10 +109,6 @@ def temporal_weights(source: ResultsSource, capture: str) -> dict[str, TemporalW
 
     What is returned is their magnitude: a weight times a learned bias is the same with both signs
     turned, so that the sign says nothing of how perturbed a frame is.
-
-    Raises:
-        BadResult: a file does not hold as many finite weights as frames, or a frame below 0.
-        BadInput: a file is damaged.
     """
     folder = source.place(capture, "diagnostics")
     found = {}
@@ -168,7 +155,6 @@ def find_captures(
     """Find what the evaluated captures say of themselves; nothing is rendered for it.
 
     Args:
-        results: evaluations.
         folders: capture folders to look at; simulated captures in the toolkit's cache are
             found without.
 
@@ -181,11 +167,7 @@ def find_captures(
 def open_captures_of(
     results: Iterable[Results], folders: Sequence[str | os.PathLike[str]] = ()
 ) -> dict[str, Capture]:
-    """Open the evaluated captures that `find_captures` finds, by digest.
-
-    Raises:
-        BadCapture, BadInput: one of them is damaged.
-    """
+    """Open the evaluated captures that `find_captures` finds, by digest."""
     found = _located(results, folders)
     return {digest: open_capture(place) for digest, (_, place) in found.items()}
 
@@ -222,11 +204,6 @@ def mean_severity(
 ) -> dict[str, float]:
     """Return the mean severity of each declared perturbation over the frames to learn from.
 
-    Args:
-        info: the capture.
-        test: the test frames, which are left out.
-        perturbed_only: average over the frames where the perturbation is present.
-
     Returns:
         By perturbation, 0 to 5; those of unknown severity are left out.
     """
@@ -258,13 +235,7 @@ class DataGroup:
 
 
 def data_groups(sources: Sequence[ResultsSource], *, oracles: bool = False) -> list[DataGroup]:
-    """Return results by data, in the order of their first result.
-
-    Args:
-        sources: the results.
-        oracles: keep runs on chosen training frames (`--frames clean`) with the others, for a
-            table that shows both. Without it they are a group of their own.
-    """
+    """Return results by data, in the order of their first result."""
     found: dict[str, list[ResultsSource]] = {}
     for source in sources:
         found.setdefault(data_key(source.results, oracles=oracles), []).append(source)
@@ -276,12 +247,7 @@ def data_groups(sources: Sequence[ResultsSource], *, oracles: bool = False) -> l
 
 
 def data_key(results: Results, *, oracles: bool = False) -> str:
-    """Return a digest of the data of a result: captures, splits, test frames, masks, protocols.
-
-    Args:
-        results: the result.
-        oracles: leave out which training frames the method was given.
-    """
+    """Return a digest of the data of a result: captures, splits, test frames, masks, protocols."""
     captures = sorted(
         (c.id, c.digest, c.split_digest, [frame.frame for frame in c.frames], c.exact_masks)
         for c in results.captures
@@ -316,7 +282,6 @@ def stacked(groups: Sequence[DataGroup], tables: Sequence[Table]) -> Table:
     """Put the tables of several groups under one another; rows are ranked within their group.
 
     Args:
-        groups: the groups.
         tables: the table of each, of one kind; their columns may differ.
 
     Returns:

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.analysis.compare import macro_by_seed, rank_methods, verdict
+from hwp_bench.analysis.columns import Filled, block_breaks, score_column, score_title, table_of
+from hwp_bench.analysis.compare import macro_by_seed, macro_mean, rank_methods, verdict
 from hwp_bench.analysis.cost import BUDGETS, MethodCost, method_costs
 from hwp_bench.analysis.pairing import MethodRuns, common_metrics, group_runs
 from hwp_bench.base.errors import UsageError
@@ -16,71 +17,55 @@ from hwp_bench.capture.schema import CaptureInfo
 from hwp_bench.metrics import metric as metric_facts
 from hwp_bench.metrics.score import aggregate
 from hwp_bench.report.sources import ResultsSource, mean_severity, mean_temporal_weight
-from hwp_bench.report.tables import HEADLINE, labels, score_column
+from hwp_bench.report.tables import HEADLINE, labels
 from hwp_bench.results import Results
 from hwp_bench.results.schema import score_rows
 from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
 #: Metric of the ranks and of the sentence that says who wins.
 METRIC = HEADLINE[0]
-_GB = 1e9
 
 
 def rank_table(runs: Sequence[MethodRuns]) -> Table:
-    """Return one row a method, best first: rank with interval, score, what it is behind, ties.
-
-    Args:
-        runs: the methods, on the same data.
-
-    Raises:
-        UsageError: two methods have no seed in common.
-    """
+    """Return one row a method, best first: rank with interval, score, what it is behind, ties."""
     ranking = rank_methods(runs, METRIC)
     facts = metric_facts(METRIC)
     others = [name for name in common_metrics(runs, HEADLINE) if name != METRIC]
     by_label = {run.label: run for run in runs}
-    columns = [
-        Column("Method"),
-        Column("Rank", 0, group="Rank"),
-        Column("95 %", group="Rank"),
-        score_column(METRIC),
-        Column("Difference", facts.digits, group="Less the first"),
-        Column("Low", facts.digits, group="Less the first"),
-        Column("High", facts.digits, group="Less the first"),
-        Column("Ties"),
-        *(score_column(name) for name in others),
-        Column("Seeds", 0),
+    ranks = ranking.ranks
+    behind = [item.behind for item in ranks]
+    less = "Less the first"
+    columns: list[Filled] = [
+        (Column("Method"), [item.standing.label for item in ranks]),
+        (Column("Rank", 0, group="Rank"), [item.rank for item in ranks]),
+        (Column("95 %", group="Rank"), [item.interval for item in ranks]),
+        (score_column(METRIC), [item.standing.mean for item in ranks]),
+        (
+            Column("Difference", facts.digits, group=less),
+            [b.value if b else None for b in behind],
+        ),
+        (Column("Low", facts.digits, group=less), [b.low if b else None for b in behind]),
+        (
+            Column("High", facts.digits, group=less),
+            [b.high if b else None for b in behind],
+        ),
+        (Column("Ties"), [item.standing.ties for item in ranks]),
     ]
-    rows: list[tuple[Cell, ...]] = []
-    for item in ranking.ranks:
-        behind = item.behind
-        rows.append(
-            (
-                item.standing.label,
-                item.rank,
-                f"{item.best}" if item.best == item.worst else f"{item.best} to {item.worst}",
-                item.standing.mean,
-                *((behind.value, behind.low, behind.high) if behind else (None, None, None)),
-                item.standing.ties,
-                *(float(macro_by_seed(by_label[item.standing.label], n).mean()) for n in others),
-                item.standing.seeds,
-            )
-        )
+    for name in others:
+        means = [macro_mean(by_label[item.standing.label], name) for item in ranks]
+        columns.append((score_column(name), means))
+    columns.append((Column("Seeds", 0), [item.standing.seeds for item in ranks]))
     notes = (
         verdict(ranking),
         "Macro means. Interval of a rank: what a method's significant differences leave "
         "(Bonferroni over its pairs), so that each interval holds with 95 %. Methods that share "
         "a letter are tied (Holm over all pairs).",
     )
-    return Table(f"Ranks by {facts.label}", tuple(columns), tuple(rows), notes)
+    return table_of(f"Ranks by {facts.label}", columns, notes)
 
 
 def winner_note(results: Sequence[Results]) -> str | None:
-    """Return the sentence that says who wins; None where there is nothing to compare.
-
-    Args:
-        results: on the same data.
-    """
+    """Return the sentence that says who wins; None where there is nothing to compare."""
     try:
         runs = group_runs(results)
         if len(runs) < 2 or not common_metrics(runs, [METRIC]):
@@ -92,38 +77,25 @@ def winner_note(results: Sequence[Results]) -> str | None:
 
 
 def cost_table(runs: Sequence[MethodRuns]) -> Table:
-    """Return one row a method: its score, the score after fixed times, seconds and memory.
-
-    Args:
-        runs: the methods, on the same data.
-    """
+    """Return one row a method: its score, the score after fixed times, seconds and memory."""
     facts = metric_facts(METRIC)
     costs = method_costs(runs, METRIC, budgets=BUDGETS)
-    scores = [float(macro_by_seed(run, METRIC).mean()) for run in runs]
-    budgets = list(costs[0].at)
-    unit = f"{facts.label} [{facts.unit}]"
-    columns = [
-        Column("Method"),
-        Column("Test", facts.digits, True, unit),
-        *(Column(f"{budget:g} s", facts.digits, True, f"{unit} after") for budget in budgets),
-        Column("Fit [s]", 1, False, "Cost"),
-        Column("One core [s]", 1, False, "Cost"),
-        Column("Memory [GB]", 2, False, "Cost"),
-        Column("Render [frames/s]", 1, True, "Cost"),
-        Column("Front"),
+    scores = [macro_mean(run, METRIC) for run in runs]
+    unit = score_title(METRIC)
+    front = [on_front(*one, costs, scores) for one in zip(costs, scores, strict=True)]
+    columns: list[Filled] = [
+        (Column("Method"), [cost.label for cost in costs]),
+        (Column("Test", facts.digits, True, unit), scores),
     ]
-    rows = [
-        (
-            cost.label,
-            score,
-            *(cost.at[budget] for budget in budgets),
-            cost.fit_seconds,
-            cost.cpu_seconds,
-            cost.peak_memory / _GB if cost.peak_memory else None,
-            cost.frames_per_second,
-            "yes" if on_front(cost, score, costs, scores) else None,
-        )
-        for cost, score in zip(costs, scores, strict=True)
+    for budget in costs[0].at:
+        head = Column(f"{budget:g} s", facts.digits, True, f"{unit} after")
+        columns.append((head, [cost.at[budget] for cost in costs]))
+    columns += [
+        (Column("Fit [s]", 1, False, "Cost"), [cost.fit_seconds for cost in costs]),
+        (Column("One core [s]", 1, False, "Cost"), [cost.cpu_seconds for cost in costs]),
+        (Column("Memory [GB]", 2, False, "Cost"), [cost.peak_gb for cost in costs]),
+        (Column("Render [frames/s]", 1, True, "Cost"), [one.frames_per_second for one in costs]),
+        (Column("Front"), ["yes" if first else None for first in front]),
     ]
     notes = (
         "Test: macro mean. After a time: validation frames, outside the method's clock. One core: "
@@ -131,20 +103,13 @@ def cost_table(runs: Sequence[MethodRuns]) -> Table:
         "Front: no other method has at least this test score in as few seconds. Means over "
         "captures and seeds; memory is the largest. Seconds compare on one machine only.",
     )
-    return Table("Accuracy and cost", tuple(columns), tuple(rows), notes)
+    return table_of("Accuracy and cost", columns, notes)
 
 
 def on_front(
     cost: MethodCost, score: float, costs: Sequence[MethodCost], scores: Sequence[float]
 ) -> bool:
-    """Return whether no other method is at least as good in as few seconds, and better in one.
-
-    Args:
-        cost: of the method.
-        score: its test score, larger is better.
-        costs: of all methods.
-        scores: their test scores.
-    """
+    """Return whether no other method is at least as good in as few seconds, and better in one."""
     if cost.fit_seconds is None:
         return False
     for other, theirs in zip(costs, scores, strict=True):
@@ -168,10 +133,6 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
     Args:
         sources: for every method an evaluation on the perturbed frames and one on the clean
             ones (`--frames clean`), the clean-data oracle; seeds are averaged.
-        base: name of the method that the share of the gap is counted from.
-
-    Raises:
-        UsageError: no method was evaluated on both, or none is called `base`.
     """
     runs = group_runs([source.results for source in sources])
     perturbed = [run for run in runs if run.first.frames == "perturbed"]
@@ -184,24 +145,23 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
         )
     start = _base(perturbed, base)
     names = common_metrics(runs, ROBUST)
-    columns = [Column("Method")]
+    columns: list[Filled] = [(Column("Method"), [run.first.method.title for run, _ in pairs])]
     for name in names:
-        label = metric_facts(name).label
-        column = score_column(name)
-        columns += [
-            Column("Perturbed", column.digits, column.higher_is_better, label),
-            Column("Clean", column.digits, group=label),
-            Column("Change [%]", 1, group=label),
-            Column("Gap closed [%]", 1, True, label),
+        label, head = metric_facts(name).label, score_column(name)
+        scores = [(macro_mean(run, name), macro_mean(clean, name)) for run, clean in pairs]
+        changes = [100 * (score - best) / abs(best) if best else None for score, best in scores]
+        closed = [
+            _closed(run, start, name, *own) for (run, _), own in zip(pairs, scores, strict=True)
         ]
-    rows = []
-    for run, clean in pairs:
-        cells: list[Cell] = [run.first.method.title]
-        for name in names:
-            score, oracle = _macro(run, name), _macro(clean, name)
-            change = 100 * (score - oracle) / abs(oracle) if oracle else None
-            cells += [score, oracle, change, _closed(run, start, name, score, oracle)]
-        rows.append(tuple(cells))
+        columns += [
+            (
+                Column("Perturbed", head.digits, head.higher_is_better, label),
+                [score for score, _ in scores],
+            ),
+            (Column("Clean", head.digits, group=label), [best for _, best in scores]),
+            (Column("Change [%]", 1, group=label), changes),
+            (Column("Gap closed [%]", 1, True, label), closed),
+        ]
     notes = (
         "Clean: the same method fitted on the clean frames of the same captures, the most that "
         "it can reach. Change: perturbed against clean.",
@@ -209,7 +169,7 @@ def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) 
         + (f"{start.first.method.title} on perturbed frames" if start else "a base (--base)")
         + " to that oracle, the share that the method goes. Macro means.",
     )
-    return Table("Robustness", tuple(columns), tuple(rows), notes)
+    return table_of("Robustness", columns, notes)
 
 
 def _oracle(run: MethodRuns, runs: Sequence[MethodRuns]) -> MethodRuns | None:
@@ -241,25 +201,13 @@ def _closed(
     """Return 100 (score - base) / (oracle - base); None without a base or a gap."""
     if start is None or start is run:
         return None
-    base = _macro(start, name)
+    base = macro_mean(start, name)
     gap = oracle - base if metric_facts(name).higher_is_better else base - oracle
     return 100 * (score - base) / (oracle - base) if gap > 0 else None
 
 
-def _macro(run: MethodRuns, name: str) -> float:
-    return float(macro_by_seed(run, name).mean())
-
-
 def severity_table(sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo]) -> Table:
-    """Return one row a perturbation, level of severity and method.
-
-    Args:
-        sources: the evaluations.
-        captures: by digest, as `report.sources.find_captures` gives them.
-
-    Raises:
-        UsageError: the severity of no capture is known.
-    """
+    """Return one row a perturbation, level of severity and method."""
     results = [source.results for source in sources]
     names = [name for name in HEADLINE[:3] if all(name in r.metrics for r in results)]
     cells: dict[tuple[int, int], dict[int, list[list[float]]]] = {}
@@ -280,22 +228,28 @@ def severity_table(sources: Sequence[ResultsSource], captures: Mapping[str, Capt
             field="--captures",
             remedy="Name the capture folders, or render the suite on this machine.",
         )
-    columns = [Column("Perturbation"), Column("Severity", 0), Column("Captures", 0)]
-    columns += [Column("Method"), *(score_column(name) for name in names)]
-    rows: list[tuple[Cell, ...]] = []
-    breaks = []
     titles = labels(results)
-    for (index, level), methods in sorted(cells.items()):
-        breaks.append(len(rows))
-        for place, scores in methods.items():
-            heading = perturbation(PERTURBATIONS[index]).heading
-            means_over = [float(value) for value in np.mean(scores, axis=0)]
-            rows.append((heading, level, len(scores), titles[place], *means_over))
+    shown = [
+        (index, level, titles[place], scores)
+        for (index, level), methods in sorted(cells.items())
+        for place, scores in methods.items()
+    ]
+    headings = [perturbation(PERTURBATIONS[index]).heading for index, _, _, _ in shown]
+    columns: list[Filled] = [
+        (Column("Perturbation"), headings),
+        (Column("Severity", 0), [level for _, level, _, _ in shown]),
+        (Column("Captures", 0), [len(scores) for _, _, _, scores in shown]),
+        (Column("Method"), [title for _, _, title, _ in shown]),
+    ]
+    for place, name in enumerate(names):
+        over = [float(np.mean(scores, axis=0)[place]) for _, _, _, scores in shown]
+        columns.append((score_column(name), over))
     note = (
         "Severity: mean over the frames to learn from that show the perturbation, rounded. The "
         "test frames that are scored show none."
     )
-    return Table("By severity", tuple(columns), tuple(rows), (note,), breaks=tuple(breaks[1:]))
+    breaks = block_breaks([(index, level) for index, level, _, _ in shown])
+    return table_of("By severity", columns, [note], breaks=breaks)
 
 
 def bias_rows(
@@ -328,11 +282,7 @@ def _level(severity: float | None) -> str | None:
 
 
 def bias_table(sources: Sequence[ResultsSource], captures: Mapping[str, CaptureInfo]) -> Table:
-    """Return the mean temporal weight against the perturbation level, a row a capture.
-
-    Raises:
-        UsageError: no evaluation has temporal weights.
-    """
+    """Return the mean temporal weight against the perturbation level, a row a capture."""
     names = [name for name in HEADLINE if all(name in s.results.metrics for s in sources)]
     rows = bias_rows(sources, captures, names)
     if not rows:
@@ -363,19 +313,20 @@ def seeds_table(sources: Sequence[ResultsSource]) -> Table:
     """Return one row a method: mean and standard deviation over seeds of the macro mean."""
     runs = group_runs([source.results for source in sources])
     names = common_metrics(runs, HEADLINE)
-    columns = [Column("Method"), Column("Seeds", 0)]
+    columns: list[Filled] = [
+        (Column("Method"), [run.label for run in runs]),
+        (Column("Seeds", 0), [len(run.seeds) for run in runs]),
+    ]
     for name in names:
-        column = score_column(name)
+        head = score_column(name)
+        means = [macro_by_seed(run, name) for run in runs]
+        spread = [float(own.std(ddof=1)) if len(own) > 1 else None for own in means]
         columns += [
-            Column("Mean", column.digits, column.higher_is_better, column.title),
-            Column("Deviation", column.digits + 2, group=column.title),
+            (
+                Column("Mean", head.digits, head.higher_is_better, head.title),
+                [float(own.mean()) for own in means],
+            ),
+            (Column("Deviation", head.digits + 2, group=head.title), spread),
         ]
-    rows = []
-    for run in runs:
-        cells: list[Cell] = [run.label, len(run.seeds)]
-        for name in names:
-            means = macro_by_seed(run, name)
-            cells += [float(means.mean()), float(means.std(ddof=1)) if len(means) > 1 else None]
-        rows.append(tuple(cells))
     note = "Macro means; the standard deviation is the sample's (n - 1)."
-    return Table("Over seeds", tuple(columns), tuple(rows), (note,))
+    return table_of("Over seeds", columns, [note])

@@ -8,10 +8,11 @@ from dataclasses import replace
 import numpy as np
 
 from hwp_bench.analysis.bootstrap import bootstrap_mean
+from hwp_bench.analysis.columns import Filled, block_breaks, score_column, table_of, with_columns
 from hwp_bench.analysis.pairing import MethodRuns, group_runs
 from hwp_bench.base.errors import BadResult, UsageError
 from hwp_bench.base.tables import Cell, Column, Table
-from hwp_bench.metrics import HWP_V1, METRICS, Protocol, metric
+from hwp_bench.metrics import HWP_V1, METRICS, Protocol
 from hwp_bench.metrics.score import Aggregate, Scores, Summary, aggregate
 from hwp_bench.results import CaptureResult, FreeViewResult, Results
 from hwp_bench.results.schema import (
@@ -42,9 +43,6 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
     `overall` (single, interacting, macro mean, with cost), `captures`, `perturbations`,
     `details` (every metric of protocol hwp-v1), `micro` (every frame counts the same) and
     `paper` (protocol paper-wildghand).
-
-    Raises:
-        UsageError: evaluations of one name were made on different data.
     """
     same_data(results)
     means = [aggregate(score_rows(result)) for result in results]
@@ -66,18 +64,21 @@ def overall_table(
     """Return one row a method: means, and what they cost.
 
     Args:
-        results: the evaluations.
-        groups: for each group of columns, the means of every evaluation.
         metrics: which metrics; those that an evaluation lacks are left out.
     """
     table = mean_table(results, groups, metrics)
-    columns = [
-        Column("Fit [s]", 1, group="Cost"),
-        Column("Render [frames/s]", 1, group="Cost"),
-        Column("Failed frames", 0, group="Cost"),
+    costs: list[Filled] = [
+        (Column("Fit [s]", 1, group="Cost"), [_fit_seconds(result) for result in results]),
+        (
+            Column("Render [frames/s]", 1, group="Cost"),
+            [_render_rate(result) for result in results],
+        ),
+        (
+            Column("Failed frames", 0, group="Cost"),
+            [sum(capture.failed_frames for capture in result.captures) for result in results],
+        ),
     ]
-    rows = [(*row, *_cost(result)) for row, result in zip(table.rows, results, strict=True)]
-    return replace(table, columns=(*table.columns, *columns), rows=tuple(rows))
+    return with_columns(table, costs)
 
 
 def mean_table(
@@ -88,17 +89,17 @@ def mean_table(
 ) -> Table:
     """Return one row a method: means of `metrics` in each group of columns."""
     names = _present(results, metrics)
-    columns = [Column("Method")]
-    columns += [score_column(name, title) for title in groups for name in names]
-    rows = [
-        (label, *(means[index].get(name) for means in groups.values() for name in names))
-        for index, label in enumerate(labels(results))
+    columns: list[Filled] = [(Column("Method"), labels(results))]
+    columns += [
+        (score_column(name, title), [mean.get(name) for mean in means])
+        for title, means in groups.items()
+        for name in names
     ]
     scope = f"Every mean is over captures of means over test frames; {_scope(results)}."
     if MACRO in groups:
         scope += " Macro: the mean over perturbations, each over the captures with it."
     notes = tuple(text for text in (note, scope, makers_note(results)) if text)
-    return Table("All captures", tuple(columns), tuple(rows), notes)
+    return table_of("All captures", columns, notes)
 
 
 def _groups(means: Sequence[Aggregate]) -> dict[str, list[Scores]]:
@@ -116,55 +117,52 @@ def _groups(means: Sequence[Aggregate]) -> dict[str, list[Scores]]:
 def capture_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Table:
     """Return one row a method and capture."""
     names = _present(results, HEADLINE)
-    columns = [Column("Capture"), Column("Hands"), Column("Method")]
-    columns += [score_column(name) for name in names]
-    columns += [Column("Fit [s]", 1), Column("Failed frames", 0)]
-    imported = any(capture.made_by for result in results for capture in result.captures)
-    columns += [Column("Made by")] if imported else []
-    rows: list[tuple[Cell, ...]] = []
-    breaks = []
-    for identifier in dict.fromkeys(c.id for result in results for c in result.captures):
-        breaks.append(len(rows))
-        for label, result, mean in zip(labels(results), results, means, strict=True):
-            for capture in result.captures:
-                if capture.id == identifier:
-                    scores = [mean.overall.captures[identifier].get(name) for name in names]
-                    hands = "interacting" if capture.hands == "both" else "single"
-                    tail = (capture.fit_seconds, capture.failed_frames)
-                    maker = (capture.made_by,) if imported else ()
-                    rows.append((identifier, hands, label, *scores, *tail, *maker))
+    ids = dict.fromkeys(capture.id for result in results for capture in result.captures)
+    shown = [
+        (capture, label, mean.overall.captures[identifier])
+        for identifier in ids
+        for label, result, mean in zip(labels(results), results, means, strict=True)
+        for capture in result.captures
+        if capture.id == identifier
+    ]
+    captures = [capture for capture, _, _ in shown]
+    hands = ["interacting" if capture.hands == "both" else "single" for capture in captures]
+    columns: list[Filled] = [
+        (Column("Capture"), [capture.id for capture in captures]),
+        (Column("Hands"), hands),
+        (Column("Method"), [label for _, label, _ in shown]),
+        *((score_column(name), [scores.get(name) for _, _, scores in shown]) for name in names),
+        (Column("Fit [s]", 1), [capture.fit_seconds for capture in captures]),
+        (Column("Failed frames", 0), [capture.failed_frames for capture in captures]),
+    ]
+    if any(capture.made_by for capture in captures):
+        columns.append((Column("Made by"), [capture.made_by for capture in captures]))
     # Captures are of unequal difficulty: only methods on one capture are ranked. Lines between
     # captures are drawn where there are several methods.
-    separate = tuple(breaks[1:])
     ranked = len(results) > 1
-    return Table(
-        "Per capture", tuple(columns), tuple(rows), ranked=ranked, breaks=separate if ranked else ()
-    )
+    breaks = block_breaks([capture.id for capture in captures]) if ranked else ()
+    return table_of("Per capture", columns, ranked=ranked, breaks=breaks)
 
 
 def perturbation_table(results: Sequence[Results], means: Sequence[Aggregate]) -> Table:
     """Return one row a method, one group of columns a perturbation, as the paper's table."""
     names = _present(results, HEADLINE[:3])
     present = [p for p in PERTURBATIONS if any(p in mean.overall.perturbations for mean in means)]
-    columns = [Column("Method")]
-    columns += [score_column(name, perturbation(p).heading) for p in present for name in names]
-    rows = [
+    columns: list[Filled] = [(Column("Method"), labels(results))]
+    columns += [
         (
-            label,
-            *(mean.overall.perturbations.get(p, {}).get(name) for p in present for name in names),
+            score_column(name, perturbation(p).heading),
+            [mean.overall.perturbations.get(p, {}).get(name) for mean in means],
         )
-        for label, mean in zip(labels(results), means, strict=True)
+        for p in present
+        for name in names
     ]
     note = "Mean over the captures with the perturbation; a capture may have several."
-    return Table("Per perturbation", tuple(columns), tuple(rows), (note,))
+    return table_of("Per perturbation", columns, [note])
 
 
 def same_data(results: Sequence[Results]) -> None:
-    """Refuse captures of one name that differ in their data or their split.
-
-    Raises:
-        UsageError: naming the capture.
-    """
+    """Refuse captures of one name that differ in their data or their split."""
     seen: dict[str, CaptureResult] = {}
     for result in results:
         for capture in result.captures:
@@ -177,13 +175,6 @@ def same_data(results: Sequence[Results]) -> None:
                     where=capture.id,
                     remedy="Evaluate the methods on the same captures with the same splits.",
                 )
-
-
-def score_column(name: str, group: str = "") -> Column:
-    """Return the column of a metric: label and unit, digits, direction."""
-    facts = metric(name)
-    title = f"{facts.label} [{facts.unit}]" if facts.unit else facts.label
-    return Column(title, facts.digits, facts.higher_is_better, group)
 
 
 def makers_note(results: Sequence[Results]) -> str:
@@ -233,17 +224,17 @@ _TELLING: tuple[Callable[[Results], str], ...] = (
 )
 
 
-def _cost(result: Results) -> list[Cell]:
+def _fit_seconds(result: Results) -> float | None:
+    """Mean seconds of a fit; None where no capture says any."""
     fits = [c.fit_seconds for c in result.captures if c.fit_seconds is not None]
-    renders = [
-        (len(c.frames), c.render_seconds) for c in result.captures if c.render_seconds is not None
-    ]
-    seconds = sum(spent for _, spent in renders)
-    return [
-        sum(fits) / len(fits) if fits else None,
-        per_second(sum(count for count, _ in renders), seconds),
-        sum(capture.failed_frames for capture in result.captures),
-    ]
+    return sum(fits) / len(fits) if fits else None
+
+
+def _render_rate(result: Results) -> float | None:
+    """Frames a second, over the captures that say how long they were rendered."""
+    timed = [c for c in result.captures if c.render_seconds is not None]
+    frames = sum(len(capture.frames) for capture in timed)
+    return per_second(frames, sum(capture.render_seconds or 0.0 for capture in timed))
 
 
 def _scope(results: Sequence[Results]) -> str:
@@ -267,11 +258,6 @@ def over_seeds(table: Table, results: Sequence[Results]) -> Table:
 
     Measurements become means. Counts to the right of the method's name are added up, and texts
     there are joined.
-
-    Args:
-        table: with one row, or one in each block, for each of the results, which its column
-            `Method` calls by `labels(results)`.
-        results: the evaluations.
 
     Returns:
         The table; as it is where no method has several seeds, or one has a seed twice.
@@ -352,11 +338,6 @@ def free_view_table(results: Sequence[Results]) -> Table:
 
     Args:
         results: evaluations; those without any scores of a clip are left out.
-
-    Raises:
-        UsageError: none has such scores, no capture is common to all, two results are of the same
-            method and seed, or the clips of a capture differ.
-        BadResult: a clip lists no frame, or frames without the main metric.
     """
     scored = [r for r in results if any(item.free_view for item in r.captures)]
     if not scored:
@@ -376,31 +357,37 @@ def free_view_table(results: Sequence[Results]) -> Table:
     if not common:
         raise UsageError("no capture has a scored clip in every result", field="RESULTS")
     names = [name for name in OTHERS if all(_has(captures, name) for captures in found.values())]
-    rows: list[tuple[Cell, ...]] = []
-    breaks = []
-    for title, captures in [*((one, [one]) for one in common), (ALL, common)]:
-        if title == ALL and len(common) == 1:
-            continue
-        breaks.append(len(rows))
-        for run in runs:
-            clips = [found[run.label][capture] for capture in captures]
-            failed = sum(f.failure is not None for own in clips for c in own for f in c.frames)
-            test = _test(run, captures)
-            rows.append((title, run.label, *_cells(clips, names), test, failed))
+    blocks = [(one, [one]) for one in common]
+    blocks += [(ALL, common)] if len(common) > 1 else []
+    shown = [
+        (title, run, captures, [found[run.label][capture] for capture in captures])
+        for title, captures in blocks
+        for run in runs
+    ]
+    clips = [own for _, _, _, own in shown]
+    estimates = [
+        bootstrap_mean([_values(clip, MAIN) for clip in own], resamples=_RESAMPLES) for own in clips
+    ]
     main = score_column(MAIN)
-    columns = (
-        Column("Capture"),
-        Column("Method"),
-        main,
-        Column("Low", main.digits, group=_INTERVAL),
-        Column("High", main.digits, group=_INTERVAL),
-        *(score_column(name) for name in names),
-        Column(main.title, main.digits, group=_TEST),
-        Column("Failed", 0),
-    )
-    if not any(row[-1] for row in rows):
-        columns, rows = columns[:-1], [row[:-1] for row in rows]
-    return Table("Novel views", columns, tuple(rows), _NOTES, breaks=tuple(breaks[1:]))
+    columns: list[Filled] = [
+        (Column("Capture"), [title for title, _, _, _ in shown]),
+        (Column("Method"), [run.label for _, run, _, _ in shown]),
+        (main, [estimate.value for estimate in estimates]),
+        (Column("Low", main.digits, group=_INTERVAL), [one.low for one in estimates]),
+        (Column("High", main.digits, group=_INTERVAL), [one.high for one in estimates]),
+    ]
+    for name in names:
+        means = [float(np.mean([_values(clip, name).mean() for clip in own])) for own in clips]
+        columns.append((score_column(name), means))
+    tests = [_test(run, captures) for _, run, captures, _ in shown]
+    columns.append((Column(main.title, main.digits, group=_TEST), tests))
+    failed = [
+        sum(frame.failure is not None for clip in own for one in clip for frame in one.frames)
+        for own in clips
+    ]
+    columns += [(Column("Failed", 0), failed)] if any(failed) else []
+    breaks = block_breaks([title for title, _, _, _ in shown])
+    return table_of("Novel views", columns, _NOTES, breaks=breaks)
 
 
 # Headings of the interval and of the score of test frames.
@@ -461,13 +448,6 @@ def _has(captures: Mapping[str, Sequence[FreeViewResult]], metric: str) -> bool:
 def _values(clips: Sequence[FreeViewResult], metric: str) -> np.ndarray:
     """(S, F) scores of one capture."""
     return np.array([[frame.scores[metric] for frame in clip.frames] for clip in clips])
-
-
-def _cells(captures: Sequence[Sequence[FreeViewResult]], names: Sequence[str]) -> tuple[Cell, ...]:
-    samples = [_values(clips, MAIN) for clips in captures]
-    estimate = bootstrap_mean(samples, resamples=_RESAMPLES)
-    others = [float(np.mean([_values(clips, name).mean() for clips in captures])) for name in names]
-    return (estimate.value, estimate.low, estimate.high, *others)
 
 
 def _test(run: MethodRuns, captures: Sequence[str]) -> float:

@@ -19,7 +19,6 @@ from hwp_bench.leaderboard.board import (
     at_severity,
     board_rows,
     board_tables,
-    make_row,
     method_rows,
     reference_lead,
     severities_of,
@@ -101,14 +100,14 @@ def test_a_stranger_moves_no_row_by_a_seed_or_a_revision() -> None:
         if added.by == "B":
             named = {method.label for method in (own, *strange)}
             assert named == {"Mine (by A)", "Mine (by B)"}
-            own = next(m for m in (own, *strange) if m.row.entries == (checked,))
+            own = next(m for m in (own, *strange) if m.entries == (checked,))
             assert not own.older
         else:
             assert own.older == (other,)
-        assert own.row.entries == (checked,)
+        assert own.entries == (checked,)
         # What was checked as far, and is of the same submitter, does take the place.
         revised = replace(other, checks=(check_of(other),))
-        taken = any(method.row.entries == (revised,) for method in method_rows([checked, revised]))
+        taken = any(method.entries == (revised,) for method in method_rows([checked, revised]))
         assert taken == (added.by == "B" or seed == 0)
 
 
@@ -125,12 +124,12 @@ def test_the_row_of_a_method_is_its_newest_and_the_others_are_its_history() -> N
     ]
     (method,) = method_rows(runs)
     assert method.label == "Mine"
-    assert method.row.entries == (runs[1],)
+    assert method.entries == (runs[1],)
     assert method.older == (runs[0], runs[2])
     # A run that was checked stays ahead of newer ones that were not.
     checked = replace(runs[2], checks=(check_of(runs[2]),))
     (method,) = method_rows([*runs[:2], checked])
-    assert method.row.entries == (checked,)
+    assert method.entries == (checked,)
 
 
 def test_seconds_are_means_over_seeds_or_unknown() -> None:
@@ -345,9 +344,9 @@ def test_a_severity_keeps_the_perturbations_that_have_it(entry) -> None:
 
 
 def test_rows_hold_the_means_of_every_severity(entry) -> None:
-    row = make_row(BoardRow((entry,)))
+    row = BoardRow((entry,))
     assert severities_of([row]) == [2, 3, 4]
-    scores = {scope: values["psnr"] for scope, values in row.scores.items()}
+    scores = {scope: values["psnr"] for scope, values in row.scopes.items()}
     # Capture 4 alone has objects of severity 2, and capture 3 alone of severity 3.
     assert scores["hand_object_interaction@2"] == scores["macro@2"] == pytest.approx(24.0)
     assert scores["hand_object_interaction@3"] == pytest.approx(23.0)

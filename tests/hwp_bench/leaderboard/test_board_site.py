@@ -20,7 +20,7 @@ from hwp_bench.base.files import sha256_json
 from hwp_bench.base.images import write_image
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import frame_name
-from hwp_bench.leaderboard.board import BoardRow, board_rows, budget_text, curve_plot, make_row
+from hwp_bench.leaderboard.board import BoardRow, board_rows, budget_text, curve_plot
 from hwp_bench.leaderboard.entries import Entry, Submission, entry_name, make_entry
 from hwp_bench.leaderboard.site import (
     FRAMES,
@@ -75,11 +75,11 @@ def entries(make_results) -> list[Entry]:
 
 
 def test_rows_hold_the_means_of_every_scope(entries) -> None:
-    row = make_row(BoardRow((entries[0],)))
-    assert row.scores["macro"]["psnr"] == pytest.approx(20.0)
-    assert row.scores["motion_blur"]["psnr"] == pytest.approx(10.0)
-    assert row.scores["interacting"]["psnr"] is None
-    assert row.fit == pytest.approx(2.0)
+    row = BoardRow((entries[0],))
+    assert row.scopes["macro"]["psnr"] == pytest.approx(20.0)
+    assert row.scopes["motion_blur"]["psnr"] == pytest.approx(10.0)
+    assert row.scopes["interacting"]["psnr"] is None
+    assert row.fit_seconds == pytest.approx(2.0)
     assert budget_text({"seconds": 60.0, "steps": 500}) == "60 s, 500 steps"
     assert budget_text({"seconds": None, "steps": None}) == "no limit"
 
@@ -254,9 +254,9 @@ def test_the_board_shows_the_current_revision_of_one_protocol(entries) -> None:
     assert f"reports/{first.name}/" not in page
     assert "Omega" not in page
     assert page.count('<td data-key="level"') == 3
-    row = make_row(BoardRow((second,)), older=[first])
+    row = BoardRow((second,), older=(first,))
     assert (row.level, row.badge) == ("self-reported", "not tried")
-    assert [(old.name, old.why) for old in row.older] == [
+    assert [(old.name, row.why_older(old)) for old in row.older] == [
         (first.name, "replaced: the device was wrong")
     ]
 
@@ -348,7 +348,7 @@ def test_each_row_is_shown_once_and_each_suite_has_its_own_captures(
     captures = {sha256_json(one.info.to_json()): one for one in (small, large)}
     monkeypatch.setattr("hwp_bench.leaderboard.site.open_captures_of", lambda results: captures)
     # One capture is a whole suite here.
-    monkeypatch.setattr("hwp_bench.leaderboard.board.missing", lambda results: [])
+    monkeypatch.setattr("hwp_bench.leaderboard.board.find_missing", lambda results: [])
     sources = [
         entry_of(tmp_path / "better", small, "Mine", gain=0.9, seed=1),
         entry_of(tmp_path / "first", small, "Mine", gain=0.9, seed=0),
@@ -471,7 +471,7 @@ EVIL_NAME = "</td><script>alert(1)</script>"
 
 
 def rows_of(*entries):
-    return [(row, make_row(row)) for row in board_rows(entries)]
+    return board_rows(entries)
 
 
 def written(folder: Path, *entries, scenes=()) -> dict[str, str]:

@@ -290,9 +290,8 @@ def test_entries_on_data_that_were_rounded_otherwise_stand(
     assert on_current_data(after) == after
     methods = method_rows(sound_entries(tmp_path))
     ranks, sentence = ranks_of(methods)
-    rows = [method.row for method in methods]
     assert "+1.00 dB against Before" in sentence
-    assert {row.first.method.name: ranks[row.entries[0].name].rank for row in rows} == {
+    assert {row.first.method.name: ranks[row.entries[0].name].rank for row in methods} == {
         "after": 1,
         "before": 2,
     }
@@ -373,5 +372,5 @@ def test_a_revision_of_somebody_elses_row_is_a_row_of_its_own(tmp_path: Path, ca
     write_check(tmp_path, check_of(mine))
     assert main(["leaderboard", "check", "--entries", str(tmp_path)]) == 2
     assert "which somebody else stands for" in capsys.readouterr().err
-    labels = {m.label: m.row.level for m in method_rows(sound_entries(tmp_path))}
+    labels = {m.label: m.level for m in method_rows(sound_entries(tmp_path))}
     assert labels == {"Mine (by A)": "rescored", "Mine (by B)": "self-reported"}
