@@ -20,13 +20,12 @@ from torch import Tensor
 from wildghand.gaussians.found import Found, Kept
 from wildghand.light.settings import LightSettings
 from wildghand.light.sphere import spread_directions
+from wildghand.shadows.cast_light import SRGB
 
 # Turns of albedo and light.
 _TURNS = 12
 # Irradiances below this share of the mean are as dark; ratios beyond these are cut.
 _DARKEST, _LEAST, _MOST = 1e-3, 0.2, 3.0
-# Linear light to sRGB is about this power.
-_SRGB = 1.0 / 2.2
 # Cosine between normal and viewing direction below which a Gaussian is a part of the rim, which
 # the network has learnt as such, and from which it is seen from the front.
 _RIM, _FRONT = 0.0, 0.2
@@ -85,7 +84,7 @@ class KnownLight(Found):
 
     def ratio(self, normals: Tensor, known: Tensor) -> Tensor:
         """Factor on an sRGB colour at `known` for the same skin at `normals`: (...)."""
-        ratio = (self.irradiance(normals) / self.irradiance(known)) ** _SRGB
+        ratio = (self.irradiance(normals) / self.irradiance(known)) ** SRGB
         return ratio.clamp(_LEAST, _MOST)
 
     def unknown(self, normals: Tensor, facing: Tensor) -> Tensor:

@@ -10,10 +10,10 @@ import numpy as np
 from wildghand.gaussians.found import Found, Kept
 
 # Bounds of what is read: parts of unit vectors, and strengths.
-_UNIT, _LARGEST = 1.001, 1e6
+_PART, _MOST_LIGHT = 1.001, 1e6
 # Irradiance that is added where two are compared, in that of ordinary skin: in the dark nothing
 # casts a shadow.
-_LEAST = 1e-3
+_DARK = 1e-3
 # Linear light to sRGB is about this power.
 SRGB = 1.0 / 2.2
 
@@ -25,11 +25,11 @@ class CastLight(Found):
     prefix = "shadows_"
     longest: ClassVar = {"K": 4096}
     #: (K, 3) unit vectors towards the light, float32.
-    directions: Annotated[np.ndarray, Kept(("K", 3), -_UNIT, _UNIT)]
+    directions: Annotated[np.ndarray, Kept(("K", 3), -_PART, _PART)]
     #: (K,) not negative, float32; the mean irradiance of what was read is about 1.
-    strengths: Annotated[np.ndarray, Kept(("K",), 0.0, _LARGEST)]
+    strengths: Annotated[np.ndarray, Kept(("K",), 0.0, _MOST_LIGHT)]
     #: Light that nothing takes off, not negative.
-    ambient: Annotated[float, Kept((), 0.0, _LARGEST)]
+    ambient: Annotated[float, Kept((), 0.0, _MOST_LIGHT)]
 
     def darkening(self, normals: np.ndarray, free: np.ndarray, darkest: float) -> np.ndarray:
         """Factor on the sRGB colour of skin that it has without anything in the way.
@@ -43,8 +43,8 @@ class CastLight(Found):
             (M,) up to 1.
         """
         falling = np.maximum(normals @ self.directions.T, 0.0) * self.strengths
-        without = self.ambient + falling.sum(axis=1) + _LEAST
-        share = (self.ambient + (falling * free).sum(axis=1) + _LEAST) / without
+        without = self.ambient + falling.sum(axis=1) + _DARK
+        share = (self.ambient + (falling * free).sum(axis=1) + _DARK) / without
         return np.clip(share, darkest, 1.0) ** SRGB
 
     def lit(self) -> CastLight:

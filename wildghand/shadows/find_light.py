@@ -29,9 +29,9 @@ CONE = 7
 # The six walls.
 _WALLS = np.concatenate([np.eye(3), -np.eye(3)])
 # Turns of albedo, strengths and robust weights.
-_TURNS = 6
+_ROUNDS = 6
 # Irradiance and albedo below these are as dark.
-_DARKEST = 1e-3
+_NO_LIGHT = 1e-3
 # Residuals count a half at this many medians; the misfit counts them from this residual on.
 _MEDIANS, _MISFIT = 3.0, 0.25
 # Lamps that are nearer than this to each other are one, and how often a direction is refined.
@@ -131,10 +131,10 @@ class _Pursuit:
             basis: (M, C) irradiance of each part of the light.
         """
         samples, light = self._samples, self._samples.light
-        strengths = 1.0 / (basis.shape[1] * np.maximum(basis.mean(axis=0), _DARKEST))
+        strengths = 1.0 / (basis.shape[1] * np.maximum(basis.mean(axis=0), _NO_LIGHT))
         robust = np.ones(len(light))
-        for _ in range(_TURNS):
-            irradiance = np.maximum(basis @ strengths, _DARKEST)
+        for _ in range(_ROUNDS):
+            irradiance = np.maximum(basis @ strengths, _NO_LIGHT)
             ratio = self._ratio(irradiance, samples.weights * robust)
             off = np.abs(ratio - 1.0)
             robust = 1.0 / (1.0 + (off / (_MEDIANS * np.median(off) + 1e-6)) ** 2)
@@ -148,7 +148,7 @@ class _Pursuit:
             strengths = nnls(root.T, np.linalg.solve(root, right))[0]
             mean = np.average(basis @ strengths, weights=samples.weights)
             strengths = strengths / max(float(mean), 1e-6)
-        irradiance = np.maximum(basis @ strengths, _DARKEST)
+        irradiance = np.maximum(basis @ strengths, _NO_LIGHT)
         off = self._ratio(irradiance, weights) - 1.0
         misfit = np.average(1.0 - 1.0 / (1.0 + (off / _MISFIT) ** 2), weights=samples.weights)
         return _Solved(strengths, irradiance, off, weights, float(misfit))
@@ -198,7 +198,7 @@ class _Pursuit:
     def _ratio(self, irradiance: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """(M,) light over albedo times irradiance; the albedo is the mean at each place."""
         albedo = self._means((self._samples.light / irradiance)[:, None], weights)[:, 0]
-        return self._samples.light / (np.maximum(albedo, _DARKEST)[self._place] * irradiance)
+        return self._samples.light / (np.maximum(albedo, _NO_LIGHT)[self._place] * irradiance)
 
 
 def _light_of(
