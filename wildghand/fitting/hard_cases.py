@@ -17,12 +17,12 @@ from torch import Tensor
 
 from hwp_bench.stability import Case, Context, Measured
 from wildghand.dpd.dpd import DynamicPerturbation, drop
-from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.dpd.temporal import TemporalTarget
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
 from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.model import terms
 from wildghand.pao.pao import PAPER_PAO, PerturbationAwareWeights, Weights
-from wildghand.pao.regions.frame_regions import FrameRegions, overlapping, partition, stack_regions
+from wildghand.pao.regions import FrameRegions, overlapping, partition, stack_regions
 
 #: Largest relative L2 distance of a float32 gradient from that of float64.
 GRADIENT_TOLERANCE = 1e-4

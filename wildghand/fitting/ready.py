@@ -15,10 +15,10 @@ from wildghand.gaussians.closed_surface import off_surface
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading_cpu import fill_harmonics
+from wildghand.light import Obstacles
 from wildghand.model.dress import dress
 from wildghand.network import NetworkOutput, Refinement
 from wildghand.network.frame_heads_cpu import warm_up as warm_up_heads
-from wildghand.shadows import Obstacles
 
 
 def ready_fit(name: str) -> torch.device:

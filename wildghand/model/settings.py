@@ -18,14 +18,13 @@ from hwp_bench.base.text import nearest
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.evidence import EvidenceSettings
-from wildghand.light import LightSettings
+from wildghand.light import LightSettings, ShadowSettings
 from wildghand.model.former_settings import current_names
 from wildghand.model.terms import PAPER_TERMS, TermWeights
 from wildghand.network.settings import NetworkSettings, network_settings
 from wildghand.pao.pao import PAPER_PAO, PaoSettings
-from wildghand.poses.settings import PoseSettings
+from wildghand.poses.errors import PoseSettings
 from wildghand.prepass import PrepassSettings
-from wildghand.shadows import ShadowSettings
 from wildghand.subject import SubjectSettings
 
 #: Where messages place a wrong setting.

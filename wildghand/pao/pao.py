@@ -1,4 +1,4 @@
-"""Perturbation-aware optimization: how much each pixel of a frame counts."""
+"""PAO."""
 
 from __future__ import annotations
 
@@ -11,9 +11,123 @@ from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.methods.settings import check_source
+from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.losses import full_precision
-from wildghand.pao.regions.frame_regions import Regions
-from wildghand.pao.running_median import LEAST, running_median
+from wildghand.pao.regions import ClipRegions, Regions
+
+#: Share of the newest median in the running one.
+RATE = 0.05
+#: Least median: half a level of 8 bits, below which differences are rounding.
+LEAST = 0.002
+
+
+@torch.no_grad()
+def running_median(
+    previous: float | Tensor | None, errors: Tensor, counted: Tensor
+) -> float | Tensor:
+    """Follow the median of errors over the steps of a fit.
+
+    Args:
+        previous: what this gave at the step before; None at the first.
+        errors: (...) not negative.
+        counted: as `errors`, bool: those that count; the others, and those that are not finite,
+            do not.
+
+    Returns:
+        The new median, at least `LEAST`; `previous` where nothing counts. A number on the CPU,
+        elsewhere a scalar on the device, float64, which nobody waits for.
+    """
+    counted = counted & errors.isfinite()
+    if errors.device.type != "cpu":
+        return _on_device(previous, errors, counted)
+    values = errors[counted]
+    if not len(values):
+        return LEAST if previous is None else previous
+    newest = float(values.median())
+    if previous is not None:
+        newest = float(previous) + RATE * (newest - float(previous))
+    return max(newest, LEAST)
+
+
+def _on_device(previous: float | Tensor | None, errors: Tensor, counted: Tensor) -> Tensor:
+    """As above, without a shape that follows from the values."""
+    ordered = torch.where(counted, errors, math.inf).flatten().sort().values
+    middle = (counted.sum() - 1).clamp(min=0) // 2
+    found = ordered.gather(0, middle[None])[0].double()
+    if previous is None:
+        newest = torch.where(counted.any(), found, LEAST)
+    else:
+        newest = torch.where(counted.any(), previous + RATE * (found - previous), previous)
+    return newest.clamp(min=LEAST)
+
+
+#: Share of the newest error of a place in its ordinary one, in a frame that is surely clean.
+PLACE_RATE = 0.1
+#: An error counts at most this often the ordinary one: something in front changes it slowly.
+MOST = 3.0
+
+
+class PlaceErrors:
+    """The ordinary error of each place of the hand at this point of a fit.
+
+    A hand that is not the template, a nail, a ring or poses that are always a little wrong leave
+    errors at the same places in every frame. Regions are compared with these, not with the mean
+    hand, and never with less than the running median of all regions.
+
+    Args:
+        places: the place of each pixel of the R frames; frames share their numbers.
+        trust: (R,) in [0, 1], how much a frame may teach what is ordinary: the probability that it
+            is clean.
+        count: C, places of the clip; they are numbered from 0.
+
+    Attributes:
+        ordinary: (C,) mean over channels of |rendering - input|; 0 where nothing is known.
+    """
+
+    def __init__(self, places: ClipRegions, trust: Tensor, count: int) -> None:
+        self._places, self._trust = places, trust
+        self.ordinary = torch.zeros(count, device=trust.device)
+
+    def expected(self, rows: Tensor, median: float | Tensor) -> Tensor:
+        """The ordinary error at every pixel, at least the running median.
+
+        Args:
+            rows: (B,) int64 on the CPU, which of the frames.
+            median: of the regions' errors.
+
+        Returns:
+            (B, H, W), positive.
+        """
+        places = self._places(rows)
+        floor = torch.clamp(self.ordinary, min=LEAST)
+        floor = torch.maximum(floor, torch.as_tensor(median, device=floor.device).to(floor))
+        # The regions of a batch may end before the last place of the clip.
+        return places.spread(floor[: places.count].expand(len(rows), -1).contiguous())
+
+    @torch.no_grad()
+    def watch(self, rows: Tensor, error: Tensor, hand: Tensor, median: float | Tensor) -> None:
+        """Learn from B frames.
+
+        Args:
+            rows: (B,) int64 on the CPU.
+            error: (B, H, W) mean over channels of |rendering - input|; finite where `hand` is.
+            hand: (B, H, W) bool.
+            median: of the regions' errors; the first error of a place counts at most `MOST` times.
+        """
+        places, ones = self._places(rows), hand.to(error)
+        pixels = places.sums(ones)
+        errors = places.sums(torch.where(hand, error, torch.zeros_like(error)))
+        errors = errors / pixels.clamp(min=1.0)
+        unit = torch.as_tensor(median, device=error.device).to(error)
+        trusts = self._trust[upload(rows, self._trust.device)]
+        ordinary = self.ordinary[: places.count]
+        for mine, seen, trust in zip(errors, pixels > 0.0, trusts, strict=True):
+            known = torch.where(ordinary > 0.0, ordinary, unit)
+            bounded = torch.minimum(mine, MOST * torch.maximum(known, unit))
+            moved = known + PLACE_RATE * trust * (bounded - known)
+            ordinary = torch.where(seen & mine.isfinite(), moved, ordinary)
+        self.ordinary = torch.cat([ordinary, self.ordinary[places.count :]])
+
 
 #: Colour channels: the paper's background error is their sum, its region error their mean.
 _CHANNELS = 3.0
@@ -41,7 +155,7 @@ class PaoSettings:
     #: weights of regions alone, as printed. `none`: nothing, as in the authors' code.
     temporal: Literal["teaching", "all", "regions", "none"] = "teaching"
     #: What E_u is counted in. `place`: the ordinary error of the region's places on the hand
-    #: (`wildghand.pao.place_errors`). `median`: the running median of the regions' errors.
+    #: (`wildghand.pao.pao`). `median`: the running median of the regions' errors.
     #: `batch`: from the smallest to the largest of a batch on [0, 1], as the authors do.
     #: `absolute`: colours in [0, 1], as printed.
     errors: Literal["place", "median", "batch", "absolute"] = "place"

@@ -1,4 +1,4 @@
-"""The assessment of frames: the result of the pre-pass, and the severities estimated from it."""
+"""A."""
 
 from __future__ import annotations
 
@@ -8,6 +8,68 @@ from types import MappingProxyType
 
 import cv2
 import numpy as np
+
+
+@dataclass(frozen=True)
+class PrepassSettings:
+    """How training frames are judged; the defaults suit every capture."""
+
+    #: Judge the frames before the fit.
+    enabled: bool = True
+    #: Refine the pose of frames whose mask disagrees with it.
+    frame_poses: bool = True
+    #: Edge of the cells that share one albedo, m on the rest surface.
+    patch_size: float = 0.004
+    #: Pixels of all frames together from which the intensity model is fitted.
+    sample_count: int = 120_000
+    #: Pixels of all frames together beyond which they are judged at a lower resolution.
+    pixel_budget: int = 30_000_000
+    #: Passes of the robust fit.
+    iterations: int = 10
+    #: Samples that the mean skin colour is worth in the albedo of a cell.
+    albedo_prior: float = 3.0
+    #: Share of the frames that is taken to be clean at least; the densest such part of a cue's
+    #: values says what is normal.
+    clean_share: float = 0.35
+    #: Least log gain that counts as one deviation: what shading leaves unexplained.
+    gain_floor: float = 0.08
+    #: Least change of the log of the residual that does.
+    residual_floor: float = 0.25
+    #: Least loss of texture that does.
+    texture_floor: float = 0.15
+    #: Least change of the log of the border's width that does.
+    border_floor: float = 0.15
+    #: Least misplacement that does, share of the hand's size.
+    misplacement_floor: float = 0.0006
+    #: Least hidden share of the hand that does.
+    hidden_floor: float = 0.02
+    #: Evidence (`wildghand.prepass.judge.evidence`) at which a frame is as likely clean as not.
+    tolerance: float = 1.2
+    #: Validation frames, which are clean, raise it to the median of what is found against them.
+    validated: bool = True
+    #: Deviation from which a cue by itself calls a frame blurred or misplaced.
+    clear_deviation: float = 3.0
+    #: Least weight of a frame in the fit.
+    weight_floor: float = 0.1
+    #: Chance that omega is dropped in a clean frame.
+    omega_dropout: float = 0.3
+    #: A frame is clean for `omega_dropout` from this probability on.
+    clean_threshold: float = 0.5
+    #: Residual, in those of the clean frames at the same place, at which a pixel's weight has
+    #: halved.
+    residual_scale: float = 2.5
+    #: Distance of a pixel's tint from the skin's, in those of the clean frames at the same place,
+    #: at which its weight has halved.
+    tint_scale: float = 4.0
+    #: Factor on both scales in a frame that is surely clean. Little can cover the hand there, and
+    #: what looks odd (nails, rings, seams of a glove a little off their place) belongs to it.
+    clean_scale: float = 4.0
+    #: Pixels that what is normal in the clean frames is worth in what is normal at a place.
+    residual_prior: float = 20.0
+    #: Fewer usable frames than this cannot be compared: all are judged clean. Nor do fewer
+    #: validation frames raise the tolerance.
+    least_frames: int = 4
+
 
 #: The cue that tells each perturbation, and how many of its deviations make one level: about
 #: what they are on simulated captures, where the levels are known (docs/prepass.md).
@@ -164,3 +226,69 @@ def estimated_severity(assessment: FrameAssessment) -> dict[str, np.ndarray]:
         level = np.clip(np.rint(getattr(assessment, cue) / deviations), 0, 5)
         levels[kind] = np.where(acting, level, 0).astype(np.int64)
     return levels
+
+
+def densest(values: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find the values that lie closest together.
+
+    The value whose `share` nearest values are nearest to it is the middle; they are the part.
+
+    Args:
+        values: (F, K) float, finite; F at least 1.
+        share: part of the values that must agree, in (0, 1].
+
+    Returns:
+        (K,) mean of the part, and (F,) bool which values it holds.
+    """
+    count = min(len(values), max(2, round(share * len(values))))
+    squares = (values**2).sum(axis=1)
+    distance = squares[:, None] + squares[None] - 2.0 * values @ values.T
+    radius = np.partition(distance, count - 1, axis=1)[:, count - 1]
+    nearest = np.argsort(distance[int(np.argmin(radius))], kind="stable")[:count]
+    part = np.zeros(len(values), dtype=bool)
+    part[nearest] = True
+    return values[part].mean(axis=0), part
+
+
+def normal_value(values: np.ndarray, share: float) -> tuple[float, float]:
+    """Median and robust deviation of the shortest part of the values: those that are normal.
+
+    Args:
+        values: (F,) float; those that are not finite are left out.
+        share: part of the values that is normal at least, in (0, 1].
+
+    Returns:
+        Both 0 where no value is finite.
+    """
+    known = np.sort(values[np.isfinite(values)])
+    if not len(known):
+        return 0.0, 0.0
+    count = min(len(known), max(2, round(share * len(known))))
+    width = known[count - 1 :] - known[: len(known) - count + 1]
+    start = int(np.argmin(width))
+    normal = float(np.median(known[start : start + count]))
+    # Half of the shortest part that holds a share s of a normal distribution is z(s) deviations.
+    return normal, 0.5 * float(width[start]) / _half_width(count / len(known))
+
+
+def excess(values: np.ndarray, share: float, floor: float) -> np.ndarray:
+    """How far values lie above what is normal among them, in robust deviations.
+
+    Args:
+        values: (F,) float; not finite counts as normal.
+        share: part of the values that is normal at least.
+        floor: least deviation that counts as one, positive.
+
+    Returns:
+        (F,) float64, 0 where a value is not above normal.
+    """
+    normal, deviation = normal_value(values, share)
+    above = np.maximum(values - normal, 0.0) / max(deviation, floor)
+    return np.where(np.isfinite(values), above, 0.0)
+
+
+def _half_width(share: float) -> float:
+    """Deviations to either side of the mean that hold a share of a normal distribution."""
+    from scipy.special import ndtri
+
+    return float(ndtri(0.5 + 0.5 * min(share, 0.99)))

@@ -9,9 +9,7 @@ import torch
 
 from hwp_bench.base.colors import log_light
 from wildghand.gaussians.shading import sh_basis
-from wildghand.prepass.assessment import CLEAN_FROM
-from wildghand.prepass.robust_location import densest
-from wildghand.prepass.settings import PrepassSettings
+from wildghand.prepass.assessment import CLEAN_FROM, PrepassSettings, densest
 
 #: 8-bit values outside this range say nothing about the light: noise, or clipped.
 LOWEST, HIGHEST = 4, 250

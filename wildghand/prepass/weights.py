@@ -7,10 +7,8 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from wildghand.prepass.assessment import CLEAN_FROM
+from wildghand.prepass.assessment import CLEAN_FROM, PrepassSettings, normal_value
 from wildghand.prepass.measurements import FrameMeasurements
-from wildghand.prepass.robust_location import normal_value
-from wildghand.prepass.settings import PrepassSettings
 
 # Edge of the window over which residuals are shared out, px.
 _WINDOW = 5

@@ -17,11 +17,9 @@ from scipy.linalg import solve
 from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
-from wildghand.subject.compared_frames import ComparedFrames
-from wildghand.subject.outline_rows import outline_rows
-from wildghand.subject.settings import SubjectSettings
-from wildghand.subject.shape import SubjectShape
-from wildghand.subject.unknowns import Unknowns
+from wildghand.subject.outlines import ComparedFrames
+from wildghand.subject.shape import SubjectSettings, SubjectShape
+from wildghand.subject.unknowns import Unknowns, outline_rows
 
 #: Stiffnesses among which frames that are not compared choose, the stiffest first. A stiffness
 #: multiplies the expected error of an outline and divides the expected change of a proportion.

@@ -34,7 +34,7 @@ from wildghand.prepass import (
     capture_input,
     judge_frames,
 )
-from wildghand.prepass.borders import interior
+from wildghand.prepass.measurements import interior
 
 SPARED = np.setdiff1d(np.arange(FRAMES), np.arange(7, 15))
 

@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hwp_bench.base.colors import linear_to_srgb
-from wildghand.prepass.borders import border_width, misplacement
-from wildghand.prepass.classify import clean_probability, clip_tolerance, evidence
-from wildghand.prepass.robust_location import densest, excess, normal_value
-from wildghand.prepass.settings import PrepassSettings
+from wildghand.prepass.assessment import PrepassSettings, densest, excess, normal_value
+from wildghand.prepass.judge import clean_probability, clip_tolerance, evidence
+from wildghand.prepass.measurements import border_width, misplacement
 
 
 def test_normal_values_of_a_normal_distribution() -> None:

@@ -12,9 +12,8 @@ from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand, project
 from hwp_bench.hands.raster import draw_silhouette
 from wildghand.subject import SubjectSettings, SubjectShape, fit_subject
-from wildghand.subject.compared_frames import ComparedFrames
-from wildghand.subject.outlines import MaskOutline, compare_outlines
-from wildghand.subject.proportions import hand_proportions
+from wildghand.subject.outlines import ComparedFrames, MaskOutline, compare_outlines
+from wildghand.subject.unknowns import hand_proportions
 
 FRAMES, SIZE = 12, 96
 # The masks are exact: less noise is expected than in a clip.

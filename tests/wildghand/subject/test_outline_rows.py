@@ -8,9 +8,8 @@ import pytest
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.raster import draw_silhouette
-from wildghand.subject.compared_frames import ComparedFrames, PosedFrames
-from wildghand.subject.outline_rows import outline_rows
-from wildghand.subject.unknowns import Unknowns
+from wildghand.subject.outlines import ComparedFrames, PosedFrames
+from wildghand.subject.unknowns import Unknowns, outline_rows
 
 SIZE, FRAMES = 96, 2
 # Of every unknown; the change of a pixel is linear in it up to its square.

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wildghand.light.sphere import ring_around, spread_directions
-from wildghand.shadows import CastLight, ShadowSamples, ShadowSettings, find_light
+from wildghand.light import CastLight, ShadowSamples, ShadowSettings, find_light
+from wildghand.light.lights import ring_around, spread_directions
 
 LAMPS = np.array([[0.55, -0.6, -0.58], [-0.7, -0.2, -0.69]])
 LAMPS /= np.linalg.norm(LAMPS, axis=1, keepdims=True)

@@ -11,13 +11,7 @@ import torch
 from tiny_networks import write_sam_file, write_sam_folder
 
 from hwp_bench.base.errors import BadInput
-from wildghand.pao.regions import (
-    PromptedHand,
-    RegionCache,
-    SegmentAnything,
-    mask_of,
-    open_sam,
-)
+from wildghand.pao.segmenters import PromptedHand, RegionCache, SegmentAnything, mask_of, open_sam
 from wildghand.sam import check_checkpoint
 
 PICTURE = np.random.default_rng(0).integers(0, 256, (40, 48, 3), dtype=np.uint8)

@@ -18,9 +18,9 @@ from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig, make_rig
+from wildghand.light import CastLight, HandShadows, Obstacles, ShadowSettings, ShadowTable
+from wildghand.light.hand_shadows import LIFT
 from wildghand.model.settings import read_settings
-from wildghand.shadows import CastLight, HandShadows, Obstacles, ShadowSettings, ShadowTable
-from wildghand.shadows.obstacles import LIFT
 
 DEEP = ShadowSettings(darkest=0.0)
 TrainingMaker = Callable[..., TrainingCapture]
