@@ -1,4 +1,4 @@
-"""Segment Anything. Oracles: Meta's code (segment-anything 1.0) on the tiny weights; a stub network.
+"""Segment Anything. Oracles: Meta's code (segment-anything 1.0) on tiny weights; a stub network.
 
 `sam_reference.npz` is what Meta's `SamPredictor` (every fourth logit before it is enlarged) and
 `SamAutomaticMaskGenerator` (8 points along an edge, quality 5.0, stability 0.95 at offset 0.5,
