@@ -1,4 +1,4 @@
-"""An avatar as its turntable shows it: colours of its Gaussians from all around.
+"""Gaussians for other programs: colours from all around, scale, and the axes of those programs.
 
 What a clip taught of its light holds in front of its camera. Hands are therefore turned in front of
 the camera, as the turntable does it, and a file remembers which colour each Gaussian had from which
@@ -14,11 +14,12 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
+from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.hands import TemplateTensors
 from hwp_bench.methods.contract import HandPose
 from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar
-from wildghand.avatar.playback import shown_sides
+from wildghand.avatar.render import shown_sides
 from wildghand.gaussians.quaternions import quat_multiply, quat_third_axis
 
 #: Turns in degrees: about the camera's vertical, then about its horizontal. The first is the front.
@@ -92,11 +93,7 @@ class SeenGaussians:
 
 
 def standing(avatar: WildGHandAvatar, capture: Capture | None, frame: int) -> Standing:
-    """Hands as a frame of a capture shows them; without a capture, as they stand in the studio.
-
-    Raises:
-        UsageError: the capture shows none of the avatar's hands, or belongs to another hand model.
-    """
+    """Hands as a frame of a capture shows them; without a capture, as they stand in the studio."""
     if capture is None:
         return Standing(avatar.studio.posed(), np.eye(4))
     shown = capture.hand_poses(frame)
@@ -110,8 +107,6 @@ def turned(
     """Hands after x -> turn (x - centre) + centre.
 
     Args:
-        avatar: whose hands they are.
-        hands: by side.
         turn: (3, 3) rotation.
         centre: (3,) m.
     """
@@ -145,15 +140,7 @@ def middle(splats: PosedGaussians) -> np.ndarray:
 
 
 def seen(avatar: WildGHandAvatar, place: Standing) -> SeenGaussians:
-    """The Gaussians of hands, and their colours while they turn in front of the camera.
-
-    Args:
-        avatar: what is seen.
-        place: the hands, and the camera.
-
-    Raises:
-        BadInput: the avatar gives numbers that are not finite.
-    """
+    """The Gaussians of hands, and their colours while they turn in front of the camera."""
     front = avatar.pose(place.hands, closed=True, viewmat=place.viewmat)
     front.require_finite()
     centre = middle(front)
@@ -179,11 +166,6 @@ def harmonics(given: SeenGaussians, degree: int) -> np.ndarray:
     """Spherical harmonics of the colours of N Gaussians, as splat formats keep them.
 
     A viewer draws 0.5 + sum of harmonics, cut at 0, in the direction from it to the Gaussian.
-
-    Args:
-        given: in the place in which they are written.
-        degree: 0 to 3. 0: one colour; up to the rim that of the front, behind it that of the sides
-            to which a Gaussian turns.
 
     Returns:
         (N, (degree + 1)^2, 3) float32, degree by degree.
@@ -212,17 +194,7 @@ def harmonics(given: SeenGaussians, degree: int) -> np.ndarray:
 
 
 def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
-    """Real spherical harmonics in the order and with the signs of splat formats.
-
-    Args:
-        directions: (..., 3) of length 1.
-        degree: 0 to 3.
-
-    Returns:
-        (..., (degree + 1)^2).
-
-    Source: Kerbl et al. 2023, the authors' code; the same in SPZ and KHR_gaussian_splatting.
-    """
+    """Real spherical harmonics in the order and with the signs of splat formats."""
     x, y, z = np.moveaxis(directions, -1, 0)
     terms = [np.full_like(x, SH_CONSTANT)]
     if degree >= 1:
@@ -239,3 +211,84 @@ def sh_basis(directions: np.ndarray, degree: int) -> np.ndarray:
         terms += [-c * x * (4.0 * z * z - x * x - y * y), e * z * (x * x - y * y)]
         terms += [-a * x * (x * x - 3.0 * y * y)]
     return np.stack(terms, axis=-1)
+
+
+#: SuperSplat's grid has cells of one unit: a hand of 0.2 m is two of them long.
+SUPERSPLAT_SCALE = 10.0
+#: Half a turn about x: between y up and y down, z back and z front.
+HALF_TURN = np.diag([1.0, -1.0, -1.0])
+# Degrees about the vertical from the camera of a capture, which looks along z, to that of
+# SuperSplat. It turns files half around z and looks from azimuth -45 degrees (controls.initialAzim
+# of src/scene-config.ts in playcanvas/supersplat): from +x and +z of the file.
+_SUPERSPLAT_TURN = 225.0
+
+
+def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
+    """Make Gaussians larger or smaller about the origin.
+
+    Args:
+        splats: the Gaussians, m.
+    """
+    require_scale(factor)
+    with np.errstate(over="ignore"):
+        made = replace(
+            splats,
+            means=(splats.means.astype(np.float64) * factor).astype(np.float32),
+            scales=(splats.scales.astype(np.float64) * factor).astype(np.float32),
+        )
+    if not (np.isfinite(made.means).all() and np.isfinite(made.scales).all()):
+        raise UsageError(
+            f"is {factor:g}, by which numbers become infinite",
+            field="--scale",
+            remedy="Use a smaller one.",
+        )
+    return made
+
+
+def require_scale(factor: float) -> None:
+    """Refuse a scale that is none."""
+    if not (np.isfinite(factor) and factor > 0.0):
+        raise UsageError(f"is {factor}", field="--scale", remedy="Use a number above 0.")
+
+
+def laid_to_rest(
+    avatar: WildGHandAvatar, given: SeenGaussians, hands: Mapping[str, HandPose]
+) -> SeenGaussians:
+    """Move hands from the studio to where the hand model lies at rest, with their colours."""
+    rest, owners = avatar.rest_poses(), _owners(avatar, tuple(hands))
+    turns, shifts = np.empty((len(owners), 3, 3)), np.empty((len(owners), 3))
+    for number, (side, hand) in enumerate(hands.items()):
+        turn = Rotation.from_rotvec(hand.pose[0]).as_matrix().T
+        wrist = wrist_at_rest(avatar.model.rigs[side].template, hand.betas)
+        own = owners == number
+        turns[own] = turn
+        shifts[own] = wrist + rest[side].transl - turn @ (wrist + hand.transl)
+    return given.moved(turns, shifts)
+
+
+def for_supersplat(
+    avatar: WildGHandAvatar, given: SeenGaussians, hands: Mapping[str, HandPose]
+) -> SeenGaussians:
+    """Turn hands so that SuperSplat opens them upright, palms to the viewer; y is down.
+
+    Two hands keep their places to each other: what is upright is the mean of both.
+    """
+    angles = avatar.studio.angles
+    upright = Rotation.concatenate(
+        [
+            angles[side].upright * Rotation.from_rotvec(hand.pose[0]).inv()
+            for side, hand in hands.items()
+        ]
+    ).mean()
+    turn = (Rotation.from_euler("y", _SUPERSPLAT_TURN, degrees=True) * upright).as_matrix()
+    made = given.moved(turn, np.zeros(3))
+    return made.moved(np.eye(3), -middle(made.splats))
+
+
+def _owners(avatar: WildGHandAvatar, sides: tuple[str, ...]) -> np.ndarray:
+    """(N,) which hand each Gaussian belongs to: those of the hands, then those of their walls."""
+    counts = [len(avatar.model.rigs[side]) for side in sides]
+    for side in sides:
+        wall = avatar.model.wall(side)
+        counts.append(0 if wall is None else len(wall))
+    return np.repeat([*range(len(sides)), *range(len(sides))], counts)
