@@ -1,10 +1,10 @@
-"""DPD."""
+"""Dynamic perturbation disentanglement: temporally weighted biases of Gaussian attributes."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import cast
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor, nn
@@ -112,19 +112,21 @@ class DpdSettings:
     pay_back: float = number(0.0, 0.0, 1000.0)
     #: Addition: a gain of each frame's colours, held near that of clean frames.
     gains: bool = True
-    #: Weight of the square of the log gains, for a frame that is surely clean.
-    gain_weight: float = number(0.1)
-    #: Weight of the square of what separates the log gains of a frame's channels: exposure wanders
-    #: more than white balance, and a palm that only perturbed frames show is redder by itself.
-    tint_weight: float = number(1.0)
-    #: Chance that a frame's biases are left out of a step. With the pre-pass, that of clean frames
-    #: holds instead (`prepass.omega_dropout`).
-    omega_dropout: float = number(0.3, 0.0, 1.0)
     #: Addition: temporal weight that a frame of the least weight in the pre-pass starts at and is
     #: held near. 0: all start at 0, and only those of clean frames are held there.
     omega_scale: float = number(0.5, 0.0, 0.9)
-    #: Weight of the squared distance of the temporal weights from what the pre-pass says.
-    omega_weight: float = number(1.0)
+
+    #: Weight of the square of the log gains, for a frame that is surely clean; 2 wins nothing.
+    gain_weight: ClassVar[float] = 0.1
+    #: Weight of the square of what separates the log gains of a frame's channels: exposure wanders
+    #: more than white balance, and a palm that only perturbed frames show is redder by itself.
+    tint_weight: ClassVar[float] = 1.0
+    #: Chance that a frame's biases are left out of a step, the paper's. With the pre-pass, all of
+    #: clean frames are.
+    omega_dropout: ClassVar[float] = 0.3
+    #: Weight of the squared distance of the temporal weights from what the pre-pass says: any
+    #: factor may move between omega and varphi, so that it need not be tuned.
+    omega_weight: ClassVar[float] = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -309,9 +311,7 @@ def encode_frames(frames: Tensor, frame_count: int) -> Tensor:
 
 
 def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator) -> Tensor:
-    """Set temporal weights to 0 at random: the canonical attributes learn without biases.
-
-    Training only; the paper's probability is 0.3 for every frame.
+    """Set temporal weights to 0 at random, the paper's probability being 0.3 for every frame.
 
     Args:
         omega: (B,).

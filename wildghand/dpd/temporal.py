@@ -1,4 +1,8 @@
-"""Temporal."""
+"""Temporal weights and what a frame teaches.
+
+Where omega starts and what holds it there (`TemporalTarget`), how much of a frame its biases
+explain (`PayBack`), and how much of its gradient the canonical hand takes (`scale_gradients`).
+"""
 
 from __future__ import annotations
 

@@ -1,10 +1,18 @@
-"""Evidence."""
+"""Gaussians that are the more opaque discs on the skin, the less the frames say of them.
+
+An offset from the skin moves a Gaussian along the line of sight too, where a single direction shows
+nothing of it; from elsewhere it is at the wrong place. Its shape is as uncertain. The maximum of a
+Gaussian likelihood of n frames and a prior that weighs as much as k of them keeps n / (n + k) of
+what the frames say, and the rest of the prior: no offset, and a disc that closes the skin.
+
+Colours change too, where the other hand or the skin around a place says more of it than frames do.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
@@ -25,19 +33,20 @@ class EvidenceSettings:
     #: Share of the training frames that must show a Gaussian until half of its offset from the skin
     #: is kept.
     offset_share: float = number(0.08, 0.0, 100.0)
-    #: Share of the training frames that must show a Gaussian until half of its shape and
-    #: transparency is kept.
-    shape_share: float = number(0.002, 0.0, 100.0)
     #: Share of the training frames that must show a place clearly until its colour is half its own;
     #: the rest is that of the same place of the other hand, where that is known. 0: all of it is.
     color_share: float = number(0.02, 0.0, 100.0)
     #: Share of the training frames that must show a place until its colour is half its own; the
     #: rest is that of the skin around it. 0: all of it is its own.
     fill_share: float = number(0.02, 0.0, 100.0)
+
+    #: Share of the training frames that must show a Gaussian until half of its shape and
+    #: transparency is kept: an image says more of these than of an offset.
+    shape_share: ClassVar[float] = 0.002
     #: After the last step, take a quarter or four times of `offset_share`, or 0, where that draws
     #: the validation frames better, and nothing of it where that draws them much better; then five
     #: times of `fill_share`, or 0. With fewer than four of these frames the settings hold.
-    validated: bool = True
+    validated: ClassVar[bool] = True
 
 
 _WALLS = "evidence_wall_"

@@ -1,4 +1,20 @@
-"""Fits lights."""
+"""Lights that are fitted to the colours of places that turn: light = albedo of the place * E(n).
+
+E is linear in strengths that are nowhere negative: albedo and strengths are solved by turns.
+
+After a fit, `fit_light` carries colours on. A camera that stands still shows normals of one half of
+the sphere; what a network says about the other half is chance. A matte surface under light is
+simple: E(n) = a + sum_k b_k max(0, n . d_k). It is fitted to the colours that the network gives to
+normals that frames have shown; beyond them the network is asked for the nearest known normal, and
+its colour is multiplied by the ratio of both irradiances.
+
+Before a fit, `find_light` finds what casts shadows: an ambient light, six walls (half spaces of the
+sky around the six axes) and a few lamps, of which each has its own free share v in E(n, v). Lamps
+are found one after the other (orthogonal matching pursuit, Pati et al. 1993): the next one is the
+direction which explains most of what is left, once the albedo has been taken out of both; then all
+strengths are solved again. Weights fall with residuals, so that what objects and wrong poses do to
+single samples counts little.
+"""
 
 from __future__ import annotations
 
@@ -17,14 +33,19 @@ from wildghand.gaussians.found import Found, Kept
 from wildghand.light.lights import (
     SRGB,
     CastLight,
-    LightSettings,
     ShadowSettings,
     ring_around,
     spread_directions,
 )
 
+# Of `fit_light`. Directions from which light may come; the ridge on their strengths makes them one
+# smooth light.
+_DIRECTIONS = 32
 # Turns of albedo and light.
 _TURNS = 12
+# Share of the normals that frames show at the border of what they show, where the network has
+# learnt little; it counts as unknown.
+_BORDER = 0.25
 # Irradiances below this share of the mean are as dark; ratios beyond these are cut.
 _DARKEST, _LEAST, _MOST = 1e-3, 0.2, 3.0
 # Cosine between normal and viewing direction below which a Gaussian is a part of the rim, which
@@ -100,40 +121,38 @@ class KnownLight(Found):
         return beyond * ((facing - _RIM) / (_FRONT - _RIM)).clamp(0.0, 1.0)
 
 
-def fit_light(samples: LightSamples, settings: LightSettings) -> KnownLight | None:
-    """Fit a light to the colours of places that turn: light = albedo of the place * E(n).
+def fit_light(samples: LightSamples, *, ridge: float = 0.03) -> KnownLight | None:
+    """Fit a light to what the network says of places that turn; None where they are too few.
 
-    Albedo and light are solved by turns; both are ratios, so that dark skin counts as light skin.
+    Both unknowns are ratios, so that dark skin counts as light skin.
 
     Args:
         samples: of one clip, of both hands together where there are two.
-        settings: how.
-
-    Returns:
-        The light; None where there are too few samples.
+        ridge: on the strengths, in the mean size of the normal matrix's diagonal.
     """
-    if len(samples.places) < 10 * settings.directions or not samples.weights.sum() > 0.0:
+    if len(samples.places) < 10 * _DIRECTIONS or not samples.weights.sum() > 0.0:
         return None
-    directions = spread_directions(settings.directions)
+    directions = spread_directions(_DIRECTIONS)
     facing = np.maximum(samples.normals @ directions.T, 0.0)
     basis = np.column_stack([np.ones(len(facing)), facing])
     _, places = np.unique(samples.places, return_inverse=True)
     light, weights = np.maximum(samples.light, 0.0), samples.weights
     strengths = np.zeros(basis.shape[1])
     strengths[0] = 1.0
+
+    def damped(normal: np.ndarray) -> np.ndarray:
+        """All but the ambient light is damped."""
+        damping = ridge * np.trace(normal) / len(normal) * np.eye(len(normal))
+        damping[0, 0] = 0.0
+        return np.asarray(normal + damping + 1e-9 * np.eye(len(normal)))
+
     for _ in range(_TURNS):
         seen = basis @ strengths
         squares = np.bincount(places, weights * seen**2)
         albedo = np.bincount(places, weights * light * seen) / np.maximum(squares, 1e-9)
         dark = np.maximum(albedo, 1e-3)[places]
         scale = np.sqrt(weights)
-        matrix = basis * scale[:, None]
-        normal = matrix.T @ matrix / len(matrix)
-        right = matrix.T @ (scale * light / dark) / len(matrix)
-        ridge = settings.ridge * np.trace(normal) / len(normal) * np.eye(len(normal))
-        ridge[0, 0] = 0.0
-        root = np.linalg.cholesky(normal + ridge + 1e-9 * np.eye(len(normal)))
-        strengths = nnls(root.T, np.linalg.solve(root, right))[0]
+        strengths = _solve_strengths(basis * scale[:, None], scale * light / dark, damped)
         strengths = strengths / max(float(np.average(basis @ strengths, weights=weights)), 1e-6)
     axis = weights @ samples.normals
     length = float(np.linalg.norm(axis))
@@ -141,7 +160,7 @@ def fit_light(samples: LightSamples, settings: LightSettings) -> KnownLight | No
         axis, cosine = np.array([0.0, 0.0, 1.0]), -1.0
     else:
         axis = axis / length
-        cosine = float(np.quantile(samples.normals @ axis, settings.border))
+        cosine = float(np.quantile(samples.normals @ axis, _BORDER))
     return KnownLight(
         directions=_real(directions),
         strengths=_real(strengths[1:]),
@@ -151,10 +170,24 @@ def fit_light(samples: LightSamples, settings: LightSettings) -> KnownLight | No
     )
 
 
+def _solve_strengths(
+    matrix: np.ndarray, target: np.ndarray, steady: Callable[[np.ndarray], np.ndarray]
+) -> np.ndarray:
+    """Strengths x >= 0, (C,), that bring (M, C) x near the (M,) target; `steady` damps them."""
+    normal = matrix.T @ matrix / len(matrix)
+    right = matrix.T @ target / len(matrix)
+    root = np.linalg.cholesky(steady(normal))
+    return np.asarray(nnls(root.T, np.linalg.solve(root, right))[0])
+
+
 def _real(values: np.ndarray | float) -> Tensor:
     return torch.as_tensor(values, dtype=torch.float32)
 
 
+# Of `find_light`. Directions among which a lamp is sought, as far apart as lamps are told apart.
+_CANDIDATES = 162
+# Share of the misfit that a further lamp must take away; less is noise (docs/person.md).
+_LEAST_GAIN = 0.006
 #: Directions of the sky from which the walls shine; they come after those of the lamps.
 SKY = 48
 #: Directions of one lamp, its middle first.
@@ -209,15 +242,15 @@ class _Solved:
     misfit: float
 
 
-def find_light(samples: ShadowSamples, settings: ShadowSettings) -> CastLight | None:
-    """Find a light; nothing is random.
+def find_light(
+    samples: ShadowSamples, settings: ShadowSettings, *, softness: float = 12.0
+) -> CastLight | None:
+    """Find a light; nothing is random. None where there are too few samples.
 
     Args:
         samples: of one clip, of both hands together where there are two.
-        settings: how.
-
-    Returns:
-        The light; None where there are too few samples.
+        settings: how many lamps.
+        softness: half the angle over which a lamp is spread, degrees: poses are not exact.
     """
     most = 1 + len(_WALLS) + settings.lamps
     if len(samples.places) < _SAMPLES_EACH * most or not samples.weights.sum() > 0.0:
@@ -228,18 +261,18 @@ def find_light(samples: ShadowSamples, settings: ShadowSettings) -> CastLight | 
     shares = np.maximum(sky @ _WALLS.T, 0.0) * (4.0 / SKY)
     basis = np.column_stack([np.ones(len(samples.light)), samples.falling(sky) @ shares])
     solved = pursuit.solve(basis)
-    candidates = spread_directions(settings.directions)
+    candidates = spread_directions(_CANDIDATES)
     falling = samples.falling(candidates)
     lamps: list[np.ndarray] = []
     while len(lamps) < settings.lamps:
         lamp, column = pursuit.next_lamp(candidates, falling, lamps, solved)
         wider = np.column_stack([basis, column])
         trial = pursuit.solve(wider)
-        if trial.misfit > solved.misfit * (1.0 - settings.least_gain):
+        if trial.misfit > solved.misfit * (1.0 - _LEAST_GAIN):
             break
         lamps.append(lamp)
         basis, solved = wider, trial
-    return _light_of(solved.strengths, lamps, sky, shares, settings.softness)
+    return _light_of(solved.strengths, lamps, sky, shares, softness)
 
 
 class _Pursuit:
@@ -274,11 +307,7 @@ class _Pursuit:
             weights = samples.weights * robust
             # In shares of what is expected, so that dark skin counts as light skin does.
             matrix = basis * (np.sqrt(weights) / irradiance)[:, None]
-            normal = matrix.T @ matrix / len(matrix)
-            normal += 1e-4 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(normal))
-            right = matrix.T @ (np.sqrt(weights) * ratio) / len(matrix)
-            root = np.linalg.cholesky(normal)
-            strengths = nnls(root.T, np.linalg.solve(root, right))[0]
+            strengths = _solve_strengths(matrix, np.sqrt(weights) * ratio, _steadied)
             mean = np.average(basis @ strengths, weights=samples.weights)
             strengths = strengths / max(float(mean), 1e-6)
         irradiance = np.maximum(basis @ strengths, _NO_LIGHT)
@@ -332,6 +361,10 @@ class _Pursuit:
         """(M,) light over albedo times irradiance; the albedo is the mean at each place."""
         albedo = self._means((self._samples.light / irradiance)[:, None], weights)[:, 0]
         return self._samples.light / (np.maximum(albedo, _NO_LIGHT)[self._place] * irradiance)
+
+
+def _steadied(normal: np.ndarray) -> np.ndarray:
+    return np.asarray(normal + (1e-4 * np.diag(np.diag(normal)) + 1e-9 * np.eye(len(normal))))
 
 
 def _light_of(

@@ -1,4 +1,4 @@
-"""Shadows."""
+"""Shadows that hands cast on themselves and on each other, and how bright they make Gaussians."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from hwp_bench.hands import TemplateTensors, pose_hand, vertex_normals
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip
-from wildghand.light.lights import SRGB, CastLight, ShadowSettings
+from wildghand.light.lights import DARKEST, SRGB, CastLight, ShadowSettings
 
 #: How far a ray starts from the skin, m: the surface of an estimated hand is not exact, and a
 #: fold must not shade itself.
@@ -91,12 +91,18 @@ class HandShadows:
         rigs: by side; the light of each is kept off by all that are posed with it.
         light: under which they stand.
         settings: how hands are drawn in it.
+        darkest: share of the light that is left in the darkest shadow.
     """
 
     def __init__(
-        self, rigs: Mapping[str, HandRig], light: CastLight, settings: ShadowSettings
+        self,
+        rigs: Mapping[str, HandRig],
+        light: CastLight,
+        settings: ShadowSettings,
+        *,
+        darkest: float = DARKEST,
     ) -> None:
-        self._settings = settings
+        self._settings, self._darkest = settings, darkest
         self._templates = {side: _on_cpu(rig.template) for side, rig in rigs.items()}
         self._faces = {side: made.faces.numpy() for side, made in self._templates.items()}
         self._light = light.lit()
@@ -164,7 +170,7 @@ class HandShadows:
 
     def _dark(self, in_the_way: Obstacles, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
         free = in_the_way.free(places, normals, self._light.directions)
-        return self._light.darkening(normals, free, self._settings.darkest)
+        return self._light.darkening(normals, free, self._darkest)
 
     def _posed(
         self, side: str, pose: Tensor, betas: Tensor, transl: Tensor

@@ -1,4 +1,4 @@
-"""Lights."""
+"""Lights of a clip: their settings, directions, and the one that casts shadows."""
 
 from __future__ import annotations
 
@@ -18,14 +18,8 @@ class LightSettings:
 
     #: Fit a light at the end of a fit, and draw unknown normals by it.
     enabled: bool = True
-    #: Directions from which light may come, evenly spread over the sphere.
-    directions: int = number(32, 6, 512)
-    #: Ridge on their strengths, in the mean size of the normal matrix's diagonal.
-    ridge: float = number(0.03, 0.0, 100.0)
-    #: Share of the normals that frames show at the border of what they show; it counts as unknown.
-    border: float = number(0.25, 0.0, 0.9)
-    #: Samples from which the light is fitted, at most.
-    samples: int = number(40_000, 100, 10_000_000)
+    #: Samples from which the light is fitted, at most: more change nothing, and take time.
+    samples: ClassVar[int] = 40_000
 
 
 @dataclass(frozen=True)
@@ -34,23 +28,20 @@ class ShadowSettings:
 
     #: Find a light before the first step, and darken Gaussians that the hands keep it from.
     enabled: bool = True
-    #: Frames that are read at most, spread over the clip.
-    frames: int = number(96, 1, 1000)
-    #: Places on each hand that are read.
-    places: int = number(400, 10, 100_000)
     #: Lamps at most.
     lamps: int = number(4, 0, 32)
-    #: Directions, evenly spread over the sphere, among which a lamp is sought.
-    directions: int = number(162, 12, 4096)
-    #: Share of the misfit that a further lamp must take away.
-    least_gain: float = number(0.006, 0.0, 1.0)
-    #: Half the angle over which a lamp is spread, degrees.
-    softness: float = number(12.0, 0.0, 60.0)
     #: The light also says how bright a normal is with nothing in the way; the network says what is
     #: left. Else the network alone does.
     shading: bool = True
-    #: Share of the light that is left in the darkest shadow.
-    darkest: float = number(0.15, 0.0, 1.0)
+
+    #: Frames that are read at most, spread over the clip, and places on each hand: rays to all
+    #: candidate lamps take a second.
+    frames: ClassVar[int] = 96
+    places: ClassVar[int] = 400
+
+
+#: Share of the light that is left in the darkest shadow: skin around a place lights it too.
+DARKEST = 0.15
 
 
 def spread_directions(count: int) -> np.ndarray:

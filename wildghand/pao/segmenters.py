@@ -1,4 +1,4 @@
-"""Segmenters."""
+"""Regions and hands without a network: superpixels, kept on disk for each image, and graph cuts."""
 
 from __future__ import annotations
 

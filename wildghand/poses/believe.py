@@ -1,4 +1,4 @@
-"""Believe."""
+"""The poses that a fit believes in: the given ones, less what they probably err by."""
 
 from __future__ import annotations
 
@@ -85,6 +85,8 @@ def _numbers(pose: np.ndarray, transl: np.ndarray) -> np.ndarray:
 # Joints and numbers of the fingers; the wrist and the place are what is left of 51.
 _FINGERS = slice(3, 48)
 _OTHERS = [0, 1, 2, 48, 49, 50]
+# Rounds in which the spread of the true poses is found; it hardly moves after.
+_ROUNDS = 10
 # Frames that are corrected at once, which bounds the memory.
 _CHUNK = 1024
 
@@ -127,14 +129,14 @@ def _believed(
     extent = extent_in(template, _rows(hand, valid), viewmats[valid])
 
     def covariances(rows: np.ndarray) -> np.ndarray:
-        return pose_covariances(template, _rows(hand, rows), viewmats[rows], extent, settings)
+        return pose_covariances(template, _rows(hand, rows), viewmats[rows], extent)
 
     poses, errors = _in_vectors(_rows(hand, some), covariances(some))
     size = error_size(poses, errors)
     mean_square = np.trace(errors, axis1=1, axis2=2).mean() / errors.shape[1]
     if size * np.sqrt(mean_square) < settings.least_error:
         return hand
-    spread = spread_of(poses, size**2 * errors, settings.rounds)
+    spread = spread_of(poses, size**2 * errors, _ROUNDS)
     pose, transl = hand.pose.copy(), hand.transl.copy()
     for start in range(0, len(valid), _CHUNK):
         rows = valid[start : start + _CHUNK]

@@ -1,4 +1,9 @@
-"""Errors."""
+"""The errors of given poses, and how true poses spread, both told by the given poses alone.
+
+The form of the errors, which joints err together, is that of an estimator that goes by landmarks.
+Their size and the spread follow by factor analysis: a given pose is a true one, which comes from a
+normal distribution, plus an error whose covariance is known for each frame up to a factor.
+"""
 
 from __future__ import annotations
 
@@ -21,29 +26,22 @@ from hwp_bench.methods.settings import number
 
 @dataclass(frozen=True)
 class PoseSettings:
-    """How far given poses are drawn to what the clip's other poses say of them.
-
-    The two errors of landmarks state the form of the poses' errors, not their size, which is found.
-    """
+    """How far given poses are drawn to what the clip's other poses say of them."""
 
     #: Correct the given poses of the clip before the fit.
     enabled: bool = True
     #: Frames at most from which the spread of poses is learnt, evenly spread over the clip.
     frames: int = number(240, 3, 10_000)
-    #: Error of a landmark in the image, as a share of the hand's extent.
-    image_error: float = number(0.01, 1e-6, 1.0)
-    #: Error of a landmark in space against the hand's centre, along each axis, m.
-    space_error: float = number(0.005, 1e-6, 1.0)
-    #: What estimators expect of a joint before they see landmarks, rad about each axis.
-    expected_turn: float = number(0.5, 1e-3, 10.0)
-    #: What they expect of the hand's place, m along each axis.
-    expected_shift: float = number(0.01, 1e-4, 10.0)
-    #: Rounds in which the spread of the true poses is found.
-    rounds: int = number(10, 1, 1000)
     #: Errors below this, rad (root mean square of finger joints), are left alone.
     least_error: float = number(0.01, 0.0, 10.0)
 
 
+# Error of a landmark in the image, as a share of the hand's extent, and in space against the hand's
+# centre, along each axis, m. They state the form of the poses' errors, not their size.
+_IMAGE_ERROR, _SPACE_ERROR = 0.01, 0.005
+# What estimators expect before they see landmarks: of a joint, rad about each axis, and of the
+# hand's place, m along each axis.
+_EXPECTED_TURN, _EXPECTED_SHIFT = 0.5, 0.01
 # A landmark nearer to the camera says nothing of where it lies in the image, m.
 _NEAREST = 0.01
 
@@ -68,7 +66,6 @@ def pose_covariances(
     hand: HandParameters,
     viewmats: np.ndarray,
     extent: float,
-    settings: PoseSettings,
 ) -> np.ndarray:
     """Covariance of the errors of each frame's pose, up to a factor that all frames share.
 
@@ -81,15 +78,14 @@ def pose_covariances(
         hand: given parameters of F frames, in front of the cameras.
         viewmats: (F, 4, 4) world to camera.
         extent: of the hand in the clip, by `extent_in`: all its frames have one.
-        settings: errors of landmarks, and what is expected.
 
     Returns:
         (F, 51, 51): 16 joints about their own axes, rad, then the place in camera axes, m.
     """
     posed = _seen(template, hand, viewmats)
-    rows = landmark_rows(posed, settings.image_error * extent, settings.space_error)
+    rows = landmark_rows(posed, _IMAGE_ERROR * extent, _SPACE_ERROR)
     told = np.einsum("fnk,fnl->fkl", rows, rows)
-    turn, shift = settings.expected_turn, settings.expected_shift
+    turn, shift = _EXPECTED_TURN, _EXPECTED_SHIFT
     expected = np.repeat([turn, shift], [DEGREES - 3, 3]) ** -2.0
     answer = np.linalg.inv(told + np.diag(expected))
     return np.asarray(answer @ told @ answer)

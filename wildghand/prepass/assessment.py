@@ -1,13 +1,16 @@
-"""A."""
+"""The assessment of frames: its settings, the result of the pre-pass, and robust locations."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import ClassVar
 
 import cv2
 import numpy as np
+
+from hwp_bench.methods.settings import number
 
 
 @dataclass(frozen=True)
@@ -18,59 +21,22 @@ class PrepassSettings:
     enabled: bool = True
     #: Refine the pose of frames whose mask disagrees with it.
     frame_poses: bool = True
-    #: Edge of the cells that share one albedo, m on the rest surface.
-    patch_size: float = 0.004
-    #: Pixels of all frames together from which the intensity model is fitted.
-    sample_count: int = 120_000
-    #: Pixels of all frames together beyond which they are judged at a lower resolution.
-    pixel_budget: int = 30_000_000
-    #: Passes of the robust fit.
-    iterations: int = 10
-    #: Samples that the mean skin colour is worth in the albedo of a cell.
-    albedo_prior: float = 3.0
-    #: Share of the frames that is taken to be clean at least; the densest such part of a cue's
-    #: values says what is normal.
-    clean_share: float = 0.35
-    #: Least log gain that counts as one deviation: what shading leaves unexplained.
-    gain_floor: float = 0.08
-    #: Least change of the log of the residual that does.
-    residual_floor: float = 0.25
-    #: Least loss of texture that does.
-    texture_floor: float = 0.15
-    #: Least change of the log of the border's width that does.
-    border_floor: float = 0.15
-    #: Least misplacement that does, share of the hand's size.
-    misplacement_floor: float = 0.0006
-    #: Least hidden share of the hand that does.
-    hidden_floor: float = 0.02
     #: Evidence (`wildghand.prepass.judge.evidence`) at which a frame is as likely clean as not.
-    tolerance: float = 1.2
-    #: Validation frames, which are clean, raise it to the median of what is found against them.
-    validated: bool = True
-    #: Deviation from which a cue by itself calls a frame blurred or misplaced.
-    clear_deviation: float = 3.0
+    tolerance: float = number(1.2, 1e-6, 1e6)
     #: Least weight of a frame in the fit.
-    weight_floor: float = 0.1
-    #: Chance that omega is dropped in a clean frame.
-    omega_dropout: float = 0.3
-    #: A frame is clean for `omega_dropout` from this probability on.
-    clean_threshold: float = 0.5
-    #: Residual, in those of the clean frames at the same place, at which a pixel's weight has
-    #: halved.
-    residual_scale: float = 2.5
-    #: Distance of a pixel's tint from the skin's, in those of the clean frames at the same place,
-    #: at which its weight has halved.
-    tint_scale: float = 4.0
-    #: Factor on both scales in a frame that is surely clean. Little can cover the hand there, and
-    #: what looks odd (nails, rings, seams of a glove a little off their place) belongs to it.
-    clean_scale: float = 4.0
-    #: Pixels that what is normal in the clean frames is worth in what is normal at a place.
-    residual_prior: float = 20.0
-    #: Fewer usable frames than this cannot be compared: all are judged clean. Nor do fewer
-    #: validation frames raise the tolerance.
-    least_frames: int = 4
+    weight_floor: float = number(0.2, 0.0, 1.0)
+
+    #: Validation frames, which are clean, raise the tolerance to the median of what is found
+    #: against them.
+    validated: ClassVar[bool] = True
+    #: Least misplacement that counts as one deviation, share of the hand's size: what rounding to
+    #: pixels leaves in frames whose poses are true.
+    misplacement_floor: ClassVar[float] = 0.0006
 
 
+#: Share of the frames that is taken to be clean at least; the densest such part of a cue's values
+#: says what is normal. Clips of `mini` and `wild-dev` have 40 % clean frames or more.
+CLEAN_SHARE = 0.35
 #: The cue that tells each perturbation, and how many of its deviations make one level: about
 #: what they are on simulated captures, where the levels are known (docs/prepass.md).
 CUES: Mapping[str, tuple[str, float]] = MappingProxyType(
@@ -102,7 +68,8 @@ class FrameAssessment:
     clean: np.ndarray
     #: (R,) weight of the frame in the fit, from the floor to 1.
     frame_weights: np.ndarray
-    #: (R,) chance that omega is dropped in training: only where the frame is judged clean.
+    #: (R,) chance that omega is dropped in training: 1 where the frame is judged clean, else 0.
+    #: What little biases took from clean frames, the avatar lacked (docs/wildghand.md).
     omega_dropout: np.ndarray
     #: (R,) bool: sharp frames whose mask says that the hand is elsewhere.
     refine_pose: np.ndarray
@@ -151,16 +118,9 @@ class FrameAssessment:
 
 
 def neutral_assessment(
-    indices: np.ndarray, usable: np.ndarray, size: tuple[int, int], omega_dropout: float
+    indices: np.ndarray, usable: np.ndarray, size: tuple[int, int]
 ) -> FrameAssessment:
-    """Call every usable frame clean, because there is too little to compare.
-
-    Args:
-        indices: (R,) frames.
-        usable: (R,) bool.
-        size: height and width.
-        omega_dropout: chance for clean frames.
-    """
+    """Call every usable frame, (R,) bool, clean, because there is too little to compare."""
     count = len(indices)
     good = usable.astype(np.float64)
     zeros = np.zeros(count)
@@ -169,7 +129,7 @@ def neutral_assessment(
         usable=usable,
         clean=good,
         frame_weights=np.ones(count),
-        omega_dropout=omega_dropout * good,
+        omega_dropout=good,
         refine_pose=np.zeros(count, dtype=bool),
         log_gains=np.zeros((count, 3)),
         gain_deviation=zeros,
@@ -188,13 +148,7 @@ def neutral_assessment(
 
 
 def enlarged(assessment: FrameAssessment, factor: int, size: tuple[int, int]) -> FrameAssessment:
-    """The assessment of shrunk frames, brought back to their size.
-
-    Args:
-        assessment: of frames at 1 / factor of the resolution.
-        factor: at least 1.
-        size: height and width of the frames.
-    """
+    """The assessment of frames at 1 / factor of the resolution, brought back to their size."""
     weights = [
         cv2.resize(weight, size[::-1], interpolation=cv2.INTER_LINEAR)
         for weight in assessment.pixel_weights
@@ -229,13 +183,9 @@ def estimated_severity(assessment: FrameAssessment) -> dict[str, np.ndarray]:
 
 
 def densest(values: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
-    """Find the values that lie closest together.
+    """Find the part of (F, K) finite values, a share of them, that lies closest together.
 
     The value whose `share` nearest values are nearest to it is the middle; they are the part.
-
-    Args:
-        values: (F, K) float, finite; F at least 1.
-        share: part of the values that must agree, in (0, 1].
 
     Returns:
         (K,) mean of the part, and (F,) bool which values it holds.
@@ -251,14 +201,9 @@ def densest(values: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
 
 
 def normal_value(values: np.ndarray, share: float) -> tuple[float, float]:
-    """Median and robust deviation of the shortest part of the values: those that are normal.
+    """Median and robust deviation of the shortest part, a share, of (F,) finite values.
 
-    Args:
-        values: (F,) float; those that are not finite are left out.
-        share: part of the values that is normal at least, in (0, 1].
-
-    Returns:
-        Both 0 where no value is finite.
+    Values that are not finite are left out; both numbers are 0 where none is finite.
     """
     known = np.sort(values[np.isfinite(values)])
     if not len(known):
@@ -272,15 +217,9 @@ def normal_value(values: np.ndarray, share: float) -> tuple[float, float]:
 
 
 def excess(values: np.ndarray, share: float, floor: float) -> np.ndarray:
-    """How far values lie above what is normal among them, in robust deviations.
+    """How far (F,) values lie above what is normal among them, in robust deviations; else 0.
 
-    Args:
-        values: (F,) float; not finite counts as normal.
-        share: part of the values that is normal at least.
-        floor: least deviation that counts as one, positive.
-
-    Returns:
-        (F,) float64, 0 where a value is not above normal.
+    The floor is the least deviation that counts as one. Values that are not finite are normal.
     """
     normal, deviation = normal_value(values, share)
     above = np.maximum(values - normal, 0.0) / max(deviation, floor)

@@ -1,4 +1,4 @@
-"""Outlines."""
+"""Outlines: where the border of drawn hands lies against that of a mask, frame by frame."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Shape."""
+"""The shape of a person's hand: what the rest surface and joints of a template lack."""
 
 from __future__ import annotations
 
@@ -20,35 +20,12 @@ class SubjectSettings:
     enabled: bool = True
     #: Frames that are compared at most, evenly spread over the clip.
     frames: int = number(24, 1, 1000)
-    #: Control points on the hand.
-    nodes: int = number(200, 20, 1000)
-    #: Rounds; in each the silhouettes are drawn again.
-    rounds: int = number(2, 1, 100)
-    #: Points of all outlines together that are compared in a round.
-    points: int = number(3000, 100, 100_000)
-    #: Distance at which a point of the outline counts a quarter in the last round, px; three times
-    #: as far in the first.
-    reach: float = number(1.5, 0.1, 100.0)
     #: Expected error of a point of the outline, px; as large as neighbouring points and frames,
     #: which err together, make it.
     noise: float = number(1.5, 0.01, 1000.0)
-    #: Expected change of the length of a bone, or of a side of the palm, relative to the template.
-    length_spread: float = number(0.1, 1e-6, 1.0)
-    #: Expected change of the thickness of a finger's segment.
-    thickness_spread: float = number(0.15, 1e-6, 1.0)
-    #: Expected displacement of a control point, m.
-    spread: float = number(4e-3, 1e-5, 0.1)
-    #: Expected difference between control points 1 cm apart, m.
-    roughness: float = number(1e-3, 1e-6, 0.1)
-    #: Expected distance of a joint from where its surroundings take it, m.
-    joint_spread: float = number(2e-3, 1e-6, 0.1)
-    #: Expected error of the given translation of a hand in a frame, m.
-    transl_spread: float = number(2e-3, 1e-6, 0.1)
     #: Let frames that are not compared choose how far the hand bends: validation frames, or
     #: training frames where there are fewer than four of those. Else the hand is rather stiff.
     validated: bool = True
-    #: Share of the template's misfit in those frames by which a softer hand must be better.
-    least_gain: float = number(0.04, 0.0, 1.0)
 
 
 # Largest displacement that is read, m.

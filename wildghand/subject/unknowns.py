@@ -1,4 +1,9 @@
-"""Unknowns."""
+"""The numbers that describe a person's hand, and how an outline in the image moves with each.
+
+In one vector, in this order: displacements of control points, displacements of joints, proportions,
+and a translation of each hand in each frame. A posed hand is linear in its rest surface and rest
+joints, so that every point of an outline is linear in all of them.
+"""
 
 from __future__ import annotations
 
@@ -12,7 +17,18 @@ from hwp_bench.hands import HandTemplate, unique_edges
 from hwp_bench.hands.skeleton import FINGERS, PARENTS, finger_joints, moved_joints, palm_directions
 from hwp_bench.hands.template import JOINT_COUNT
 from wildghand.subject.outlines import ComparedFrames, OutlinePoints, PosedFrames
-from wildghand.subject.shape import SubjectSettings, SubjectShape, side_flip
+from wildghand.subject.shape import SubjectShape, side_flip
+
+#: Control points on the hand, about a centimetre apart.
+NODES = 200
+#: Expected change of the length of a bone, or of a side of the palm, and of the thickness of a
+#: finger's segment, relative to the template: about how people differ.
+LENGTH_SPREAD, THICKNESS_SPREAD = 0.1, 0.15
+# Expected displacement of a control point, and difference between control points 1 cm apart, m.
+_SPREAD, _ROUGHNESS = 4e-3, 1e-3
+# Expected distance of a joint from where its surroundings take it, and error of the given
+# translation of a hand in a frame, m.
+_JOINT_SPREAD, _TRANSL_SPREAD = 2e-3, 2e-3
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,17 +145,10 @@ class Unknowns:
     frames: int
 
     @classmethod
-    def of(cls, template: HandTemplate, nodes: int, hands: int, frames: int) -> Unknowns:
-        """The unknowns of a template's person.
-
-        Args:
-            template: of either side.
-            nodes: number of control points.
-            hands: one or two.
-            frames: that are compared.
-        """
+    def of(cls, template: HandTemplate, hands: int, frames: int) -> Unknowns:
+        """The unknowns of a person whose hands, one or two, are compared in some frames."""
         return cls(
-            place_control_points(template, nodes),
+            place_control_points(template, NODES),
             hand_proportions(template),
             _joint_surroundings(template),
             hands,
@@ -168,25 +177,19 @@ class Unknowns:
         """(S, F, 3) m, added to the given translations of the hands."""
         return values[self.cuts[2] :].reshape(self.hands, self.frames, 3)
 
-    def expected(self, settings: SubjectSettings) -> np.ndarray:
-        """(N, N) inverse covariance of the unknowns before anything is seen.
-
-        Args:
-            settings: how large each is expected to be.
-        """
+    def expected(self) -> np.ndarray:
+        """(N, N) inverse covariance of the unknowns before anything is seen."""
         points, size, (cut, end, proportions) = self.points, len(self), self.cuts
         count = points.shares.shape[1]
         result = np.zeros((size, size))
-        diagonal = np.full(size, 1.0 / settings.transl_spread**2)
-        diagonal[:cut] = 1.0 / settings.spread**2
+        diagonal = np.full(size, 1.0 / _TRANSL_SPREAD**2)
+        diagonal[:cut] = 1.0 / _SPREAD**2
         diagonal[cut:end] = 0.0
-        spreads = np.where(
-            self.proportions.lengths, settings.length_spread, settings.thickness_spread
-        )
+        spreads = np.where(self.proportions.lengths, LENGTH_SPREAD, THICKNESS_SPREAD)
         diagonal[end:proportions] = 1.0 / spreads**2
         result[np.arange(size), np.arange(size)] = diagonal
         first, second = points.pairs.T
-        rough = 0.01 / (points.lengths * settings.roughness**2)
+        rough = 0.01 / (points.lengths * _ROUGHNESS**2)
         together = np.zeros((count + JOINT_COUNT,) * 2)
         np.add.at(together, (first, first), rough)
         np.add.at(together, (second, second), rough)
@@ -195,7 +198,7 @@ class Unknowns:
         # Joints go where the surface around them goes.
         around = self.surroundings @ points.shares
         tie = np.concatenate([around, -np.eye(JOINT_COUNT)], axis=1)
-        together += tie.T @ tie / settings.joint_spread**2
+        together += tie.T @ tie / _JOINT_SPREAD**2
         together[count, count] += 1e12  # the wrist
         result[:end, :end] += np.kron(together, np.eye(3))
         return result

@@ -79,7 +79,7 @@ def test_lamps_are_found_where_they_are(found: CastLight) -> None:
 def test_shadows_are_as_dark_as_they_are(found: CastLight) -> None:
     seen, points = samples(seed=9)
     # Without softness, as the truth has none.
-    hard = find_light(samples()[0], ShadowSettings(softness=0.0))
+    hard = find_light(samples()[0], ShadowSettings(), softness=0.0)
     assert hard is not None
     dark = hard.darkening(seen.normals, free(points, hard.directions), 0.0) ** 2.2
     off = dark - truth(seen.normals, points)

@@ -48,7 +48,7 @@ def _truth(seed: int = 0, frames: int = FRAMES) -> HandParameters:
 def _covariances(hand: HandParameters) -> np.ndarray:
     viewmats = _cameras(len(hand.pose)).viewmats
     extent = extent_in(TEMPLATE, hand, viewmats)
-    return pose_covariances(TEMPLATE, hand, viewmats, extent, PoseSettings())
+    return pose_covariances(TEMPLATE, hand, viewmats, extent)
 
 
 def _with_errors(truth: HandParameters, size: float, seed: int = 1) -> HandParameters:
