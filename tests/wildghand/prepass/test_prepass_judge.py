@@ -296,7 +296,7 @@ def test_a_frame_without_a_hand_is_set_apart(lit_frames: Lit, spoil: object) -> 
     check_ranges(judgement, FRAMES)
     assert np.flatnonzero(~judgement.usable).tolist() == [5]
     assert judgement.clean[5] == 0
-    assert judgement.frame_weights[5] == pytest.approx(0.1)
+    assert judgement.frame_weights[5] == pytest.approx(0.2)
     assert (judgement.pixel_weights[5] == 255).all()
     assert (np.delete(judgement.clean, 5) > 0.5).all()
 
