@@ -19,8 +19,8 @@ from scipy.ndimage import map_coordinates
 from scipy.spatial.transform import Rotation
 
 from hwp_bench.base.images import as_uint8, write_image
-from hwp_bench.base.ray_mesh import ray_mesh
-from hwp_bench.hands.parameters import Camera, HandPose
+from hwp_bench.base.rays import ray_mesh
+from hwp_bench.hands.skeleton import Camera, HandPose
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar
 from wildghand.export.formats import ExportSettings, export

@@ -22,12 +22,10 @@ import numpy as np
 import torch
 from msgspec import Meta
 
-from hwp_bench.base.arguments import place
-from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.base.errors import BadInput, HwpError, place, shown
 from hwp_bench.base.files import atomic_folder, read_json, write_json
 from hwp_bench.base.images import read_gray, write_image
 from hwp_bench.base.records import Seed, parse_record
-from hwp_bench.base.text import shown
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar

@@ -11,12 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from hwp_bench.base.console import track
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_folder, check_places
-from hwp_bench.base.images import as_uint8, write_image
-from hwp_bench.base.movies import check_encoder, write_movie
-from hwp_bench.base.progress import track
+from hwp_bench.base.images import as_uint8, check_encoder, write_image, write_movie
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.gaussians.training import TrainingClip

@@ -14,8 +14,7 @@ import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 
-from hwp_bench.base.errors import UsageError
-from hwp_bench.base.text import did_you_mean
+from hwp_bench.base.errors import UsageError, did_you_mean
 from hwp_bench.hands import (
     HandTemplate,
     TemplateTensors,
@@ -25,9 +24,8 @@ from hwp_bench.hands import (
     pose_from_joint_angles,
     pose_hand,
 )
-from hwp_bench.hands.gestures import finger_pose, gestures, mirrored
-from hwp_bench.hands.parameters import Camera, HandPose
-from hwp_bench.hands.skeleton import JOINT_NAMES, palm_directions, unit
+from hwp_bench.hands.poses import finger_pose, gestures, mirrored
+from hwp_bench.hands.skeleton import JOINT_NAMES, Camera, HandPose, palm_directions, unit
 
 #: The three angles of a joint.
 ANGLES = ("flexion", "abduction", "twist")

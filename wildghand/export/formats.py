@@ -9,7 +9,7 @@ import numpy as np
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.base.version import __version__
+from hwp_bench.base.packages import __version__
 from hwp_bench.capture import Capture
 from hwp_bench.hands import load_template
 from wildghand.avatar.avatar import WildGHandAvatar

@@ -19,7 +19,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.hands import HandTemplate, TemplateTensors
 from hwp_bench.hands.articulation import joint_axes, pose_from_joint_angles
 from hwp_bench.hands.skeleton import JOINT_NAMES, PARENTS
-from hwp_bench.hands.topology import boundary_loop
+from hwp_bench.hands.template import boundary_loop
 from hwp_bench.methods.contract import HandPose
 from wildghand.avatar import WildGHandAvatar
 from wildghand.export.splat_files import ATTRIBUTES, INDICES, GlbBuilder

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 from scipy import ndimage
 
-from hwp_bench.base.nearest import kd_tree
-from hwp_bench.base.ray_mesh import ray_mesh
+from hwp_bench.base.numerics import kd_tree
+from hwp_bench.base.rays import ray_mesh
 from hwp_bench.hands import HandTemplate, pose_hand, vertex_normals
 from hwp_bench.methods.contract import Camera, HandPose
 from wildghand.avatar.avatar import WildGHandAvatar

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.base.ray_mesh import ray_mesh
+from hwp_bench.base.rays import ray_mesh
 from hwp_bench.hands import TemplateTensors, pose_hand, vertex_normals
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.rig import HandRig

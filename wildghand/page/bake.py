@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from hwp_bench.hands import pose_hand
-from hwp_bench.hands.rotations import axis_angle_to_matrix
+from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.hands.skeleton import PARENTS
 from wildghand.avatar import PosedGaussians, WildGHandAvatar
 from wildghand.gaussians.rig import HandRig

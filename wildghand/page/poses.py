@@ -10,8 +10,8 @@ import cv2
 import numpy as np
 import torch
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.errors import UsageError
-from hwp_bench.base.evenly import evenly
 from hwp_bench.capture import Capture
 from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
 from hwp_bench.methods.contract import Camera, HandPose

@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
+from hwp_bench.base.arrays import read_tensors
 from hwp_bench.base.errors import BadInput, MissingDependency
 from hwp_bench.base.files import read_json, sha256_json, sha256_of
-from hwp_bench.base.tensor_files import read_tensors
 from wildghand.pao.regions import FrameRegions, overlapping
 
 if TYPE_CHECKING:

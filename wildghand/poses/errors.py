@@ -12,7 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from hwp_bench.hands import HandParameters, HandTemplate
-from hwp_bench.hands.posed_skeleton import (
+from hwp_bench.hands.articulation import right_jacobian
+from hwp_bench.hands.poses import (
     DEGREES,
     PosedSkeleton,
     hand_extent,
@@ -20,7 +21,6 @@ from hwp_bench.hands.posed_skeleton import (
     posed_skeleton,
     rest_skeleton,
 )
-from hwp_bench.hands.rotations import right_jacobian
 from hwp_bench.methods.settings import number
 
 

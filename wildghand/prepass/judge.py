@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.hands.footprint import Footprint, HandSurfaces
+from hwp_bench.hands.anchors import Footprint, HandSurfaces
 from wildghand.prepass.assessment import (
     CLEAN_FROM,
     CLEAN_SHARE,

@@ -12,7 +12,7 @@ from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.capture import Cameras, Capture
 from hwp_bench.hands import HandParameters, HandTemplate, load_template
-from hwp_bench.hands.footprint import Footprint
+from hwp_bench.hands.anchors import Footprint
 from wildghand.prepass.intensity import HIGHEST, LOWEST, IntensityModel, log_light_table
 
 

@@ -14,8 +14,14 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from hwp_bench.hands import HandTemplate, unique_edges
-from hwp_bench.hands.skeleton import FINGERS, PARENTS, finger_joints, moved_joints, palm_directions
-from hwp_bench.hands.template import JOINT_COUNT
+from hwp_bench.hands.skeleton import (
+    FINGERS,
+    JOINT_COUNT,
+    PARENTS,
+    finger_joints,
+    moved_joints,
+    palm_directions,
+)
 from wildghand.subject.outlines import ComparedFrames, OutlinePoints, PosedFrames
 from wildghand.subject.shape import SubjectShape, side_flip
 

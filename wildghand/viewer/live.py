@@ -10,8 +10,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hwp_bench.base.console import notice
 from hwp_bench.base.drawing import PAPER, fitted, labelled
-from hwp_bench.base.progress import notice
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.glance import Glance, glance
 from wildghand.gaussians.fit_loop import Loss

@@ -12,12 +12,12 @@ import pytest
 from denormal_probe import Probe, states
 from small_captures import CaptureMaker
 
-from hwp_bench.base.denormals import flushed, flushed_process, flushes, set_flush
+from hwp_bench.base.numerics import flushed, flushed_process, flushes, set_flush
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.methods.request import write_request
-from hwp_bench.run.engine.process import LocalJob, run_in_process
+from hwp_bench.run.engine.processes import LocalJob, run_in_process
 from hwp_bench.run.runner import run_method
 
 TESTS = Path(__file__).parents[2]

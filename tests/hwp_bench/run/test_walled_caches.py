@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from hostile import folder_of, hostile_method
 
-from hwp_bench.base.trees import open_up
+from hwp_bench.base.folders import open_up
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.run.runner import run_method
 from hwp_bench.run.sandbox.confinement import Confinement
@@ -77,14 +77,14 @@ print("{{}}")
 
 CALL = """
 import numpy as np
-from hwp_bench.metrics.ssim_kernel import similarity
+from hwp_bench.metrics.pixels import similarity
 row = np.ones(4)
 similarity((row, row), (row, row), row.copy(), (0.1, 0.1, 1.0))
 print("called")
 """
 POISON = """
 import hashlib, pickle
-from hwp_bench.base import machine_code
+from hwp_bench.base import kernels
 class Poison:
     def __reduce__(self):
         return print, ("POISONED",)
@@ -92,8 +92,8 @@ def save(self, sig, data):
     content = pickle.dumps(Poison())
     name = self._name(self._key(sig, data.codegen))
     digest = hashlib.sha256(content).digest()
-    print("left", machine_code.write_private(machine_code.code_folder() / name, digest + content))
-machine_code.MachineCode.save_overload = save
+    print("left", kernels.write_private(kernels.code_folder() / name, digest + content))
+kernels.MachineCode.save_overload = save
 """
 
 

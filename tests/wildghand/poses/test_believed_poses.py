@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from hwp_bench.base.errors import BadInput
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, load_template
-from hwp_bench.hands.posed_skeleton import posed_skeleton, rest_skeleton, turned
+from hwp_bench.hands.poses import posed_skeleton, rest_skeleton, turned
 from wildghand.poses import ClipPoses, PoseSettings, believe, believed_hands
 from wildghand.poses.errors import (
     error_size,
