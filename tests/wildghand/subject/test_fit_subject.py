@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Iterator
 from unittest import mock
 
@@ -205,7 +206,7 @@ def test_frames_of_the_template_itself_keep_it() -> None:
 
 def test_a_softer_hand_must_be_clearly_better(monkeypatch: pytest.MonkeyPatch) -> None:
     masks = masks_of(person())
-    monkeypatch.setattr("wildghand.subject.fit_subject._LEAST_GAIN", 1.0)
+    monkeypatch.setattr(sys.modules[fit_subject.__module__], "_LEAST_GAIN", 1.0)
     shape = fitted("right", masks, masks)
     assert not shape.vertices.any()
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import numpy as np
 import pytest
 
@@ -42,7 +44,8 @@ def frames_of(sides: tuple[str, ...]) -> ComparedFrames:
 
 def unknowns_of(frames: ComparedFrames) -> Unknowns:
     template = next(iter(frames.templates.values()))
-    return Unknowns.of(template, 60, len(frames.templates), len(frames))
+    with mock.patch("wildghand.subject.unknowns.NODES", 60):
+        return Unknowns.of(template, len(frames.templates), len(frames))
 
 
 def posed_at(frames: ComparedFrames, unknowns: Unknowns, values: np.ndarray) -> PosedFrames:
