@@ -168,7 +168,7 @@ def preload() -> dict[str, Callable[[Sequence[str]], int]]:
         "hwp_bench.evaluation.evaluate", "hwp_bench.report.page", "hwp_bench.capture.check",
         "hwp_bench.leaderboard.entries", "hwp_bench.publish", "hwp_bench.sim",
         "hwp_bench.sim.produce.production", "wildghand.avatar.files", "wildghand.fitting",
-        "wildghand.export.formats", "wildghand.from_video.api", "matplotlib",
+        "wildghand.export.formats", "wildghand.from_video.make", "matplotlib",
     ):  # fmt: skip
         try:
             importlib.import_module(name)

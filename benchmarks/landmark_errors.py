@@ -9,7 +9,7 @@ import numpy as np
 import torch
 
 from hwp_bench.importers.video import VideoImport
-from hwp_bench.importers.video.from_video import fit_video, read_source
+from hwp_bench.importers.video.api import fit_video, read_source
 from hwp_bench.sim.produce.tracker_geometry import curl, edge_on
 
 #: Share of the frames with the smallest errors that says how large errors are in easy frames.

@@ -57,7 +57,7 @@ def test_harder_clips_show_what_their_names_say() -> None:
 
 
 def test_settings_keep_their_types() -> None:
-    settings = changed(FitSettings(), ["texture_weight=0", "contour_rounds=2"])
-    assert settings.texture_weight == 0.0
+    settings = changed(FitSettings(), ["texture=false", "contour_rounds=2"])
+    assert settings.texture is False
     assert settings.contour_rounds == 2
     assert isinstance(settings.contour_rounds, int)

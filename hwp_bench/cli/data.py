@@ -331,7 +331,7 @@ def do_track(args: argparse.Namespace) -> int:
     )
     if args.sheet is not None:
         from hwp_bench.base.images import write_image
-        from hwp_bench.tracking.sheet import landmark_sheet
+        from hwp_bench.tracking.track_video import landmark_sheet
 
         write_image(args.sheet, landmark_sheet(tracked))
     if args.json:

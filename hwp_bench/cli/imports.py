@@ -133,7 +133,7 @@ def do_video(args: argparse.Namespace) -> int:
 def _print_video(clip: ImportedClip, args: argparse.Namespace) -> None:
     import numpy as np
 
-    from hwp_bench.importers.shared.writing import SHEET_NAME
+    from hwp_bench.importers.shared.output import SHEET_NAME
 
     facts = clip.facts()
     video = clip.source.video
@@ -220,7 +220,7 @@ def do_wildghand(args: argparse.Namespace) -> int:
     from hwp_bench.base.console import notice
     from hwp_bench.base.files import check_places
     from hwp_bench.importers.official import OfficialImport, import_official
-    from hwp_bench.importers.official.folders import find_folders
+    from hwp_bench.importers.official.records import find_folders
 
     check_places(
         {"--out": args.out},

@@ -114,7 +114,7 @@ def verify_results(
         splits: splits by capture id; None applies the 80/10/10 rule.
 
     Raises:
-        BadInput, BadResult: the result file is find_missing or damaged.
+        BadInput, BadResult: the result file is missing or damaged.
     """
     file = file / "results.json" if file.is_dir() else file
     results = read_results(file)
@@ -488,7 +488,7 @@ def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
     absent = [name for name in results.metrics if name in _with_weights() and name not in here]
     if absent:
         notes.append(
-            f"Not recomputed, because their weights are find_missing: {', '.join(absent)}."
+            f"Not recomputed, because their weights are missing: {', '.join(absent)}."
         )
     if results.toolkit != __version__:
         notes.append(f"Made with version {results.toolkit}; this is {__version__}.")

@@ -59,7 +59,7 @@ class BoardRow:
 
     @property
     def whole(self) -> bool:
-        """Whether no capture or test frame of the suite is find_missing."""
+        """Whether no capture or test frame of the suite is missing."""
         return not find_missing(self.first)
 
     @property

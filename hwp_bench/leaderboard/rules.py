@@ -38,7 +38,7 @@ def check_entries(entries: Iterable[Entry]) -> list[Entry]:
         UsageError: an entry is of no suite, of clean frames, of settings that are not its
             protocol's, or of other data, splits or test frames than the entries of the same
             suite and protocol; or a revision is of no entry that can be revised.
-        BadResult: scores are find_missing or impossible.
+        BadResult: scores are missing or impossible.
     """
     listed = list(entries)
     for entry in listed:
@@ -107,7 +107,7 @@ def check_complete(entry: Entry) -> None:
     """Refuse an entry that lacks a part of its suite.
 
     Raises:
-        BadResult: captures or test frames are find_missing, or are not the suite's.
+        BadResult: captures or test frames are missing, or are not the suite's.
     """
     if problems := find_missing(entry.results):
         raise BadResult(

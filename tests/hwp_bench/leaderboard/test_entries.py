@@ -271,7 +271,7 @@ def test_other_names_and_fields_are_refused(fit_results, tmp_path) -> None:
         read_entries(tmp_path)
     moved.write_text("{}")
     with pytest.raises(
-        BadResult, match="schema: is find_missing where 'hwp-leaderboard-entry/1' is read"
+        BadResult, match="schema: is missing where 'hwp-leaderboard-entry/1' is read"
     ):
         read_entries(tmp_path)
 

@@ -26,16 +26,14 @@ import wildghand
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import open_capture
-from hwp_bench.importers.shared.hand_tracks import read_hand_tracks, write_hand_tracks
-from hwp_bench.tracking.model_files import HAND, PALM, models_folder
+from hwp_bench.importers.shared.landmarks import read_hand_tracks, write_hand_tracks
+from hwp_bench.tracking.networks import HAND, PALM, models_folder
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.from_video import VideoFit, make_avatar, sheet, turntable
-from wildghand.from_video.capture import import_options, stride
-from wildghand.from_video.job import Job
-from wildghand.from_video.settings import QUICK as QUICK_CHANGES
-from wildghand.from_video.settings import QUICK_FRAMES, with_quick
-from wildghand.from_video.stages import STAGES
+from wildghand.from_video import VideoFit, make_avatar, pictures
+from wildghand.from_video.job import QUICK as QUICK_CHANGES
+from wildghand.from_video.job import QUICK_FRAMES, Job, with_quick
+from wildghand.from_video.stages import STAGES, import_options, stride
 from wildghand.model.settings import read_settings
 
 pytestmark = pytest.mark.slow
@@ -88,7 +86,7 @@ def folder(made: Path, tmp_path: Path) -> Path:
 def small_turntable(monkeypatch: pytest.MonkeyPatch) -> None:
     """One of full size is most of a run's time."""
     for name, value in zip(("SIZE", "FRAMES"), SMALL, strict=True):
-        monkeypatch.setattr(turntable, name, value)
+        monkeypatch.setattr(pictures, name, value)
 
 
 def tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -173,9 +171,9 @@ from pathlib import Path
 sys.path[:0] = sys.argv[4:]
 from test_from_video import SMALL, choices
 from wildghand.fitting import session
-from wildghand.from_video import capture, make_avatar, run, turntable
+from wildghand.from_video import make_avatar, pictures, run, stages
 folder, out, where = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
-turntable.SIZE, turntable.FRAMES = SMALL
+pictures.SIZE, pictures.FRAMES = SMALL
 def die(*args, **more):
     os.kill(os.getpid(), signal.SIGKILL)
 if where == "fit":
@@ -186,9 +184,9 @@ if where == "fit":
             die()
     session.save_state = save_and_die
 elif where == "import":
-    capture.import_video = die
+    stages.import_video = die
 elif where == "turntable":
-    turntable.as_uint8 = die
+    pictures.as_uint8 = die
 elif where == "between":
     write = run.write_record
     def write_and_die(path, record):
@@ -258,9 +256,9 @@ def test_the_command(folder: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> N
     record["source"]["video"] |= {"ends_early": True, "warning": "ends early, after 12 of 24"}
     (capture / "capture.json").write_text(json.dumps(record))
     labels: list[str] = []
-    labelled = sheet.labelled
+    labelled = pictures.labelled
     monkeypatch.setattr(
-        sheet, "labelled", lambda tile, text: labels.append(text) or labelled(tile, text)
+        pictures, "labelled", lambda tile, text: labels.append(text) or labelled(tile, text)
     )
     (folder / "my_hand" / "sheet.jpg").unlink()
     assert main([*words, "-o", str(folder / "my_hand")]) == 0
@@ -271,7 +269,7 @@ def test_the_command(folder: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> N
 def test_from_python(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a folder it goes next to the video, under the video's name."""
     monkeypatch.setattr(
-        "wildghand.from_video.api.VideoFit", functools.partial(VideoFit, importer=IMPORT)
+        "wildghand.from_video.make.VideoFit", functools.partial(VideoFit, importer=IMPORT)
     )
     (folder / "my_hand").rename(folder / "hand_avatar")
     avatar = wildghand.fit(
@@ -358,7 +356,7 @@ def test_without_the_tracker_or_the_network_one_line_says_so(
 
     with monkeypatch.context() as here:
         here.setenv("HWP_CACHE", str(folder / "cache"))
-        here.setattr("hwp_bench.tracking.model_files._open", offline)
+        here.setattr("hwp_bench.tracking.networks._open", offline)
         assert main(words) == 1
         told = capsys.readouterr().err
         assert "cannot be downloaded (network is unreachable)" in told

@@ -21,7 +21,7 @@ from hwp_bench.hands import pose_hand
 from hwp_bench.hands.raster import overlap
 from hwp_bench.importers.shared.landmarks import read_landmarks
 from hwp_bench.importers.video import FitSettings, ImportedClip, VideoImport, import_video
-from hwp_bench.importers.video.fit_clip import Footage, fit_landmarks, share_camera
+from hwp_bench.importers.video.solve import Footage, fit_landmarks, share_camera
 from hwp_bench.importers.video.source import read_source
 from hwp_bench.results import read_results
 
@@ -31,7 +31,7 @@ QUICK = FitSettings(
     landmark_steps=90,
     contour_steps=20,
     contour_rounds=1,
-    texture_weight=0.0,
+    texture=False,
     picture_rounds=2,
 )
 
