@@ -487,9 +487,7 @@ def _notes(results: Results, networks: Mapping[str, Network]) -> list[str]:
     here = metric_names(networks=networks)
     absent = [name for name in results.metrics if name in _with_weights() and name not in here]
     if absent:
-        notes.append(
-            f"Not recomputed, because their weights are missing: {', '.join(absent)}."
-        )
+        notes.append(f"Not recomputed, because their weights are missing: {', '.join(absent)}.")
     if results.toolkit != __version__:
         notes.append(f"Made with version {results.toolkit}; this is {__version__}.")
     mine = environment()
