@@ -22,10 +22,10 @@ from hwp_bench.capture import Capture, open_capture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar
 from wildghand.gaussians.quaternions import quat_third_axis
+from wildghand.light import CastLight
+from wildghand.light.fit_lights import CONE, SKY
 from wildghand.model.dress import Gaussians
 from wildghand.model.rasterize_hands import rasterize_hands
-from wildghand.shadows import CastLight
-from wildghand.shadows.find_light import CONE, SKY
 
 
 def lamps_of(light: CastLight) -> list[tuple[np.ndarray, float]]:

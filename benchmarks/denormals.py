@@ -13,6 +13,7 @@ import argparse
 import json
 from collections.abc import Mapping
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import torch
@@ -20,6 +21,7 @@ import torch
 from benchmarks.small_capture import opened_request, small_capture
 from benchmarks.step_loops import WildGHandLoop, mean_of
 from hwp_bench.base.tables import Column, Table, print_table
+from wildghand.dpd.dpd import DpdSettings
 from wildghand.model.terms import TermWeights
 
 #: What the loss is multiplied with, so that gradients of pixels are about 1e-40.
@@ -31,10 +33,9 @@ TERMS = {
         for name in TermWeights.__dataclass_fields__
         if name not in ("dssim_weight", "outside_weight", "leave_hidden")
     },
-    "dpd.gain_weight": 0.1,
-    "dpd.tint_weight": 1.0,
-    "dpd.omega_weight": 1.0,
 }
+#: The same of DPD, where the weights are constants.
+CONSTANTS = {"gain_weight": 0.1, "tint_weight": 1.0, "omega_weight": 1.0}
 
 
 def processor_ms(
@@ -51,8 +52,11 @@ def processor_ms(
         loops = {name: WildGHandLoop(training, values) for name, values in settings.items()}
         for turn in range(rounds + 1):
             for name, loop in loops.items():
+                faded = FADED if name == "faded" else 1.0
+                weights = {constant: faded * weight for constant, weight in CONSTANTS.items()}
                 for flush in (True, False):
-                    _, processor = mean_of(loop.block(flush=flush))
+                    with mock.patch.multiple(DpdSettings, **weights):
+                        _, processor = mean_of(loop.block(flush=flush))
                     if turn > 0:
                         spent.setdefault((name, flush), []).append(processor)
     return {key: 1e3 * float(np.median(values)) for key, values in spent.items()}

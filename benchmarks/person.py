@@ -14,6 +14,7 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from unittest import mock
 
 import cv2
 import numpy as np
@@ -33,16 +34,14 @@ from wildghand.fitting.judging_frames import judging_frames
 from wildghand.fitting.subject_shape import subject_of
 from wildghand.gaussians.training import TrainingFrames, load_frames
 from wildghand.model.settings import read_settings
-from wildghand.subject import SubjectShape
+from wildghand.subject import SubjectShape, unknowns
 from wildghand.subject.shape import side_flip
 
-#: Settings of a fit, and whether validation frames may choose, by what is compared.
-WAYS: Mapping[str, tuple[dict[str, object], bool]] = {
+#: How large proportions are expected to be, and whether validation frames may choose, by what is
+#: compared.
+WAYS: Mapping[str, tuple[dict[str, float], bool]] = {
     "bent": ({}, True),
-    "no proportions": (
-        {"subject.length_spread": 1e-6, "subject.thickness_spread": 1e-6},
-        True,
-    ),
+    "no proportions": ({"LENGTH_SPREAD": 1e-6, "THICKNESS_SPREAD": 1e-6}, True),
     "training frames choose": ({}, False),
 }
 # Edge of a drawn hand, px, and the distance that is drawn as the hottest colour, m.
@@ -62,13 +61,14 @@ class Person:
     #: What the model's right hand lacks of the person's.
     truth: SubjectShape
 
-    def shape(self, settings: Mapping[str, object], validation: bool) -> tuple[SubjectShape, float]:
+    def shape(self, spreads: Mapping[str, float], validation: bool) -> tuple[SubjectShape, float]:
         """The shape that a fit finds, and its seconds."""
-        training, found = self.training, read_settings(settings)
+        training, found = self.training, read_settings({})
         templates = {side: training.template(side) for side in training.sides}
         judges = judging_frames(training, found) if validation else None
         began = time.perf_counter()
-        shape = subject_of(training, self.frames, templates, found, judges)
+        with mock.patch.multiple(unknowns, **spreads):
+            shape = subject_of(training, self.frames, templates, found, judges)
         assert shape is not None
         return shape, time.perf_counter() - began
 

@@ -4,15 +4,91 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import cast
+from typing import ClassVar, cast
 
 import torch
 from torch import Tensor, nn
 
 from hwp_bench.base.errors import BadInput, ShapeMismatch, UsageError
 from hwp_bench.methods.settings import number
-from wildghand.dpd.field import BiasField
-from wildghand.gaussians.attributes import SIZES, RawAttributes
+from wildghand.gaussians.attributes import CHANNELS, SIZES, RawAttributes
+from wildghand.gaussians.rig import HandRig
+from wildghand.gaussians.shading import sh_basis, sh_count
+
+#: Joints whose skinning weights say where on the hand a Gaussian is.
+_JOINTS = 16
+#: Degree of the harmonics of the normal; light of degree 2 is enough for a matte surface.
+_DEGREE = 2
+#: Numbers of one place: the skinning weights, which add up to a constant, and the harmonics
+#: without theirs.
+PLACE_CHANNELS = _JOINTS + sh_count(_DEGREE) - 1
+
+
+class BiasField(nn.Module):
+    """F_l(x) = sum_k a_k(z_l) B_k x for every frame of a clip: 14 numbers at each Gaussian.
+
+    x is the place: which bones move the Gaussian, and where its normal points in this frame. A
+    light from the side is a field of colours over normals, a wrong finger one of offsets over
+    bones. B starts at zero, hence F.
+
+    Args:
+        rank: K, at least 1.
+        width: of the temporal embedding z.
+
+    Raises:
+        UsageError: `rank` is below 1.
+
+    Source: ours; the paper's bias has the same shift for all Gaussians of a frame.
+    """
+
+    def __init__(self, rank: int, width: int) -> None:
+        super().__init__()
+        if rank < 1:
+            raise UsageError(f"is {rank}", field="rank", remedy="Use 1 or more.")
+        self.codes = nn.Linear(width, rank)
+        self.maps = nn.Parameter(torch.zeros(rank, PLACE_CHANNELS, CHANNELS))
+
+    def forward(self, z: Tensor, bones: Tensor, normals: Tensor) -> Tensor:
+        """Evaluate the field.
+
+        Args:
+            z: (B, width) temporal embedding.
+            bones: (N, 16) as from `bone_features`.
+            normals: (B, N, 3) of length 1: the posed surface's, without gradient.
+
+        Returns:
+            (B, N, 14), in the order of the attributes.
+
+        Raises:
+            ShapeMismatch: the arguments do not describe the same Gaussians and frames.
+        """
+        if normals.shape != (len(z), len(bones), 3) or bones.shape[1] != _JOINTS:
+            raise ShapeMismatch(
+                f"are {tuple(z.shape)}, {tuple(bones.shape)} and {tuple(normals.shape)}",
+                field="z, bones, normals",
+            )
+        # The sum over k first: one small matrix for each frame.
+        maps = torch.einsum("bk,kpc->bpc", self.codes(z), self.maps)
+        by_bone, by_normal = maps.split([_JOINTS, PLACE_CHANNELS - _JOINTS], dim=1)
+        harmonics = sh_basis(normals, _DEGREE)[..., 1:]
+        return torch.baddbmm(bones @ by_bone, harmonics, by_normal)
+
+
+def bone_features(rig: HandRig) -> Tensor:
+    """How far each bone moves each anchor, scaled so that a single bone counts 4.
+
+    With 4, the square root of 16, their mean square is at most that of the harmonics, 1.
+
+    Args:
+        rig: N anchors.
+
+    Returns:
+        (N, 16) float32, rows sum to 4.
+    """
+    corners = rig.template.weights[rig.template.faces[rig.anchors.face_index]]
+    barycentric = torch.as_tensor(rig.anchors.barycentric).to(corners)
+    return math.sqrt(_JOINTS) * torch.einsum("ncj,nc->nj", corners, barycentric)
+
 
 #: K of the paper: the encoding has the octaves 0 to K.
 OCTAVES = 9
@@ -26,29 +102,31 @@ class DpdSettings:
 
     #: Component: explain perturbations as biases of the attributes.
     enabled: bool = True
-    #: Addition: rank of the field of biases over place and normal (`wildghand.dpd.field`); 0: all
+    #: Addition: rank of the field of biases over place and normal (`wildghand.dpd.dpd`); 0: all
     #: Gaussians of a frame share their shift, as in the paper.
     rank: int = number(6, 0, 64)
     #: Add the biases. Off: the temporal weights remain, which PAO reads.
     biases: bool = True
     #: Addition: residual, in those of clean frames, at which the canonical hand learns a third of a
-    #: frame that its biases explain (`wildghand.dpd.pay_back`); 0: explaining pays nothing back.
+    #: frame that its biases explain (`wildghand.dpd.temporal`); 0: explaining pays nothing back.
     pay_back: float = number(0.0, 0.0, 1000.0)
     #: Addition: a gain of each frame's colours, held near that of clean frames.
     gains: bool = True
-    #: Weight of the square of the log gains, for a frame that is surely clean.
-    gain_weight: float = number(0.1)
-    #: Weight of the square of what separates the log gains of a frame's channels: exposure wanders
-    #: more than white balance, and a palm that only perturbed frames show is redder by itself.
-    tint_weight: float = number(1.0)
-    #: Chance that a frame's biases are left out of a step. With the pre-pass, that of clean frames
-    #: holds instead (`prepass.omega_dropout`).
-    omega_dropout: float = number(0.3, 0.0, 1.0)
     #: Addition: temporal weight that a frame of the least weight in the pre-pass starts at and is
     #: held near. 0: all start at 0, and only those of clean frames are held there.
     omega_scale: float = number(0.5, 0.0, 0.9)
-    #: Weight of the squared distance of the temporal weights from what the pre-pass says.
-    omega_weight: float = number(1.0)
+
+    #: Weight of the square of the log gains, for a frame that is surely clean; 2 wins nothing.
+    gain_weight: ClassVar[float] = 0.1
+    #: Weight of the square of what separates the log gains of a frame's channels: exposure wanders
+    #: more than white balance, and a palm that only perturbed frames show is redder by itself.
+    tint_weight: ClassVar[float] = 1.0
+    #: Chance that a frame's biases are left out of a step, the paper's. With the pre-pass, all of
+    #: clean frames are.
+    omega_dropout: ClassVar[float] = 0.3
+    #: Weight of the squared distance of the temporal weights from what the pre-pass says: any
+    #: factor may move between omega and varphi, so that it need not be tuned.
+    omega_weight: ClassVar[float] = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -233,9 +311,7 @@ def encode_frames(frames: Tensor, frame_count: int) -> Tensor:
 
 
 def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator) -> Tensor:
-    """Set temporal weights to 0 at random: the canonical attributes learn without biases.
-
-    Training only; the paper's probability is 0.3 for every frame.
+    """Set temporal weights to 0 at random, the paper's probability being 0.3 for every frame.
 
     Args:
         omega: (B,).

@@ -1,15 +1,16 @@
 """Evidence: how much training frames say of each Gaussian, and what holds where they do not."""
 
-from wildghand.evidence.color_changes import ColorChanges, rename_former
 from wildghand.evidence.count import shown_frames
 from wildghand.evidence.evidence import (
+    ColorChanges,
     Evidence,
+    EvidenceSettings,
     fill_shares,
     kept_share,
+    rename_former,
     strengths,
     weigh_evidence,
 )
-from wildghand.evidence.settings import EvidenceSettings
 
 __all__ = [
     "ColorChanges",

@@ -4,21 +4,50 @@ An offset from the skin moves a Gaussian along the line of sight too, where a si
 nothing of it; from elsewhere it is at the wrong place. Its shape is as uncertain. The maximum of a
 Gaussian likelihood of n frames and a prior that weighs as much as k of them keeps n / (n + k) of
 what the frames say, and the rest of the prior: no offset, and a disc that closes the skin.
+
+Colours change too, where the other hand or the skin around a place says more of it than frames do.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from wildghand.evidence.settings import EvidenceSettings
+from hwp_bench.methods.settings import number
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.found import Found, Kept, read_tensor
+
+
+@dataclass(frozen=True)
+class EvidenceSettings:
+    """How much evidence outweighs that a Gaussian is an opaque disc on the skin."""
+
+    #: Draw free poses with Gaussians that are the more discs on the skin, the fewer frames have
+    #: shown them.
+    enabled: bool = True
+    #: Share of the training frames that must show a Gaussian until half of its offset from the skin
+    #: is kept.
+    offset_share: float = number(0.08, 0.0, 100.0)
+    #: Share of the training frames that must show a place clearly until its colour is half its own;
+    #: the rest is that of the same place of the other hand, where that is known. 0: all of it is.
+    color_share: float = number(0.02, 0.0, 100.0)
+    #: Share of the training frames that must show a place until its colour is half its own; the
+    #: rest is that of the skin around it. 0: all of it is its own.
+    fill_share: float = number(0.02, 0.0, 100.0)
+
+    #: Share of the training frames that must show a Gaussian until half of its shape and
+    #: transparency is kept: an image says more of these than of an offset.
+    shape_share: ClassVar[float] = 0.002
+    #: After the last step, take a quarter or four times of `offset_share`, or 0, where that draws
+    #: the validation frames better, and nothing of it where that draws them much better; then five
+    #: times of `fill_share`, or 0. With fewer than four of these frames the settings hold.
+    validated: ClassVar[bool] = True
+
 
 _WALLS = "evidence_wall_"
 # The disc: standard deviations along the skin and across it, in spacings of the anchors, and its
@@ -154,3 +183,36 @@ def fill_shares(settings: EvidenceSettings) -> list[float]:
     """
     own = settings.fill_share
     return [own, 5.0 * own, 0.0] if own > 0.0 else [0.0]
+
+
+_PREFIX = "color_changes_"
+# Of avatars from before places that are seldom seen took the colours around them.
+_FORMER = "other_hand_"
+# Largest change of a colour that is read, in logits.
+_LARGEST = 20.0
+
+
+@dataclass(frozen=True, eq=False)
+class ColorChanges(Found):
+    """Changes of the colours of Gaussians, in logits of sRGB."""
+
+    prefix = _PREFIX
+    #: (N, 3) by side.
+    changes: Annotated[Mapping[str, Tensor], Kept(("N", 3), -_LARGEST, _LARGEST, name="")]
+
+    def color(self, side: str, raw: RawAttributes) -> RawAttributes:
+        """Gaussians in their changed colours.
+
+        Args:
+            side: which hand.
+            raw: (..., N, k) attributes.
+        """
+        return replace(raw, logit_colors=raw.logit_colors + self.changes[side])
+
+
+def rename_former(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """The tensors of an avatar by their names of today."""
+    return {
+        _PREFIX + name.removeprefix(_FORMER) if name.startswith(_FORMER) else name: value
+        for name, value in tensors.items()
+    }

@@ -9,8 +9,8 @@ from torch import Tensor
 from wildghand.fitting.shadow_samples import shadow_samples
 from wildghand.fitting.weighting import Weighting
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
+from wildghand.light import ShadowSettings, ShadowTable, find_light
 from wildghand.model.model import WildGHandModel
-from wildghand.shadows import ShadowSettings, ShadowTable, find_light
 
 #: From rows, (B,) int64 on the CPU, to (B, N) factors on the Gaussians' colours by side.
 Dark = Callable[[Tensor], dict[str, Tensor]]

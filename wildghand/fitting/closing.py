@@ -54,7 +54,7 @@ class LightFit:
             self.settings.samples * read // count,
             self.seed,
         )
-        return fit_light(samples, self.settings)
+        return fit_light(samples)
 
     def seconds(self) -> float:
         """Return about how long `learn` takes.

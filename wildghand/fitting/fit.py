@@ -15,7 +15,7 @@ from hwp_bench.capture.schema import HandModelId
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.dpd.dpd import draw_kept
-from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.dpd.temporal import TemporalTarget
 from wildghand.evidence import shown_frames, weigh_evidence
 from wildghand.fitting.averaging import StepAverage
 from wildghand.fitting.believed_poses import in_believed_poses

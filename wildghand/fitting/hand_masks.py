@@ -13,7 +13,8 @@ from hwp_bench.hands.raster import draw_faces
 from hwp_bench.methods.contract import TrainingCapture
 from hwp_bench.methods.settings import source_path
 from wildghand.gaussians.training import TrainingFrames
-from wildghand.pao.regions import PromptedHand, RegionCache, graph_cut_hands, mask_of, open_sam
+from wildghand.pao.sam import PromptedHand, mask_of, open_sam
+from wildghand.pao.segmenters import RegionCache, graph_cut_hands
 
 # Frames that are posed at a time, so that memory does not grow with the clip.
 _CHUNK = 32

@@ -17,19 +17,19 @@ from torch import Tensor
 
 from hwp_bench.stability import Case, Context, Measured
 from wildghand.dpd.dpd import DynamicPerturbation, drop
-from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.dpd.temporal import TemporalTarget
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
 from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.model import terms
 from wildghand.pao.pao import PAPER_PAO, PerturbationAwareWeights, Weights
-from wildghand.pao.regions.frame_regions import FrameRegions, overlapping, partition, stack_regions
+from wildghand.pao.regions import FrameRegions, overlapping, partition, stack_regions
 
 #: Largest relative L2 distance of a float32 gradient from that of float64.
 GRADIENT_TOLERANCE = 1e-4
 
 _SIZE = 16
 _GAUSSIANS = 24
-_PRINTED = replace(PAPER_PAO, share_of="hand")
+_PRINTED = PAPER_PAO
 _Entry = tuple[str, str, Callable[[Context], Measured]]
 
 
@@ -222,7 +222,7 @@ def _run_regions(regions: FrameRegions, hand: Tensor, context: Context) -> Measu
 
 
 def _run_constant(context: Context) -> Measured:
-    module = PerturbationAwareWeights(replace(_PRINTED, errors="batch"))
+    module = PerturbationAwareWeights(replace(_PRINTED, errors="batch"), share_of="hand")
     # 0.4 has rounding in its sums, which must not be stretched either.
     error = torch.full((1, _SIZE, _SIZE), 0.4)
     made = module(error, stack_regions([_halves()]), _hand(), torch.zeros(1))
@@ -231,8 +231,9 @@ def _run_constant(context: Context) -> Measured:
 
 
 def _run_no_weight(context: Context) -> Measured:
-    closed = replace(_PRINTED, error_threshold=0.0, background_threshold=0.0)
-    module = PerturbationAwareWeights(closed)
+    closed = replace(_PRINTED, error_threshold=0.0)
+    module = PerturbationAwareWeights(closed, share_of="hand")
+    module.T_b.data.zero_()
     image = _noise(1, _SIZE, _SIZE, 3).requires_grad_(True)
     error = image.detach().mean(dim=-1)
     made = module(error, stack_regions([_halves()]), _hand(), torch.zeros(1))
@@ -249,7 +250,7 @@ def _run_frame(frame: Tensor, hand: Tensor, context: Context) -> Measured:
     leaf = _noise(1, _SIZE, _SIZE, 3, seed=4).requires_grad_(True)
     regions = stack_regions([_halves()])
     error = (leaf.detach() - frame).abs().mean(dim=-1)
-    modules = [PerturbationAwareWeights(), PerturbationAwareWeights(_PRINTED)]
+    modules = [PerturbationAwareWeights(), PerturbationAwareWeights(_PRINTED, share_of="hand")]
     made = [module(error, regions, hand, torch.zeros(1)) for module in modules]
     weights = torch.cat([found.weights for found in made])
     image, frame = leaf.expand(2, -1, -1, -1), frame.expand(2, -1, -1, -1)
@@ -283,7 +284,7 @@ def _run_gradient(
 
 
 def _loss_of_thresholds(thresholds: Tensor) -> Tensor:
-    module = PerturbationAwareWeights(_PRINTED)
+    module = PerturbationAwareWeights(_PRINTED, share_of="hand")
     error = 0.6 * _noise(1, _SIZE, _SIZE).to(thresholds)
     named = dict(zip(("T_E", "T_mu", "T_b"), thresholds.unbind(), strict=True))
     arguments = (error, stack_regions([_halves()]), _hand(), torch.zeros(1).to(error))
@@ -317,7 +318,7 @@ def _attributes(frames: int) -> RawAttributes:
 
 
 def _weigh(error: Tensor, regions: FrameRegions, hand: Tensor, omega: float) -> Weights:
-    module = PerturbationAwareWeights(_PRINTED)
+    module = PerturbationAwareWeights(_PRINTED, share_of="hand")
     return module(error, stack_regions([regions]), hand, torch.tensor([omega]))
 
 

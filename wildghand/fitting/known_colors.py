@@ -13,7 +13,7 @@ from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
 from wildghand.evidence import ColorChanges
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight
-from wildghand.light.sphere import ring_around
+from wildghand.light.lights import ring_around
 from wildghand.model.model import WildGHandModel
 
 # Normals at which colours are read: the axis of the cap that the light knows, and so many around it

@@ -12,8 +12,8 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.methods.settings import source_path
 from wildghand.gaussians.perceptual import FilterBankLoss, Vgg19
 from wildghand.model.settings import WildGHandSettings, read_settings
-from wildghand.pao.regions import Segmenter, Superpixels, open_sam
-from wildghand.sam import check_checkpoint
+from wildghand.pao.sam import check_checkpoint, open_sam
+from wildghand.pao.segmenters import Segmenter, Superpixels
 
 
 def check_networks(values: Mapping[str, Any]) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.dpd.temporal import TemporalTarget
 from wildghand.fitting.networks import choose_perceptual
 from wildghand.fitting.weighting import FrameTarget
 from wildghand.gaussians.attributes import RawAttributes

@@ -14,10 +14,10 @@ from wildghand.gaussians.fit_loop import ready_device
 from wildghand.gaussians.regularizers import off_surface, sum_bags
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading import fill_harmonics
+from wildghand.light import Obstacles
 from wildghand.model.dress import dress
 from wildghand.network import NetworkOutput, Refinement
 from wildghand.network.frame_heads import warm_up_heads
-from wildghand.shadows import Obstacles
 
 
 def ready_fit(name: str) -> torch.device:

@@ -14,7 +14,7 @@ from wildghand.fitting.weighting import Weighting
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
-from wildghand.shadows import Obstacles, ShadowSamples, ShadowSettings, obstacles_in_frames
+from wildghand.light import Obstacles, ShadowSamples, ShadowSettings, obstacles_in_frames
 
 # Weight of a frame from which it is read, if at least so many frames have it.
 _GOOD, _LEAST = 0.5, 4

@@ -11,7 +11,7 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.subject import SubjectShape, fit_subject
-from wildghand.subject.compared_frames import ComparedFrames
+from wildghand.subject.outlines import ComparedFrames
 
 
 def subject_of(

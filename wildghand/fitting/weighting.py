@@ -12,7 +12,7 @@ from torch import Tensor
 
 from hwp_bench.hands import HandTemplate
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.dpd.pay_back import PayBack
+from wildghand.dpd.temporal import PayBack
 from wildghand.fitting.hidden_skin import hidden_skin
 from wildghand.fitting.networks import choose_segmenter
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
@@ -25,11 +25,9 @@ from wildghand.gaussians.training import (
 )
 from wildghand.model.rendered import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
-from wildghand.pao.pao import PerturbationAwareWeights, binary_weights
-from wildghand.pao.place_errors import PlaceErrors
+from wildghand.pao.pao import PerturbationAwareWeights, PlaceErrors, binary_weights, running_median
 from wildghand.pao.regions import ClipRegions, FrameRegions
-from wildghand.pao.regions.superpixels import RegionCache
-from wildghand.pao.running_median import running_median
+from wildghand.pao.segmenters import RegionCache
 from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
 
 

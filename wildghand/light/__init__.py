@@ -1,6 +1,26 @@
-"""Light beyond what a clip shows: colours at normals that no training frame has faced."""
+"""Light: beyond what a clip shows, and where hands keep it from themselves and from each other."""
 
-from wildghand.light.known_light import KnownLight, LightSamples, fit_light
-from wildghand.light.settings import LightSettings
+from wildghand.light.fit_lights import (
+    KnownLight,
+    LightSamples,
+    ShadowSamples,
+    find_light,
+    fit_light,
+)
+from wildghand.light.hand_shadows import HandShadows, Obstacles, ShadowTable, obstacles_in_frames
+from wildghand.light.lights import CastLight, LightSettings, ShadowSettings
 
-__all__ = ["KnownLight", "LightSamples", "LightSettings", "fit_light"]
+__all__ = [
+    "CastLight",
+    "HandShadows",
+    "KnownLight",
+    "LightSamples",
+    "LightSettings",
+    "Obstacles",
+    "ShadowSamples",
+    "ShadowSettings",
+    "ShadowTable",
+    "find_light",
+    "fit_light",
+    "obstacles_in_frames",
+]

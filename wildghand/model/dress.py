@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from torch import Tensor
 
 from wildghand.dpd.dpd import Perturbation
-from wildghand.dpd.scale_gradients import scale_gradients
+from wildghand.dpd.temporal import scale_gradients
 from wildghand.gaussians.attributes import Activation
 from wildghand.gaussians.quaternions import quat_multiply, quat_rotate
 from wildghand.gaussians.rig import AnchorPoses

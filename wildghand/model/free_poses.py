@@ -15,10 +15,10 @@ from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal
 from wildghand.evidence import ColorChanges, Evidence
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.light import KnownLight
+from wildghand.light.hand_shadows import Hand
 from wildghand.model.dress import Gaussians, dress
 from wildghand.model.relight import relit
 from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
-from wildghand.shadows.hand_shadows import Hand
 
 
 class HandModel(Protocol):

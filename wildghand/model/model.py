@@ -8,14 +8,14 @@ from dataclasses import replace
 import torch
 from torch import Tensor, nn
 
-from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal
-from wildghand.dpd.field import bone_features
-from wildghand.dpd.scale_gradients import scale_refinement
+from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal, bone_features
+from wildghand.dpd.temporal import scale_refinement
 from wildghand.evidence import ColorChanges, Evidence
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.gaussians.training import TrainingClip
-from wildghand.light import KnownLight
+from wildghand.light import CastLight, HandShadows, KnownLight, ShadowSettings
+from wildghand.light.hand_shadows import Hand, Hands
 from wildghand.model.dress import Gaussians, dress
 from wildghand.model.free_poses import dimmed, dressed, predict_hand
 from wildghand.model.rasterize_hands import rasterize_hands
@@ -23,8 +23,6 @@ from wildghand.model.rendered import HandState, RenderedFrames, largest
 from wildghand.model.wrist import WristWall
 from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
 from wildghand.poses import ClipPoses
-from wildghand.shadows import CastLight, HandShadows, ShadowSettings
-from wildghand.shadows.hand_shadows import Hand, Hands
 from wildghand.subject import SubjectShape
 
 

@@ -17,14 +17,13 @@ from hwp_bench.base.records import flattened, merged
 from hwp_bench.methods.settings import check_source, choice, number, settings_from
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.evidence import EvidenceSettings
-from wildghand.light import LightSettings
+from wildghand.light import LightSettings, ShadowSettings
 from wildghand.model.former_settings import current_names
 from wildghand.model.terms import PAPER_TERMS, TermWeights
 from wildghand.network.settings import NetworkSettings, network_settings
 from wildghand.pao.pao import PAPER_PAO, PaoSettings
-from wildghand.poses.settings import PoseSettings
+from wildghand.poses.errors import PoseSettings
 from wildghand.prepass import PrepassSettings
-from wildghand.shadows import ShadowSettings
 from wildghand.subject import SubjectSettings
 
 #: Where messages place a wrong setting.
@@ -139,12 +138,8 @@ class WildGHandSettings:
     #: Addition: Gaussians that few frames show are discs on the skin.
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
-    #: covered, and which poses need refining. It leaves the biases out of every clean
-    #: frame, not out of three in ten: what little they took from these, the avatar lacked
-    #: (docs/wildghand.md).
-    prepass: PrepassSettings = field(
-        default_factory=lambda: PrepassSettings(weight_floor=0.2, omega_dropout=1.0)
-    )
+    #: covered, and which poses need refining.
+    prepass: PrepassSettings = field(default_factory=PrepassSettings)
     #: The network.
     network: NetworkSettings = field(default_factory=NetworkSettings)
     #: Weights of the terms of the loss.
@@ -166,11 +161,9 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
         "pao": {
             "variant": PAPER_PAO.variant,
             "errors": "batch",
-            "alpha": PAPER_PAO.alpha,
             "beta": PAPER_PAO.beta,
             "error_threshold": PAPER_PAO.error_threshold,
             "share_threshold": PAPER_PAO.share_threshold,
-            "spare_clean": False,
         },
         "start_colors": False,
         "poses": {"enabled": False},
@@ -230,18 +223,16 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
     {
         "start_colors": False,
         "dpd": {"rank": 0},
-        "pao": {"errors": "median", "mismatch": 0.0, "spare_clean": False},
+        "pao": {"errors": "median"},
         "poses": {"enabled": False},
         "subject": {"enabled": False},
         "light": {"enabled": False},
         "shadows": {"enabled": False},
         "evidence": {
             "enabled": False,
-            "validated": False,
             "color_share": 0.0,
             "fill_share": 0.0,
         },
-        "prepass": {"clean_scale": 1.0, "validated": False},
         "schedule": {"root_steps": 0.0, "average_share": 0.0, "validated": False},
         "terms": {
             "surface": 0.0,
@@ -249,6 +240,32 @@ _BEFORE: Mapping[str, Any] = MappingProxyType(
             "leave_hidden": False,
             "dssim_inexact": 1.0,
         },
+    }
+)
+
+
+#: Numbers that avatars may store and that are constants.
+_CONSTANTS: Mapping[str, str] = MappingProxyType(
+    {
+        "poses": "image_error space_error expected_turn expected_shift rounds",
+        "subject": (
+            "rounds points reach length_spread thickness_spread spread roughness "
+            "joint_spread transl_spread least_gain nodes"
+        ),
+        "light": "directions ridge border samples",
+        "shadows": "frames places directions least_gain softness darkest",
+        "evidence": "shape_share validated",
+        "prepass": (
+            "patch_size sample_count pixel_budget iterations albedo_prior clean_share "
+            "gain_floor residual_floor texture_floor border_floor misplacement_floor "
+            "hidden_floor validated clear_deviation omega_dropout clean_threshold "
+            "residual_scale tint_scale clean_scale residual_prior least_frames"
+        ),
+        "pao": (
+            "mismatch spare_clean alpha background_threshold background_threshold_both "
+            "share_of binary_outside"
+        ),
+        "dpd": "gain_weight tint_weight omega_dropout omega_weight",
     }
 )
 
@@ -289,6 +306,10 @@ def read_stored(values: Mapping[str, Any]) -> WildGHandSettings:
         BadMethod: as for `read_settings`.
     """
     tree = current_names(values)
+    for table, names in _CONSTANTS.items():
+        inner = tree.get(table)
+        if isinstance(inner, dict):
+            tree[table] = {name: inner[name] for name in inner.keys() - set(names.split())}
     heads = tree.get("heads", {})
     if isinstance(heads, Mapping) and "template" not in heads:
         # Without heads iii and iv, the third acted.

@@ -1,20 +1,141 @@
-"""Perturbation-aware optimization: how much each pixel of a frame counts."""
+"""Perturbation-aware optimization: how much each pixel of a frame counts.
+
+Weights follow the errors of regions. An error is counted in what is ordinary: the running median of
+all regions, or the ordinary error of the region's places on the hand.
+"""
 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
-from typing import Literal
+from dataclasses import dataclass
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
-from hwp_bench.base.errors import ShapeMismatch, UsageError
-from hwp_bench.methods.settings import check_source
+from hwp_bench.base.errors import ShapeMismatch
+from hwp_bench.methods.settings import check_source, number
 from wildghand.gaussians.losses import full_precision
-from wildghand.pao.regions.frame_regions import Regions
-from wildghand.pao.running_median import LEAST, running_median
+from wildghand.gaussians.training import upload
+from wildghand.pao.regions import ClipRegions, Regions
 
+#: Share of the newest median in the running one.
+RATE = 0.05
+#: Least median: half a level of 8 bits, below which differences are rounding.
+LEAST = 0.002
+
+
+@torch.no_grad()
+def running_median(
+    previous: float | Tensor | None, errors: Tensor, counted: Tensor
+) -> float | Tensor:
+    """Follow the median of errors over the steps of a fit.
+
+    Args:
+        previous: what this gave at the step before; None at the first.
+        errors: (...) not negative.
+        counted: as `errors`, bool: those that count; the others, and those that are not finite,
+            do not.
+
+    Returns:
+        The new median, at least `LEAST`; `previous` where nothing counts. A number on the CPU,
+        elsewhere a scalar on the device, float64, which nobody waits for.
+    """
+    counted = counted & errors.isfinite()
+    if errors.device.type != "cpu":
+        return _on_device(previous, errors, counted)
+    values = errors[counted]
+    if not len(values):
+        return LEAST if previous is None else previous
+    newest = float(values.median())
+    if previous is not None:
+        newest = float(previous) + RATE * (newest - float(previous))
+    return max(newest, LEAST)
+
+
+def _on_device(previous: float | Tensor | None, errors: Tensor, counted: Tensor) -> Tensor:
+    """As above, without a shape that follows from the values."""
+    ordered = torch.where(counted, errors, math.inf).flatten().sort().values
+    middle = (counted.sum() - 1).clamp(min=0) // 2
+    found = ordered.gather(0, middle[None])[0].double()
+    if previous is None:
+        newest = torch.where(counted.any(), found, LEAST)
+    else:
+        newest = torch.where(counted.any(), previous + RATE * (found - previous), previous)
+    return newest.clamp(min=LEAST)
+
+
+#: Share of the newest error of a place in its ordinary one, in a frame that is surely clean.
+PLACE_RATE = 0.1
+#: An error counts at most this often the ordinary one: something in front changes it slowly.
+MOST = 3.0
+
+
+class PlaceErrors:
+    """The ordinary error of each place of the hand at this point of a fit.
+
+    A hand that is not the template, a nail, a ring or poses that are always a little wrong leave
+    errors at the same places in every frame. Regions are compared with these, not with the mean
+    hand, and never with less than the running median of all regions.
+
+    Args:
+        places: the place of each pixel of the R frames; frames share their numbers.
+        trust: (R,) in [0, 1], how much a frame may teach what is ordinary: the probability that it
+            is clean.
+        count: C, places of the clip; they are numbered from 0.
+
+    Attributes:
+        ordinary: (C,) mean over channels of |rendering - input|; 0 where nothing is known.
+    """
+
+    def __init__(self, places: ClipRegions, trust: Tensor, count: int) -> None:
+        self._places, self._trust = places, trust
+        self.ordinary = torch.zeros(count, device=trust.device)
+
+    def expected(self, rows: Tensor, median: float | Tensor) -> Tensor:
+        """The ordinary error at every pixel, at least the running median.
+
+        Args:
+            rows: (B,) int64 on the CPU, which of the frames.
+            median: of the regions' errors.
+
+        Returns:
+            (B, H, W), positive.
+        """
+        places = self._places(rows)
+        floor = torch.clamp(self.ordinary, min=LEAST)
+        floor = torch.maximum(floor, torch.as_tensor(median, device=floor.device).to(floor))
+        # The regions of a batch may end before the last place of the clip.
+        return places.spread(floor[: places.count].expand(len(rows), -1).contiguous())
+
+    @torch.no_grad()
+    def watch(self, rows: Tensor, error: Tensor, hand: Tensor, median: float | Tensor) -> None:
+        """Learn from B frames.
+
+        Args:
+            rows: (B,) int64 on the CPU.
+            error: (B, H, W) mean over channels of |rendering - input|; finite where `hand` is.
+            hand: (B, H, W) bool.
+            median: of the regions' errors; the first error of a place counts at most `MOST` times.
+        """
+        places, ones = self._places(rows), hand.to(error)
+        pixels = places.sums(ones)
+        errors = places.sums(torch.where(hand, error, torch.zeros_like(error)))
+        errors = errors / pixels.clamp(min=1.0)
+        unit = torch.as_tensor(median, device=error.device).to(error)
+        trusts = self._trust[upload(rows, self._trust.device)]
+        ordinary = self.ordinary[: places.count]
+        for mine, seen, trust in zip(errors, pixels > 0.0, trusts, strict=True):
+            known = torch.where(ordinary > 0.0, ordinary, unit)
+            bounded = torch.minimum(mine, MOST * torch.maximum(known, unit))
+            moved = known + PLACE_RATE * trust * (bounded - known)
+            ordinary = torch.where(seen & mine.isfinite(), moved, ordinary)
+        self.ordinary = torch.cat([ordinary, self.ordinary[places.count :]])
+
+
+#: T_b at the start, for one hand and for two, as the authors have it: background pixels whose
+#: error, summed over channels, is above it have weight 0.
+BACKGROUND_THRESHOLDS = (3.0, 10.0)
 #: Colour channels: the paper's background error is their sum, its region error their mean.
 _CHANNELS = 3.0
 #: Errors that differ by less than this share are equal: stretching would show rounding.
@@ -41,67 +162,42 @@ class PaoSettings:
     #: weights of regions alone, as printed. `none`: nothing, as in the authors' code.
     temporal: Literal["teaching", "all", "regions", "none"] = "teaching"
     #: What E_u is counted in. `place`: the ordinary error of the region's places on the hand
-    #: (`wildghand.pao.place_errors`). `median`: the running median of the regions' errors.
+    #: (`wildghand.pao.pao`). `median`: the running median of the regions' errors.
     #: `batch`: from the smallest to the largest of a batch on [0, 1], as the authors do.
     #: `absolute`: colours in [0, 1], as printed.
     errors: Literal["place", "median", "batch", "absolute"] = "place"
-    #: How far a mismatch that every frame of the clip shares lifts the weights of regions towards
-    #: 1 (`wildghand.prepass.FrameAssessment.shared_mismatch`); 0: not at all. Read with
-    #: `errors` "place".
-    mismatch: float = 1.0
-    #: Lift the weights of a frame's regions towards 1 by the probability that the frame is clean,
-    #: as the pre-pass judges: a large error there is a fault of the fit. Read with `errors`
-    #: "place".
-    spare_clean: bool = True
-    #: Factor of every region's weight.
-    alpha: float = 1.0
     #: How strongly the temporal weight of a frame lowers its weight; 0 = not at all.
-    beta: float = 100.0
+    beta: float = number(100.0)
     #: T_E at the start: regions with a mean error above it have weight 0.
-    error_threshold: float = 3.0
+    error_threshold: float = number(3.0)
     #: T_mu at the start: regions with a smaller share of hand have weight 0.
-    share_threshold: float = 0.0
-    #: T_b at the start: background pixels whose error, summed over channels, is above it have
-    #: weight 0. For a single hand.
-    background_threshold: float = 3.0
-    #: The same for two hands.
-    background_threshold_both: float = 10.0
-    #: What mu is a share of: "hand" = |region and hand| / |hand|, the paper's formula, which
-    #: needs regions as large as a hand; "region" = |region and hand| / |region|, the paper's
-    #: sentence, which superpixels can reach too. "auto" takes the formula where regions may
-    #: overlap (Segment Anything's) and the sentence for a partition into superpixels.
-    share_of: Literal["auto", "hand", "region"] = "auto"
-    #: Weight outside the hand in the variant `binary`.
-    binary_outside: float = 0.0
+    share_threshold: float = number(0.0)
+
+    #: How far a mismatch that every frame of the clip shares lifts the weights of regions towards
+    #: 1 (`wildghand.prepass.FrameAssessment.shared_mismatch`), with `errors` "place".
+    mismatch: ClassVar[float] = 1.0
+    #: Lift the weights of a frame's regions towards 1 by the probability that the frame is clean,
+    #: as the pre-pass judges, with `errors` "place": a large error there is a fault of the fit.
+    spare_clean: ClassVar[bool] = True
+    #: Weight outside the hand in the variant `binary`: the paper gives no formula.
+    binary_outside: ClassVar[float] = 0.0
 
     def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if isinstance(value, float) and not (math.isfinite(value) and value >= 0.0):
-                raise UsageError(
-                    f"is {value}", field=item.name, remedy="Use a finite number, 0 or more."
-                )
         check_source(self.regions, "regions", ("superpixels",), ("sam",))
         check_source(self.hand, "hand", ("estimated", "graph-cut"), ("sam",))
-        for name, known in (
-            ("variant", ("scaled", "printed", "binary")),
-            ("temporal", ("teaching", "all", "regions", "none")),
-            ("errors", ("place", "median", "batch", "absolute")),
-            ("share_of", ("auto", "hand", "region")),
-        ):
-            if getattr(self, name) not in known:
-                raise UsageError(
-                    f"is {getattr(self, name)!r}", field=name, remedy=f"Use one of {known}."
-                )
+
+    @property
+    def alpha(self) -> float:
+        """Factor of every region's weight; as printed it is that of the authors' code."""
+        return 100.0 if self.variant == "printed" else 1.0
 
 
-#: The equations as printed, with the paper's thresholds; alpha and beta, which it does not print,
-#: are those of the authors' code.
+#: The equations as printed, with the paper's thresholds; beta, which it does not print, is that of
+#: the authors' code.
 PAPER_PAO = PaoSettings(
     variant="printed",
     temporal="regions",
     errors="absolute",
-    alpha=100.0,
     beta=1000.0,
     error_threshold=1.0,
     share_threshold=0.3,
@@ -137,6 +233,10 @@ class PerturbationAwareWeights(nn.Module):
     Args:
         settings: factors, and the thresholds at the start.
         hands: one or two; the background threshold differs.
+        share_of: what mu is a share of. "hand" is the paper's formula, |region and hand| / |hand|,
+            which needs regions as large as a hand; "region" its sentence, |region and hand| /
+            |region|, which superpixels can reach too. "auto" takes the formula where regions may
+            overlap (Segment Anything's) and the sentence for a partition into superpixels.
 
     The thresholds need their own learning rate (the paper's is 1e-6). Gradients reach nothing
     but them: a gradient through the errors would reward errors that lower a weight, and a gradient
@@ -147,15 +247,18 @@ class PerturbationAwareWeights(nn.Module):
     read so that they are defined everywhere; `docs/dpd_pao.md` lists the differences.
     """
 
-    def __init__(self, settings: PaoSettings = PaoSettings(), hands: int = 1) -> None:
+    def __init__(
+        self,
+        settings: PaoSettings = PaoSettings(),
+        hands: int = 1,
+        *,
+        share_of: Literal["auto", "hand", "region"] = "auto",
+    ) -> None:
         super().__init__()
-        self.settings = settings
+        self.settings, self._share_of = settings, share_of
         self.T_E = nn.Parameter(torch.tensor(settings.error_threshold))
         self.T_mu = nn.Parameter(torch.tensor(settings.share_threshold))
-        background = settings.background_threshold
-        if hands > 1:
-            background = settings.background_threshold_both
-        self.T_b = nn.Parameter(torch.tensor(background))
+        self.T_b = nn.Parameter(torch.tensor(BACKGROUND_THRESHOLDS[hands > 1]))
 
     def forward(
         self,
@@ -257,7 +360,7 @@ class PerturbationAwareWeights(nn.Module):
     ) -> tuple[Tensor, Tensor, Tensor]:
         """The regions' mean errors, mu_u, and which have any hand, (B, U) each."""
         errors, pixels = _region_means(error, regions, counted)
-        share_of = self.settings.share_of
+        share_of = self._share_of
         if share_of == "auto":
             share_of = "region" if regions.membership is None else "hand"
         if share_of == "hand":

@@ -1,7 +1,6 @@
 """The poses of a clip: what an estimator's poses probably err by, told by the poses alone."""
 
-from wildghand.poses.believe import believed_hands
-from wildghand.poses.clip_poses import ClipPoses
-from wildghand.poses.settings import PoseSettings
+from wildghand.poses.believe import ClipPoses, believed_hands
+from wildghand.poses.errors import PoseSettings
 
 __all__ = ["ClipPoses", "PoseSettings", "believed_hands"]

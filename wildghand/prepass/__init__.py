@@ -1,9 +1,8 @@
 """The pre-pass: judges training frames before the fit, without a network, in about a second."""
 
-from wildghand.prepass.assessment import FrameAssessment, estimated_severity
-from wildghand.prepass.inputs import PrepassInput, capture_input
+from wildghand.prepass.assessment import FrameAssessment, PrepassSettings, estimated_severity
 from wildghand.prepass.judge import judge_frames
-from wildghand.prepass.settings import PrepassSettings
+from wildghand.prepass.measurements import PrepassInput, capture_input
 
 __all__ = [
     "FrameAssessment",

@@ -1,14 +1,42 @@
-"""The assessment of frames: the result of the pre-pass, and the severities estimated from it."""
+"""The assessment of frames: its settings, the result of the pre-pass, and robust locations."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from types import MappingProxyType
+from typing import ClassVar
 
 import cv2
 import numpy as np
 
+from hwp_bench.methods.settings import number
+
+
+@dataclass(frozen=True)
+class PrepassSettings:
+    """How training frames are judged; the defaults suit every capture."""
+
+    #: Judge the frames before the fit.
+    enabled: bool = True
+    #: Refine the pose of frames whose mask disagrees with it.
+    frame_poses: bool = True
+    #: Evidence (`wildghand.prepass.judge.evidence`) at which a frame is as likely clean as not.
+    tolerance: float = number(1.2, 1e-6, 1e6)
+    #: Least weight of a frame in the fit.
+    weight_floor: float = number(0.2, 0.0, 1.0)
+
+    #: Validation frames, which are clean, raise the tolerance to the median of what is found
+    #: against them.
+    validated: ClassVar[bool] = True
+    #: Least misplacement that counts as one deviation, share of the hand's size: what rounding to
+    #: pixels leaves in frames whose poses are true.
+    misplacement_floor: ClassVar[float] = 0.0006
+
+
+#: Share of the frames that is taken to be clean at least; the densest such part of a cue's values
+#: says what is normal. Clips of `mini` and `wild-dev` have 40 % clean frames or more.
+CLEAN_SHARE = 0.35
 #: The cue that tells each perturbation, and how many of its deviations make one level: about
 #: what they are on simulated captures, where the levels are known (docs/prepass.md).
 CUES: Mapping[str, tuple[str, float]] = MappingProxyType(
@@ -40,7 +68,8 @@ class FrameAssessment:
     clean: np.ndarray
     #: (R,) weight of the frame in the fit, from the floor to 1.
     frame_weights: np.ndarray
-    #: (R,) chance that omega is dropped in training: only where the frame is judged clean.
+    #: (R,) chance that omega is dropped in training: 1 where the frame is judged clean, else 0.
+    #: What little biases took from clean frames, the avatar lacked (docs/wildghand.md).
     omega_dropout: np.ndarray
     #: (R,) bool: sharp frames whose mask says that the hand is elsewhere.
     refine_pose: np.ndarray
@@ -89,16 +118,9 @@ class FrameAssessment:
 
 
 def neutral_assessment(
-    indices: np.ndarray, usable: np.ndarray, size: tuple[int, int], omega_dropout: float
+    indices: np.ndarray, usable: np.ndarray, size: tuple[int, int]
 ) -> FrameAssessment:
-    """Call every usable frame clean, because there is too little to compare.
-
-    Args:
-        indices: (R,) frames.
-        usable: (R,) bool.
-        size: height and width.
-        omega_dropout: chance for clean frames.
-    """
+    """Call every usable frame, (R,) bool, clean, because there is too little to compare."""
     count = len(indices)
     good = usable.astype(np.float64)
     zeros = np.zeros(count)
@@ -107,7 +129,7 @@ def neutral_assessment(
         usable=usable,
         clean=good,
         frame_weights=np.ones(count),
-        omega_dropout=omega_dropout * good,
+        omega_dropout=good,
         refine_pose=np.zeros(count, dtype=bool),
         log_gains=np.zeros((count, 3)),
         gain_deviation=zeros,
@@ -126,13 +148,7 @@ def neutral_assessment(
 
 
 def enlarged(assessment: FrameAssessment, factor: int, size: tuple[int, int]) -> FrameAssessment:
-    """The assessment of shrunk frames, brought back to their size.
-
-    Args:
-        assessment: of frames at 1 / factor of the resolution.
-        factor: at least 1.
-        size: height and width of the frames.
-    """
+    """The assessment of frames at 1 / factor of the resolution, brought back to their size."""
     weights = [
         cv2.resize(weight, size[::-1], interpolation=cv2.INTER_LINEAR)
         for weight in assessment.pixel_weights
@@ -164,3 +180,54 @@ def estimated_severity(assessment: FrameAssessment) -> dict[str, np.ndarray]:
         level = np.clip(np.rint(getattr(assessment, cue) / deviations), 0, 5)
         levels[kind] = np.where(acting, level, 0).astype(np.int64)
     return levels
+
+
+def densest(values: np.ndarray, share: float) -> tuple[np.ndarray, np.ndarray]:
+    """Find the part of (F, K) finite values, a share of them, that lies closest together.
+
+    The value whose `share` nearest values are nearest to it is the middle; they are the part.
+
+    Returns:
+        (K,) mean of the part, and (F,) bool which values it holds.
+    """
+    count = min(len(values), max(2, round(share * len(values))))
+    squares = (values**2).sum(axis=1)
+    distance = squares[:, None] + squares[None] - 2.0 * values @ values.T
+    radius = np.partition(distance, count - 1, axis=1)[:, count - 1]
+    nearest = np.argsort(distance[int(np.argmin(radius))], kind="stable")[:count]
+    part = np.zeros(len(values), dtype=bool)
+    part[nearest] = True
+    return values[part].mean(axis=0), part
+
+
+def normal_value(values: np.ndarray, share: float) -> tuple[float, float]:
+    """Median and robust deviation of the shortest part, a share, of (F,) finite values.
+
+    Values that are not finite are left out; both numbers are 0 where none is finite.
+    """
+    known = np.sort(values[np.isfinite(values)])
+    if not len(known):
+        return 0.0, 0.0
+    count = min(len(known), max(2, round(share * len(known))))
+    width = known[count - 1 :] - known[: len(known) - count + 1]
+    start = int(np.argmin(width))
+    normal = float(np.median(known[start : start + count]))
+    # Half of the shortest part that holds a share s of a normal distribution is z(s) deviations.
+    return normal, 0.5 * float(width[start]) / _half_width(count / len(known))
+
+
+def excess(values: np.ndarray, share: float, floor: float) -> np.ndarray:
+    """How far (F,) values lie above what is normal among them, in robust deviations; else 0.
+
+    The floor is the least deviation that counts as one. Values that are not finite are normal.
+    """
+    normal, deviation = normal_value(values, share)
+    above = np.maximum(values - normal, 0.0) / max(deviation, floor)
+    return np.where(np.isfinite(values), above, 0.0)
+
+
+def _half_width(share: float) -> float:
+    """Deviations to either side of the mean that hold a share of a normal distribution."""
+    from scipy.special import ndtri
+
+    return float(ndtri(0.5 + 0.5 * min(share, 0.99)))

@@ -9,9 +9,7 @@ import torch
 
 from hwp_bench.base.colors import log_light
 from wildghand.gaussians.shading import sh_basis
-from wildghand.prepass.assessment import CLEAN_FROM
-from wildghand.prepass.robust_location import densest
-from wildghand.prepass.settings import PrepassSettings
+from wildghand.prepass.assessment import CLEAN_FROM, CLEAN_SHARE, densest
 
 #: 8-bit values outside this range say nothing about the light: noise, or clipped.
 LOWEST, HIGHEST = 4, 250
@@ -25,8 +23,10 @@ _FRAME_SCALE = 0.25
 # Part of a clip's frames over which clean views of a cell must be spread. An object that stays for
 # one episode does not belong to the hand, even if nothing else is wrong with its frames.
 _SPREAD = 1.0 / 3.0
-# Samples that the skin colour is worth in such a cell.
-_KNOWN_PRIOR = 1.0
+# Samples that the skin colour is worth in the albedo of a cell, and of one that clean frames show.
+_PRIOR, _KNOWN_PRIOR = 3.0, 1.0
+# Passes of the robust fit: weights and gains no longer change then.
+_PASSES = 10
 # Distance from the skin colour beyond which a cell has another one, and the share of the cells that
 # must have it.
 _SECOND_OFF, _SECOND_SHARE = 0.7, 0.03
@@ -45,7 +45,7 @@ def shading_basis(normals: np.ndarray) -> np.ndarray:
 
 
 @dataclass(frozen=True, eq=False)
-class LightSamples:
+class IntensitySamples:
     """M pixels of R frames, ordered by frame."""
 
     #: (R + 1,) int64: frame r has the samples starts[r] to starts[r + 1].
@@ -95,9 +95,8 @@ class IntensityModel:
 
 
 def fit_intensity(
-    samples: LightSamples,
+    samples: IntensitySamples,
     cell_normals: np.ndarray,
-    settings: PrepassSettings,
     verdict: Verdict | None = None,
 ) -> IntensityModel:
     """Fit albedo, shading and gains by turns, with weights that leave outliers out.
@@ -109,7 +108,6 @@ def fit_intensity(
     Args:
         samples: at least one.
         cell_normals: (C, 3) normal of every cell on the rest surface; zeros where unknown.
-        settings: share of clean frames, prior and passes.
         verdict: on the frames of the samples.
     """
     counts = np.diff(samples.starts)
@@ -131,10 +129,10 @@ def fit_intensity(
         known = _known_cells(verdict.clean, cells, rows, len(used))
         # Squared: doubtful frames count little, because they may all show the same object.
         sure = np.where(known[cells], verdict.clean[rows] ** 2, 1.0)
-    prior = np.where(known, _KNOWN_PRIOR, settings.albedo_prior)
+    prior = np.where(known, _KNOWN_PRIOR, _PRIOR)
     shade = np.zeros_like(light)
     scale = 1.0
-    for _ in range(settings.iterations):
+    for _ in range(_PASSES):
         near = 1.0 / (1.0 + (np.linalg.norm(gains, axis=1) / _FRAME_SCALE) ** 2)
         trust = weights * sure * near[rows]
         rest = light - shade - gains[rows]
@@ -146,7 +144,7 @@ def fit_intensity(
         shade = basis @ shading
         rest = light - albedo[cells] - shade
         gains = _frame_medians(rest, samples.starts)
-        centre, part = densest(gains, settings.clean_share)
+        centre, part = densest(gains, CLEAN_SHARE)
         gains = gains - centre
         residual = np.abs(rest - centre - gains[rows]) @ np.full(3, 1.0 / 3.0)
         scale = max(float(np.median(residual[part[rows]])), 0.01)

@@ -7,11 +7,19 @@ from collections.abc import Mapping, Sequence
 import cv2
 import numpy as np
 
-from wildghand.prepass.assessment import CLEAN_FROM
+from wildghand.prepass.assessment import CLEAN_FROM, CLEAN_SHARE, normal_value
 from wildghand.prepass.measurements import FrameMeasurements
-from wildghand.prepass.robust_location import normal_value
-from wildghand.prepass.settings import PrepassSettings
 
+#: Distance of a pixel's tint from the skin's, in those of the clean frames at the same place, at
+#: which its weight has halved. Half of it takes more away than it saves (docs/prepass.md).
+TINT_SCALE = 4.0
+#: Factor on both scales in a frame that is surely clean. Little can cover the hand there, and what
+#: looks odd (nails, rings, seams of a glove a little off their place) belongs to it.
+CLEAN_SCALE = 4.0
+# Residual, in those of the clean frames at the same place, at which a pixel's weight has halved.
+_RESIDUAL_SCALE = 2.5
+# Pixels that what is normal in the clean frames is worth in what is normal at a place.
+_PRIOR = 20.0
 # Edge of the window over which residuals are shared out, px.
 _WINDOW = 5
 # Least residual of clean frames, log: about what a sensor's noise leaves.
@@ -25,14 +33,13 @@ def weigh_pixels(
     measured: Mapping[int, FrameMeasurements],
     clean: np.ndarray,
     known: np.ndarray,
-    settings: PrepassSettings,
 ) -> np.ndarray:
     """Weigh the pixels of all frames.
 
     Two factors are multiplied. The residual under the intensity model measures whether the place
     looks as in other frames. If only perturbed frames show a place, the model has learnt the
     object that covers it; the tint measures, for every place, whether the pixel is skin. In a frame
-    that is surely clean more is allowed (`PrepassSettings.clean_scale`).
+    that is surely clean more is allowed (`CLEAN_SCALE`).
 
     Args:
         masks: (R, H, W) uint8, 255 = visible hand.
@@ -40,7 +47,6 @@ def weigh_pixels(
         clean: (R,) probability that nothing perturbs a frame.
         known: (C,) bool, the cells of the surface that clean frames from different parts of the
             clip show.
-        settings: how far off halves a weight.
 
     Returns:
         (R, H, W) uint8, 255 = full weight; 255 also outside silhouette and mask, where there is
@@ -54,10 +60,9 @@ def weigh_pixels(
     levels = np.array([one.level for one in found])
     tint_levels = np.array([np.median(tint) for tint in tints])
     level, tint_level = (
-        max(normal_value(values, settings.clean_share)[0], _LEAST_LEVEL)
-        for values in (levels, tint_levels)
+        max(normal_value(values, CLEAN_SHARE)[0], _LEAST_LEVEL) for values in (levels, tint_levels)
     )
-    prior = settings.residual_prior
+    prior = _PRIOR
     # Where clean frames all fit badly, the larger of both means is what is normal.
     normal = np.maximum(
         normal_residuals(residuals, cells, trusts, cell_count, level, prior),
@@ -69,19 +74,19 @@ def weigh_pixels(
         seen = masks[row].reshape(-1) / 255.0
         weight = np.ones(seen.size)
         shared = _shared(one.residual, one.pixels, masks[row].shape)
-        allowed = 1.0 + (settings.clean_scale - 1.0) * _sureness(clean[row])
+        allowed = 1.0 + (CLEAN_SCALE - 1.0) * _sureness(clean[row])
         # An object that stays for one episode passes for clean where no other frame shows the hand:
         # there a residual is allowed to the pixels alone that have the colour of the hand.
         safe = _amid(known[one.cells], one.pixels, masks[row].shape)
-        half_tint = settings.tint_scale * normal_tint[one.cells]
+        half_tint = TINT_SCALE * normal_tint[one.cells]
         tinted = _fit(one.tint, np.where(safe, allowed, 1.0) * half_tint)
         spared = 1.0 + (allowed - 1.0) * tinted
         weight[one.pixels] = (
-            _fit(shared, spared * settings.residual_scale * normal[one.cells])
+            _fit(shared, spared * _RESIDUAL_SCALE * normal[one.cells])
             * tinted
             * (_UNMASKED + (1.0 - _UNMASKED) * seen[one.pixels])
         )
-        weight[one.beyond] = _fit(one.tint_beyond, allowed * settings.tint_scale * tint_level)
+        weight[one.beyond] = _fit(one.tint_beyond, allowed * TINT_SCALE * tint_level)
         weights[row] = np.round(255.0 * weight).reshape(masks[row].shape)
     return weights
 

@@ -17,11 +17,9 @@ from scipy.linalg import solve
 from hwp_bench.base.arrays import evenly
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate
-from wildghand.subject.compared_frames import ComparedFrames
-from wildghand.subject.outline_rows import outline_rows
-from wildghand.subject.settings import SubjectSettings
-from wildghand.subject.shape import SubjectShape
-from wildghand.subject.unknowns import Unknowns
+from wildghand.subject.outlines import ComparedFrames
+from wildghand.subject.shape import SubjectSettings, SubjectShape
+from wildghand.subject.unknowns import Unknowns, outline_rows
 
 #: Stiffnesses among which frames that are not compared choose, the stiffest first. A stiffness
 #: multiplies the expected error of an outline and divides the expected change of a proportion.
@@ -30,6 +28,14 @@ STIFFNESS = (8.0, 4.0, 2.0, 1.0, 0.7)
 FIXED_STIFFNESS = 4.0
 #: Frames that choose, at most and at least: one or two say little.
 MOST_CHOOSING, LEAST_CHOOSING = 8, 4
+# Share of the template's misfit in the frames that choose by which a softer hand must be better.
+_LEAST_GAIN = 0.04
+# Rounds; in each the silhouettes are drawn again, and a third one changes little.
+_ROUNDS = 2
+# Points of all outlines together that are compared in a round.
+_POINTS = 3000
+# Distance at which a point of the outline counts a quarter in the last round, px.
+_REACH = 1.5
 # The reach in the first round, in those of the last.
 _FIRST_REACH = 3.0
 # Least number of points that a fit needs.
@@ -84,19 +90,18 @@ def fit_subject(
 
 def _chosen(bending: _Bending, judges: ComparedFrames) -> SubjectShape:
     """The stiffest hand whose outlines meet those of other frames almost as well as any does."""
-    settings = bending.settings
-    before = judges.misfit(bending.shape, settings.reach)
+    before = judges.misfit(bending.shape, _REACH)
     if before is None:
         return bending.begin(FIXED_STIFFNESS)
     shapes, misfits = [bending.shape], [before]
     for stiffness in STIFFNESS:
         shape = bending.begin(stiffness) if len(shapes) == 1 else bending.soften(stiffness)
-        misfit = judges.misfit(shape, settings.reach)
+        misfit = judges.misfit(shape, _REACH)
         if misfit is None or misfit >= misfits[-1]:
             break
         shapes.append(shape)
         misfits.append(misfit)
-    enough = misfits[-1] + settings.least_gain * before
+    enough = misfits[-1] + _LEAST_GAIN * before
     return next(shape for shape, one in zip(shapes, misfits, strict=True) if one <= enough)
 
 
@@ -114,8 +119,8 @@ class _Bending:
     def __init__(self, frames: ComparedFrames, settings: SubjectSettings) -> None:
         self.frames, self.settings = frames, settings
         template = next(iter(frames.templates.values()))
-        self.unknowns = Unknowns.of(template, settings.nodes, len(frames.templates), len(frames))
-        self.expected = self.unknowns.expected(settings)
+        self.unknowns = Unknowns.of(template, len(frames.templates), len(frames))
+        self.expected = self.unknowns.expected()
         self.values = np.zeros(len(self.unknowns))
         self.shape = self.unknowns.shape(self.values)
 
@@ -128,9 +133,8 @@ class _Bending:
         Returns:
             The shape; the one before where too little can be compared.
         """
-        settings = self.settings
-        for fraction in np.linspace(0.0, 1.0, settings.rounds):
-            reach = settings.reach * _FIRST_REACH ** (1.0 - fraction)
+        for fraction in np.linspace(0.0, 1.0, _ROUNDS):
+            reach = _REACH * _FIRST_REACH ** (1.0 - fraction)
             if not self._solve(reach, stiffness):
                 break
         return self.shape
@@ -140,7 +144,7 @@ class _Bending:
 
         Arguments and result are those of `begin`.
         """
-        self._solve(self.settings.reach, stiffness)
+        self._solve(_REACH, stiffness)
         return self.shape
 
     def _solve(self, reach: float, stiffness: float) -> bool:
@@ -156,7 +160,7 @@ class _Bending:
         rows, gaps = [], []
         frames, unknowns = self.frames, self.unknowns
         posed = frames.posed(self.shape, unknowns.moves(self.values))
-        quota = max(20, self.settings.points // len(frames))
+        quota = max(20, _POINTS // len(frames))
         for frame in range(len(frames)):
             seen = frames.compare(posed, frame, quota)
             if len(seen.gap):

@@ -8,8 +8,13 @@ import torch
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from hwp_bench.hands import load_template
-from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
-from wildghand.dpd.field import PLACE_CHANNELS, BiasField, bone_features
+from wildghand.dpd.dpd import (
+    PLACE_CHANNELS,
+    BiasField,
+    DynamicPerturbation,
+    Perturbation,
+    bone_features,
+)
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.shading import sh_basis

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from wildghand.dpd.pay_back import PayBack
+from wildghand.dpd.temporal import PayBack
 
 CLEAN = torch.tensor([1.0, 0.9, 0.8, 0.1, 0.0])
 

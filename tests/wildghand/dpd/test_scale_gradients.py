@@ -7,7 +7,7 @@ import dataclasses
 import pytest
 import torch
 
-from wildghand.dpd.scale_gradients import scale_gradients
+from wildghand.dpd.temporal import scale_gradients
 from wildghand.gaussians.attributes import SIZES, RawAttributes
 from wildghand.network import NetworkOutput
 from wildghand.network.network import Refinement

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from wildghand.dpd.dpd import DynamicPerturbation
-from wildghand.dpd.temporal_loss import TemporalTarget
+from wildghand.dpd.temporal import TemporalTarget
 from wildghand.gaussians.attributes import RawAttributes
 
 SCALE, FLOOR = 0.5, 0.02

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -72,8 +73,9 @@ def amounts(most: float) -> st.SearchStrategy[float]:
 def test_shares_are_those_of_the_formula(
     shown: float, count: int, offset: float, shape: float
 ) -> None:
-    settings = EvidenceSettings(offset_share=offset, shape_share=shape)
-    found = weigh_evidence({"left": torch.tensor([shown])}, count, settings)
+    settings = EvidenceSettings(offset_share=offset)
+    with mock.patch.object(EvidenceSettings, "shape_share", shape):
+        found = weigh_evidence({"left": torch.tensor([shown])}, count, settings)
     for share, half in ((found.offsets, offset), (found.shapes, shape)):
         expected = np.float64(shown) / (shown + half * count) if half else 1.0
         expected = 0.0 if np.isnan(expected) else expected

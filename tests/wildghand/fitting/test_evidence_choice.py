@@ -305,11 +305,14 @@ def test_looking_changes_nothing_and_finishing_keeps_the_best(
 
 
 @pytest.mark.parametrize(
-    "changes", [{"evidence.validated": False}, {"evidence.enabled": False}, {"mode": "paper"}]
+    "changes", [{"validated": False}, {"evidence.enabled": False}, {"mode": "paper"}]
 )
 def test_nothing_is_chosen_where_it_is_off(
-    changes: dict[str, Any], training: TrainingCapture
+    changes: dict[str, Any], training: TrainingCapture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    if "validated" in changes:
+        monkeypatch.setattr(EvidenceSettings, "validated", False)
+        changes = {}
     fit = begun(training, **changes)
     assert fit.choice.drawings is None
     if fit.settings.evidence.enabled:

@@ -30,7 +30,7 @@ from wildghand.fitting.fit import Fit
 from wildghand.fitting.hand_masks import hand_masks, hand_roots
 from wildghand.fitting.networks import check_networks
 from wildghand.model.settings import read_settings
-from wildghand.sam import AutomaticSettings
+from wildghand.pao.sam import AutomaticSettings
 
 FIT: dict[str, Any] = {**QUICK, "gaussians": 300, "schedule.steps": 3}
 TrainingMaker = Callable[..., TrainingCapture]
@@ -49,7 +49,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture
 def _fewer_points(monkeypatch: pytest.MonkeyPatch) -> None:
     """Prompt a tenth of the points; the sandboxed fits prompt all of them."""
-    monkeypatch.setattr("wildghand.pao.regions.sam.PUBLIC", AutomaticSettings(points=10))
+    monkeypatch.setattr("wildghand.pao.sam.PUBLIC", AutomaticSettings(points=10))
 
 
 def weights(training: TrainingCapture, **changes: Any) -> torch.Tensor:
@@ -68,7 +68,7 @@ def test_regions_and_hand_reach_the_weights_and_are_found_once(
     folder: Path, make_training: TrainingMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Of the regions only: the cache also holds compiled kernels.
-    monkeypatch.setattr("wildghand.pao.regions.superpixels.cache_root", lambda: tmp_path / "cache")
+    monkeypatch.setattr("wildghand.pao.segmenters.cache_root", lambda: tmp_path / "cache")
     training = make_training()
     plain = weights(training, mode="paper")
     chosen = {"mode": "paper", "pao.regions": f"sam:{folder / 'sam.pth'}"}
@@ -82,7 +82,7 @@ def test_regions_and_hand_reach_the_weights_and_are_found_once(
     def load(*_: object) -> None:
         raise AssertionError("the network was loaded again")
 
-    monkeypatch.setattr("wildghand.pao.regions.sam.load_network", load)
+    monkeypatch.setattr("wildghand.pao.sam.load_network", load)
     again = weights(training, **chosen, **{"pao.hand": f"sam:{folder / 'sam.pth'}"})
     assert torch.equal(again, both)
 

@@ -26,8 +26,8 @@ from wildghand.fitting.rates import make_optimizer
 from wildghand.fitting.skin_places import skin_places
 from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
 from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, choose_device, ready_device
+from wildghand.light import ShadowTable
 from wildghand.model.settings import read_settings
-from wildghand.shadows import ShadowTable
 
 FAKE = torch.device("meta")
 HAS_GPU = choose_device("auto").type == "cuda"

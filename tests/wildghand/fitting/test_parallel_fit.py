@@ -36,12 +36,12 @@ from wildghand.model.settings import read_settings
 
 SHORT: dict[str, Any] = {**TINY, "schedule.steps": 4, "schedule.batch": 2}
 VARIANTS: dict[str, dict[str, Any]] = {
-    # Every other frame keeps its biases: processes must draw the same chances.
-    "default": {"dpd.omega_dropout": 0.5},
+    "default": {},
     # What precedes the first step is the same in all processes, and compared in the default.
     "pay back": {**UNJUDGED, "dpd.pay_back": 1.5},
     # The weights compare the frames of a batch, and omega learns from their size.
-    "paper": {"mode": "paper", "dpd.omega_dropout": 0.5},
+    # Three frames in ten keep no biases: processes must draw the same chances.
+    "paper": {"mode": "paper"},
 }
 TrainingMaker = Callable[..., TrainingCapture]
 State = dict[str, torch.Tensor]

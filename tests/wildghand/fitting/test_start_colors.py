@@ -17,8 +17,8 @@ from wildghand.fitting.cast_shadows import shadows_in
 from wildghand.fitting.chosen_frames import best_of_each_part
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.start_colors import start_from_colors, tint_share
+from wildghand.light import CastLight
 from wildghand.model.settings import read_settings
-from wildghand.shadows import CastLight
 
 PLAIN: dict[str, Any] = {
     **UNJUDGED,

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput
-from wildghand.light import KnownLight, LightSamples, LightSettings, fit_light
+from wildghand.light import KnownLight, LightSamples, fit_light
 
 LAMPS = np.array([[0.6, 0.0, 0.8], [-0.5, 0.7, 0.51]])
 LAMPS /= np.linalg.norm(LAMPS, axis=1, keepdims=True)
@@ -40,7 +40,7 @@ def samples(count: int = 6000, seed: int = 0) -> LightSamples:
 
 @pytest.fixture(scope="module")
 def found() -> KnownLight:
-    light = fit_light(samples(), LightSettings(ridge=1e-4))
+    light = fit_light(samples(), ridge=1e-4)
     assert light is not None
     return light
 
@@ -51,7 +51,7 @@ def test_no_light_is_negative(found: KnownLight) -> None:
     # A hand whose colours grow without any light that could make them so.
     seen = samples(2000)
     odd = LightSamples(seen.places, seen.normals, 0.1 + seen.normals[:, 2] ** 8, seen.weights)
-    light = fit_light(odd, LightSettings())
+    light = fit_light(odd)
     assert light is not None
     assert float(light.strengths.min()) >= 0.0
     assert float(light.ambient) >= 0.0
@@ -91,7 +91,7 @@ def test_the_nearest_known_normal_lies_in_the_cap(vector: tuple[float, float, fl
 
 
 def test_the_rim_of_a_hand_is_known() -> None:
-    light = fit_light(samples(), LightSettings())
+    light = fit_light(samples())
     assert light is not None
     behind = torch.tensor([0.0, 0.0, -1.0]).expand(3, 3)
     facing = torch.tensor([-0.1, 0.1, 1.0])
@@ -100,24 +100,22 @@ def test_the_rim_of_a_hand_is_known() -> None:
 
 def test_too_few_samples_are_no_light() -> None:
     few = samples(100)
-    assert fit_light(few, LightSettings(directions=32)) is None
+    assert fit_light(few) is None
     seen = samples(2000)
     weightless = LightSamples(seen.places, seen.normals, seen.light, np.zeros(len(seen.light)))
-    assert fit_light(weightless, LightSettings()) is None
+    assert fit_light(weightless) is None
 
 
 def test_normals_from_everywhere_leave_nothing_unknown() -> None:
     normals = unit(4, 3000)
     normals = np.concatenate([normals, -normals])
-    light = fit_light(
-        LightSamples(np.arange(6000) % 50, normals, truth(normals), np.ones(6000)), LightSettings()
-    )
+    light = fit_light(LightSamples(np.arange(6000) % 50, normals, truth(normals), np.ones(6000)))
     assert light is not None
     assert not bool(light.unknown(torch.from_numpy(unit(5, 100)).float(), torch.ones(100)).any())
 
 
 def test_it_repeats_exactly(found: KnownLight) -> None:
-    again = fit_light(samples(), LightSettings(ridge=1e-4))
+    again = fit_light(samples(), ridge=1e-4)
     assert again is not None
     for name, tensor in found.to_tensors().items():
         assert torch.equal(tensor, again.to_tensors()[name])

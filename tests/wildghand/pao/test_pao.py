@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.base.errors import BadMethod, ShapeMismatch, UsageError
+from hwp_bench.methods.settings import settings_from
 from wildghand.pao.pao import (
     PAPER_PAO,
     PaoSettings,
@@ -19,7 +21,7 @@ from wildghand.pao.pao import (
 )
 from wildghand.pao.regions import FrameRegions, Regions, overlapping, partition, stack_regions
 
-PRINTED = replace(PAPER_PAO, share_of="hand")
+PRINTED = PAPER_PAO
 STRETCHED = replace(PRINTED, errors="batch")
 SIZE = 12
 
@@ -37,32 +39,51 @@ def regions_of(masks: np.ndarray) -> Regions:
     return stack_regions([overlapping(frame) for frame in masks])
 
 
+def module_of(
+    chosen: PaoSettings, share_of: Any = "hand", background: float = 3.0
+) -> PerturbationAwareWeights:
+    """The weights with another T_b."""
+    made = PerturbationAwareWeights(chosen, share_of=share_of)
+    with torch.no_grad():
+        made.T_b.fill_(background)
+    return made
+
+
 def printed(
-    error: np.ndarray, masks: np.ndarray, hand: np.ndarray, omega: float, chosen: PaoSettings
+    error: np.ndarray,
+    masks: np.ndarray,
+    hand: np.ndarray,
+    omega: float,
+    chosen: PaoSettings,
+    share_of: str,
 ) -> np.ndarray:
-    """W of one frame, as the paper writes it, with |omega|."""
+    """W of one frame, as the paper writes it, with |omega|; T_b is 1.2."""
     total = np.zeros_like(error)
     for mask in masks:
         both = mask & hand
-        mu = both.sum() / (hand.sum() if chosen.share_of == "hand" else mask.sum())
+        mu = both.sum() / (hand.sum() if share_of == "hand" else mask.sum())
         weight = chosen.alpha * max(chosen.error_threshold - error[both].mean(), 0.0)
         weight *= max(mu - chosen.share_threshold, 0.0) / (1.0 + chosen.beta * abs(omega))
         total += weight * mask
-    return total + ~hand * np.maximum(chosen.background_threshold - 3.0 * error, 0.0)
+    return total + ~hand * np.maximum(1.2 - 3.0 * error, 0.0)
 
 
 @pytest.mark.parametrize("share_of", ["hand", "region"])
 @pytest.mark.parametrize("threshold", [0.3, 0.55])
 def test_weights_are_the_papers(share_of: str, threshold: float) -> None:
-    chosen = replace(
-        PRINTED, share_of=share_of, error_threshold=threshold, background_threshold=1.2
-    )
+    chosen = replace(PRINTED, error_threshold=threshold)
     error, masks, hand = scene()
     omega = torch.tensor([-0.3, 0.001], dtype=torch.float64)
-    made = PerturbationAwareWeights(chosen).double()(error, regions_of(masks), hand, omega)
+    module = module_of(chosen, share_of, 1.2).double()
+    made = module(error, regions_of(masks), hand, omega)
     for frame in range(2):
         expected = printed(
-            error[frame].numpy(), masks[frame], hand[frame].numpy(), float(omega[frame]), chosen
+            error[frame].numpy(),
+            masks[frame],
+            hand[frame].numpy(),
+            float(omega[frame]),
+            chosen,
+            share_of,
         )
         # The thresholds were float32 for a moment.
         np.testing.assert_allclose(made.weights[frame].detach(), expected, atol=1e-5)
@@ -72,7 +93,7 @@ def test_a_partition_is_the_same_regions_as_its_masks() -> None:
     error, _, hand = scene()
     labels = np.arange(SIZE * SIZE).reshape(SIZE, SIZE) // 30
     masks = np.stack([labels == u for u in range(labels.max() + 1)])
-    module = PerturbationAwareWeights(replace(PRINTED, share_threshold=0.05))
+    module = module_of(replace(PRINTED, share_threshold=0.05))
     omega = torch.zeros(2)
     apart = module(error, stack_regions([partition(labels)] * 2), hand, omega)
     general = module(error, regions_of(np.stack([masks] * 2)), hand, omega)
@@ -97,7 +118,7 @@ def test_only_the_thresholds_get_a_gradient_and_the_right_one() -> None:
     error.requires_grad_(True)
     omega = torch.tensor([0.01, -0.02], dtype=torch.float64, requires_grad=True)
     regions = regions_of(masks)
-    module = PerturbationAwareWeights(replace(PRINTED, background_threshold=1.5)).double()
+    module = module_of(PRINTED, background=1.5).double()
     parameters = tuple(module.parameters())
     (module(error, regions, hand, omega).weights * error.detach()).mean().backward()
     assert error.grad is None
@@ -114,7 +135,7 @@ def test_only_the_thresholds_get_a_gradient_and_the_right_one() -> None:
 
 def test_the_reward_of_weight_moves_the_thresholds_apart() -> None:
     error, masks, hand = scene()
-    module = PerturbationAwareWeights(replace(PRINTED, background_threshold=1.5))
+    module = module_of(PRINTED, background=1.5)
     (-0.5 * module(error, regions_of(masks), hand, torch.zeros(2)).weights.mean()).backward()
     assert module.T_E.grad < 0.0 < module.T_mu.grad
     assert module.T_b.grad < 0.0
@@ -142,7 +163,7 @@ def test_superpixels_qualify_unless_the_formula_is_asked_for() -> None:
     masks = np.stack([labels == u for u in range(36)])
 
     def share(share_of: str, regions: Regions) -> float:
-        module = PerturbationAwareWeights(replace(STRETCHED, share_of=share_of))
+        module = module_of(STRETCHED, share_of)
         weights = module(error, regions, hand, torch.zeros(1)).weights.detach()
         return float((weights[hand] > 0.0).double().mean())
 
@@ -159,7 +180,7 @@ def test_a_covered_region_counts_less_than_a_visible_one() -> None:
     error[:, :, SIZE // 2 :] = 0.6
     hand = torch.ones(1, SIZE, SIZE)
     regions = stack_regions([partition(labels)])
-    made = PerturbationAwareWeights(PRINTED)(error, regions, hand, torch.zeros(1))
+    made = module_of(PRINTED)(error, regions, hand, torch.zeros(1))
     # (1 - 0.6) / (1 - 0.02) at equal shares.
     ratio = made.weights[0, 0, -1] / made.weights[0, 0, 0]
     assert float(ratio.detach()) == pytest.approx(0.4 / 0.98, rel=1e-5)
@@ -169,18 +190,17 @@ def test_scaled_weights_are_the_docs_equation() -> None:
     """Oracle: docs/dpd_pao.md, region by region in numpy; 1e-5."""
     error, masks, _ = scene()
     coverage = torch.from_numpy(np.random.default_rng(3).uniform(size=(2, SIZE, SIZE)))
-    chosen = PaoSettings(error_threshold=1.5, share_threshold=0.1, share_of="region", alpha=0.7)
+    chosen = PaoSettings(error_threshold=1.5, share_threshold=0.1)
     omega, median = torch.tensor([0.4, 0.0], dtype=torch.float64), 0.4
-    made = PerturbationAwareWeights(chosen).double()(
-        error, regions_of(masks), coverage, omega, median
-    )
+    module = module_of(chosen, "region").double()
+    made = module(error, regions_of(masks), coverage, omega, median)
     for frame in range(2):
         hand, expected = coverage[frame].numpy() > 0.5, np.zeros((SIZE, SIZE))
         for mask in masks[frame]:
             both = mask & hand
             gate = max(1.0 - error[frame].numpy()[both].mean() / median / 1.5, 0.0)
             gate *= max(both.sum() / mask.sum() - 0.1, 0.0) / 0.9
-            expected += 0.7 * gate * mask
+            expected += gate * mask
         expected *= coverage[frame].numpy()
         np.testing.assert_allclose(made.weights[frame].detach(), expected, atol=1e-5)
         assert float(made.temporal[frame]) == pytest.approx(1.0 / (1.0 + 100.0 * omega[frame]))
@@ -198,7 +218,7 @@ def test_without_a_running_median_that_of_the_frames_counts() -> None:
 @pytest.mark.parametrize("temporal", ["regions", "all", "none", "teaching"])
 def test_what_the_temporal_factor_scales(temporal: str) -> None:
     error, masks, hand = scene()
-    module = PerturbationAwareWeights(replace(PRINTED, temporal=temporal))
+    module = module_of(replace(PRINTED, temporal=temporal))
     omega = torch.tensor([0.01, 0.0], requires_grad=True)
     made = module(error, regions_of(masks), hand, omega)
     plain = module(error, regions_of(masks), hand, torch.zeros(2))
@@ -247,7 +267,7 @@ def test_weights_are_finite_and_not_negative_everywhere(
         "empty mask": overlapping(~ones),
         "whole mask": overlapping(ones),
     }[region]
-    module = PerturbationAwareWeights(replace(chosen, share_of=share_of))
+    module = module_of(chosen, share_of)
     with torch.no_grad():
         module.T_mu.fill_(threshold)
     made = module(error, stack_regions([regions]), mask, torch.tensor([omega]))
@@ -280,9 +300,11 @@ def test_bad_arguments_are_named() -> None:
         module(error, regions_of(masks), hand, torch.zeros(3))
     with pytest.raises(ShapeMismatch):
         module(error, regions_of(masks), hand[:, 1:], torch.zeros(2))
-    for bad in ({"alpha": float("nan")}, {"beta": -1.0}, {"variant": "mask"}, {"share_of": "u"}):
-        with pytest.raises(UsageError, match=next(iter(bad))):
-            PaoSettings(**bad)
+    for bad in ({"beta": float("nan")}, {"beta": -1.0}, {"variant": "mask"}):
+        with pytest.raises(BadMethod, match=next(iter(bad))):
+            settings_from(PaoSettings, bad, "a method")
+    with pytest.raises(UsageError, match="hand"):
+        PaoSettings(hand="none")
 
 
 @pytest.mark.parametrize("dtype", [torch.float16, torch.bfloat16])

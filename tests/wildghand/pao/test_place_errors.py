@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from wildghand.pao.pao import PaoSettings, PerturbationAwareWeights
-from wildghand.pao.place_errors import MOST, RATE, PlaceErrors
+from wildghand.pao.pao import MOST, PLACE_RATE, PaoSettings, PerturbationAwareWeights, PlaceErrors
 from wildghand.pao.regions import ClipRegions, FrameRegions, stack_regions
 
 CPU = torch.device("cpu")
@@ -45,11 +44,13 @@ def test_one_step_is_the_mean_by_hand() -> None:
     places = watcher()
     rows = torch.tensor([4])
     places.watch(rows, errors(2, 0.05)[rows], HAND[rows], MEDIAN)
-    expected = [MEDIAN, MEDIAN, MEDIAN + RATE * (0.05 - MEDIAN), MEDIAN]
+    expected = [MEDIAN, MEDIAN, MEDIAN + PLACE_RATE * (0.05 - MEDIAN), MEDIAN]
     np.testing.assert_allclose(places.ordinary, expected, rtol=1e-5)
     # An error counts at most a few times what is ordinary.
     places.watch(rows, errors(1, 100.0)[rows], HAND[rows], MEDIAN)
-    np.testing.assert_allclose(places.ordinary[1], MEDIAN + RATE * (MOST - 1) * MEDIAN, rtol=1e-5)
+    np.testing.assert_allclose(
+        places.ordinary[1], MEDIAN + PLACE_RATE * (MOST - 1) * MEDIAN, rtol=1e-5
+    )
 
 
 def test_an_error_of_every_frame_becomes_ordinary_and_one_of_a_frame_does_not() -> None:

@@ -8,7 +8,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildghand.pao.running_median import LEAST, RATE, running_median
+from wildghand.pao.pao import LEAST, RATE, running_median
 
 
 def test_it_starts_at_the_first_and_follows() -> None:
@@ -43,7 +43,7 @@ def test_the_newest_is_numpys_lower_median(count: int, seed: int) -> None:
 
 def test_the_same_where_nobody_waits() -> None:
     """The code of other devices, run on the CPU through its own function."""
-    from wildghand.pao.running_median import _on_device
+    from wildghand.pao.pao import _on_device
 
     random = np.random.default_rng(1)
     errors = torch.from_numpy(random.uniform(0.0, 1.0, (3, 7)))

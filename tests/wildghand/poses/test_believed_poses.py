@@ -16,8 +16,13 @@ from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.poses import posed_skeleton, rest_skeleton, turned
 from wildghand.poses import ClipPoses, PoseSettings, believe, believed_hands
-from wildghand.poses.landmark_errors import extent_in, pose_covariances, vector_changes
-from wildghand.poses.spread import error_size, spread_of
+from wildghand.poses.errors import (
+    error_size,
+    extent_in,
+    pose_covariances,
+    spread_of,
+    vector_changes,
+)
 
 FRAMES = 80
 TEMPLATE = load_template("anny", "right")
@@ -43,7 +48,7 @@ def _truth(seed: int = 0, frames: int = FRAMES) -> HandParameters:
 def _covariances(hand: HandParameters) -> np.ndarray:
     viewmats = _cameras(len(hand.pose)).viewmats
     extent = extent_in(TEMPLATE, hand, viewmats)
-    return pose_covariances(TEMPLATE, hand, viewmats, extent, PoseSettings())
+    return pose_covariances(TEMPLATE, hand, viewmats, extent)
 
 
 def _with_errors(truth: HandParameters, size: float, seed: int = 1) -> HandParameters:

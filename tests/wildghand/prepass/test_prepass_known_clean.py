@@ -9,7 +9,7 @@ import pytest
 from lit_hand import FRAMES, HIT, SIZE, Lit, as_input, check_ranges, developed, only
 
 from hwp_bench.base.errors import BadInput
-from wildghand.prepass import FrameAssessment, PrepassInput, PrepassSettings, judge_frames
+from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames
 
 #: Frames whose verdict is known, amid and after the others.
 KNOWN = np.array([3, 5, 18, 19, 21, 23])
@@ -23,7 +23,9 @@ def darkened(lit_frames: Lit, known: np.ndarray = KNOWN[:0]) -> PrepassInput:
     return as_input(developed(linear), lit_frames[1])
 
 
-def test_frames_that_are_known_to_be_clean_say_what_is_ordinary_in_a_clip(lit_frames: Lit) -> None:
+def test_frames_that_are_known_to_be_clean_say_what_is_ordinary_in_a_clip(
+    lit_frames: Lit, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Where clean frames are dark too, darkness does not tell that a frame is perturbed."""
     given = darkened(lit_frames, KNOWN[1:])
     rest = np.setdiff1d(np.arange(FRAMES), KNOWN)
@@ -37,9 +39,10 @@ def test_frames_that_are_known_to_be_clean_say_what_is_ordinary_in_a_clip(lit_fr
     # It is what is known of them that tells, and not that they are compared with the rest.
     assert judge_frames(given).clean[HIT].max() < 0.5
     # At a lower resolution too.
-    few = PrepassSettings(pixel_budget=len(rest) * SIZE * SIZE // 3)
-    assert judge_frames(only(given, rest), few).clean[hit].max() < 0.5
-    assert judge_frames(only(given, rest), few, only(given, KNOWN)).clean[hit].min() > 0.5
+    monkeypatch.setattr("wildghand.prepass.judge.PIXEL_BUDGET", len(rest) * SIZE * SIZE // 3)
+    assert judge_frames(only(given, rest)).clean[hit].max() < 0.5
+    known = judge_frames(only(given, rest), known_clean=only(given, KNOWN))
+    assert known.clean[hit].min() > 0.5
 
 
 @pytest.mark.parametrize("dark", [0, 3])

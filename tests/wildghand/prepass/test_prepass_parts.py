@@ -9,10 +9,9 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
 from hwp_bench.base.colors import linear_to_srgb
-from wildghand.prepass.borders import border_width, misplacement
-from wildghand.prepass.classify import clean_probability, clip_tolerance, evidence
-from wildghand.prepass.robust_location import densest, excess, normal_value
-from wildghand.prepass.settings import PrepassSettings
+from wildghand.prepass.assessment import PrepassSettings, densest, excess, normal_value
+from wildghand.prepass.judge import LEAST_FRAMES, clean_probability, clip_tolerance, evidence
+from wildghand.prepass.measurements import border_width, misplacement
 
 
 def test_normal_values_of_a_normal_distribution() -> None:
@@ -96,11 +95,11 @@ def test_evidence_is_shared_with_neighbours_only() -> None:
 
 @given(arrays(np.float64, st.integers(0, 12), elements=st.floats(0.0, 1e6)))
 def test_most_frames_that_are_known_to_be_clean_are_judged_so(found: np.ndarray) -> None:
-    settings = PrepassSettings()
-    tolerance = clip_tolerance(found, settings)
-    if len(found) < settings.least_frames:
-        assert tolerance == settings.tolerance
+    least = PrepassSettings().tolerance
+    tolerance = clip_tolerance(found, least)
+    if len(found) < LEAST_FRAMES:
+        assert tolerance == least
         return
     assert 2 * (clean_probability(found, tolerance) >= 0.5).sum() >= len(found)
     # It is no larger than it must be: as many are at it or above.
-    assert tolerance == settings.tolerance or 2 * (found >= tolerance).sum() >= len(found)
+    assert tolerance == least or 2 * (found >= tolerance).sum() >= len(found)

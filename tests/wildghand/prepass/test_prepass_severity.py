@@ -22,7 +22,7 @@ def test_every_perturbation_has_a_cue() -> None:
 
 @pytest.mark.parametrize("kind", list(CUES))
 def test_levels_grow_with_their_cue_and_with_no_other(kind: str) -> None:
-    neutral = neutral_assessment(np.arange(4), np.array([True, True, True, False]), (8, 8), 0.3)
+    neutral = neutral_assessment(np.arange(4), np.array([True, True, True, False]), (8, 8))
     cue, deviations = CUES[kind]
     judgement = dataclasses.replace(
         neutral,

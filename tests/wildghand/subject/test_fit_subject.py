@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import sys
+from collections.abc import Iterator
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -12,13 +15,18 @@ from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, HandTemplate, load_template, pose_hand, project
 from hwp_bench.hands.raster import draw_silhouette
 from wildghand.subject import SubjectSettings, SubjectShape, fit_subject
-from wildghand.subject.compared_frames import ComparedFrames
-from wildghand.subject.outlines import MaskOutline, compare_outlines
-from wildghand.subject.proportions import hand_proportions
+from wildghand.subject.outlines import ComparedFrames, MaskOutline, compare_outlines
+from wildghand.subject.unknowns import hand_proportions
 
 FRAMES, SIZE = 12, 96
 # The masks are exact: less noise is expected than in a clip.
-SETTINGS = SubjectSettings(nodes=80, frames=FRAMES, noise=1.0)
+SETTINGS = SubjectSettings(frames=FRAMES, noise=1.0)
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _few_control_points() -> Iterator[None]:
+    with mock.patch("wildghand.subject.unknowns.NODES", 80):
+        yield
 
 
 def parameters(side: str) -> HandParameters:
@@ -196,9 +204,10 @@ def test_frames_of_the_template_itself_keep_it() -> None:
     assert not shape.joints.any()
 
 
-def test_a_softer_hand_must_be_clearly_better() -> None:
+def test_a_softer_hand_must_be_clearly_better(monkeypatch: pytest.MonkeyPatch) -> None:
     masks = masks_of(person())
-    shape = fitted("right", masks, masks, dataclasses.replace(SETTINGS, least_gain=1.0))
+    monkeypatch.setattr(sys.modules[fit_subject.__module__], "_LEAST_GAIN", 1.0)
+    shape = fitted("right", masks, masks)
     assert not shape.vertices.any()
 
 

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
-from wildghand.subject.linear_hand import joint_turns, vertex_turns
+from wildghand.subject.unknowns import joint_turns, vertex_turns
 
 POSE = np.random.default_rng(3).normal(0.0, 0.5, (1, 16, 3))
 

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
+from unittest import mock
+
 import numpy as np
 import pytest
 
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters, load_template
 from hwp_bench.hands.raster import draw_silhouette
-from wildghand.subject.compared_frames import ComparedFrames, PosedFrames
-from wildghand.subject.outline_rows import outline_rows
-from wildghand.subject.unknowns import Unknowns
+from wildghand.subject.outlines import ComparedFrames, PosedFrames
+from wildghand.subject.unknowns import Unknowns, outline_rows
 
 SIZE, FRAMES = 96, 2
 # Of every unknown; the change of a pixel is linear in it up to its square.
@@ -43,7 +44,8 @@ def frames_of(sides: tuple[str, ...]) -> ComparedFrames:
 
 def unknowns_of(frames: ComparedFrames) -> Unknowns:
     template = next(iter(frames.templates.values()))
-    return Unknowns.of(template, 60, len(frames.templates), len(frames))
+    with mock.patch("wildghand.subject.unknowns.NODES", 60):
+        return Unknowns.of(template, len(frames.templates), len(frames))
 
 
 def posed_at(frames: ComparedFrames, unknowns: Unknowns, values: np.ndarray) -> PosedFrames:

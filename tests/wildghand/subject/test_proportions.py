@@ -7,7 +7,7 @@ import pytest
 
 from hwp_bench.hands import load_template
 from hwp_bench.hands.skeleton import FINGERS, finger_joints, palm_directions
-from wildghand.subject.proportions import Proportions, hand_proportions
+from wildghand.subject.unknowns import Proportions, hand_proportions
 
 TEMPLATE = load_template("anny", "right")
 

@@ -18,11 +18,10 @@ from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig, make_rig
+from wildghand.light import CastLight, HandShadows, Obstacles, ShadowSettings, ShadowTable
+from wildghand.light.hand_shadows import LIFT
 from wildghand.model.settings import read_settings
-from wildghand.shadows import CastLight, HandShadows, Obstacles, ShadowSettings, ShadowTable
-from wildghand.shadows.obstacles import LIFT
 
-DEEP = ShadowSettings(darkest=0.0)
 TrainingMaker = Callable[..., TrainingCapture]
 
 
@@ -80,7 +79,7 @@ def test_what_is_in_the_way_is_what_rays_meet() -> None:
 
 
 def test_an_open_hand_has_less_shadow_than_a_bent_one(rigs: dict[str, HandRig]) -> None:
-    shadows = HandShadows({"right": rigs["right"]}, a_light(), DEEP)
+    shadows = HandShadows({"right": rigs["right"]}, a_light(), ShadowSettings(), darkest=0.0)
     least = []
     for bend in (0.0, 0.9):
         dark = shadows.of({"right": hand(bend, (0.0, 0.0, 0.4))})["right"]
@@ -93,7 +92,7 @@ def test_an_open_hand_has_less_shadow_than_a_bent_one(rigs: dict[str, HandRig]) 
 
 def test_factors_at_vertices_are_those_of_the_formula(rigs: dict[str, HandRig]) -> None:
     light, darkest = a_light(), 0.15
-    shadows = HandShadows({"right": rigs["right"]}, light, ShadowSettings(darkest=darkest))
+    shadows = HandShadows({"right": rigs["right"]}, light, ShadowSettings(), darkest=darkest)
     pose = hand(0.9, (0.0, 0.0, 0.4))
     got = shadows.at_vertices({"right": pose})["right"][0]
     template = rigs["right"].template
@@ -114,7 +113,7 @@ def test_factors_at_vertices_are_those_of_the_formula(rigs: dict[str, HandRig]) 
 
 def test_a_hand_in_the_light_of_the_other_shades_it(rigs: dict[str, HandRig]) -> None:
     lamp = CastLight(np.array([[0.0, 0.0, -1.0]], np.float32), np.ones(1, np.float32), 0.25)
-    shadows = HandShadows(rigs, lamp, DEEP)
+    shadows = HandShadows(rigs, lamp, ShadowSettings(), darkest=0.0)
     middles = {side: rig.template.vertices.mean(dim=0) for side, rig in rigs.items()}
     # One is straight in front of the other.
     far = hand(0.0, tuple((torch.tensor([0.0, 0.0, 0.5]) - middles["right"]).tolist()))

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hwp_bench.base.errors import ShapeMismatch
-from wildghand.pao.regions import graph_cut_hands
+from wildghand.pao.segmenters import graph_cut_hands
 
 
 def drawn(shift: int, size: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,7 +1,12 @@
-"""Temporal weights follow what the pre-pass found: their start, and the loss that holds them."""
+"""Temporal weights and what a frame teaches.
+
+Where omega starts and what holds it there (`TemporalTarget`), how much of a frame its biases
+explain (`PayBack`), and how much of its gradient the canonical hand takes (`scale_gradients`).
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -12,6 +17,10 @@ from torch import Tensor, nn
 
 from wildghand.dpd.dpd import DynamicPerturbation
 from wildghand.gaussians.adam import ClippedAdam
+from wildghand.gaussians.attributes import RawAttributes
+from wildghand.gaussians.training import upload
+from wildghand.network import NetworkOutput
+from wildghand.network.network import Refinement
 
 #: Steps of Adam, and the size of the first, that bring temporal weights to their start.
 _STEPS, _RATE = 100, 5e-3
@@ -143,3 +152,113 @@ class _HeldDistance(torch.autograd.Function):
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, gradient: Tensor) -> tuple[Tensor | None, ...]:
         return (*(made * gradient for made in ctx.saved_tensors), None, None, None)
+
+
+#: Share of the newest residual of a frame in its running one.
+_FORGET = 0.5
+#: Probability from which a frame says what an ordinary residual is.
+_CLEAN_FROM = 0.5
+
+
+class PayBack:
+    """How well each frame is explained, biases included, next to the clean frames.
+
+    The share of frame l is exp(-(r_l / (tolerance r_clean))^2): r_l is the running mean error of
+    its hand as drawn with its biases, r_clean the median of the clean frames'.
+
+    Args:
+        clean: (R,) probability that a frame is clean, where the fit runs.
+        tolerance: above 0.
+
+    Attributes:
+        residuals: (R,) r; 0 for a frame that has not been drawn.
+    """
+
+    def __init__(self, clean: Tensor, tolerance: float) -> None:
+        self.residuals = torch.zeros_like(clean)
+        self._clean = clean > _CLEAN_FROM
+        self._tolerance = tolerance
+
+    @torch.no_grad()
+    def watch(self, rows: Tensor, error: Tensor, weights: Tensor) -> None:
+        """Take in how well B frames are drawn.
+
+        Args:
+            rows: (B,) int64, which of the R frames; on the CPU.
+            error: (B, H, W) mean over channels of |rendering - input|.
+            weights: (B, H, W) how much the pixels count; off the hand 0.
+        """
+        known = torch.nan_to_num(error) * weights
+        newest = known.sum(dim=(1, 2)) / weights.sum(dim=(1, 2)).clamp(min=1.0)
+        rows = upload(rows, self.residuals.device)
+        before = self.residuals[rows]
+        mixed = torch.where(before > 0.0, before + _FORGET * (newest - before), newest)
+        self.residuals.index_copy_(0, rows, mixed)
+
+    @torch.no_grad()
+    def shares(self, rows: Tensor) -> Tensor:
+        """(B,) in [0, 1] how much of B frames is explained; 0 while that is not known.
+
+        Args:
+            rows: (B,) int64, which of the R frames; on the CPU.
+        """
+        drawn = self._clean & (self.residuals > 0.0)
+        ordinary = torch.where(drawn, self.residuals, math.nan).nanmedian()
+        residual = self.residuals[upload(rows, self.residuals.device)]
+        found = torch.exp(-((residual / (self._tolerance * ordinary)) ** 2))
+        return torch.where((residual > 0.0) & ordinary.isfinite(), found, 0.0)
+
+
+class _Share(torch.autograd.Function):
+    """The tensor itself; its gradient times a factor."""
+
+    @staticmethod
+    def forward(ctx: Any, values: Tensor, factor: Tensor) -> Tensor:
+        ctx.save_for_backward(factor)
+        return values.view_as(values)
+
+    @staticmethod
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor, None]:
+        (factor,) = ctx.saved_tensors
+        return gradients[0] * factor, None
+
+
+def scale_gradients(prediction: NetworkOutput, shares: Tensor) -> NetworkOutput:
+    """The same output, which learns from each of B frames by its share.
+
+    What belongs to a single frame (biases, gain, pose) still learns from all of its gradient: a
+    perturbed frame is explained by what is particular to it and hardly changes the hand. Weighing
+    the frame's loss instead would silence both.
+
+    Args:
+        prediction: of B frames.
+        shares: (B,) in [0, 1], without gradient.
+    """
+    return dataclasses.replace(
+        prediction,
+        raw=RawAttributes(
+            **{name: _by_frame(values, shares) for name, values in prediction.raw.items()}
+        ),
+        shadow=_by_frame(prediction.shadow, shares),
+        template_offsets=_by_frame(prediction.template_offsets.expand(len(shares), -1, -1), shares),
+        refinement=scale_refinement(prediction.refinement, shares),
+    )
+
+
+def scale_refinement(refinement: Refinement, shares: Tensor) -> Refinement:
+    """The same corrections of the hand parameters, which learn from each of B frames by its share.
+
+    Args:
+        refinement: of B frames.
+        shares: (B,) in [0, 1], without gradient.
+    """
+    return Refinement(
+        pose=_by_frame(refinement.pose, shares),
+        betas=_by_frame(refinement.betas.expand(len(shares), -1), shares),
+        transl=_by_frame(refinement.transl, shares),
+    )
+
+
+def _by_frame(values: Tensor, shares: Tensor) -> Tensor:
+    factor = shares.reshape(len(shares), *[1] * (values.ndim - 1)).to(values)
+    return _Share.apply(values, factor)

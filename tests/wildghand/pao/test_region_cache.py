@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from wildghand.pao.regions import FrameRegions, RegionCache, overlapping, partition
+from wildghand.pao.regions import FrameRegions, overlapping, partition
+from wildghand.pao.segmenters import RegionCache
 
 
 class Counting:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from scipy.ndimage import label
 
 from hwp_bench.base.errors import UsageError
-from wildghand.pao.regions import Superpixels
+from wildghand.pao.segmenters import Superpixels
 
 
 def disc_image(height: int = 96, width: int = 96, seed: int = 0) -> np.ndarray:

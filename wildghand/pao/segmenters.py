@@ -1,11 +1,11 @@
-"""Regions without a network: superpixels, computed once for each image and kept on disk."""
+"""Regions and hands without a network: superpixels, kept on disk for each image, and graph cuts."""
 
 from __future__ import annotations
 
 import contextlib
 import math
 import os
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Protocol
@@ -13,11 +13,11 @@ from typing import Protocol
 import numpy as np
 
 from hwp_bench.base.arrays import read_npz, take, write_npz
-from hwp_bench.base.errors import BadInput, HwpError, UsageError
+from hwp_bench.base.errors import BadInput, HwpError, ShapeMismatch, UsageError
 from hwp_bench.base.files import cache_root, sha256_json
 from hwp_bench.base.folders import trim
 from hwp_bench.base.images import pixel_digest
-from wildghand.pao.regions.frame_regions import FrameRegions, partition
+from wildghand.pao.regions import FrameRegions, partition
 
 #: Bytes that the cached regions may take; those of a frame take some 10 kB.
 MAX_CACHE_BYTES = 512 * 1024 * 1024
@@ -159,3 +159,55 @@ def _store(path: Path, regions: FrameRegions) -> None:
     if regions.membership is not None:
         arrays["membership"] = regions.membership
     write_npz(path, arrays)
+
+
+def graph_cut_hands(
+    images: Sequence[np.ndarray], silhouettes: Sequence[np.ndarray]
+) -> Iterator[np.ndarray]:
+    """y_h of raw frames: graph cuts prompted by the projected hand, one colour model for all.
+
+    Args:
+        images: (H, W, 3) uint8 sRGB each.
+        silhouettes: (H, W) bool each, where the posed hand would be seen if nothing covered it;
+            where it is empty, so is the mask.
+
+    Yields:
+        (H, W) bool for each frame.
+
+    Raises:
+        ShapeMismatch: a silhouette that does not belong to its image.
+
+    Source: `hwp_bench.importers.video.masks`, which the video import uses.
+    """
+    from hwp_bench.importers.video.masks import NARROW, Prompt, segment_clip
+
+    if len(images) != len(silhouettes) or any(
+        image.shape[:2] != drawn.shape for image, drawn in zip(images, silhouettes, strict=True)
+    ):
+        raise ShapeMismatch("do not fit the images", field="silhouettes")
+    if not images:
+        return
+
+    def prompt(frame: int) -> Prompt:
+        drawn = np.where(silhouettes[frame], 255, 0).astype(np.uint8)
+        return Prompt(drawn, np.zeros(drawn.shape, dtype=bool), detected=True)
+
+    segmented = segment_clip(
+        lambda frame: np.ascontiguousarray(images[frame]),
+        prompt,
+        len(images),
+        _hand_size(silhouettes),
+        NARROW,
+    )
+    for _, masks in segmented:
+        yield masks.hand > 127
+
+
+def _hand_size(silhouettes: Sequence[np.ndarray]) -> float:
+    """Median over the frames of the larger side of the silhouette's box, px."""
+    sides = [
+        max(np.ptp(np.flatnonzero(drawn.any(axis=axis))) + 1.0 for axis in (0, 1))
+        for drawn in silhouettes
+        if drawn.any()
+    ]
+    return float(np.median(sides)) if sides else 1.0

@@ -1,20 +1,75 @@
-"""How bright a light makes Gaussians: in any pose, and in the frames of a clip."""
+"""Shadows that hands cast on themselves and on each other, and how bright they make Gaussians."""
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from hwp_bench.base.rays import ray_mesh
 from hwp_bench.hands import TemplateTensors, pose_hand, vertex_normals
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip, upload
-from wildghand.shadows.cast_light import SRGB, CastLight
-from wildghand.shadows.obstacles import Obstacles, obstacles_in_frames
-from wildghand.shadows.settings import ShadowSettings
+from wildghand.light.lights import DARKEST, SRGB, CastLight, ShadowSettings
+
+#: How far a ray starts from the skin, m: the surface of an estimated hand is not exact, and a
+#: fold must not shade itself.
+LIFT = 2e-3
+# Cosine between normal and direction up to which a place has no light from there anyway.
+_GRAZING = 0.02
+
+
+def obstacles_in_frames(
+    surfaces: Sequence[tuple[np.ndarray, np.ndarray]],
+) -> Iterator[Obstacles]:
+    """The hands of one frame after the other.
+
+    Args:
+        surfaces: (B, V, 3) m in B frames and (F, 3) of each hand, at least one.
+    """
+    for frame in range(len(surfaces[0][0])):
+        yield Obstacles([(vertices[frame], faces) for vertices, faces in surfaces])
+
+
+class Obstacles:
+    """The surfaces of one hand or two in one pose.
+
+    Args:
+        surfaces: (V, 3) m and (F, 3) of each hand.
+
+    Raises:
+        HwpError: Embree refuses the mesh.
+    """
+
+    def __init__(self, surfaces: Sequence[tuple[np.ndarray, np.ndarray]]) -> None:
+        starts = np.cumsum([0, *(len(vertices) for vertices, _ in surfaces)])
+        self._mesh = ray_mesh(
+            np.concatenate([vertices for vertices, _ in surfaces]),
+            np.concatenate([faces + s for (_, faces), s in zip(surfaces, starts, strict=False)]),
+        )
+
+    def free(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Whether light from far away reaches places of the surface.
+
+        Args:
+            points: (M, 3) m.
+            normals: (M, 3) of length 1.
+            directions: (K, 3) towards the light, of length 1.
+
+        Returns:
+            (M, K) float64, 0 where a hand is in the way and 1 elsewhere, also where the place
+            faces away from the light.
+        """
+        free = np.ones((len(points), len(directions)))
+        place, way = np.nonzero(normals @ directions.T > _GRAZING)
+        starts = (points + LIFT * normals)[place].astype(np.float64)
+        blocked = self._mesh.blocked(starts, directions[way].astype(np.float64))
+        free[place[blocked], way[blocked]] = 0.0
+        return free
+
 
 # Least and largest irradiance that skin is drawn in: where little is seen the light may be wrong.
 _DIM, _BRIGHT = 0.15, 4.0
@@ -35,12 +90,18 @@ class HandShadows:
         rigs: by side; the light of each is kept off by all that are posed with it.
         light: under which they stand.
         settings: how hands are drawn in it.
+        darkest: share of the light that is left in the darkest shadow.
     """
 
     def __init__(
-        self, rigs: Mapping[str, HandRig], light: CastLight, settings: ShadowSettings
+        self,
+        rigs: Mapping[str, HandRig],
+        light: CastLight,
+        settings: ShadowSettings,
+        *,
+        darkest: float = DARKEST,
     ) -> None:
-        self._settings = settings
+        self._settings, self._darkest = settings, darkest
         self._templates = {side: _on_cpu(rig.template) for side, rig in rigs.items()}
         self._faces = {side: made.faces.numpy() for side, made in self._templates.items()}
         self._light = light.lit()
@@ -108,7 +169,7 @@ class HandShadows:
 
     def _dark(self, in_the_way: Obstacles, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
         free = in_the_way.free(places, normals, self._light.directions)
-        return self._light.darkening(normals, free, self._settings.darkest)
+        return self._light.darkening(normals, free, self._darkest)
 
     def _posed(
         self, side: str, pose: Tensor, betas: Tensor, transl: Tensor

@@ -9,8 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from wildghand.light.sphere import ring_around, spread_directions
-from wildghand.shadows import CastLight, ShadowSamples, ShadowSettings, find_light
+from wildghand.light import CastLight, ShadowSamples, ShadowSettings, find_light
+from wildghand.light.lights import ring_around, spread_directions
 
 LAMPS = np.array([[0.55, -0.6, -0.58], [-0.7, -0.2, -0.69]])
 LAMPS /= np.linalg.norm(LAMPS, axis=1, keepdims=True)
@@ -79,7 +79,7 @@ def test_lamps_are_found_where_they_are(found: CastLight) -> None:
 def test_shadows_are_as_dark_as_they_are(found: CastLight) -> None:
     seen, points = samples(seed=9)
     # Without softness, as the truth has none.
-    hard = find_light(samples()[0], ShadowSettings(softness=0.0))
+    hard = find_light(samples()[0], ShadowSettings(), softness=0.0)
     assert hard is not None
     dark = hard.darkening(seen.normals, free(points, hard.directions), 0.0) ** 2.2
     off = dark - truth(seen.normals, points)
