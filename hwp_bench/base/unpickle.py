@@ -137,7 +137,7 @@ class _Memo(dict[int, Any]):
 
 
 #: Python's own reader, whose every step can be changed.
-_Reader: Any = pickle._Unpickler  # type: ignore[attr-defined]
+_Reader: Any = pickle._Unpickler
 #: The steps that are taken: those of files of plain data.
 _STEPS = (
     "PROTO FRAME STOP MARK POP POP_MARK DUP MEMOIZE PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET "
@@ -149,7 +149,7 @@ _STEPS = (
 )
 
 
-class _Unpickler(_Reader):  # type: ignore[misc]
+class _Unpickler(_Reader):
     def __init__(
         self, stream: _Exact, path: Path, stand_ins: Collection[str], max_steps: int
     ) -> None:

@@ -40,6 +40,10 @@ def cases() -> list[Case]:
     return list(_CASES)
 
 
+def _without_context(run: _Run, given: tuple[Any, ...]) -> Callable[[Any], Any]:
+    return lambda context: run(*given)
+
+
 def _case(name: str, must_hold: str, *values: Any) -> Callable[[_Run], _Run]:
     """Decorator: a case, or one for each value, which stands in its words and is its argument."""
 
@@ -47,8 +51,7 @@ def _case(name: str, must_hold: str, *values: Any) -> Callable[[_Run], _Run]:
         for value in values or ((),):
             given = value if isinstance(value, tuple) else (value,)
             words = name.format(*given), must_hold.format(*given)
-            call = functools.partial(run, *given)
-            _CASES.append(Case(words[0], "hands", words[1], lambda context, call=call: call()))
+            _CASES.append(Case(words[0], "hands", words[1], _without_context(run, given)))
         return run
 
     return add
