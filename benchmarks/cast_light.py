@@ -23,7 +23,7 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.model.dress import Gaussians
-from wildghand.model.rasterize_hands import rasterize_hands
+from wildghand.model.frames import rasterize_hands
 from wildghand.shadows import CastLight
 from wildghand.shadows.find_light import CONE, SKY
 

@@ -48,7 +48,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "shading": ("wildghand.plain.model:sh_basis",),
     "rasterizer": (
         "wildghand.model.model:rasterize_hands",
-        "wildghand.model.rasterize_hands:rasterize",
+        "wildghand.model.frames:rasterize",
         "wildghand.plain.model:rasterize",
     ),
     "photometric loss": (

@@ -14,8 +14,8 @@ from hwp_bench.base.images import as_uint8
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.gaussians.training import TrainingClip
+from wildghand.model.frames import largest
 from wildghand.model.model import WildGHandModel
-from wildghand.model.rendered import largest
 from wildghand.splat.threads import denormals_flushed
 
 #: How much a difference of colours is stretched around grey in a picture.

@@ -29,7 +29,7 @@ from wildghand.avatar.tensors import MAX_TENSORS, read_tensors
 from wildghand.avatar.weight_masks import read_weight_masks, write_weight_masks
 from wildghand.evidence import ColorChanges, Evidence, rename_former
 from wildghand.light import KnownLight
-from wildghand.model.assemble import make_model
+from wildghand.model.model import make_model
 from wildghand.model.settings import read_stored, read_version_1
 from wildghand.poses import ClipPoses
 from wildghand.shadows import CastLight

@@ -46,7 +46,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.files import check_places
     from hwp_bench.cli.overrides import overrides
     from wildghand.pretrain.session import pretrain
-    from wildghand.prior.files import WEIGHTS
+    from wildghand.prior.prior import WEIGHTS
 
     check_places({"--out": args.out}, {"CAPTURE": args.captures}, replaces=args.overwrite)
     if args.steps is not None and args.steps < 1:

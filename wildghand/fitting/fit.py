@@ -39,12 +39,11 @@ from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
 from wildghand.gaussians.fit_loop import Loss, repeatable
 from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.training import TrainingClip, load_frames
-from wildghand.model.assemble import make_model
-from wildghand.model.model import WildGHandModel
-from wildghand.model.rendered import RenderedFrames
+from wildghand.model.frames import RenderedFrames
+from wildghand.model.model import WildGHandModel, make_model
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import HandFeatures
-from wildghand.prior.files import choose_prior
+from wildghand.prior.prior import choose_prior
 
 
 class Fit:

@@ -16,8 +16,7 @@ from hwp_bench.metrics.protocol import HWP_V1
 from wildghand.evidence import ColorChanges, Evidence
 from wildghand.fitting.cast_shadows import Dark, shadows_in
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
-from wildghand.model.free_poses import HandPrediction, dressed, predict_hand
-from wildghand.model.model import WildGHandModel
+from wildghand.model.model import HandPrediction, WildGHandModel
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import HandFeatures
 
@@ -78,8 +77,7 @@ class JudgedDrawings:
         """
         viewmats = self._clip.viewmats[row : row + 1]
         return {
-            side: predict_hand(
-                self.model,
+            side: self.model.predict_hand(
                 side,
                 (pose[row : row + 1], betas, transl[row : row + 1]),
                 viewmats,
@@ -161,7 +159,7 @@ class JudgedDrawings:
         """(H, W, 3) sRGB over black."""
         dark, here = self._dark(torch.tensor([row])), slice(row, row + 1)
         found = {
-            side: dressed(self.model, side, hand, refine=self.refine, dark=dark.get(side))
+            side: self.model.dressed(side, hand, refine=self.refine, dark=dark.get(side))
             for side, hand in predicted.items()
         }
         size = self.training.width, self.training.height

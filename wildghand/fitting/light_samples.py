@@ -11,8 +11,8 @@ from hwp_bench.base.colors import srgb_to_linear
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import LightSamples
+from wildghand.model.frames import camera_centres
 from wildghand.model.model import WildGHandModel
-from wildghand.model.relight import camera_centres
 
 # Cosine between normal and viewing direction from which a place is seen, and from which its colour
 # counts: at a grazing angle pixels are mixed with what is behind.

@@ -17,8 +17,8 @@ from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.laplacian import surface_laplacian
 from wildghand.gaussians.rig import HandRig
 from wildghand.model import terms
+from wildghand.model.frames import RenderedFrames
 from wildghand.model.model import WildGHandModel
-from wildghand.model.rendered import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import HandFeatures
 

@@ -18,7 +18,7 @@ from wildghand.fitting.networks import choose_segmenter
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.gaussians.frame_table import FrameTable, shares_of_255, soft_weights, upload
 from wildghand.gaussians.training import TrainingFrames
-from wildghand.model.rendered import RenderedFrames
+from wildghand.model.frames import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
 from wildghand.pao.pao import PerturbationAwareWeights, binary_weights
 from wildghand.pao.place_errors import PlaceErrors

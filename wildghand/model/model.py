@@ -1,31 +1,54 @@
-"""The model that is fitted: network, perturbation biases, frame-wise corrections, and drawing."""
+"""The model that is fitted: network, perturbation biases, frame-wise corrections, and drawing.
+
+A hand in free poses is drawn in two stages. What network and light say comes first and takes
+longest (`predict_hand`). What evidence, changes of colours, shadows and the refined pose make of it
+comes second (`dressed`), so that it can be tried in several ways.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor, nn
 
+from hwp_bench.hands import HandTemplate, sample_surface
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal
 from wildghand.dpd.field import bone_features
 from wildghand.dpd.scale_gradients import scale_refinement
 from wildghand.evidence import ColorChanges, Evidence
 from wildghand.gaussians.quaternions import quat_third_axis
-from wildghand.gaussians.rig import AnchorPoses, HandRig
+from wildghand.gaussians.rig import AnchorPoses, HandRig, rig_of
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight
 from wildghand.model.dress import Gaussians, dress
-from wildghand.model.free_poses import dimmed, dressed, predict_hand
-from wildghand.model.rasterize_hands import rasterize_hands
-from wildghand.model.rendered import HandState, RenderedFrames, largest
+from wildghand.model.frames import HandState, RenderedFrames, largest, rasterize_hands, relit
+from wildghand.model.settings import WildGHandSettings
 from wildghand.model.wrist import WristWall
-from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
+from wildghand.network import (
+    HandFeatures,
+    NetworkOutput,
+    PredictionNetwork,
+    mirrored_anchors,
+    surface_points,
+)
 from wildghand.poses import ClipPoses
 from wildghand.shadows import CastLight, HandShadows, ShadowSettings
 from wildghand.shadows.hand_shadows import Hand, Hands
 from wildghand.subject import SubjectShape
+
+
+@dataclass(frozen=True, eq=False)
+class HandPrediction:
+    """One hand in B free poses, after the first stage."""
+
+    #: Pose (B, 16, 3), betas (10,) and translation (B, 3).
+    hand: Hand
+    #: In these poses.
+    anchors: AnchorPoses
+    #: Of the network, and of the light where the network knows no colours.
+    prediction: NetworkOutput
 
 
 class WildGHandModel(nn.Module):
@@ -328,8 +351,82 @@ class WildGHandModel(nn.Module):
         hand = pose, betas, transl
         if dark is None:
             dark = self.cast({side: hand}).get(side)
-        predicted = predict_hand(self, side, hand, viewmats, features)
-        return dressed(self, side, predicted, refine=refine, rows=rows, dark=dark)
+        predicted = self.predict_hand(side, hand, viewmats, features)
+        return self.dressed(side, predicted, refine=refine, rows=rows, dark=dark)
+
+    def predict_hand(
+        self,
+        side: str,
+        hand: Hand,
+        viewmats: Tensor | None,
+        features: HandFeatures | None = None,
+    ) -> HandPrediction:
+        """What network and light say of one hand.
+
+        Args:
+            side: which hand.
+            hand: pose (B, 16, 3), betas (10,) and translation (B, 3).
+            viewmats: (B, 4, 4) of the cameras that look at it; None: the light says nothing.
+            features: of the network, where they are at hand already.
+        """
+        pose = hand[0]
+        anchors = self.rigs[side].pose(*hand)
+        features = self.network.features(side) if features is None else features
+        prediction = self.predict(side, anchors, pose, features)
+        if self.light is not None and viewmats is not None:
+            prediction = relit(
+                prediction,
+                self.light,
+                lambda normals: self.shaded(self.network(side, normals, pose, features), normals),
+                anchors,
+                viewmats,
+            )
+        return HandPrediction(hand, anchors, prediction)
+
+    def dressed(
+        self,
+        side: str,
+        predicted: HandPrediction,
+        *,
+        refine: bool = False,
+        rows: Tensor | None = None,
+        dark: Tensor | None = None,
+    ) -> tuple[Gaussians, Hand]:
+        """The Gaussians of one hand.
+
+        Args:
+            side: which hand.
+            predicted: of it, by `predict_hand`.
+            refine: apply the network's refinement of the parameters (head iv).
+            rows: (B,) positions among the training frames, whose biases and gains are added; None:
+                free of perturbations.
+            dark: (B, N) factors of the hands' shadows; None: ones.
+
+        Returns:
+            The Gaussians, and the parameters that they are posed by: the given or the refined ones.
+        """
+        rig, anchors, prediction = self.rigs[side], predicted.anchors, predicted.prediction
+        pose, betas, transl = predicted.hand
+        if self.evidence is not None:
+            bias = self.network.activation.log_scale_bias
+            settled = self.evidence.settle(side, prediction.raw, rig.spacing, bias)
+            prediction = replace(prediction, raw=settled)
+        if self.color_changes is not None:
+            prediction = replace(prediction, raw=self.color_changes.color(side, prediction.raw))
+        prediction = dimmed(prediction, dark)
+        if refine:
+            step = prediction.refinement
+            pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
+            anchors = rig.follow(pose, betas, transl)
+        hand = pose, betas, transl
+        if rows is None:
+            return dress(anchors, prediction, self.network.activation)[0], hand
+        perturbation = None
+        if side in self.perturbation:
+            temporal = self.biases_of(side).temporal(rows)
+            perturbation = self.perturbation_in(side, temporal, anchors, None)
+        made = dress(anchors, prediction, self.network.activation, perturbation)[0]
+        return replace(made, colors=made.colors * self.log_gains[rows].exp()[:, None]), hand
 
     def shaded(self, prediction: NetworkOutput, normals: Tensor) -> NetworkOutput:
         """A prediction in the light that casts shadows, with nothing in its way."""
@@ -366,9 +463,89 @@ class WildGHandModel(nn.Module):
         return replace(made, template_offsets=torch.zeros_like(made.template_offsets))
 
 
+def dimmed(prediction: NetworkOutput, dark: Tensor | None) -> NetworkOutput:
+    """A prediction whose colours are multiplied by (B, N) factors; None: as it is."""
+    if dark is None:
+        return prediction
+    return replace(prediction, shadow=prediction.shadow * dark[..., None])
+
+
 def _in_frames(
     parameters: tuple[Tensor, Tensor, Tensor], rows: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The parameters of a hand in some frames of a clip."""
     pose, betas, transl = parameters
     return pose[rows], betas, transl[rows]
+
+
+def make_model(
+    templates: Mapping[str, HandTemplate],
+    settings: WildGHandSettings,
+    mean_color: torch.Tensor,
+    frame_count: int,
+    seed: int,
+    device: torch.device,
+    subject: SubjectShape | None = None,
+) -> WildGHandModel:
+    """Make the model that a fit starts from; the same arguments make the same model.
+
+    Args:
+        templates: by side.
+        settings: which parts it has.
+        mean_color: (3,) sRGB in [0, 1] of the visible hand.
+        frame_count: training frames that are fitted.
+        seed: of the places of the Gaussians, and of the initial weights.
+        device: where it lives.
+        subject: how the person's hand differs from the templates; None: not at all.
+    """
+    rigs = make_rigs(templates, settings.gaussians, seed, device, subject)
+    surfaces = {
+        side: surface_points(templates[side], rig.anchors, rig.spacing, mean_color)
+        for side, rig in rigs.items()
+    }
+    network = PredictionNetwork(settings.network, surfaces, seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        dpd = settings.dpd
+        model = WildGHandModel(
+            rigs,
+            network,
+            frame_count,
+            dpd=dpd.enabled,
+            rank=dpd.rank,
+            template=settings.heads.template,
+            shadows=settings.shadows,
+        )
+    if subject is not None:
+        model.keep(subject)
+    return model.to(device)
+
+
+def make_rigs(
+    templates: Mapping[str, HandTemplate],
+    count: int,
+    seed: int,
+    device: torch.device,
+    subject: SubjectShape | None = None,
+) -> dict[str, HandRig]:
+    """Spread anchors over one hand or two, at the same places of the skin.
+
+    They are spread over the template, whatever the person's hand is: a prior knows these places.
+
+    Args:
+        templates: by side.
+        count: anchors on each hand.
+        seed: of their places.
+        device: where the tensors live.
+        subject: how the person's hand differs from the templates.
+    """
+    rigs: dict[str, HandRig] = {}
+    anchors = None
+    for side, template in templates.items():
+        # The left template is the right one's mirror image, face by face.
+        anchors = (
+            sample_surface(template, count, seed) if anchors is None else mirrored_anchors(anchors)
+        )
+        bent = template if subject is None else subject.applied(template)
+        rigs[side] = rig_of(bent, anchors, device)
+    return rigs

@@ -9,9 +9,8 @@ import torch
 
 from hwp_bench.methods.contract import Avatar
 from wildghand.gaussians.training import TrainingClip
-from wildghand.plain.avatar import PlainAvatar
 from wildghand.plain.hooks import Batch, Drawing, Material, Recipe
-from wildghand.plain.model import PlainModel, make_model
+from wildghand.plain.model import PlainAvatar, PlainModel, make_model
 from wildghand.plain.settings import FitSettings
 
 # Standard deviations stay within these, m: thinner than paper or wider than a finger explains

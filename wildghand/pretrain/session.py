@@ -21,8 +21,7 @@ from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.fitting.session import SAVE_EVERY, STATE, every_frame
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.pretrain.joint import JointFit, take_steps
-from wildghand.prior.files import save_prior
-from wildghand.prior.prior import Prior
+from wildghand.prior.prior import Prior, save_prior
 from wildghand.splat.threads import denormals_flushed
 
 # Thousands of steps end with low rates, as those of the shipped prior did.

@@ -30,7 +30,7 @@ from wildghand.fitting.evidence_choice import EvidenceChoice, Gaps
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.training import load_validation_frames
 from wildghand.model.dress import Gaussians
-from wildghand.model.rasterize_hands import rasterize_hands
+from wildghand.model.frames import rasterize_hands
 from wildghand.subject.fit_subject import LEAST_CHOOSING
 
 QUICK: dict[str, Any] = {**UNJUDGED, "light.enabled": False}

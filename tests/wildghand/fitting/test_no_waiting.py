@@ -178,7 +178,7 @@ def fake_device(monkeypatch: pytest.MonkeyPatch) -> None:
     optimizers = sys.modules[torch.optim.Optimizer.__module__]
     name = "_get_fused_kernels_supported_devices"
     monkeypatch.setattr(optimizers, name, lambda: ["cpu", "cuda", "meta"])
-    monkeypatch.setattr("wildghand.model.rasterize_hands.rasterize", stand_in)
+    monkeypatch.setattr("wildghand.model.frames.rasterize", stand_in)
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -230,7 +230,7 @@ def test_on_a_gpu_only_the_rasterizer_waits(
     name: str, monkeypatch: pytest.MonkeyPatch, make_training: TrainingMaker
 ) -> None:
     """gsplat itself reads how many tiles its splats cover; for that call the mode is off."""
-    import wildghand.model.rasterize_hands as module
+    import wildghand.model.frames as module
 
     rasterize = module.rasterize
 

@@ -11,9 +11,9 @@ from painted import QUICK, SilentReport, TrainingMaker
 from hwp_bench.base.errors import DidNotConverge
 from hwp_bench.methods.contract import Budget
 from wildghand.gaussians.training import load_frames
-from wildghand.plain.avatar import PlainAvatar
 from wildghand.plain.loop import run_fit
 from wildghand.plain.method import RecipeMethod
+from wildghand.plain.model import PlainAvatar
 from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
 from wildghand.plain.settings import FitSettings
 

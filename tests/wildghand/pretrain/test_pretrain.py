@@ -34,7 +34,7 @@ from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.network import network_settings
 from wildghand.pretrain.joint import JointFit, take_steps
-from wildghand.prior.files import DESCRIPTION, WEIGHTS, choose_prior, find_prior, load_prior
+from wildghand.prior.prior import DESCRIPTION, WEIGHTS, choose_prior, find_prior, load_prior
 
 QUICK: dict[str, Any] = {**TINY, "gaussians": 400, "schedule.steps": 40}
 NETWORK = network_settings(identity_resolution=24, plane_resolution=12)
