@@ -19,10 +19,8 @@ from one_shot_prior_fit.method import (
 )
 from one_shot_prior_fit.model import OneShotModel
 from wildghand.gaussians.training import TrainingFrames, load_frames
-from wildghand.plain.hooks import Material
 from wildghand.plain.loop import run_fit
-from wildghand.plain.recipe import PlainRecipe
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import FitSettings, Material, PlainRecipe
 
 CPU = torch.device("cpu")
 SMALL = OneShotSettings(gaussians=500, steps=3, device="cpu")

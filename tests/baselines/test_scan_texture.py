@@ -37,7 +37,7 @@ from scan_texture_fit.model import ScanSettings, _two_columns
 from scan_texture_fit.unwrap import nearest_anchor, read_pixels, weighted_median
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.training import load_frames
-from wildghand.plain.hooks import Material
+from wildghand.plain.recipe import Material
 
 #: A texture that is fine enough for the small captures of these tests.
 SMALL = {**QUICK, "gaussians": 1500, "texture_size": 64, "steps": 200}

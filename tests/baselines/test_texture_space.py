@@ -26,7 +26,7 @@ from texture_space_fit.model import SpaceModel, to_srgb
 from texture_space_fit.skins import FILE, shipped_skins, skin_uv
 from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.training import load_frames
-from wildghand.plain.hooks import Material
+from wildghand.plain.recipe import Material
 
 ROOT = Path(__file__).resolve().parents[2]
 #: SHA-256 of the file that `python -m texture_space_fit.build` wrote.

@@ -45,7 +45,7 @@ def run(args: argparse.Namespace) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
     from hwp_bench.cli.overrides import overrides
-    from wildghand.pretrain.session import pretrain
+    from wildghand.pretrain.pretrain import pretrain
     from wildghand.prior.prior import WEIGHTS
 
     check_places({"--out": args.out}, {"CAPTURE": args.captures}, replaces=args.overwrite)

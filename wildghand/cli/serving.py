@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from wildghand.fitting.optimize import Watch
+    from wildghand.fitting.session import Watch
     from wildghand.viewer.server import Address
 
 

@@ -18,8 +18,8 @@ from pathlib import Path
 
 from hwp_bench.base.errors import BadCapture
 from hwp_bench.capture.schema import check_id
-from wildghand.fitting.optimize import Watch
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
+from wildghand.fitting.session import Watch
 from wildghand.from_video.settings import VideoFit
 
 

@@ -16,8 +16,8 @@ from hwp_bench.capture import open_capture
 from hwp_bench.importers.video.decode import probe
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
-from wildghand.fitting.optimize import Watch
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
+from wildghand.fitting.session import Watch
 from wildghand.from_video.job import Job
 from wildghand.from_video.record import JobRecord
 from wildghand.from_video.run import run_stages

@@ -33,7 +33,7 @@ class TermWeights:
     #: Weight in the reconstruction of a pixel outside the visible-hand mask; inside it is 1.
     outside_weight: float = number(0.03, 0.0, 1.0)
     #: Leave out of the reconstruction what the mask leaves out though the posed hand covers it:
-    #: there something is in front of the hand (`wildghand.fitting.hidden_skin`).
+    #: there something is in front of the hand (`wildghand.fitting.judging`).
     leave_hidden: bool = True
     #: `bias_size`: biases of the perturbation module.
     bias: float = 1e-3

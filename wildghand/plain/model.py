@@ -1,4 +1,4 @@
-"""The plain model: Gaussians anchored on one or two hands, lit by spherical harmonics; its avatar."""
+"""The plain model: anchored Gaussians of one or two hands, lit by harmonics; its avatar."""
 
 from __future__ import annotations
 

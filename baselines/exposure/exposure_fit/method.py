@@ -11,9 +11,7 @@ from exposure_fit.motion import motion_px, pose_velocities, velocities
 from hwp_bench.methods.settings import number
 from wildghand.gaussians.rig import CHUNK, AnchorPoses
 from wildghand.gaussians.training import join_hands
-from wildghand.plain.method import RecipeMethod
-from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 
 
 @dataclass(frozen=True)

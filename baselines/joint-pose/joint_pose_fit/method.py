@@ -9,9 +9,7 @@ import torch
 
 from hwp_bench.methods.settings import number
 from wildghand.gaussians.training import join_hands
-from wildghand.plain.method import RecipeMethod
-from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 
 
 @dataclass(frozen=True)

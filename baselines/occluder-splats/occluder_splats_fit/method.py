@@ -12,9 +12,7 @@ from hwp_bench.methods.settings import choice, number
 from occluder_splats_fit.occluders import make_occluders, mask_boxes
 from wildghand.gaussians.frame_table import shares_of_255
 from wildghand.gaussians.losses import photometric_loss
-from wildghand.plain.method import RecipeMethod
-from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 
 
 @dataclass(frozen=True)
@@ -128,9 +126,9 @@ class OccluderRecipe(PlainRecipe[OccluderSettings]):
         )
 
     @torch.no_grad()
-    def after_step(self, batch: Batch) -> None:
+    def move_back(self, batch: Batch) -> None:
         """Keep the tensors within their ranges."""
-        super().after_step(batch)
+        super().move_back(batch)
         low, high = _SIGMAS
         self.occluders.log_sigmas.clamp_(math.log(low), math.log(high))
 

@@ -13,13 +13,11 @@ import torch
 from hwp_bench.methods.contract import Avatar
 from hwp_bench.methods.settings import choice, number
 from one_shot_prior_fit.model import OneShotAvatar, OneShotModel
-from wildghand.fitting.ready import ready_fit
+from wildghand.fitting.method import ready_fit
 from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
 from wildghand.model.terms import silhouette
-from wildghand.plain.hooks import Batch, Drawing, Material, Recipe
-from wildghand.plain.method import RecipeMethod
-from wildghand.plain.settings import LoopSettings
+from wildghand.plain.recipe import Batch, Drawing, LoopSettings, Material, Recipe, RecipeMethod
 
 
 @dataclass(frozen=True)

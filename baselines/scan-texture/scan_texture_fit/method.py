@@ -16,8 +16,7 @@ from wildghand.gaussians.laplacian import surface_laplacian
 from wildghand.gaussians.rig import AnchorPoses, make_rig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.terms import silhouette
-from wildghand.plain.hooks import Batch, Drawing, Material, Recipe
-from wildghand.plain.method import RecipeMethod
+from wildghand.plain.recipe import Batch, Drawing, Material, Recipe, RecipeMethod
 
 # Displacements stay within these, m.
 _FARTHEST = 0.008
@@ -153,7 +152,7 @@ class ScanRecipe(Recipe[ScanSettings]):
         return loss
 
     @torch.no_grad()
-    def after_step(self, batch: Batch) -> None:
+    def move_back(self, batch: Batch) -> None:
         """See `Recipe`."""
         for side in self.model.rigs:
             hand = self.model.hand(side)

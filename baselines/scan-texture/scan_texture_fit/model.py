@@ -14,7 +14,7 @@ from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.network.sampling import CellPooling, FixedGather, PlaneSampler
-from wildghand.plain.settings import LoopSettings
+from wildghand.plain.recipe import LoopSettings
 from wildghand.splat import rasterize
 
 _WIDTH = 16

@@ -14,10 +14,8 @@ from shadow_albedo_fit.model import RADIUS, ShadowedModel
 from wildghand.gaussians.laplacian import SurfaceLaplacian, surface_laplacian
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading import MAX_DEGREE
-from wildghand.plain.method import RecipeMethod
 from wildghand.plain.model import PlainModel
-from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 
 
 @dataclass(frozen=True)

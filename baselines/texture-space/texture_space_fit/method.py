@@ -16,9 +16,7 @@ from texture_space_fit.skins import shipped_skins, skin_uv
 from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.terms import silhouette
-from wildghand.plain.hooks import Batch, Drawing, Material, Recipe
-from wildghand.plain.method import RecipeMethod
-from wildghand.plain.settings import LoopSettings
+from wildghand.plain.recipe import Batch, Drawing, LoopSettings, Material, Recipe, RecipeMethod
 
 
 @dataclass(frozen=True)

@@ -22,9 +22,7 @@ from trimmed_fit.inliers import (
     vote_loss,
 )
 from wildghand.gaussians.frame_table import FrameTable, upload
-from wildghand.plain.method import RecipeMethod
-from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 
 
 @dataclass(frozen=True)

@@ -25,10 +25,8 @@ from wild_fit.frames import (
 )
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.training import TrainingFrames
-from wildghand.plain.method import RecipeMethod
 from wildghand.plain.model import PlainAvatar, PlainModel
-from wildghand.plain.recipe import Batch, Drawing, Material, PlainRecipe
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 from wildghand.splat.threads import denormals_flushed
 
 

@@ -22,7 +22,7 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.export.formats import ExportSettings, export
-from wildghand.fitting import believed_poses
+from wildghand.fitting import start as believed_poses
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.page.poses import sample_poses
 from wildghand.page.settings import PageSettings

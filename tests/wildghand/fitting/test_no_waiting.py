@@ -14,19 +14,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from odd_fits import part
 from painted import TrainingMaker
 from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from hwp_bench.methods.contract import TrainingCapture
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.data import skin_places
+from wildghand.fitting.descent import make_optimizer
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import Plateau
-from wildghand.fitting.rates import make_optimizer
-from wildghand.fitting.skin_places import skin_places
-from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
+from wildghand.fitting.judging import Prepass
+from wildghand.fitting.weights import Pao, Weighting, needs_places
 from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, choose_device, ready_device
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import Plateau
 from wildghand.shadows import ShadowTable
 
 FAKE = torch.device("meta")
@@ -134,9 +137,9 @@ def moved(value: Any) -> Any:
 def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     """A fit that was made on the CPU and then brought to the fake device."""
     settings = read_settings({**QUICK, "device": "cpu", **changes})
-    fit = Fit(training, settings, 0, torch.device("cpu"))
+    fit = make_fit(training, settings, 0, torch.device("cpu"))
     templates = {side: training.template(side) for side in training.sides}
-    assessment = assess_frames(training, fit.frames, templates, settings)
+    assessment = Prepass(training, fit.data.frames, templates, settings)
     fit.device = FAKE
     fit.model = fit.model.to(FAKE)
     fit.model.rigs = moved(fit.model.rigs)
@@ -144,14 +147,16 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     fit.clip._rigs = fit.model.rigs
     objective = fit.objective
     objective.temporal, objective._laplacians = moved((objective.temporal, objective._laplacians))
-    places = skin_places(training, fit.frames, templates) if needs_places(settings) else ()
+    places = skin_places(training, fit.data.frames, templates) if needs_places(settings) else ()
     if fit.model.shadows is not None:
         for name in ("_corners", "_directions", "_strengths"):
             setattr(fit.model.shadows, name, moved(getattr(fit.model.shadows, name)))
         assert isinstance(fit.dark, ShadowTable)
         fit.dark._device = FAKE
-    fit.weighting = Weighting(fit.frames, len(training.sides), assessment, settings, FAKE, places)
-    fit.optimizer = make_optimizer(fit.model, fit.weighting.pao, settings)
+    fit.weighting = Weighting(
+        fit.data.frames, len(training.sides), assessment, settings, FAKE, places
+    )
+    fit.descent.optimizer = make_optimizer(fit.model, part(fit, Pao).weights, settings)
     return fit
 
 
@@ -186,7 +191,7 @@ def test_a_step_reads_nothing_from_the_device(
     name: str, fake_device: None, make_training: TrainingMaker
 ) -> None:
     fit = fake_fit(make_training("both" if name == "two hands" else "right"), VARIANTS[name])
-    order = batches(len(fit.frames), fit.settings.schedule.batch, 0)
+    order = batches(len(fit.data.frames), fit.settings.schedule.batch, 0)
     fit.step(next(order), 0.0)  # tables of targets are made in the first step
     guard, plateau = Guard(), Plateau(10 * WINDOW)
     with Waits() as waits, HandedOver() as handed:
@@ -243,8 +248,8 @@ def test_on_a_gpu_only_the_rasterizer_waits(
 
     settings = read_settings({**QUICK, "device": "cuda", **VARIANTS[name]})
     training = make_training("both" if name == "two hands" else "right")
-    fit = Fit(training, settings, 0, ready_device("cuda"))
-    order = batches(len(fit.frames), settings.schedule.batch, 0)
+    fit = make_fit(training, settings, 0, ready_device("cuda"))
+    order = batches(len(fit.data.frames), settings.schedule.batch, 0)
     for _ in range(3):
         fit.step(next(order), 0.0)
     monkeypatch.setattr(module, "rasterize", may_wait)

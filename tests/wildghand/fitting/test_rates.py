@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from wildghand.fitting.rates import rate_factor, set_rates
+from wildghand.fitting.descent import rate_factor, set_rates
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.model.settings import ScheduleSettings
 

@@ -8,13 +8,17 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from odd_fits import part
 from tiny_fits import TINY
 
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.judging_frames import judging_frames
-from wildghand.fitting.subject_shape import bent_templates, subject_of
-from wildghand.fitting.weighting import assess_frames
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.data import judging_frames
+from wildghand.fitting.disentangle import Dpd
+from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.judging import Prepass
+from wildghand.fitting.start import bent_templates, subject_of
+from wildghand.fitting.weights import Pao
 from wildghand.model.settings import read_settings
 
 CPU = torch.device("cpu")
@@ -27,13 +31,13 @@ TrainingMaker = Callable[..., TrainingCapture]
 def fit_of(training: TrainingCapture, **changes: Any) -> Fit:
     """A fit before its first step; shadows take part in no weight, and their time is saved."""
     settings = read_settings({**TINY, "shadows.enabled": False, **changes})
-    return Fit(training, settings, 0, CPU)
+    return make_fit(training, settings, 0, CPU)
 
 
 def test_frames_teach_by_their_temporal_weights(make_training: TrainingMaker) -> None:
     fit = fit_of(make_training(), **STRICT)
     omega = torch.tensor([0.0, -0.2])
-    shares = fit.weighting.shares(ROWS, omega)
+    shares = part(fit, Pao).shares(ROWS, omega)
     np.testing.assert_allclose(shares, [1.0, 1.0 / (1.0 + 100.0 * 0.2)], rtol=1e-6)
 
 
@@ -45,18 +49,18 @@ def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
     training = make_training()
     fit = fit_of(training, **{"pao.mismatch": 0.5, "subject.enabled": False})
     templates = {side: training.template(side) for side in training.sides}
-    assessment = assess_frames(training, fit.frames, templates, fit.settings)
+    assessment = Prepass(training, fit.data.frames, templates, fit.settings)
     assert assessment is not None
     found = np.quantile(assessment.misplacement[assessment.usable], 0.1)
     shared = 0.5 * found / fit.settings.prepass.misplacement_floor
     tolerance = shared**2 / (1.0 + shared**2)
     assert 0.0 < tolerance < 1.0
-    shares = fit.weighting.shares(ROWS, torch.tensor([0.0, -0.2]))
+    shares = part(fit, Pao).shares(ROWS, torch.tensor([0.0, -0.2]))
     alone = 1.0 / (1.0 + 100.0 * 0.2)
     np.testing.assert_allclose(shares, [1.0, alone + tolerance * (1.0 - alone)], rtol=1e-6)
     # Regions that are rejected keep that share of the hand's weight.
-    drawing = fit.draw(ROWS)
-    lifted = fit.weighting(ROWS, drawing).weights
+    drawing = fit.draw(Batch(ROWS))
+    lifted = fit.compare(Batch(ROWS), drawing).weights
     without = {"pao.mismatch": 0.0, "subject.enabled": False}
     strict = fit_of(training, **without).weighting(ROWS, drawing).weights
     assert (lifted >= strict - 1e-6).all()
@@ -94,7 +98,7 @@ def test_what_is_explained_teaches(make_training: TrainingMaker) -> None:
     assert float(before[0]) < 0.03
     # Drawing a frame is what tells how well it is explained.
     weighting.pay_back.residuals.zero_()
-    weighting(ROWS, fit.draw(ROWS))
+    weighting(ROWS, fit.draw(Batch(ROWS)))
     assert (weighting.pay_back.residuals[ROWS] > 0.0).all()
     assert int((weighting.pay_back.residuals > 0.0).sum()) == 2
 
@@ -110,12 +114,15 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
     )
     templates = {side: training.template(side) for side in training.sides}
     judges = judging_frames(training, fit.settings)
-    subject = subject_of(training, fit.frames, templates, fit.settings, judges)
+    subject = subject_of(training, fit.data.frames, templates, fit.settings, judges)
     bent = bent_templates(templates, subject)
-    assessment = assess_frames(training, fit.frames, bent, fit.settings, judges)
+    assessment = Prepass(training, fit.data.frames, bent, fit.settings, judges)
     assert assessment is not None
-    drawing = fit.draw(ROWS)
-    weights, whole = fit.weighting(ROWS, drawing).weights, bare.weighting(ROWS, drawing).weights
+    drawing = fit.draw(Batch(ROWS))
+    weights, whole = (
+        fit.compare(Batch(ROWS), drawing).weights,
+        bare.compare(Batch(ROWS), drawing).weights,
+    )
     expected = whole * torch.from_numpy(assessment.pixel_weights[ROWS.numpy()]).float() / 255.0
     torch.testing.assert_close(weights.detach(), expected.detach(), rtol=1e-5, atol=1e-6)
 
@@ -134,9 +141,9 @@ def test_validation_frames_are_known_to_be_clean(make_training: TrainingMaker) -
     subject = subject_of(training, alone.frames, templates, alone.settings, judges)
     bent = bent_templates(templates, subject)
     for fit, known in ((believing, judges), (alone, None)):
-        expected = assess_frames(training, fit.frames, bent, believing.settings, known)
+        expected = Prepass(training, fit.data.frames, bent, believing.settings, known)
         assert expected is not None
-        np.testing.assert_array_equal(fit.weighting.clean, np.float32(expected.clean))
+        np.testing.assert_array_equal(fit.data.judgement.clean, np.float32(expected.clean))
     assert (believing.weighting.clean >= alone.weighting.clean).all()
     assert not torch.equal(believing.weighting.clean, alone.weighting.clean)
     # They teach nothing: a fit has the rows of its training frames alone.
@@ -166,25 +173,25 @@ def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(
 def test_regions_that_are_drawn_badly_count_less(make_training: TrainingMaker) -> None:
     fit = fit_of(make_training(), **{"prepass.enabled": False, "pao.temporal": "none"})
     row = torch.tensor([0])
-    drawing = fit.draw(row)
-    target = fit.weighting(row, drawing)
-    hand = fit.weighting(row, drawing).hand[0] > 0.9
+    drawing = fit.draw(Batch(row))
+    target = fit.compare(Batch(row), drawing)
+    hand = fit.compare(Batch(row), drawing).hand[0] > 0.9
     error = (drawing.image[0].detach() - target.image[0]).abs().mean(dim=-1)
     worst, best = (error >= error[hand].quantile(0.9)), (error <= error[hand].quantile(0.1))
     weights = target.weights[0].detach()
     assert weights[hand & worst].mean() < 0.8 * weights[hand & best].mean()
-    assert fit.weighting.median is not None
+    assert part(fit, Pao).median is not None
 
 
 def test_omega_starts_where_the_prepass_weight_puts_it(make_training: TrainingMaker) -> None:
     fit = fit_of(make_training())
-    rows = torch.arange(len(fit.frames))
+    rows = torch.arange(len(fit.data.frames))
     omega = fit.model.biases[0].temporal(rows).omega.detach()
-    target = fit.objective.temporal.omega
+    target = part(fit, Dpd).temporal.omega
     assert float((omega - target).abs().mean()) < 0.05
     # docs/dpd_pao.md: 1 in a clean frame, 0.02 in a perturbed one.
-    expected = 1.0 / (1.0 + 12.5 * (1.0 / fit.weighting.frame_weights - 1.0))
-    factor = fit.weighting.pao.temporal_factor(target)
+    expected = 1.0 / (1.0 + 12.5 * (1.0 / fit.data.judgement.frame_weights - 1.0))
+    factor = part(fit, Pao).weights.temporal_factor(target)
     torch.testing.assert_close(factor, expected, rtol=1e-4, atol=1e-4)
     assert 0.0196 - 1e-4 <= float(factor.min()) < float(factor.max()) <= 1.0
 
@@ -199,14 +206,20 @@ def test_without_heads_the_template_stands_and_nothing_else_changes(
             for value in made.model.network.template_head.parameters():
                 value.fill_(0.05)
     row = torch.tensor([0])
-    moved = fit.draw(row).hands["right"].prediction.template_offsets
-    still = bare.draw(row).hands["right"].prediction.template_offsets
+    moved = fit.draw(Batch(row)).hands["right"].prediction.template_offsets
+    still = bare.draw(Batch(row)).hands["right"].prediction.template_offsets
     assert moved.abs().max() > 0.0
     assert (still == 0.0).all()
-    raw = (made.draw(row).hands["right"].prediction.raw.concatenate() for made in (fit, bare))
+    raw = (
+        made.draw(Batch(row)).hands["right"].prediction.raw.concatenate() for made in (fit, bare)
+    )
     assert torch.equal(*raw)
     loss = bare.objective(
-        bare.model, bare.draw(row), bare.weighting(row, bare.draw(row)), row, torch.ones(1)
+        bare.model,
+        bare.draw(Batch(row)),
+        bare.weighting(row, bare.draw(Batch(row))),
+        row,
+        torch.ones(1),
     )
     loss.backward()
     assert all(

@@ -28,13 +28,13 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.cli.main import main
 from wildghand.fitting import fit_capture
-from wildghand.fitting.fit import Fit
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.method import WildGHandMethod
-from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.parallel import World
-from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.fitting.session import load_state, save_state
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import Watchers, run_fit
 from wildghand.splat import rasterize
 
 FIT: dict[str, Any] = {**QUICK, "schedule.steps": 60}
@@ -128,14 +128,14 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
             raise Stopped
 
     report = SilentReport()
-    whole = optimize(Fit(training, settings, 0, device), Budget(), report)
+    whole = run_fit(make_fit(training, settings, 0, device), Budget(), report)
     assert [step for step, _ in report.offers] == list(range(31))
-    half = Fit(training, settings, 0, device)
+    half = make_fit(training, settings, 0, device)
     with pytest.raises(Stopped):
-        optimize(half, Budget(), SilentReport(), after_step=stop)
-    rest, watchers = Fit(training, settings, 0, device), Watchers(0)
+        run_fit(half, Budget(), SilentReport(), after_step=stop)
+    rest, watchers = make_fit(training, settings, 0, device), Watchers(0)
     assert load_state(tmp_path / "state", rest, watchers, "of this fit") == (17, 1.5)
-    resumed = optimize(rest, Budget(), SilentReport(), start=17, watchers=watchers)
+    resumed = run_fit(rest, Budget(), SilentReport(), start=17, watchers=watchers)
     expected, found = whole.model.snapshot(), resumed.model.snapshot()
     assert all(torch.equal(expected[name], found[name]) for name in expected)
     with pytest.raises(BadInput, match="another capture"):

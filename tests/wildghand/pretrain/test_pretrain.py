@@ -28,12 +28,13 @@ from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import Watchers
-from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.session import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.network import network_settings
-from wildghand.pretrain.joint import JointFit, take_steps
+from wildghand.plain.loop import Watchers
+from wildghand.pretrain.pretrain import JointFit, take_steps
 from wildghand.prior.prior import DESCRIPTION, WEIGHTS, choose_prior, find_prior, load_prior
 
 QUICK: dict[str, Any] = {**TINY, "gaussians": 400, "schedule.steps": 40}
@@ -86,12 +87,12 @@ def mean_loss(fit: Fit) -> float:
     """L1 + D-SSIM over all training frames, without steps."""
     with torch.no_grad():
         losses = []
-        for row in range(len(fit.frames)):
+        for row in range(len(fit.data.frames)):
             rows = torch.tensor([row])
-            drawing = fit.draw(rows)
-            target = fit.weighting(rows, drawing)
+            drawing = fit.draw(Batch(rows))
+            target = fit.compare(Batch(rows), drawing)
             losses.append(
-                fit.objective(fit.model, drawing, target, rows, fit.weighting.clean[rows])
+                fit.objective(fit.model, drawing, target, rows, fit.data.judgement.clean[rows])
             )
         return float(torch.stack(losses).mean())
 
@@ -102,8 +103,8 @@ def test_a_prior_of_two_subjects_helps_a_third(
     training = training_of(subjects["dora"], tmp_path)
     # Without the light of the clip, which tells both most of what a prior of 60 steps knows.
     alone = {**QUICK, "shadows.enabled": False}
-    plain = Fit(training, read_settings(alone), 0, CPU)
-    ahead = Fit(training, read_settings({**alone, "prior": str(prior)}), 0, CPU)
+    plain = make_fit(training, read_settings(alone), 0, CPU)
+    ahead = make_fit(training, read_settings({**alone, "prior": str(prior)}), 0, CPU)
     assert mean_loss(ahead) < 0.8 * mean_loss(plain)
     # And it stays ahead while both are fitted.
     for fit in (plain, ahead):
@@ -144,7 +145,7 @@ def test_maps_are_averaged_and_a_hand_not_seen_takes_the_other_ones(
     both = make_training("both")
     # Frames' colours would change the maps of the two hands apart.
     settings = read_settings({**QUICK, "prior": str(prior), "start_colors": False})
-    network = Fit(both, settings, 0, CPU).model.network
+    network = make_fit(both, settings, 0, CPU).model.network
     assert torch.equal(network.identity("left"), network.identity("right"))
 
 
@@ -296,22 +297,22 @@ def test_the_prior_that_ships_saw_no_subject_and_no_scene_of_a_suite(
 
 def test_a_default_fit_starts_from_the_prior_that_ships(make_training: Callable[..., Any]) -> None:
     training = make_training("right")
-    fit = Fit(training, read_settings({"gaussians": 200}), 0, CPU)
+    fit = make_fit(training, read_settings({"gaussians": 200}), 0, CPU)
     shipped = choose_prior(fit.settings, training.hand_model)
     assert shipped is not None
     assert fit.source["prior"] == shipped.record.weights
     # Start colours change channels of the map after the prior is there.
-    untinted = Fit(training, read_settings({"gaussians": 200, "start_colors": False}), 0, CPU)
+    untinted = make_fit(training, read_settings({"gaussians": 200, "start_colors": False}), 0, CPU)
     found = untinted.model.network.identity("right")
     torch.testing.assert_close(found, shipped.tensors[MAP], rtol=0, atol=0)
-    bare = Fit(training, read_settings({"gaussians": 200, "prior": ""}), 0, CPU)
+    bare = make_fit(training, read_settings({"gaussians": 200, "prior": ""}), 0, CPU)
     assert "prior" not in bare.source
 
 
 def test_captures_of_different_hand_models_are_refused(
     subjects: dict[str, Path], make_capture: Callable[..., Capture], tmp_path: Path
 ) -> None:
-    from wildghand.pretrain.session import pretrain
+    from wildghand.pretrain.pretrain import pretrain
 
     other = make_capture("other", frames=20)
     info = other.root / "capture.json"

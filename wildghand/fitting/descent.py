@@ -1,16 +1,133 @@
-"""Texture features that several steps of a fit share."""
+"""How a fit descends: Adam over everything, how its rates fall, texture features steps share."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+import math
+from collections.abc import Callable, Iterable, Mapping
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from wildghand.network import HandFeatures, PredictionNetwork
+from wildghand.fitting.parallel import World, average_gradients
+from wildghand.gaussians.adam import ClippedAdam
+from wildghand.gaussians.fit_loop import repeatable
+from wildghand.model.model import WildGHandModel
+from wildghand.model.settings import ScheduleSettings
+from wildghand.network import HandFeatures, PredictionNetwork, parameter_groups
 
 Features = Mapping[str, HandFeatures]
+
+
+class Descent:
+    """Steps of Adam.
+
+    Args:
+        model: everything of it that is fitted moves.
+        others: what moves besides, by the name of its rate, and is not clipped.
+        schedule: rates.
+        terms: of the loss that no frame enters, see `SharedFeatures`.
+
+    Attributes:
+        optimizer: several fits may share it.
+        shared: texture features of the steps of a block.
+        steps: that were taken.
+    """
+
+    def __init__(
+        self,
+        model: WildGHandModel,
+        others: Mapping[str, Iterable[Tensor]],
+        schedule: ScheduleSettings,
+        terms: Callable[[Features], Tensor | None],
+    ) -> None:
+        self.optimizer = make_optimizer(model, others, schedule)
+        self.shared = SharedFeatures(model.network, schedule.texture_every, terms)
+        self.steps = 0
+        self._schedule = schedule
+        self._device = model.log_gains.device
+
+    def set_rates(self, fraction: float) -> None:
+        """Set the rates of all groups for a step; see `rate_factor`."""
+        factor = rate_factor(self._schedule, fraction, self.steps)
+        for group in self.optimizer.param_groups:
+            group["lr"] = group["start"] * factor
+
+    def take(self, loss: Tensor, mean: Tensor, world: World) -> None:
+        """Take a step.
+
+        Args:
+            loss: of this process's frames.
+            mean: of the loss over all processes, with that of `shared`, without gradient.
+            world: the processes.
+        """
+        self.optimizer.clear()
+        with repeatable(self._device):
+            waiting = self.shared.backward(loss, mean)
+        average_gradients(self.tensors(), world)
+        self.optimizer.take_step(waiting)
+        self.steps += 1
+
+    def tensors(self) -> list[Tensor]:
+        """Everything that moves."""
+        return [tensor for group in self.optimizer.param_groups for tensor in group["params"]]
+
+    def state_dict(self) -> dict[str, Any]:
+        """The state for `load_state_dict`."""
+        return {
+            "optimizer": self.optimizer.state_dict(),
+            "shared": self.shared.state_dict(),
+            "steps": self.steps,
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a saved state; the model's must be loaded before."""
+        self.optimizer.load_state_dict(state["optimizer"])
+        self.shared.load_state_dict(state["shared"])
+        self.steps = int(state["steps"])
+
+
+def make_optimizer(
+    model: WildGHandModel, others: Mapping[str, Iterable[Tensor]], schedule: ScheduleSettings
+) -> ClippedAdam:
+    """Adam over everything that is fitted; each group keeps its first rate as `start`."""
+    groups = {name: list(group) for name, group in parameter_groups(model.network).items()}
+    groups["dpd"] = list(model.perturbation.parameters())
+    groups |= {name: list(group) for name, group in others.items()}
+    groups["gains"] = [model.log_gains]
+    groups["pose"] = [model.pose_steps]
+    groups["transl"] = [model.transl_steps]
+    rates = {name: getattr(schedule.rates, name) for name in groups}
+    return ClippedAdam(
+        [
+            {
+                "params": group,
+                "lr": rates[name],
+                "start": rates[name],
+                "clipped": name not in others,
+            }
+            for name, group in groups.items()
+            if group
+        ],
+        schedule.clip_gradient,
+    )
+
+
+def rate_factor(schedule: ScheduleSettings, fraction: float, steps: int) -> float:
+    """Factor on the first rates in a step.
+
+    Args:
+        schedule: how rates fall.
+        fraction: share of the budget that is used up.
+        steps: those behind.
+    """
+    if schedule.decay == "halving":
+        factor = 0.5 ** int(fraction * schedule.halvings)
+    else:
+        factor = schedule.final_rate**fraction
+    if schedule.root_steps:
+        factor /= math.sqrt(1.0 + steps / schedule.root_steps)
+    return factor
 
 
 class SharedFeatures:

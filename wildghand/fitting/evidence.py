@@ -1,4 +1,4 @@
-"""How far evidence and the skin around a place act, chosen by validation frames.
+"""Gaussians that few frames have shown: discs on the skin, as far as validation frames agree.
 
 Where a person's hand is far from the hand model, offsets from the skin are the person's and not
 errors of depth, and evidence takes away what is right. Where a palm has another colour than the
@@ -8,7 +8,6 @@ are drawn without evidence, and show other places.
 
 from __future__ import annotations
 
-import functools
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -22,14 +21,15 @@ from wildghand.evidence import (
     Evidence,
     EvidenceSettings,
     fill_shares,
+    shown_frames,
     strengths,
     weigh_evidence,
 )
-from wildghand.fitting.filled_colors import FilledColors
-from wildghand.fitting.judged_drawings import JudgedDrawings
+from wildghand.fitting.choice import JudgedDrawings, ValidationFrames
+from wildghand.fitting.colors import FilledColors
+from wildghand.fitting.fit import Component, Fit
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.model import WildGHandModel
-from wildghand.model.settings import WildGHandSettings
 
 # Most training frames in which gaps are looked for.
 _FRAMES = 12
@@ -120,118 +120,105 @@ class Gaps:
         return colors, image, coverage.detach()
 
 
-@dataclass(frozen=True, eq=False)
-class EvidenceChoice:
-    """The choice of the strength of evidence, and of colours, at the end of a fit."""
+class FewShown(Component):
+    """Evidence counts before the fit; how strongly it acts, and fill, is chosen after it.
 
-    #: What is drawn; its evidence and colours are put back.
-    model: WildGHandModel
-    #: Of the fit.
-    settings: WildGHandSettings
-    #: (N,) by side, how many training frames show each Gaussian.
+    Attributes:
+        shown: (N,) by side, how many training frames show each Gaussian.
+        gaps: what discs would leave open.
+        filled: the colours of places that few frames have shown.
+        judges: validation frames; None where they are too few, or choose nothing.
+    """
+
     shown: Mapping[str, Tensor]
-    #: Training frames that are fitted.
-    frame_count: int
-    #: Validation frames; None where they are too few, or judge nothing.
-    judges: JudgedDrawings | None
-    #: The colours of places that few frames have shown.
-    filled: FilledColors
-    #: What discs would leave open.
     gaps: Gaps
+    filled: FilledColors
+    judges: JudgedDrawings | None
 
-    @property
-    def drawings(self) -> JudgedDrawings | None:
-        """The validation frames that judge; None also where nothing is chosen."""
-        evidence = self.settings.evidence
-        return self.judges if evidence.enabled and evidence.validated else None
+    def before(self, fit: Fit) -> None:
+        """Count, and let the model keep the evidence of the settings' own strength."""
+        data, model, count = fit.data, fit.model, len(fit.data.frames)
+        self.shown = shown_frames(model.rigs, fit.clip, data.visible, count)
+        model.keep(weigh_evidence(self.shown, count, fit.settings.evidence))
+        self.gaps = Gaps(model, fit.clip, data.visible, count)
+        self.filled = FilledColors(fit, self.shown)
+        frames = fit.part(ValidationFrames) if fit.settings.evidence.validated else None
+        self.judges = None if frames is None else frames.drawings
 
-    def best(self) -> list[Evidence | ColorChanges]:
+    def after(self, fit: Fit) -> None:
+        """Let the model keep what draws validation frames best."""
+        for best in self.best(fit):
+            fit.model.keep(best)
+
+    def best(self, fit: Fit) -> list[Evidence | ColorChanges]:
         """What draws validation frames best; without what is the model's own already.
 
         Where nothing is judged, that is evidence and fill by the settings' own shares. In each case
         Gaussians that close gaps are spared.
         """
-        if not self.settings.evidence.enabled:
-            return []
-        several = self.candidates()
-        if self.drawings is None:
-            evidence, (colors,) = several[0], self.filled.carried_on(self._fills[:1])
+        several, shares = self.candidates(fit), fill_shares(fit.settings.evidence)
+        if self.judges is None:
+            evidence, (colors,) = several[0], self.filled.carried_on(shares[:1])
         else:
-            evidence, colors = self._judged(self.drawings, several)
+            evidence, colors = self._judged(fit, self.judges, several)
         found: list[Evidence | ColorChanges] = []
-        if not evidence.equals(self.model.evidence):
+        if not evidence.equals(fit.model.evidence):
             found.append(evidence)
-        if colors is not None and colors is not self.model.color_changes:
+        if colors is not None and colors is not fit.model.color_changes:
             found.append(colors)
         return found
 
-    def candidates(self) -> list[Evidence]:
+    def candidates(self, fit: Fit) -> list[Evidence]:
         """The strengths, the settings' own first; Gaussians that close gaps are spared in each."""
-        closers = self.gaps.closers(self._strongest)
-        return [self._evidence(each).spare(closers) for each in self._strengths]
+        closers = self.gaps.closers(self._strongest(fit))
+        return [self._weigh(fit, each).spare(closers) for each in strengths(fit.settings.evidence)]
 
     def _judged(
-        self, drawings: JudgedDrawings, several: Sequence[Evidence]
+        self, fit: Fit, judges: JudgedDrawings, several: Sequence[Evidence]
     ) -> tuple[Evidence, ColorChanges | None]:
         """One evidence of several, and with it the changes of colours."""
-        predicted = drawings.predict_all()
-        changes = self.model.color_changes
-        errors = [drawings.error(predicted, each, changes) for each in several]
+        predicted = judges.predict_all()
+        changes = fit.model.color_changes
+        errors = [judges.error(predicted, each, changes) for each in several]
         least = min(errors)
         # Of equal ones the first is taken, which is the settings' own.
         best = several[errors.index(least)]
-        opened = frozenset(self.model.rigs)
+        opened = frozenset(fit.model.rigs)
         for other, share in (
             (replace(best, open_wrists=opened), _IN_THE_WAY),
             (best.spare_all(), _AS_LEARNT),
             (replace(best.spare_all(), open_wrists=opened), _AS_LEARNT),
         ):
-            error = drawings.error(predicted, other, changes)
+            error = judges.error(predicted, other, changes)
             if error < (1.0 - share) * least:
                 best, least = other, error
-        if self.model.light is not None:
-            fills = self.filled.carried_on(self._fills)
-            changes = min(fills, key=lambda each: drawings.error(predicted, best, each))
+        if fit.model.light is not None:
+            fills = self.filled.carried_on(fill_shares(fit.settings.evidence))
+            changes = min(fills, key=lambda each: judges.error(predicted, best, each))
         return best, changes
 
-    def seconds(self) -> float:
-        """Return about how long `best` takes; nothing of the model changes."""
-        if not self.settings.evidence.enabled:
-            return 0.0
-        gaps = self.gaps.seconds(self._strongest)
-        return gaps + self._seconds_of_drawings() + self._seconds_of_fills()
+    def seconds(self, fit: Fit) -> float:
+        """See `Component`."""
+        total = self.gaps.seconds(self._strongest(fit))
+        settings, lit = fit.settings.evidence, fit.settings.light.enabled
+        fills = fill_shares(settings)
+        if self.judges is not None:
+            took = self.judges.seconds
+            # With a light, which there is at the end alone, the network is asked twice.
+            each = (2.0 if lit else 1.0) * took.predict
+            # Besides the strengths, three more without a wall or discs.
+            each += (len(strengths(settings)) + 3 + len(fills)) * took.draw
+            total += took.features + each * len(self.judges.frames)
+        if lit:  # without a light nothing is filled
+            begun = time.perf_counter()
+            self.filled.rehearse()
+            total += (time.perf_counter() - begun) * sum(share > 0.0 for share in fills)
+        return total
 
-    def _seconds_of_drawings(self) -> float:
-        drawings = self.drawings
-        if drawings is None:
-            return 0.0
-        took = drawings.seconds
-        # With a light, which there is at the end alone, the network is asked twice.
-        each = (2.0 if self.settings.light.enabled else 1.0) * took.predict
-        # Besides the strengths, three more without a wall or discs.
-        each += (len(self._strengths) + 3 + len(self._fills)) * took.draw
-        return took.features + each * len(drawings.frames)
-
-    def _seconds_of_fills(self) -> float:
-        """About how long the fills take; without a light there are none."""
-        if not self.settings.light.enabled:
-            return 0.0
-        begun = time.perf_counter()
-        self.filled.rehearse()
-        return (time.perf_counter() - begun) * sum(share > 0.0 for share in self._fills)
-
-    @functools.cached_property
-    def _strengths(self) -> list[EvidenceSettings]:
-        return strengths(self.settings.evidence)
-
-    @functools.cached_property
-    def _fills(self) -> list[float]:
-        return fill_shares(self.settings.evidence)
-
-    @property
-    def _strongest(self) -> Evidence:
+    def _strongest(self, fit: Fit) -> Evidence:
         """What opens the most."""
-        return self._evidence(max(self._strengths, key=lambda each: each.offset_share))
+        several = strengths(fit.settings.evidence)
+        return self._weigh(fit, max(several, key=lambda each: each.offset_share))
 
-    def _evidence(self, settings: EvidenceSettings) -> Evidence:
-        return weigh_evidence(self.shown, self.frame_count, settings)
+    def _weigh(self, fit: Fit, settings: EvidenceSettings) -> Evidence:
+        return weigh_evidence(self.shown, len(fit.data.frames), settings)
