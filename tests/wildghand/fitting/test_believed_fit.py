@@ -22,7 +22,7 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.export.formats import ExportSettings, export
-from wildghand.fitting import start as believed_poses
+from wildghand.fitting import start
 from wildghand.fitting.method import WildGHandMethod
 from wildghand.page.poses import sample_poses
 from wildghand.page.settings import PageSettings
@@ -44,7 +44,7 @@ def _bent(hands: dict[str, HandParameters]) -> dict[str, HandParameters]:
 def believing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits believe in bent fingers."""
     monkeypatch.setattr(
-        believed_poses, "believed_hands", lambda templates, hands, cameras, settings: _bent(hands)
+        start, "believed_hands", lambda templates, hands, cameras, settings: _bent(hands)
     )
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -44,7 +43,9 @@ def sharing(fit: Fit, left: float, right: float) -> ColorChanges | None:
     counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
     own = {"left": left, "right": right}
     given = {side: np.full(counts[side], own[side]) for side in counts}
-    return dataclasses.replace(part(fit, OtherHand), own=given, lent=given).learn()
+    other = part(fit, OtherHand)
+    other.own = other.lent = given
+    return other.learn(fit)
 
 
 @torch.no_grad()
@@ -92,9 +93,9 @@ def test_frames_that_show_a_hand_clearly_make_its_colours_its_own(fit: Fit) -> N
 def test_unsure_frames_say_nothing_of_colours(fit: Fit) -> None:
     rows = torch.arange(len(fit.data.frames))
     fit.data.judgement.frame_weights[:] = 0.35
-    assert not clearly_visible(fit.weighting)(rows).any()
+    assert not clearly_visible(fit.data, rows).any()
     fit.data.judgement.frame_weights[:] = 1.0
-    torch.testing.assert_close(clearly_visible(fit.weighting)(rows), fit.data.visible(rows))
+    torch.testing.assert_close(clearly_visible(fit.data, rows), fit.data.visible(rows))
 
 
 def test_known_normals_lie_in_the_cap() -> None:
@@ -112,10 +113,10 @@ def test_nothing_is_taken_without_a_light_or_another_hand(
     assert sharing(fit, 0.0, 1.0) is None
     one = make_fit(make_training(), read_settings(PLAIN), 0, torch.device("cpu"))
     one.model.keep(a_light())
-    assert one.borrowed.own == {}
-    assert one.borrowed.learn() is None
+    assert part(one, OtherHand).own == {}
+    assert part(one, OtherHand).learn(one) is None
     off = read_settings({**PLAIN, "evidence.color_share": 0.0})
-    assert make_fit(make_training("both"), off, 0, torch.device("cpu")).borrowed.own == {}
+    assert make_fit(make_training("both"), off, 0, torch.device("cpu")).part(OtherHand) is None
 
 
 def test_an_avatar_keeps_them(fit: Fit, tmp_path: Path) -> None:

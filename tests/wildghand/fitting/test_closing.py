@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from hwp_bench.methods.contract import TrainingCapture
+from wildghand.fitting import fit as fitting
 from wildghand.fitting import light as closing
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
@@ -65,10 +66,10 @@ def test_without_light_all_seconds_are_for_steps(make_training: TrainingMaker) -
 def test_weight_masks_are_made_when_they_are_asked_for(
     fit: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(closing, "MAX_MASKS", 3)
+    monkeypatch.setattr(fitting, "MAX_MASKS", 3)
     calls: list[int] = []
     draw = fit.draw
-    monkeypatch.setattr(fit, "draw", lambda rows: calls.append(int(rows[0])) or draw(rows))
+    monkeypatch.setattr(fit, "draw", lambda batch: calls.append(int(batch.rows[0])) or draw(batch))
     avatar = fit.avatar(0, final=True)
     assert not calls
     frames = fit.data.frames.indices.tolist()

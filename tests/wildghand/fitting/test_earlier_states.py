@@ -139,12 +139,12 @@ def fitted(
                 return abs(math.log(step / wanted))
         pytest.fail("the tensors are no state of the fit")
 
-    def watch(fit: Fit, step: int, loss: object) -> None:
+    def watch(step: int, watchers: object, loss: object) -> None:
         means[step] = part(fit, Averaging).average.values()
 
     monkeypatch.setattr(StateChoice, "error", lambda choice: error())
     report = SilentReport()
-    return fit, run_fit(fit, budget or Budget(), report, watch=watch), means
+    return fit, run_fit(fit, budget or Budget(), report, after_step=watch), means
 
 
 def test_a_fit_ends_with_the_state_that_draws_validation_frames_best(
@@ -186,8 +186,7 @@ def test_without_the_choice_a_fit_ends_with_its_last_state(
         torch.equal(a, b)
         for a, b in zip(part(fit, Averaging).average.now(), means[20], strict=True)
     )
-    assert part(fit, StateChoice).seconds_now(fit) == 0.0
-    assert part(fit, StateChoice).states.state_dict()["kept"] == {}
+    assert fit.part(StateChoice) is None
 
 
 def test_the_seconds_of_the_choice_are_left_out_of_the_steps(
@@ -196,7 +195,7 @@ def test_the_seconds_of_the_choice_are_left_out_of_the_steps(
     """The report's clock runs one second for each step, and one for the start."""
     monkeypatch.setattr(Fit, "seconds_for_steps", lambda fit, seconds: seconds)
     monkeypatch.setattr(
-        StateChoice, "seconds", lambda choice: 3.0 * (len(choice.states.candidates) > 0)
+        StateChoice, "seconds_now", lambda choice, fit: 3.0 * (len(choice.states.candidates) > 0)
     )
     _, avatar, _ = fitted(training, monkeypatch, 20, Budget(seconds=16.0))
     assert avatar.record.steps == 16 - 1 - 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -27,6 +28,7 @@ from wildghand.evidence import (
     weigh_evidence,
 )
 from wildghand.fitting.choice import StateChoice
+from wildghand.fitting.colors import FilledColors
 from wildghand.fitting.evidence import FewShown, Gaps
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.training import load_validation_frames
@@ -78,23 +80,25 @@ def drawn_with(fit: Fit, training: TrainingCapture, index: int) -> np.ndarray:
 
 def error_with(choice: FewShown, evidence: Evidence | None, colors: ColorChanges | None) -> float:
     """The error of all validation frames as they are drawn with both."""
-    drawings = choice.drawings
+    drawings = choice.judges
     assert drawings is not None
     return drawings.error(drawings.predict_all(), evidence, colors)
 
 
 def judged_by(choice: FewShown, images: torch.Tensor) -> FewShown:
     """The same choice, with (F, H, W, 3) uint8 images as the truth."""
-    drawings = choice.drawings
+    choice, drawings = copy.copy(choice), choice.judges
     assert drawings is not None
     frames = dataclasses.replace(drawings.frames, images=images)
-    return dataclasses.replace(choice, judges=dataclasses.replace(drawings, frames=frames))
+    choice.judges = dataclasses.replace(drawings, frames=frames)
+    return choice
 
 
 def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> None:
     fit = begun(training)
-    assert part(fit, FewShown).judges is not None
-    frames = part(fit, FewShown).judges.frames
+    judges = part(fit, FewShown).judges
+    assert judges is not None
+    frames = judges.frames
     erode = np.ones((3, 3), np.uint8)
     inside = [cv2.erode((mask > 127).astype(np.uint8), erode) for mask in frames.masks.numpy()]
     hand = np.stack(inside)[..., None]
@@ -113,11 +117,11 @@ def test_the_strength_that_draws_the_frames_best_is_chosen(
     fit = begun(training)
     images = torch.from_numpy((255.0 * drawn_with(fit, training, index)).round().astype(np.uint8))
     choice = judged_by(part(fit, FewShown), images)
-    (evidence,) = choice.best()
+    (evidence,) = choice.best(fit)
     assert isinstance(evidence, Evidence)
     assert evidence.equals(spared(fit, index))
     fit.model.keep(evidence)
-    assert choice.best() == []  # the model has it already
+    assert choice.best(fit) == []  # the model has it already
 
 
 def test_gaussians_stay_as_learnt_where_that_draws_the_frames_much_better(
@@ -133,7 +137,7 @@ def test_gaussians_stay_as_learnt_where_that_draws_the_frames_much_better(
     ]
     fit.model.evidence = before
     images = torch.from_numpy((255.0 * np.clip(np.stack(drawn), 0.0, 1.0)).round().astype(np.uint8))
-    (evidence,) = judged_by(part(fit, FewShown), images).best()
+    (evidence,) = judged_by(part(fit, FewShown), images).best(fit)
     assert isinstance(evidence, Evidence)
     assert evidence.equals(learnt)
     assert all(bool((shares == 1.0).all()) for shares in evidence.shapes.values())
@@ -159,9 +163,10 @@ def test_a_wall_in_the_way_is_left_out_and_stays_out_of_a_file(
         def error(self, _: Any, evidence: Evidence, __: Any) -> float:
             return 1.0 if side in evidence.open_wrists else 2.0
 
-    choice = dataclasses.replace(part(fit, FewShown), judges=Walls())  # type: ignore[arg-type]
+    choice = part(fit, FewShown)
+    choice.judges = Walls()  # type: ignore[assignment]
     fit.model.keep(spared(fit, 0))
-    (evidence,) = choice.best()
+    (evidence,) = choice.best(fit)
     assert isinstance(evidence, Evidence)
     assert evidence.equals(opened)
 
@@ -259,14 +264,14 @@ def test_the_fill_that_draws_the_frames_best_is_chosen(
     fit.model.keep(a_light())
     # Hardly anything is shown, so that each share changes what the frames show.
     shown = {side: 0.05 * count for side, count in part(fit, FewShown).shown.items()}
-    filled = dataclasses.replace(part(fit, FewShown).filled, shown=shown)
-    choice = dataclasses.replace(part(fit, FewShown), filled=filled)
+    choice, filled = copy.copy(part(fit, FewShown)), FilledColors(fit, shown)
+    choice.filled = filled
     fills = filled.carried_on(fill_shares(fit.settings.evidence))
     fit.model.color_changes = fills[index]
     images = torch.from_numpy((255.0 * drawn_with(fit, training, 0)).round().astype(np.uint8))
     fit.model.color_changes = None
     fit.model.keep(spared(fit, 0))
-    found = judged_by(choice, images).best()
+    found = judged_by(choice, images).best(fit)
     if index == 2:  # as they were learnt
         assert found == []
         return
@@ -294,7 +299,7 @@ def test_looking_changes_nothing_and_finishing_keeps_the_best(
     kept = weigh_evidence(
         part(fit, FewShown).shown, len(fit.data.frames), strengths(fit.settings.evidence)[3]
     )
-    monkeypatch.setattr(FewShown, "best", lambda choice: [kept])
+    monkeypatch.setattr(FewShown, "best", lambda choice, fit: [kept])
     fit.finish(0, 0.0)
     frame = int(training.validation[0])
     where = training.hand_poses(frame), training.camera(frame)
@@ -316,14 +321,15 @@ def test_nothing_is_chosen_where_it_is_off(
     changes: dict[str, Any], training: TrainingCapture
 ) -> None:
     fit = begun(training, **changes)
-    assert part(fit, FewShown).judges is None
-    if fit.settings.evidence.enabled:
-        # Gaps are closed all the same.
-        assert part(fit, FewShown).seconds(fit) > 0.0
-        fit.model.keep(spared(fit, 0))
-    else:
-        assert part(fit, FewShown).seconds(fit) == 0.0
-    assert part(fit, FewShown).best(fit) == []
+    choice = fit.part(FewShown)
+    assert (choice is not None) == fit.settings.evidence.enabled
+    if choice is None:
+        return
+    assert choice.judges is None
+    # Gaps are closed all the same.
+    assert choice.seconds(fit) > 0.0
+    fit.model.keep(spared(fit, 0))
+    assert choice.best(fit) == []
 
 
 def test_a_frame_or_two_do_not_judge(training: TrainingCapture) -> None:
@@ -331,7 +337,7 @@ def test_a_frame_or_two_do_not_judge(training: TrainingCapture) -> None:
     few = first - LEAST_CHOOSING + 1
     training.split = Split(training.id, last + 1, (0, few), (few, first), (first, last + 1))
     training._train = training.split.train
-    assert begun(training).choice.drawings is None
+    assert part(begun(training), FewShown).judges is None
 
 
 def test_validation_frames_are_spread_and_never_fitted_ones(training: TrainingCapture) -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -112,13 +111,14 @@ def test_colours_from_the_other_hand_are_known_and_carried_on(
     counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
     # No frame shows the left hand, and the right one knows all colours.
     own = {"left": np.zeros(counts["left"]), "right": np.ones(counts["right"])}
-    borrowed = dataclasses.replace(part(fit, OtherHand), own=own, lent=own)
-    taken = borrowed.learn()
+    other = part(fit, OtherHand)
+    other.own = other.lent = own
+    taken = other.learn(fit)
     assert taken is not None
     fit.model.keep(taken)
     shown = {side: torch.zeros(count) for side, count in counts.items()}
     shown["right"] += 1e9
-    found = FilledColors(fit.model, borrowed, shown, len(fit.data.frames)).carried_on([0.02])[0]
+    found = FilledColors(fit, shown).carried_on([0.02])[0]
     assert found is not None
     for side, change in taken.changes.items():
         np.testing.assert_allclose(found.changes[side].numpy(), change.numpy(), atol=1e-4)

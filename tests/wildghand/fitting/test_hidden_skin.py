@@ -15,8 +15,8 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.data import skin_places
 from wildghand.fitting.fit import Batch, Fit
-from wildghand.fitting.judging import MARGIN, hidden_skin
-from wildghand.fitting.weights import Weighting
+from wildghand.fitting.judging import MARGIN, HiddenSkin, hidden_skin
+from wildghand.fitting.weights import MaskWeights
 from wildghand.model.settings import read_settings
 
 CPU = torch.device("cpu")
@@ -49,7 +49,12 @@ def covered(training: TrainingCapture, **changes: Any) -> tuple[Fit, torch.Tenso
     fit.data.frames = dataclasses.replace(fit.data.frames, masks=masks)
     templates = {side: training.template(side) for side in training.sides}
     places = skin_places(training, fit.data.frames, templates)
-    fit.weighting = Weighting(fit.data.frames, len(training.sides), None, fit.settings, CPU, places)
+    for name in ("images", "masks"):  # what was made of the masks before
+        vars(fit.data).pop(name, None)
+    for kind in (HiddenSkin, MaskWeights):
+        found = fit.part(kind)
+        if found is not None:
+            found.before(fit)
     return fit, torch.from_numpy(hidden_skin(places, masks.numpy()))[0]
 
 
@@ -78,10 +83,9 @@ def test_hidden_pixels_ask_for_nothing_where_they_are_left_out(
     drawing = fit.draw(Batch(torch.tensor([0])))
     drawing.image.retain_grad()
     target = fit.compare(Batch(torch.tensor([0])), drawing)
-    loss = fit.objective(
-        fit.model, drawing, target, torch.tensor([0]), fit.data.judgement.clean[:1]
-    )
-    loss.backward()
+    batch = Batch(torch.tensor([0]))
+    terms = [term for each in fit.components for term in each.loss(fit, batch, drawing, target)]
+    torch.stack(terms).sum().backward()
     asked = drawing.image.grad[0].abs().sum(dim=-1)
     assert asked[~hidden].max() > 0.0
     assert bool((asked[hidden] == 0.0).all()) is leave

@@ -22,15 +22,16 @@ from torch.utils._python_dispatch import TorchDispatchMode
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.components import make_fit
-from wildghand.fitting.data import skin_places
-from wildghand.fitting.descent import make_optimizer
+from wildghand.fitting.descent import Descent
+from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.judging import Prepass
-from wildghand.fitting.weights import Pao, Weighting, needs_places
+from wildghand.fitting.judging import HiddenSkin
+from wildghand.fitting.light import Shadows
+from wildghand.fitting.objective import Regularisers
+from wildghand.fitting.weights import MaskWeights, Pao
 from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, choose_device, ready_device
 from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Plateau
-from wildghand.shadows import ShadowTable
 
 FAKE = torch.device("meta")
 HAS_GPU = choose_device("auto").type == "cuda"
@@ -138,25 +139,30 @@ def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     """A fit that was made on the CPU and then brought to the fake device."""
     settings = read_settings({**QUICK, "device": "cpu", **changes})
     fit = make_fit(training, settings, 0, torch.device("cpu"))
-    templates = {side: training.template(side) for side in training.sides}
-    assessment = Prepass(training, fit.data.frames, templates, settings)
-    fit.device = FAKE
+    fit.device = fit.data.device = FAKE
+    for name in ("images", "masks"):
+        vars(fit.data).pop(name, None)
     fit.model = fit.model.to(FAKE)
     fit.model.rigs = moved(fit.model.rigs)
     fit.clip = moved(fit.clip)
     fit.clip._rigs = fit.model.rigs
-    objective = fit.objective
-    objective.temporal, objective._laplacians = moved((objective.temporal, objective._laplacians))
-    places = skin_places(training, fit.data.frames, templates) if needs_places(settings) else ()
+    held = fit.part(Dpd)
+    if held is not None:
+        held.temporal = moved(held.temporal)
+    smooth = part(fit, Regularisers)
+    smooth._laplacians = moved(smooth._laplacians)
     if fit.model.shadows is not None:
         for name in ("_corners", "_directions", "_strengths"):
             setattr(fit.model.shadows, name, moved(getattr(fit.model.shadows, name)))
-        assert isinstance(fit.dark, ShadowTable)
-        fit.dark._device = FAKE
-    fit.weighting = Weighting(
-        fit.data.frames, len(training.sides), assessment, settings, FAKE, places
-    )
-    fit.descent.optimizer = make_optimizer(fit.model, part(fit, Pao).weights, settings)
+        table = part(fit, Shadows)._table
+        assert table is not None
+        table._device = FAKE
+    for kind in (HiddenSkin, Pao, MaskWeights):
+        found = fit.part(kind)
+        if found is not None:
+            found.before(fit)
+    others = {name: group for c in fit.components for name, group in c.parameters().items()}
+    fit.descent = Descent(fit.model, others, settings.schedule, fit._loss_of_features)
     return fit
 
 

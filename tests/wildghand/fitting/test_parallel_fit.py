@@ -27,8 +27,8 @@ from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
 from wildghand.fitting import parallel
 from wildghand.fitting.components import make_fit
+from wildghand.fitting.fit import Component
 from wildghand.fitting.method import WildGHandMethod
-from wildghand.fitting.objective import Objective
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, join, run_in_world
 from wildghand.fitting.session import load_state, save_state
 from wildghand.model.settings import read_settings
@@ -62,7 +62,7 @@ def resumed(request: Path, world: World, state: Path) -> State:
     settings = read_settings({**SHORT, **VARIANTS["default"]})
     half, watchers = make_fit(open_request(request), settings, 0, CPU, world), Watchers(0)
 
-    def save(step: int, watched: Watchers) -> None:
+    def save(step: int, watched: Watchers, loss: object) -> None:
         if step == 2 and world.is_main:
             save_state(state, half, watched, step=step, seconds=0.0, digest="d")
 
@@ -74,11 +74,11 @@ def resumed(request: Path, world: World, state: Path) -> State:
     return run_fit(rest, Budget(), SilentReport(), start=start, watchers=watchers).model.snapshot()
 
 
-class NanObjective(Objective):
-    """An objective that is always NaN."""
+class NanLoss(Component):
+    """A term that is always NaN."""
 
-    def __call__(self, *given: Any) -> torch.Tensor:
-        return super().__call__(*given) * math.nan
+    def loss(self, *given: Any) -> list[torch.Tensor]:
+        return [torch.tensor(math.nan)]
 
 
 def check_spoiled(request: Path, world: World) -> None:
@@ -87,7 +87,7 @@ def check_spoiled(request: Path, world: World) -> None:
     fit = make_fit(open_request(request), settings, 0, CPU, world)
     before = fit.model.snapshot()
     if world.rank == 1:
-        fit.objective = NanObjective(settings, fit.model.rigs)
+        fit.components = [*fit.components, NanLoss()]
     assert math.isnan(fit.step(torch.tensor([0, 1]), 0.0))
     assert all(torch.equal(before[name], v) for name, v in fit.model.snapshot().items())
 

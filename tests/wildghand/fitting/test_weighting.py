@@ -13,13 +13,13 @@ from tiny_fits import TINY
 
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.fitting.components import make_fit
-from wildghand.fitting.data import judging_frames
 from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.fit import Batch, Fit
 from wildghand.fitting.judging import Prepass
-from wildghand.fitting.start import bent_templates, subject_of
 from wildghand.fitting.weights import Pao
+from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.settings import read_settings
+from wildghand.prepass import PrepassInput, judge_frames
 
 CPU = torch.device("cpu")
 #: What the pre-pass leads PAO to spare is off.
@@ -48,9 +48,7 @@ def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
     # meet the masks of this clip.
     training = make_training()
     fit = fit_of(training, **{"pao.mismatch": 0.5, "subject.enabled": False})
-    templates = {side: training.template(side) for side in training.sides}
-    assessment = Prepass(training, fit.data.frames, templates, fit.settings)
-    assert assessment is not None
+    assessment = part(fit, Prepass).assessment
     found = np.quantile(assessment.misplacement[assessment.usable], 0.1)
     shared = 0.5 * found / fit.settings.prepass.misplacement_floor
     tolerance = shared**2 / (1.0 + shared**2)
@@ -62,11 +60,11 @@ def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
     drawing = fit.draw(Batch(ROWS))
     lifted = fit.compare(Batch(ROWS), drawing).weights
     without = {"pao.mismatch": 0.0, "subject.enabled": False}
-    strict = fit_of(training, **without).weighting(ROWS, drawing).weights
+    strict = fit_of(training, **without).compare(Batch(ROWS), drawing).weights
     assert (lifted >= strict - 1e-6).all()
     assert lifted.sum() > strict.sum()
     # Without the pre-pass nothing is known of it.
-    assert fit_of(training, **{"prepass.enabled": False}).weighting.tolerance == 0.0
+    assert part(fit_of(training, **{"prepass.enabled": False}), Pao).tolerance == 0.0
 
 
 @pytest.mark.parametrize(
@@ -83,22 +81,23 @@ def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
 def test_all_frames_teach_alike_where_a_part_of_it_is_missing(
     changes: dict[str, Any], make_training: TrainingMaker
 ) -> None:
-    assert fit_of(make_training(), **changes).weighting.shares(ROWS, torch.ones(2)) is None
+    fit = fit_of(make_training(), **changes)
+    found = fit.part(Pao)
+    assert found is None or "teach" not in found.draws(fit, Batch(ROWS))
 
 
 def test_what_is_explained_teaches(make_training: TrainingMaker) -> None:
     fit = fit_of(make_training(), **{"dpd.pay_back": 2.0, "pao.mismatch": 0.0})
-    weighting, omega = fit.weighting, torch.tensor([0.4, 0.4])
+    weighting, omega = part(fit, Pao), torch.tensor([0.4, 0.4])
     assert weighting.pay_back is not None
     before = weighting.shares(ROWS, omega)
-    weighting.clean[:] = 1.0
     weighting.pay_back._clean[:] = True
     weighting.pay_back.residuals[:] = 0.01
     assert float(weighting.shares(ROWS, omega)[0]) == pytest.approx(np.exp(-0.25), rel=1e-5)
     assert float(before[0]) < 0.03
     # Drawing a frame is what tells how well it is explained.
     weighting.pay_back.residuals.zero_()
-    weighting(ROWS, fit.draw(Batch(ROWS)))
+    fit.compare(Batch(ROWS), fit.draw(Batch(ROWS)))
     assert (weighting.pay_back.residuals[ROWS] > 0.0).all()
     assert int((weighting.pay_back.residuals > 0.0).sum()) == 2
 
@@ -112,12 +111,7 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
         fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on, **STRICT})
         for on in (True, False)
     )
-    templates = {side: training.template(side) for side in training.sides}
-    judges = judging_frames(training, fit.settings)
-    subject = subject_of(training, fit.data.frames, templates, fit.settings, judges)
-    bent = bent_templates(templates, subject)
-    assessment = Prepass(training, fit.data.frames, bent, fit.settings, judges)
-    assert assessment is not None
+    assessment = part(fit, Prepass).assessment
     drawing = fit.draw(Batch(ROWS))
     weights, whole = (
         fit.compare(Batch(ROWS), drawing).weights,
@@ -134,20 +128,22 @@ def test_validation_frames_are_known_to_be_clean(make_training: TrainingMaker) -
         fit_of(training, **{"prepass.validated": on, "prepass.tolerance": 1e-3})
         for on in (True, False)
     )
-    judges = judging_frames(training, believing.settings)
+    judges = believing.data.judges
     assert judges is not None
     assert set(judges.indices.tolist()) <= set(training.validation.tolist())
-    templates = {side: training.template(side) for side in training.sides}
-    subject = subject_of(training, alone.frames, templates, alone.settings, judges)
-    bent = bent_templates(templates, subject)
-    for fit, known in ((believing, judges), (alone, None)):
-        expected = Prepass(training, fit.data.frames, bent, believing.settings, known)
-        assert expected is not None
+
+    def given(frames: TrainingFrames) -> PrepassInput:
+        images, masks = np.asarray(frames.images), np.asarray(frames.masks)
+        bent = believing.data.bent
+        return PrepassInput(frames.indices, images, masks, training.hands, training.cameras, bent)
+
+    for fit, known in ((believing, given(judges)), (alone, None)):
+        expected = judge_frames(given(fit.data.frames), believing.settings.prepass, known)
         np.testing.assert_array_equal(fit.data.judgement.clean, np.float32(expected.clean))
-    assert (believing.weighting.clean >= alone.weighting.clean).all()
-    assert not torch.equal(believing.weighting.clean, alone.weighting.clean)
+    assert (believing.data.judgement.clean >= alone.data.judgement.clean).all()
+    assert not torch.equal(believing.data.judgement.clean, alone.data.judgement.clean)
     # They teach nothing: a fit has the rows of its training frames alone.
-    assert believing.frames.indices.tolist() == alone.frames.indices.tolist()
+    assert believing.data.frames.indices.tolist() == alone.data.frames.indices.tolist()
 
 
 def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(
@@ -158,13 +154,13 @@ def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(
     spares, strict = (
         fit_of(training, **{"pao.mismatch": 0.0, "pao.spare_clean": on}) for on in (True, False)
     )
-    clean = spares.weighting.clean[ROWS]
+    clean = spares.data.judgement.clean[ROWS]
     assert (clean > 0.0).all()
-    drawing = spares.draw(ROWS)
-    found = spares.weighting(ROWS, drawing)
-    lower = strict.weighting(ROWS, drawing).weights
+    drawing = spares.draw(Batch(ROWS))
+    found = spares.compare(Batch(ROWS), drawing)
+    lower = strict.compare(Batch(ROWS), drawing).weights
     outside = spares.settings.terms.outside_weight * (1.0 - found.hand)
-    pixels = spares.weighting._uncovered(ROWS)
+    pixels = spares.data.uncovered(ROWS)
     regions = lower - outside * pixels
     expected = lower + clean[:, None, None] * (found.hand * pixels - regions)
     torch.testing.assert_close(found.weights, expected, rtol=1e-5, atol=1e-6)
@@ -187,7 +183,9 @@ def test_omega_starts_where_the_prepass_weight_puts_it(make_training: TrainingMa
     fit = fit_of(make_training())
     rows = torch.arange(len(fit.data.frames))
     omega = fit.model.biases[0].temporal(rows).omega.detach()
-    target = part(fit, Dpd).temporal.omega
+    temporal = part(fit, Dpd).temporal
+    assert temporal is not None
+    target = temporal.omega
     assert float((omega - target).abs().mean()) < 0.05
     # docs/dpd_pao.md: 1 in a clean frame, 0.02 in a perturbed one.
     expected = 1.0 / (1.0 + 12.5 * (1.0 / fit.data.judgement.frame_weights - 1.0))

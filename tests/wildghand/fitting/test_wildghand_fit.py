@@ -120,7 +120,7 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
     class Stopped(Exception):
         pass
 
-    def stop(step: int, watchers: Watchers) -> None:
+    def stop(step: int, watchers: Watchers, loss: object) -> None:
         if step == 17:
             save_state(
                 tmp_path / "state", half, watchers, step=step, seconds=1.5, digest="of this fit"

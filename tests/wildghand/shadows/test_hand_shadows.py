@@ -16,6 +16,7 @@ from hwp_bench.hands import load_template, pose_hand, vertex_normals
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.fitting.components import make_fit
+from wildghand.fitting.light import Shadows
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig, make_rig
 from wildghand.model.settings import read_settings
@@ -198,11 +199,13 @@ def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMak
 def test_a_fit_finds_a_light_unless_it_is_switched_off(make_training: TrainingMaker) -> None:
     found = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     assert found.model.shadows is not None
-    assert set(found.dark(torch.tensor([0]))) == {"right"}
+    shadows = found.part(Shadows)
+    assert shadows is not None
+    assert set(shadows.dark(torch.tensor([0]))) == {"right"}
     off = read_settings({**UNJUDGED, "shadows.enabled": False})
     without = make_fit(make_training(), off, 0, torch.device("cpu"))
     assert without.model.shadows is None
-    assert without.dark(torch.tensor([0])) == {}
+    assert without.part(Shadows) is None
     assert not [name for name, _ in without.model.named_buffers() if name.startswith("shadows_")]
 
 

@@ -18,8 +18,10 @@ from wildghand.fitting import fit_capture
 from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.glance import Glance, glance
+from wildghand.fitting.session import Watch
+from wildghand.gaussians.fit_loop import Loss
 from wildghand.model.settings import read_settings
-from wildghand.plain.loop import run_fit
+from wildghand.plain.loop import Watchers, run_fit
 from wildghand.viewer.live import Live
 
 QUICK: dict[str, Any] = {**TINY, "gaussians": 400}
@@ -34,12 +36,16 @@ def test_a_watched_fit_gives_the_same_bits(
     settings = read_settings({**QUICK, "schedule.steps": 10, **changes})
     seen: list[Glance] = []
 
-    def fitted(**options: Any) -> dict[str, torch.Tensor]:
+    def fitted(watch: Watch) -> dict[str, torch.Tensor]:
         fit = make_fit(training, settings, 0, torch.device("cpu"))
-        return run_fit(fit, Budget(), SilentReport(), **options).model.state_dict()
 
-    expected = fitted()
-    found = fitted(watch=Live(seen.append, row=lambda count: len(seen) % count, pause=0.0))
+        def look(step: int, watchers: Watchers, loss: Loss) -> None:
+            watch(fit, step, loss)
+
+        return run_fit(fit, Budget(), SilentReport(), after_step=look).model.state_dict()
+
+    expected = fitted(lambda fit, step, loss: None)
+    found = fitted(Live(seen.append, row=lambda count: len(seen) % count, pause=0.0))
     assert expected.keys() == found.keys()
     assert all(torch.equal(expected[name], found[name]) for name in expected)
     assert [look.step for look in seen] == list(range(1, 11))
