@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.hands import HandTemplate
-from hwp_bench.hands.footprint import HandSurfaces
+from hwp_bench.hands.anchors import HandSurfaces
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.frame_table import FrameTable, shares_of_255
 from wildghand.gaussians.rig import HandRig

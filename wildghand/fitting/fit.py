@@ -16,7 +16,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from hwp_bench.base.evenly import evenly
+from hwp_bench.base.arrays import evenly
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.fitting.data import FitData

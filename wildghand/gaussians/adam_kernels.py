@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numba import carray, types
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.kernels import compiled
 from wildghand.splat.kernels.jit import inline
 from wildghand.splat.kernels.jobs import next_job
 from wildghand.splat.kernels.lanes import absolute, bits, fma, make_load, square_root, store

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import ShapeMismatch
-from hwp_bench.base.nearest import kd_tree
+from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands.anchors import anchor_frames, anchor_positions
 from wildghand.gaussians.bags import sum_bags
 from wildghand.gaussians.rig import HandRig

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numba import types
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.kernels import compiled
 from wildghand.splat.kernels.jit import inline
 from wildghand.splat.kernels.jobs import next_job
 from wildghand.splat.kernels.lanes import absolute, bits, fma, make_fill, make_load, select, store

@@ -13,7 +13,7 @@ import math
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled, helper
+from hwp_bench.base.kernels import compiled, helper
 from wildghand.splat.kernels.jobs import next_job
 
 #: Anchors that one thread places at a time.

@@ -10,7 +10,7 @@ import math
 import numpy as np
 from numba import types
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.kernels import compiled
 from wildghand.splat.kernels.jobs import next_job
 from wildghand.splat.kernels.lanes import make_fill, make_load, store
 from wildghand.splat.kernels.simd import Vector

@@ -15,7 +15,7 @@ from contextlib import contextmanager
 
 import torch
 
-from hwp_bench.base.threads import count_is_chosen
+from hwp_bench.base.numerics import count_is_chosen
 from wildghand.splat.threads import at_most
 
 #: Least number of steps that are timed together.

@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hwp_bench.base.compiled import compiled
+from hwp_bench.base.kernels import compiled
 from wildghand.network.products import (
     LANES,
     ROWS,

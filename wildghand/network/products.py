@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import ir
 from numba import types
 
-from hwp_bench.base.compiled import helper
+from hwp_bench.base.kernels import helper
 from wildghand.splat.kernels.alpha import exp2
 from wildghand.splat.kernels.jit import inline
 from wildghand.splat.kernels.lanes import fma, make_fill, make_load, select, store, store_sums

@@ -13,7 +13,7 @@ from typing import Any, Generic, TypeVar
 
 import torch
 
-from hwp_bench.base.progress import notice
+from hwp_bench.base.console import notice
 from hwp_bench.methods.contract import Avatar, Budget, Report
 from wildghand.gaussians.fit_loop import Guard, Loss, read_losses, repeatable, spent
 from wildghand.gaussians.step_threads import StepThreads

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import sha256_file, sha256_json
-from hwp_bench.base.locks import exclusive
+from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request

@@ -6,7 +6,7 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-from hwp_bench.base import compiled as compiler
+from hwp_bench.base import kernels as compiler
 
 
 class Kernel:
