@@ -29,13 +29,10 @@ from hwp_bench.base.records import Seed, parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
-from wildghand.evidence import ColorChanges, Evidence, rename_former
-from wildghand.light import KnownLight
+from wildghand.evidence import rename_former
 from wildghand.model.model import make_model
 from wildghand.model.settings import WildGHandSettings, read_stored, read_version_1
 from wildghand.network.weight_shapes import MAPS, shapes_of_settings
-from wildghand.poses import ClipPoses
-from wildghand.shadows import CastLight
 from wildghand.subject import SubjectShape
 
 #: Largest model that is read, bytes.
@@ -290,18 +287,7 @@ def load_avatar(
         model = make_model(
             templates, settings, mean_color, frame_count, value.seed, device, subject
         )
-        light = KnownLight.from_tensors(tensors, str(file))
-        cast = CastLight.from_tensors(tensors, str(file))
-        poses = ClipPoses.from_tensors(tensors, str(file))
-        for found in (light, cast, poses):
-            if found is not None:
-                model.keep(found)
-        counts = {side: len(rig) for side, rig in model.rigs.items()}
-        evidence = Evidence.from_tensors(tensors, str(file), N=counts)
-        colors = ColorChanges.from_tensors(tensors, str(file), N=counts)
-        for kept in (evidence, colors):
-            if kept is not None:
-                model.keep(kept)
+        model.keep_all(tensors, str(file))
         model.load_state_dict(tensors, strict=True)
     except RuntimeError as error:
         problem = str(error).splitlines()[0][:300]

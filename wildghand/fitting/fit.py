@@ -193,6 +193,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         self.model = make_model(
             data.templates, settings, data.mean_color, len(data.frames), seed, device, data.subject
         )
+        self.model.network.mixed_precision = settings.mixed_precision and device.type == "cuda"
         self.clip = data.pose(self.model.rigs)
         for component in components:
             component.before(self)

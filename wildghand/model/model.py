@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -18,6 +19,7 @@ from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal
 from wildghand.dpd.field import bone_features
 from wildghand.dpd.scale_gradients import scale_refinement
 from wildghand.evidence import ColorChanges, Evidence
+from wildghand.gaussians.found import Found
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig, rig_of
 from wildghand.gaussians.training import TrainingClip
@@ -37,6 +39,16 @@ from wildghand.poses import ClipPoses
 from wildghand.shadows import CastLight, HandShadows, ShadowSettings
 from wildghand.shadows.hand_shadows import Hand, Hands
 from wildghand.subject import SubjectShape
+
+#: What a model may keep, the attribute that draws by it, and whether it says something of each
+#: Gaussian. Another `Found` needs one line here.
+FOUND: tuple[tuple[type[Found], str, bool], ...] = (
+    (KnownLight, "light", False),
+    (CastLight, "shadows", False),
+    (ClipPoses, "clip_poses", False),
+    (Evidence, "evidence", True),
+    (ColorChanges, "color_changes", True),
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -110,29 +122,42 @@ class WildGHandModel(nn.Module):
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
 
-    def keep(
-        self, found: SubjectShape | ClipPoses | KnownLight | Evidence | ColorChanges | CastLight
-    ) -> None:
+    def keep(self, found: Found) -> None:
         """Keep what was fitted next to the network, so that it is saved with it.
 
         Args:
             found: the person's shape, which the rigs have already, or what the model draws by from
                 now on: see the attributes.
         """
+        device = self.log_gains.device
         for name, values in found.to_tensors().items():
-            self.register_buffer(name, values.to(self.log_gains.device))
-        if isinstance(found, KnownLight):
-            self.light = found.to(self.log_gains.device)
-        if isinstance(found, Evidence):
-            self.evidence = found.to(self.log_gains.device)
+            self.register_buffer(name, values.to(device))
+        held: Any = found.to(device)
+        if isinstance(held, CastLight):
+            held = HandShadows(self.rigs, held, self._shadow_settings)
+        if isinstance(held, Evidence):
             walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
             self._walls = {side: wall for side, wall in walls.items() if wall is not None}
-        if isinstance(found, ClipPoses):
-            self.clip_poses = found
-        if isinstance(found, ColorChanges):
-            self.color_changes = found
-        if isinstance(found, CastLight):
-            self.shadows = HandShadows(self.rigs, found, self._shadow_settings)
+        for kind, attribute, _ in FOUND:
+            if isinstance(found, kind):
+                setattr(self, attribute, held)
+
+    def keep_all(self, tensors: Mapping[str, Tensor], where: str) -> None:
+        """Keep what an avatar holds next to its network.
+
+        Args:
+            tensors: of the avatar.
+            where: the file, for messages.
+
+        Raises:
+            BadInput: a part is missing, of another shape, or holds other numbers than it may.
+        """
+        counts = {side: len(rig) for side, rig in self.rigs.items()}
+        for kind, _, of_gaussians in FOUND:
+            sizes = {"N": counts} if of_gaussians else {}
+            found = kind.from_tensors(tensors, where, **sizes)
+            if found is not None:
+                self.keep(found)
 
     def finite(self) -> bool:
         """Whether every fitted number is finite."""
