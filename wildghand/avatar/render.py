@@ -147,7 +147,7 @@ def explain_frames(
     for frame in frames:
         row = fitted.index(frame)
         biased, canonical = (
-            _drawn(model, clip, row, capture, avatar.settings.heads.refinement, biases=on)
+            _drawn(model, clip, row, capture, avatar.settings.heads, biases=on)
             for on in (True, False)
         )
         mask = capture.mask(frame)[..., None] / 255.0

@@ -1,6 +1,6 @@
 """Evidence: how much training frames say of each Gaussian, and what holds where they do not."""
 
-from wildghand.evidence.color_changes import ColorChanges, rename_former
+from wildghand.evidence.color_changes import ColorChanges
 from wildghand.evidence.count import shown_frames
 from wildghand.evidence.evidence import (
     Evidence,
@@ -17,7 +17,6 @@ __all__ = [
     "EvidenceSettings",
     "fill_shares",
     "kept_share",
-    "rename_former",
     "shown_frames",
     "strengths",
     "weigh_evidence",

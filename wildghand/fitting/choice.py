@@ -50,7 +50,7 @@ class ValidationFrames(Component):
         """Have them drawn by the model."""
         data = fit.data
         if data.judges is not None:
-            refine = fit.settings.heads.refinement
+            refine = fit.settings.heads
             self.drawings = JudgedDrawings(fit.model, data.training, refine, data.judges)
 
 

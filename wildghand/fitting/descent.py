@@ -18,6 +18,30 @@ from wildghand.network import HandFeatures, PredictionNetwork, parameter_groups
 
 Features = Mapping[str, HandFeatures]
 
+# Adam's steps at the start, by the setting `schedule.rates`: the latent identity map, the matrix
+# that adds it to the attributes, the linear part of the shadow head, head iv, and the other layers.
+# Ours are chosen for fits of a minute (docs/wildghand.md), the published ones for days.
+_RATES: Mapping[str, Mapping[str, float]] = {
+    "fast": {
+        "identity": 0.015,
+        "direct": 1e-3,
+        "light": 0.01,
+        "refinement": 1e-3,
+        "network": 0.01,
+    },
+    "published": dict.fromkeys(("identity", "direct", "light", "refinement", "network"), 1e-4),
+}
+# Thresholds of PAO, which drift away at higher rates; log gain, pose (rad) and translation (m) of
+# each frame.
+_OTHER_RATES = {"thresholds": 1e-6, "gains": 0.01, "pose": 5e-4, "transl": 5e-5}
+# Norm that the gradient is clipped to: single frames with a wrong pose would throw a fit off.
+_CLIP = 1.0
+# Rates at the end as a share of those at the start: where a mean of steps follows, and where the
+# last step is kept. After t steps those of the first are also divided by sqrt(1 + t / 200).
+_ROOT, _ROOT_STEPS, _GEOMETRIC = 0.3, 200.0, 0.05
+# The authors' schedule.
+_HALVINGS = 10
+
 
 class Descent:
     """Steps of Adam.
@@ -97,7 +121,7 @@ def make_optimizer(
     groups["gains"] = [model.log_gains]
     groups["pose"] = [model.pose_steps]
     groups["transl"] = [model.transl_steps]
-    rates = {name: getattr(schedule.rates, name) for name in groups}
+    rates = {**_RATES[schedule.rates], **_OTHER_RATES, "dpd": schedule.dpd_rate}
     return ClippedAdam(
         [
             {
@@ -109,7 +133,7 @@ def make_optimizer(
             for name, group in groups.items()
             if group
         ],
-        schedule.clip_gradient,
+        _CLIP,
     )
 
 
@@ -122,12 +146,10 @@ def rate_factor(schedule: ScheduleSettings, fraction: float, steps: int) -> floa
         steps: those behind.
     """
     if schedule.decay == "halving":
-        factor = 0.5 ** int(fraction * schedule.halvings)
-    else:
-        factor = schedule.final_rate**fraction
-    if schedule.root_steps:
-        factor /= math.sqrt(1.0 + steps / schedule.root_steps)
-    return factor
+        return 0.5 ** int(fraction * _HALVINGS)
+    if schedule.decay == "geometric":
+        return _GEOMETRIC**fraction
+    return _ROOT**fraction / math.sqrt(1.0 + steps / _ROOT_STEPS)
 
 
 class SharedFeatures:

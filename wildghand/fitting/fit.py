@@ -276,7 +276,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
             upload(batch.mine, self.device),
             self.data.training.width,
             self.data.training.height,
-            refine=self.settings.heads.refinement,
+            refine=self.settings.heads,
             **chosen | options,
         )
 

@@ -34,14 +34,15 @@ class Reconstruction(Component):
         self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
     ) -> Iterable[Tensor]:
         """Weighted L1 and D-SSIM, the perceptual distance, and the silhouette."""
-        weights, image = fit.settings.terms, drawing.image
-        dssim = weights.dssim_share(exact_poses=fit.model.clip_poses is None)
+        settings, image = fit.settings.terms, drawing.image
+        weights = settings.fixed
+        dssim = settings.dssim_share(exact_poses=fit.model.clip_poses is None)
         yield weights.reconstruction * terms.reconstruction(
             image, target.image, target.weights, dssim
         )
         if self._perceptual is not None:
             found = self._perceptual(image, target.image, target.weights)
-            yield weights.perceptual * found
+            yield settings.perceptual * found
         if weights.silhouette:
             yield weights.silhouette * terms.silhouette(drawing.coverage, target.hand)
 
@@ -51,7 +52,7 @@ class Regularisers(Component):
 
     def before(self, fit: Fit) -> None:
         """Make the Laplacians of the surface."""
-        weights = fit.settings.terms
+        weights = fit.settings.terms.fixed
         smooth = (weights.laplacian_offsets, weights.laplacian_scales, weights.laplacian_colors)
         rigs = fit.model.rigs
         self._laplacians = (
@@ -62,7 +63,10 @@ class Regularisers(Component):
         self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
     ) -> Iterable[Tensor]:
         """Biases, shadows, opacities, discs on the skin, and roughness of scales and colours."""
-        weights, model = fit.settings.terms, fit.model
+        settings, model = fit.settings.terms, fit.model
+        weights, flatness = settings.fixed, 0.0
+        if model.clip_poses is not None:
+            flatness = terms.SURFACE_INEXACT
         for side, hand in drawing.hands.items():
             raw = hand.prediction.raw
             if weights.bias and hand.bias_size is not None:
@@ -71,22 +75,22 @@ class Regularisers(Component):
                 yield weights.shadow * terms.distance_to_one(hand.prediction.shadow)
             if weights.opacity:
                 yield weights.opacity * terms.distance_to_one(hand.opacities)
-            if weights.surface:
+            if settings.surface:
                 off = off_surface(
                     raw,
                     model.network.activation,
                     model.rigs[side].spacing,
-                    flatness=weights.flatness(exact_poses=model.clip_poses is None),
+                    flatness=flatness,
                 )
-                yield weights.surface * off
+                yield settings.surface * off
             rough = weights.laplacian_scales, weights.laplacian_colors
             if any(rough):  # one product with the Laplacian
                 yield attribute_roughness(self._laplacians[side], raw.concatenate(), *rough)
 
     def loss_of_features(self, fit: Fit, features: Features) -> Tensor | None:
         """Smooth offsets of the template (head iii), and like texture of both hands."""
-        weights, found = fit.settings.terms, []
-        if weights.laplacian_offsets and fit.settings.heads.template:
+        weights, found = fit.settings.terms.fixed, []
+        if weights.laplacian_offsets and fit.settings.heads:
             for side, hand in features.items():
                 rough = self._laplacians[side].offsets(hand.template_offsets)
                 found.append(weights.laplacian_offsets * rough)

@@ -157,7 +157,7 @@ class Pao(Component):
         self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
     ) -> Iterable[Tensor]:
         """Keep it from weighing everything with 0."""
-        weight = fit.settings.terms.weight_reward
+        weight = fit.settings.terms.fixed.weight_reward
         if weight and target.sizes is not None:
             yield weight * terms.weight_reward(target.sizes)
 

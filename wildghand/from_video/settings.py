@@ -11,7 +11,7 @@ from typing import Any
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.records import merged
 from hwp_bench.importers.video import FitSettings
-from wildghand.model.former_settings import current_names
+from wildghand.model.settings import nested
 
 #: The hands that can be asked for; `auto` is one or both, as the video shows.
 SIDES = ("auto", "right", "left", "both")
@@ -77,4 +77,4 @@ class VideoFit:
 
 def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
     """Return settings of the method; if `quick`, with `QUICK` in place of what they leave out."""
-    return merged(QUICK, current_names(settings)) if quick else dict(settings)
+    return merged(QUICK, nested(settings)) if quick else dict(settings)

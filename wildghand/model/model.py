@@ -527,7 +527,7 @@ def make_model(
         side: surface_points(templates[side], rig.anchors, rig.spacing, mean_color)
         for side, rig in rigs.items()
     }
-    network = PredictionNetwork(settings.network, surfaces, seed)
+    network = PredictionNetwork(settings.network.build(), surfaces, seed)
     with torch.random.fork_rng(devices=[]):
         torch.manual_seed(seed)
         dpd = settings.dpd
@@ -537,7 +537,7 @@ def make_model(
             frame_count,
             dpd=dpd.enabled,
             rank=dpd.rank,
-            template=settings.heads.template,
+            template=settings.heads,
             shadows=settings.shadows,
         )
     if subject is not None:

@@ -35,11 +35,7 @@ from wildghand.splat.threads import denormals_flushed
 # Children of a network that belong to its subject.
 _OWN = ("identity", "charts")
 # Thousands of steps end with low rates, as those of the shipped prior did.
-_RATES = {
-    "schedule.final_rate": 0.05,
-    "schedule.root_steps": 0.0,
-    "schedule.average_share": 0.0,
-}
+_RATES = {"schedule.decay": "geometric", "schedule.average_share": 0.0}
 
 
 @denormals_flushed()

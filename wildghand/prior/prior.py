@@ -122,9 +122,7 @@ def check_tensors(
 
 
 #: Version of the folder.
-SCHEMA = "wildghand-prior/2"
-#: Versions that are read. In the first the fit's settings have their former names.
-READ = ("wildghand-prior/1", SCHEMA)
+SCHEMA = "wildghand-prior/1"
 #: Names of its files.
 DESCRIPTION = "prior.json"
 WEIGHTS = "weights.safetensors"
@@ -158,14 +156,14 @@ def choose_prior(
         return None
     if settings.prior != SHIPPED:
         path = find_prior(settings.prior)
-        return load_prior(path, settings.network, hand_model, network)
+        return load_prior(path, settings.network.build(), hand_model, network)
     root = find_prior(_SHIPPED_FOLDER)
     record = _read_record(root)
     try:
-        _check_fit(record, settings.network, hand_model, str(root))
+        _check_fit(record, settings.network.build(), hand_model, str(root))
     except BadInput:
         return None
-    return _read_prior(root, record, settings.network, network)
+    return _read_prior(root, record, settings.network.build(), network)
 
 
 def find_prior(text: str) -> Path:
@@ -230,13 +228,13 @@ def save_prior(
 
     halves = {name: value.detach().half().contiguous() for name, value in tensors.items()}
     sides = [side for side in _SIDES if f"{MAPS}{side}" in tensors]
-    check_tensors(halves, sides, shapes_of_settings(settings.network))
+    check_tensors(halves, sides, shapes_of_settings(settings.network.build()))
     data = save(halves)
     record = PriorRecord(
         schema=SCHEMA,
         hand_model=dataclasses.asdict(hand_model),
         sides=sides,
-        network=settings.network.to_json(),
+        network=settings.network.build().to_json(),
         captures=[dict(capture) for capture in captures],
         settings=dataclasses.asdict(settings),
         seed=seed,
@@ -284,7 +282,7 @@ def _read_record(root: Path) -> PriorRecord:
 
 
 def _check_record(record: PriorRecord) -> None:
-    if record.schema not in READ:
+    if record.schema != SCHEMA:
         raise BadInput(f"is {record.schema[:40]!r} where {SCHEMA!r} is read", field="schema")
     if not record.sides or record.sides != [side for side in _SIDES if side in record.sides]:
         raise BadInput(f"are {record.sides}"[:200], field="sides")

@@ -48,9 +48,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "paper": {"mode": "paper"},
     "released": {"mode": "released"},
     "binary": {"pao.variant": "binary"},
-    "bare": {"dpd.enabled": False, "pao.enabled": False, "heads.enabled": False},
+    "bare": {"dpd.enabled": False, "pao.enabled": False, "heads": False},
     "batch of 4": {"schedule.batch": 4},
-    "perceptual": {"terms.perceptual": 0.1, "terms.silhouette": 0.1, "terms.opacity": 0.1},
+    "perceptual": {"terms.perceptual": 0.1, "terms.weights": "published"},
 }
 
 

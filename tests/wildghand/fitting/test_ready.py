@@ -39,7 +39,7 @@ VARIANTS: tuple[dict[str, Any], ...] = (
     {"schedule.batch": 4},
     {"prior": ""},
     {"dpd.enabled": False},
-    {"heads.enabled": False},
+    {"heads": False},
     {"prepass.enabled": False},
 )
 _PROGRAM = """

@@ -198,7 +198,7 @@ def test_without_heads_the_template_stands_and_nothing_else_changes(
     make_training: TrainingMaker,
 ) -> None:
     training = make_training()
-    fit, bare = fit_of(training), fit_of(training, **{"heads.enabled": False})
+    fit, bare = fit_of(training), fit_of(training, **{"heads": False})
     for made in (fit, bare):
         with torch.no_grad():
             for value in made.model.network.template_head.parameters():

@@ -122,7 +122,7 @@ def test_a_fit_that_diverges_later_goes_back_to_its_best_state(
     recipe = Breaking(Material(training, load_frames(training), 0, method.device), method.settings)
     avatar = run_fit(recipe, Budget(steps=200), SilentReport())
     assert isinstance(avatar, PlainAvatar)
-    assert avatar.steps in (49, 99)
+    assert avatar.steps in (50, 100)
     assert recipe.finite()
 
 
