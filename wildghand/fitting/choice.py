@@ -194,12 +194,7 @@ class JudgedDrawings:
 
     @torch.no_grad()
     def predict(self, row: int, features: Mapping[str, HandFeatures]) -> Predicted:
-        """What network and light say of the hands in a frame.
-
-        Args:
-            row: of the frame.
-            features: of the network.
-        """
+        """What network and light say of the hands in a frame."""
         viewmats = self._clip.viewmats[row : row + 1]
         return {
             side: self.model.predict_hand(
@@ -223,13 +218,7 @@ class JudgedDrawings:
         evidence: Evidence | None,
         changes: ColorChanges | None,
     ) -> float:
-        """Mean squared error of sRGB over the pixels of the hand that scoring looks at.
-
-        Args:
-            predicted: the frames, by row.
-            evidence: instead of the model's own.
-            changes: of colours, instead of the model's own.
-        """
+        """Mean squared error of sRGB over the pixels of the hand that scoring looks at."""
         model = self.model
         before = model.evidence, model.color_changes
         model.evidence, model.color_changes = evidence, changes
@@ -431,15 +420,7 @@ class EarlierStates:
         return [step for step in sorted(self._kept, reverse=True) if 2 * step <= self._steps]
 
     def choose(self, error: Callable[[], float]) -> int | None:
-        """Go back, from the state that is there, as long as that makes an error smaller.
-
-        Args:
-            error: of the state that is in place; asked for it first, then for one state after
-                another, the last one first.
-
-        Returns:
-            Steps behind the state that is now in place; None: it is the one that was there.
-        """
+        """Go back, from the state that is there, as long as that makes an error smaller."""
         candidates = self.candidates
         if not candidates:
             return None

@@ -154,16 +154,7 @@ class FilledColors:
     shown: Mapping[str, Tensor]
 
     def carried_on(self, shares: Sequence[float]) -> list[ColorChanges | None]:
-        """All changes of colours, those of the model and those of places that are seldom shown.
-
-        Args:
-            shares: of the training frames that must show a place until its colour is half its own;
-                0 leaves colours as they are.
-
-        Returns:
-            The changes for each share; those of the model for 0, and where there is no light under
-            which colours compare.
-        """
+        """All changes of colours, those of the model and those of places that are seldom shown."""
         light, before = self.fit.model.light, self.fit.model.color_changes
         if light is None or not any(share > 0.0 for share in shares):
             return [before] * len(shares)
@@ -209,9 +200,6 @@ def start_from_colors(fit: Fit) -> None:
 
     The shadows and the light are taken out of the colours. Nothing is random. A network without a
     direct path from map to attributes stays as it is.
-
-    Args:
-        fit: before its first step; its map is changed.
     """
     model, clip, data, cast = fit.model, fit.clip, fit.data, fit.part(Shadows)
     direct = model.network.attribute_head.direct
@@ -294,13 +282,6 @@ def known_logits(
     model: WildGHandModel, clip: TrainingClip, side: str, light: KnownLight
 ) -> np.ndarray:
     """Mean colour of each Gaussian over known normals and poses of the clip.
-
-    Args:
-        model: what is read.
-        clip: its poses.
-        side: which hand.
-        light: knows the normals.
-
     Returns:
         (N, 3) in logits of sRGB.
     """
@@ -347,11 +328,7 @@ def changes_to(
 
 
 def roughness(rig: HandRig) -> Any:
-    """(N, N) sparse form whose value is the sum of squared differences between neighbours.
-
-    Args:
-        rig: the hand and its N anchors.
-    """
+    """(N, N) sparse form whose value is the sum of squared differences between neighbours."""
     from scipy.sparse import coo_array, diags_array
 
     near = nearest_on_surface(*rest_anchors(rig), _NEIGHBOURS)

@@ -70,11 +70,7 @@ class FitData:
 
     @functools.cached_property
     def frames(self) -> TrainingFrames:
-        """The R frames that are fitted.
-
-        Raises:
-            BadInput: none can be used.
-        """
+        """The R frames that are fitted."""
         return load_frames(self.training)
 
     @functools.cached_property
@@ -103,11 +99,7 @@ class FitData:
         self.frames = dataclasses.replace(self.frames, masks=masks)
 
     def pose(self, rigs: Mapping[str, HandRig]) -> TrainingClip:
-        """Hands and cameras of the frames, posed once.
-
-        Args:
-            rigs: by side.
-        """
+        """Hands and cameras of the frames, posed once."""
         return TrainingClip(self.training, self.frames.indices, rigs, self.device)
 
     @property
@@ -153,12 +145,6 @@ def skin_places(
     training: TrainingCapture, frames: TrainingFrames, templates: Mapping[str, HandTemplate]
 ) -> list[np.ndarray]:
     """Number the places of a hand, and say which of them each pixel shows.
-
-    Args:
-        training: parameters and cameras of the frames.
-        frames: R frames.
-        templates: of the person's hands, by side.
-
     Returns:
         R times (H, W) uint16: 0 where the posed hands are not, else the place, numbered without
         gaps over all frames.

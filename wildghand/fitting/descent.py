@@ -78,13 +78,7 @@ class Descent:
             group["lr"] = group["start"] * factor
 
     def take(self, loss: Tensor, mean: Tensor, world: World) -> None:
-        """Take a step.
-
-        Args:
-            loss: of this process's frames.
-            mean: of the loss over all processes, with that of `shared`, without gradient.
-            world: the processes.
-        """
+        """Take a step."""
         self.optimizer.clear()
         with repeatable(self._device):
             waiting = self.shared.backward(loss, mean)
@@ -115,7 +109,9 @@ def make_optimizer(
     model: WildGHandModel, others: Mapping[str, Iterable[Tensor]], schedule: ScheduleSettings
 ) -> ClippedAdam:
     """Adam over everything that is fitted; each group keeps its first rate as `start`."""
-    groups = {name: list(group) for name, group in parameter_groups(model.network).items()}
+    groups: dict[str, list[Tensor]] = {
+        name: [*group] for name, group in parameter_groups(model.network).items()
+    }
     groups["dpd"] = list(model.perturbation.parameters())
     groups |= {name: list(group) for name, group in others.items()}
     groups["gains"] = [model.log_gains]
@@ -138,13 +134,7 @@ def make_optimizer(
 
 
 def rate_factor(schedule: ScheduleSettings, fraction: float, steps: int) -> float:
-    """Factor on the first rates in a step.
-
-    Args:
-        schedule: how rates fall.
-        fraction: share of the budget that is used up.
-        steps: those behind.
-    """
+    """Factor on the first rates in a step."""
     if schedule.decay == "halving":
         return 0.5 ** int(fraction * _HALVINGS)
     if schedule.decay == "geometric":
@@ -194,15 +184,7 @@ class SharedFeatures:
         return self._given
 
     def backward(self, loss: Tensor, mean: Tensor) -> Tensor:
-        """The backward pass of a step; at the end of a block also that of the features.
-
-        Args:
-            loss: of the frames, a scalar.
-            mean: of the loss over all processes, without gradient.
-
-        Returns:
-            The sum of `mean` over the block so far: where it is not finite, nor are gradients.
-        """
+        """The backward pass of a step; at the end of a block also that of the features."""
         self._steps += 1
         self._sum = self._sum + mean
         total = self._sum

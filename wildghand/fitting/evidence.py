@@ -61,10 +61,6 @@ class Gaps:
 
     def closers(self, evidence: Evidence) -> dict[str, Tensor]:
         """Find the Gaussians that close what evidence would open.
-
-        Args:
-            evidence: the strongest that may be drawn by.
-
         Returns:
             (N,) bool by side.
         """

@@ -137,12 +137,7 @@ class Component:
         """After the last step: choose, or find what follows from the model."""
 
     def record(self, fit: Fit, *, final: bool) -> dict[str, Any]:
-        """Fields of the avatar's `FitRecord`.
-
-        Args:
-            fit: of this component.
-            final: whether the fit has ended, so that they may take time.
-        """
+        """Fields of the avatar's `FitRecord`."""
         return {}
 
     def state_dict(self) -> dict[str, Any]:
@@ -260,12 +255,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         return total
 
     def draw(self, batch: Batch, **options: Any) -> RenderedFrames:
-        """Draw training frames with everything that is particular to them.
-
-        Args:
-            batch: the frames.
-            options: instead of what the components say, see `DrawOptions`.
-        """
+        """Draw training frames with everything that is particular to them."""
         chosen: dict[str, Any] = {"dark": {}}
         for component in self.components:
             chosen.update(component.draws(self, batch))
@@ -281,12 +271,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         )
 
     def compare(self, batch: Batch, drawing: RenderedFrames) -> FrameTarget:
-        """What a drawing is compared with.
-
-        Args:
-            batch: the frames.
-            drawing: of this process's part of them.
-        """
+        """What a drawing is compared with."""
         mine, data = batch.mine, self.data
         target = FrameTarget(
             data.images(mine), data.masks(mine), torch.ones((), device=self.device)
@@ -355,14 +340,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
             super().tell(text)
 
     def require_same(self, step: int) -> None:
-        """Check that all processes start from the same state.
-
-        Args:
-            step: steps behind it.
-
-        Raises:
-            HwpError: one does not.
-        """
+        """Check that all processes start from the same state."""
         if self.world.size == 1:
             return
         numbers = dict(self.model.state_dict())

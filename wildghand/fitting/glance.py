@@ -40,14 +40,7 @@ class Glance:
 @denormals_flushed()
 @torch.no_grad()
 def glance(fit: Fit, row: int, step: int, loss: float) -> Glance:
-    """Look at one of the frames that are fitted.
-
-    Args:
-        fit: in the middle of its steps; nothing of it is changed.
-        row: which of its training frames.
-        step: optimizer steps so far.
-        loss: of the last step.
-    """
+    """Look at one of the frames that are fitted."""
     batch, pao, training = Batch(torch.tensor([row])), fit.part(Pao), fit.data.training
     # Weighing a frame moves the running medians along.
     before = {} if pao is None else pao.state_dict()

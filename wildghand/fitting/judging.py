@@ -141,19 +141,9 @@ def hand_masks(
     training: TrainingCapture, frames: TrainingFrames, source: str, device: torch.device
 ) -> torch.Tensor:
     """Return y_h of R frames, that of each frame found once.
-
-    Args:
-        training: hand parameters, cameras and templates of the capture.
-        frames: those that are fitted.
-        source: `graph-cut` or `sam:PATH`.
-        device: where a network runs.
-
     Returns:
         (R, H, W) uint8, 255 = hand. A frame in which no hand is found keeps its estimated mask:
         nothing in it could be learnt otherwise.
-
-    Raises:
-        HwpError: the checkpoint cannot be used.
     """
     images = frames.images.numpy()
     found: Iterator[np.ndarray]

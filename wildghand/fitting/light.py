@@ -89,12 +89,7 @@ class UnseenLight(Component):
 
 
 def learn_light(fit: Fit, frames: int | None = None) -> KnownLight | None:
-    """Fit a light to what a model says of the clip; None where too little of it is seen.
-
-    Args:
-        fit: whose model is read.
-        frames: the first frames alone, with their part of the samples; None: all.
-    """
+    """Fit a light to what a model says of the clip; None where too little of it is seen."""
     weights, settings = fit.data.judgement.frame_weights, fit.settings.light
     count = len(weights)
     read = count if frames is None else frames
@@ -157,11 +152,7 @@ def light_samples(
 
 @torch.no_grad()
 def shadow_samples(fit: Fit) -> ShadowSamples:
-    """Read the colours of places in the frames that the pre-pass weighs most.
-
-    Args:
-        fit: before its first step.
-    """
+    """Read the colours of places in the frames that the pre-pass weighs most."""
     data, settings, rigs, clip = fit.data, fit.settings.shadows, fit.model.rigs, fit.clip
     judgement = data.judgement
     rows = best_of_each_part(judgement.frame_weights, settings.frames)

@@ -92,15 +92,7 @@ def affordable(
 
 
 def check_networks(values: Mapping[str, Any]) -> None:
-    """Check the files that settings name: that they are there and hold the right tensors.
-
-    Args:
-        values: what `read_settings` takes, with absolute paths.
-
-    Raises:
-        BadMethod: a setting is unknown or out of range.
-        HwpError: a file is missing, unreadable or of another network.
-    """
+    """Check the files that settings name: that they are there and hold the right tensors."""
     settings = read_settings(values)
     for path in {source_path(settings.pao.regions), source_path(settings.pao.hand)} - {None}:
         check_checkpoint(str(path))
@@ -110,14 +102,7 @@ def check_networks(values: Mapping[str, Any]) -> None:
 
 
 def ready_fit(name: str) -> torch.device:
-    """Choose the device of a fit, and compile or load for it what the fit needs.
-
-    Args:
-        name: `auto`, `cpu` or `cuda`.
-
-    Raises:
-        MissingDependency: CUDA was asked for and is not there.
-    """
+    """Choose the device of a fit, and compile or load for it what the fit needs."""
     device = ready_device(name)
     if device.type == "cpu":
         _warm_up()

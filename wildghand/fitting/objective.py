@@ -101,12 +101,7 @@ class Regularisers(Component):
 
 
 def choose_perceptual(settings: WildGHandSettings, device: torch.device) -> nn.Module | None:
-    """The perceptual distance of a fit; None where its weight is 0.
-
-    Raises:
-        UsageError: a network was chosen for a term of weight 0.
-        HwpError: its weights cannot be used.
-    """
+    """The perceptual distance of a fit; None where its weight is 0."""
     path = source_path(settings.perceptual)
     if not settings.terms.perceptual:
         if path is not None:

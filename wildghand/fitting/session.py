@@ -14,7 +14,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Any, TypeVar
 
 import torch
 
@@ -49,21 +49,6 @@ MAX_BYTES = 8 << 30
 #: Looks at a fit: (fit, steps so far, loss of the last one). It changes nothing of the fit.
 Watch = Callable[[Fit, int, Loss], None]
 Result = TypeVar("Result")
-
-
-class Saved(Protocol):
-    """What is saved of a fit."""
-
-    #: Where its tensors live.
-    device: torch.device
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that steps change."""
-        ...
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        ...
 
 
 class _Clock:
@@ -239,19 +224,7 @@ def run_resumed(
     begin: Callable[[int], None] = lambda start: None,
     look: Callable[[int, Loss], None] = lambda step, loss: None,
 ) -> Result:
-    """Run a fit from its saved state, if there is one, and save it every 20 seconds.
-
-    Args:
-        fit: that can be saved, as `Saved` says.
-        budget: when to stop.
-        state: file of its state.
-        digest: of what is fitted and how.
-        title: of the progress bar.
-        save: whether it is saved at all.
-        is_main: whether this process shows and saves.
-        begin: called with the steps behind the fit, before the first one.
-        look: called with steps and loss after each step, while the clock stands still.
-    """
+    """Run a fit from its saved state, if there is one, and save it every 20 seconds."""
     watchers, start, before = Watchers(fit.plateau_steps), 0, 0.0
     if state.is_file():
         start, before = load_state(state, fit, watchers, digest)
@@ -278,7 +251,7 @@ def run_resumed(
 
 def save_state(
     path: str | os.PathLike[str],
-    fit: Saved,
+    fit: IterativeFit[Any],
     watchers: Watchers,
     *,
     step: int,
@@ -309,7 +282,7 @@ def save_state(
 
 def load_state(
     path: str | os.PathLike[str],
-    fit: Saved,
+    fit: IterativeFit[Any],
     watchers: Watchers,
     digest: str,
 ) -> tuple[int, float]:
@@ -317,9 +290,6 @@ def load_state(
 
     Returns:
         Steps and seconds of fitting behind it.
-
-    Raises:
-        BadInput: no such file, damaged, or of another fit.
     """
     file = Path(path)
     if not file.is_file() or file.stat().st_size > MAX_BYTES:
@@ -370,11 +340,7 @@ def _split(capture: Capture) -> Split:
 
 
 def every_frame(capture: Capture) -> Split:
-    """Every frame but the last two, which stand for the parts that a split must have.
-
-    Raises:
-        BadInput: there are fewer than three.
-    """
+    """Every frame but the last two, which stand for the parts that a split must have."""
     count = capture.info.frame_count
     if count < 3:
         raise BadInput(

@@ -181,15 +181,7 @@ class Pao(Component):
 
 
 def choose_segmenter(source: str, device: torch.device) -> Segmenter:
-    """What cuts frames into regions, as the setting `pao.regions` says.
-
-    Args:
-        source: `superpixels` or `sam:PATH`.
-        device: where a network runs.
-
-    Raises:
-        HwpError: the checkpoint cannot be used.
-    """
+    """What cuts frames into regions, as the setting `pao.regions` says."""
     path = source_path(source)
     return Superpixels() if path is None else open_sam(path, str(device))
 

@@ -123,12 +123,7 @@ class WildGHandModel(nn.Module):
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
 
     def keep(self, found: Found) -> None:
-        """Keep what was fitted next to the network, so that it is saved with it.
-
-        Args:
-            found: the person's shape, which the rigs have already, or what the model draws by from
-                now on: see the attributes.
-        """
+        """Keep what was fitted next to the network, so that it is saved with it."""
         device = self.log_gains.device
         for name, values in found.to_tensors().items():
             self.register_buffer(name, values.to(device))
@@ -143,15 +138,7 @@ class WildGHandModel(nn.Module):
                 setattr(self, attribute, held)
 
     def keep_all(self, tensors: Mapping[str, Tensor], where: str) -> None:
-        """Keep what an avatar holds next to its network.
-
-        Args:
-            tensors: of the avatar.
-            where: the file, for messages.
-
-        Raises:
-            BadInput: a part is missing, of another shape, or holds other numbers than it may.
-        """
+        """Keep what an avatar holds next to its network."""
         counts = {side: len(rig) for side, rig in self.rigs.items()}
         for kind, _, of_gaussians in FOUND:
             sizes = {"N": counts} if of_gaussians else {}
@@ -315,15 +302,7 @@ class WildGHandModel(nn.Module):
         width: int,
         height: int,
     ) -> tuple[Tensor, Tensor]:
-        """Draw hands and their walls.
-
-        Args:
-            found: by side, as `gaussians` returns them.
-            viewmats, Ks, width, height: see `draw`.
-
-        Returns:
-            See `draw`.
-        """
+        """Draw hands and their walls."""
         parts = [made for made, _ in found.values()] + self.walls(found)
         return rasterize_hands(parts, viewmats, Ks, width, height)
 
@@ -334,11 +313,7 @@ class WildGHandModel(nn.Module):
         return self._walls.get(side)
 
     def walls(self, found: Mapping[str, tuple[Gaussians, Hand]]) -> list[Gaussians]:
-        """Close the wrists of hands; none while there is no evidence.
-
-        Args:
-            found: by side, as `gaussians` returns them.
-        """
+        """Close the wrists of hands; none while there is no evidence."""
         several = ((self.wall(side), *each) for side, each in found.items())
         return [wall.close(made, *hand) for wall, made, hand in several if wall is not None]
 
@@ -368,9 +343,6 @@ class WildGHandModel(nn.Module):
             rows: (B,) positions among the training frames, whose biases and gains are added.
             features: of the network, where they are at hand already.
             dark: (B, N) factors of the hands' shadows; None: of those that it casts on itself.
-
-        Returns:
-            The Gaussians, and the parameters that they are posed by: the given or the refined ones.
         """
         hand = pose, betas, transl
         if dark is None:
@@ -425,9 +397,6 @@ class WildGHandModel(nn.Module):
             rows: (B,) positions among the training frames, whose biases and gains are added; None:
                 free of perturbations.
             dark: (B, N) factors of the hands' shadows; None: ones.
-
-        Returns:
-            The Gaussians, and the parameters that they are posed by: the given or the refined ones.
         """
         rig, anchors, prediction = self.rigs[side], predicted.anchors, predicted.prediction
         pose, betas, transl = predicted.hand
@@ -555,13 +524,6 @@ def make_rigs(
     """Spread anchors over one hand or two, at the same places of the skin.
 
     They are spread over the template, whatever the person's hand is: a prior knows these places.
-
-    Args:
-        templates: by side.
-        count: anchors on each hand.
-        seed: of their places.
-        device: where the tensors live.
-        subject: how the person's hand differs from the templates.
     """
     rigs: dict[str, HandRig] = {}
     anchors = None

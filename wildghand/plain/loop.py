@@ -94,6 +94,14 @@ class IterativeFit(Generic[Result]):
     def after_step(self) -> None:
         """Called after a step that was sound."""
 
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that steps change, where the fit can be stopped and go on."""
+        raise NotImplementedError
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        raise NotImplementedError
+
     def tell(self, text: str) -> None:
         """Say something to the person who waits."""
         notice(text)

@@ -230,11 +230,7 @@ class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
         return {name: value.detach().clone() for name, value in self._tensors().items()}
 
     def restore(self, values: dict[str, Tensor]) -> None:
-        """Bring the models back to a snapshot.
-
-        Raises:
-            ValueError: it is one of other models.
-        """
+        """Bring the models back to a snapshot."""
         current = self._tensors()
         if values.keys() != current.keys():
             raise ValueError("tensors of other models")

@@ -61,9 +61,6 @@ class Prior:
 
         A hand that the prior has not seen starts from the other hand's map: the two halves of
         the atlas hold the same skin at the same places.
-
-        Args:
-            network: with the settings of the prior's.
         """
         state = dict(self.tensors)
         maps = {side: state.pop(f"{MAPS}{side}") for side in self.record.sides}
@@ -73,14 +70,7 @@ class Prior:
 
 
 def mean_weights(networks: Iterable[PredictionNetwork]) -> dict[str, Tensor]:
-    """Weights that networks of several subjects with shared branches and heads have in common.
-
-    Args:
-        networks: they differ in their identity maps only.
-
-    Returns:
-        The shared weights, and for each hand the mean of the maps there are of it; float32, CPU.
-    """
+    """Weights that networks of several subjects with shared branches and heads have in common."""
     shared: dict[str, Tensor] = {}
     maps: dict[str, list[Tensor]] = {}
     for network in networks:
@@ -96,16 +86,7 @@ def mean_weights(networks: Iterable[PredictionNetwork]) -> dict[str, Tensor]:
 def check_tensors(
     tensors: Mapping[str, Tensor], sides: Iterable[str], shapes: Mapping[str, torch.Size]
 ) -> None:
-    """Refuse tensors that are not the weights of a network.
-
-    Args:
-        tensors: by name.
-        sides: hands that should have an identity map.
-        shapes: of the network's weights, with the maps of both hands.
-
-    Raises:
-        BadInput: one is missing, too many, of another shape, no float, or not finite; it is named.
-    """
+    """Refuse tensors that are not the weights of a network."""
     absent = {f"{MAPS}{side}" for side in ("right", "left") if side not in sides}
     expected = {name: shape for name, shape in shapes.items() if name not in absent}
     for name in sorted(expected.keys() ^ tensors.keys()):

@@ -184,15 +184,7 @@ def encodings(height: int, width: int) -> np.ndarray:
 
 
 def make_network(seed: int, device: torch.device) -> dict[str, torch.Tensor]:
-    """The tensors of a network with one hidden layer.
-
-    Args:
-        seed: of the weights.
-        device: where they live.
-
-    Returns:
-        by name, for `chances`; weights uniform like those of torch's linear layers, biases 0.
-    """
+    """The tensors of a network with one hidden layer."""
     random = torch.Generator().manual_seed(seed)
 
     def uniform(*shape: int) -> torch.Tensor:

@@ -131,27 +131,12 @@ _LITTLE = 1e-4
 
 
 def laplace_loss(error: torch.Tensor, sigma: torch.Tensor, least: float) -> torch.Tensor:
-    """Negative log likelihood of errors under a Laplace distribution, without its constant.
-
-    Args:
-        error: mean absolute error, of any shape, in units of `sigma`.
-        sigma: at least `least`.
-        least: makes the result 0 where an error of 0 has the least uncertainty.
-
-    Returns:
-        |r| / sigma + log(sigma / least); smallest at sigma = |r|.
-    """
+    """Negative log likelihood of errors under a Laplace distribution, without its constant."""
     return error / sigma + torch.log(sigma / least)
 
 
 def gauss_loss(square: torch.Tensor, beta: torch.Tensor, least: float) -> torch.Tensor:
     """Negative log likelihood of errors under a normal distribution, without its constant.
-
-    Args:
-        square: squared error, of any shape, in units of `beta` squared.
-        beta: at least `least`.
-        least: makes the result 0 where an error of 0 has the least uncertainty.
-
     Returns:
         r^2 / (2 beta^2) + log(beta / least); smallest at beta = |r|.
 
