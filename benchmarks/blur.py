@@ -17,12 +17,12 @@ import numpy as np
 from benchmarks.simulation import SPREAD, Kind, frames_of
 from hwp_bench.base.rays import EmbreeMesh, EmbreexMesh, library
 from hwp_bench.metrics.pixels import decibels
-from hwp_bench.sim.effects.plan import hands_at, plan
-from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.effects import hands_at, plan_frame
+from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.render.frame import carry_out, render_frame
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.optics import intrinsics, pixel_rays, viewmat
-from hwp_bench.sim.scene.reader import load_scene
+from hwp_bench.sim.scene.motion import intrinsics, pixel_rays, viewmat
+from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.hand import MOVING
 
 #: Scenes whose frames with motion blur are compared with their clean frames, by what they show.
@@ -100,7 +100,7 @@ def subframe_table(size: int, count: int) -> str:
     for title, name in BLURRED.items():
         scene = load_scene(name)
         for frame in frames_of(Kind(title, name, ("motion_blur",), None), scene, size, count):
-            recipe = plan(scene, frame, SPREAD, size)
+            recipe = plan_frame(scene, frame, SPREAD, size)
             dense = carry_out(scene, replace(recipe, subframes=MANY), size)
             hand = dense.coverage > 0.0
             cells = []

@@ -63,8 +63,8 @@ def use_the_rest() -> None:
     from benchmarks.simulation import KINDS, SPREAD, frames_of
     from hwp_bench.hands.raster import draw_faces, mix_corners
     from hwp_bench.sim.render.frame import render_frame
-    from hwp_bench.sim.scene.reader import load_scene
-    from wildghand.splat import warmup
+    from hwp_bench.sim.scene_files import load_scene
+    from wildghand.splat import numba_backend as warmup
 
     warmup.warm_up(4)
     triangle = np.array([[0, 1, 2]])

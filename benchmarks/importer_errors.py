@@ -3,7 +3,7 @@
 Run from the repository: `python -m benchmarks.importer_errors FOLDER` imports the clips that
 `python -m benchmarks.tracker_errors --video VIDEO --landmarks NPZ --keep FOLDER` left there and
 prints how far the hands are from the true ones. `--set NAME=VALUE` changes a number of
-`hwp_bench.importers.video.FitSettings`, for example `--set texture_weight=0`. About two minutes
+`hwp_bench.importers.video.FitSettings`, for example `--set texture=false`. About two minutes
 of one core for each clip.
 
 `--harder` adds two clips, which are rendered where FOLDER does not hold them: one in hard light,
@@ -24,11 +24,11 @@ import torch
 
 from benchmarks.landmark_errors import kept_clip, landmark_errors
 from benchmarks.tracker_clips import clip_source, make_clip, true_hand
-from hwp_bench.cli.overrides import overrides
+from hwp_bench.cli.options import overrides
 from hwp_bench.hands import HandTemplate, PosedHand, load_template, pose_hand
 from hwp_bench.hands.skeleton import FINGERS, HandParameters, finger_joints
 from hwp_bench.importers.video import FitSettings
-from hwp_bench.importers.video.from_video import fit_video
+from hwp_bench.importers.video.api import fit_video
 from hwp_bench.methods.settings import settings_from
 
 #: Seeds and kinds of the harder clips.

@@ -9,8 +9,8 @@ import numpy as np
 import torch
 
 from hwp_bench.importers.video import VideoImport
-from hwp_bench.importers.video.from_video import fit_video, read_source
-from hwp_bench.sim.produce.tracker_geometry import curl, edge_on
+from hwp_bench.importers.video.api import fit_video, read_source
+from hwp_bench.sim.produce.tracker import curl, edge_on
 
 #: Share of the frames with the smallest errors that says how large errors are in easy frames.
 EASY = 0.05
@@ -54,7 +54,7 @@ def real_clip(video: Path, landmarks: Path, keep: Path) -> RealClip:
         clip = fit_video(read_source(video, landmarks, options), options)
         model, source = clip.first.fitted.model, clip.source.landmarks
         with torch.no_grad():
-            posed = model.posed()
+            posed = model.pose()
             pixels = model.pixels(posed.landmarks).numpy()
         arrays = (
             source.image,

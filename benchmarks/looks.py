@@ -22,18 +22,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from hwp_bench.sim.effects.plan import plan
-from hwp_bench.sim.produce.estimates import estimate_mask
-from hwp_bench.sim.produce.lookalikes import confused_mask
-from hwp_bench.sim.props.planes import plane_names
+from hwp_bench.sim.effects import plan_frame
+from hwp_bench.sim.produce.estimates import confused_mask, estimate_mask
+from hwp_bench.sim.props.backdrops import plane_names
+from hwp_bench.sim.props.behind import Behind, Clutter, Face, OtherArm
 from hwp_bench.sim.render.frame import render_frame
-from hwp_bench.sim.scene.behind import Behind, Clutter, Face, OtherArm
-from hwp_bench.sim.scene.looks import Glove, Looks, Polish, Ring, Tattoo, WristWear
-from hwp_bench.sim.scene.reader import load_scene
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import load_scene
+from hwp_bench.sim.subject.arms import arm_atlas
 from hwp_bench.sim.subject.atlas import skin_atlas
-from hwp_bench.sim.subject.forearm import arm_atlas
-from hwp_bench.sim.subject.painting import of_side
+from hwp_bench.sim.subject.skin import of_side
+from hwp_bench.sim.subject.subject import Looks
+from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
 #: Scene that is varied; frames over which it is spread, and the frame that is timed (clean).
 SCENE, SPREAD, FRAME = "capture1", 240, 235
@@ -69,7 +69,7 @@ def items(scene: Scene) -> dict[str, Scene]:
 def measure_cost(repeats: int, size: int) -> None:
     """Print passes, seconds a frame and seconds of painting for every item."""
     plain = replace(load_scene(SCENE), effects=())
-    usual = plan(plain, FRAME, SPREAD, size).passes
+    usual = plan_frame(plain, FRAME, SPREAD, size).passes
     render_frame(plain, FRAME, SPREAD, size)  # loads and compiles what every item needs
     print("| item | added passes | s a frame without | with | more | painted once, s |")
     print("| --- | --- | ---: | ---: | ---: | ---: |")
@@ -82,7 +82,7 @@ def measure_cost(repeats: int, size: int) -> None:
                 render_frame(shown, FRAME, SPREAD, size)
                 best.setdefault(key, []).append(time.process_time() - start)
         seconds = {key: min(values[1:]) for key, values in best.items()}
-        passes = [row for row in plan(scene, FRAME, SPREAD, size).passes if row not in usual]
+        passes = [row for row in plan_frame(scene, FRAME, SPREAD, size).passes if row not in usual]
         more = seconds["with"] - seconds["without"]
         row = f"{seconds['without']:.3f} | {seconds['with']:.3f} | {more:+.3f} | {painting:.1f}"
         print(f"| {name} | {', '.join(passes)} | {row} |", flush=True)
@@ -113,7 +113,7 @@ def measure_masks(frames: int, size: int) -> None:
     for name, scene in shown.items():
         rows = []
         for step in range(frames):
-            recipe = plan(scene, int((step + 0.5) * SPREAD / frames), SPREAD, size)
+            recipe = plan_frame(scene, int((step + 0.5) * SPREAD / frames), SPREAD, size)
             result = render_frame(scene, recipe.frame, SPREAD, size)
             exact = result.coverage
             mask = estimate_mask(scene, recipe, exact, exact)

@@ -28,11 +28,10 @@ from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.gaussians.fit_loop import batches
-from wildghand.gaussians.frame_table import soft_weights
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.quaternions import quat_multiply, quat_rotate, quat_third_axis
 from wildghand.gaussians.rig import make_rig
-from wildghand.gaussians.training import TrainingClip, TrainingFrames, load_frames
+from wildghand.gaussians.training import TrainingClip, TrainingFrames, load_frames, soft_weights
 from wildghand.network import (
     PredictionNetwork,
     network_settings,

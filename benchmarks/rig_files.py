@@ -11,7 +11,7 @@ from hwp_bench.base.numerics import kd_tree
 from hwp_bench.hands import HandTemplate, load_template
 from hwp_bench.hands.skeleton import PARENTS
 from hwp_bench.hands.template import boundary_loop
-from hwp_bench.sim.subject.joint_names import WEBXR
+from hwp_bench.sim.hand.rigs import WEBXR
 
 #: Another frame and unit: turned, ten times larger, elsewhere.
 TURN = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

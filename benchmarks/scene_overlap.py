@@ -10,13 +10,10 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 
-from hwp_bench.sim.scene.effect_settings import (
-    ComplexPoses,
-    ObjectInteraction,
-    read_settings,
-)
-from hwp_bench.sim.scene.schema import HandKey, Scene, Subject
-from hwp_bench.sim.subject.rigs import FROM_FILE, SHIPPED
+from hwp_bench.sim.effects import ComplexPoses, ObjectInteraction, read_settings
+from hwp_bench.sim.hand.rigs import FROM_FILE, SHIPPED
+from hwp_bench.sim.scene.scene import HandKey, Scene
+from hwp_bench.sim.subject.subject import Subject
 
 #: What a scene is made of, and what of it two sets may not share.
 KINDS = ("subject", "looks", "room", "light", "object", "gestures")

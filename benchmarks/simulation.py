@@ -28,10 +28,10 @@ from pathlib import Path
 import numpy as np
 import psutil
 
-from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.effects import plan_frame
 from hwp_bench.sim.render.frame import render_frame
-from hwp_bench.sim.scene.reader import load_scene, scene_names
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import load_scene, scene_names
 
 #: Frames over which a scene is spread where frames of a kind are looked for.
 SPREAD = 240
@@ -66,7 +66,7 @@ def frames_of(kind: Kind, scene: Scene, size: int, count: int) -> list[int]:
     fitting = [
         frame
         for frame in range(SPREAD)
-        if tuple(plan(scene, frame, SPREAD, size).strength) == kind.acting
+        if tuple(plan_frame(scene, frame, SPREAD, size).strength) == kind.acting
     ]
     if not fitting:
         raise SystemExit(f"{scene.id} has no frame of the kind: {kind.title}")
@@ -158,9 +158,9 @@ def penetration_table(frames: int) -> str:
     """A Markdown table of the deepest places, over gestures and over frames of the scenes, mm."""
     from benchmarks.penetration import hand_penetration, scene_penetration
     from hwp_bench.hands.poses import gestures
-    from hwp_bench.sim.scene.motion import moment_of_key
-    from hwp_bench.sim.scene.schema import HandKey
-    from hwp_bench.sim.subject.hand import MOVING, scene_hands
+    from hwp_bench.sim.scene.motion import moment_of_key, scene_hands
+    from hwp_bench.sim.scene.scene import HandKey
+    from hwp_bench.sim.subject.hand import MOVING
 
     hand = scene_hands(load_scene("capture1"), MOVING)["right"]
     lines = ["| gesture | deepest, mm |", "| --- | ---: |"]

@@ -13,7 +13,7 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
-from hwp_bench.sim.produce.suites import ensure_captures, suite
+from hwp_bench.sim.produce.suites import ensure_suite, suite
 
 #: Frames of the small capture; a benchmark repeats them.
 FRAMES = 24
@@ -27,7 +27,7 @@ def small_capture(path: str | Path | None = None, frames: int = FRAMES) -> Captu
         frames: of the one that is rendered; `mini` has 60.
     """
     if path is None:
-        (path,) = ensure_captures([dataclasses.replace(suite("mini")[0], frame_count=frames)])
+        (path,) = ensure_suite([dataclasses.replace(suite("mini")[0], frame_count=frames)])
     return open_capture(path)
 
 

@@ -142,8 +142,8 @@ def race(found: Sequence[Contender], workload: Workload, rounds: int) -> dict[st
 def operations_per_second(threads: int) -> float:
     """Fused multiply-adds a second that the processor does at best, all threads together."""
     from wildghand.splat.kernels.jit import kernel
-    from wildghand.splat.kernels.lanes import fma, store
     from wildghand.splat.kernels.tiles import LANES, fill_pixels
+    from wildghand.splat.kernels.vectors import fma, store
     from wildghand.splat.threads import even_jobs, run
 
     @kernel

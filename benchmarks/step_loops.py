@@ -21,9 +21,9 @@ import torch
 
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from hwp_bench.methods.manifest import find_method
-from wildghand.fitting.components import make_fit
+from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import ready_fit
-from wildghand.gaussians.step_threads import StepThreads
+from wildghand.gaussians.fit_loop import StepThreads
 from wildghand.model.settings import read_settings
 from wildghand.plain.loop import Watchers, run_fit
 from wildghand.splat.threads import denormals_flushed
@@ -81,7 +81,7 @@ class WildGHandLoop:
         threads: StepThreads | None = None,
     ) -> None:
         chosen = read_settings({"device": "cpu", **settings})
-        self._fit = make_fit(training, chosen, 0, ready_fit("cpu"))
+        self._fit = Fit(training, chosen, 0, ready_fit("cpu"))
         self._watchers = Watchers(0)
         self._threads = threads or StepThreads()
         self._taken = 0

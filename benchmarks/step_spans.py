@@ -23,7 +23,7 @@ OTHER = "other"
 #: Functions by component, as `module:name`.
 FUNCTIONS: dict[str, tuple[str, ...]] = {
     "network: texture": ("wildghand.network.network:PredictionNetwork.texture",),
-    "network: coder": ("wildghand.network.compact:PlaneCoder.forward",),
+    "network: coder": ("wildghand.network.branches:PlaneCoder.forward",),
     "network: geometry": ("wildghand.network.network:PredictionNetwork.geometry",),
     "network: shared": (
         "wildghand.network.network:PredictionNetwork.features",
@@ -43,7 +43,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     ),
     "placing": (
         "wildghand.model.model:dress",
-        "wildghand.gaussians.anchored:AnchoredGaussians.place",
+        "wildghand.gaussians.attributes:AnchoredGaussians.place",
     ),
     "shading": ("wildghand.plain.model:sh_basis",),
     "rasterizer": (
@@ -58,7 +58,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "regularisers": ("wildghand.fitting.objective:Objective.__call__",),
     "targets and weights": (
         "wildghand.fitting.weights:Weighting.__call__",
-        "wildghand.gaussians.frame_table:FrameTable.__call__",
+        "wildghand.gaussians.training:FrameTable.__call__",
     ),
     "optimizer": (
         "torch.optim.optimizer:Optimizer.zero_grad",

@@ -19,14 +19,14 @@ import numpy as np
 from benchmarks.rig_files import boxes, capped, remeshed, with_forearm, without_nails, write_rig
 from hwp_bench.base.tables import to_markdown
 from hwp_bench.hands import load_template
-from hwp_bench.sim.produce.light_strips import captioned
-from hwp_bench.sim.produce.subject_table import subject_table
+from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.produce.preview import captioned
+from hwp_bench.sim.produce.truth import subject_table, template_distance
 from hwp_bench.sim.scene.motion import moment_of_key
-from hwp_bench.sim.scene.reader import load_scene
-from hwp_bench.sim.scene.schema import HandKey, Scene, Subject, Track
-from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy
+from hwp_bench.sim.scene.scene import HandKey, Scene, Track
+from hwp_bench.sim.scene_files import load_scene
 from hwp_bench.sim.subject.hand import MOVING, subject_hand
-from hwp_bench.sim.subject.template_distance import template_distance
+from hwp_bench.sim.subject.subject import Subject
 
 #: Anatomies by their captions.
 ANATOMIES = {
@@ -83,7 +83,7 @@ def subjects(person: Subject, folder: Path) -> dict[str, Subject]:
 
 def posed(scene: Scene, subject: Subject, key: HandKey) -> Scene:
     """The scene with one still hand and no effect."""
-    track = Track(scene.track.period, {"right": (key,)}, 0.0)
+    track = Track(scene.track.period, right=(key,), variation=0.0)
     return replace(scene, hands="right", subject=subject, track=track, effects=())
 
 

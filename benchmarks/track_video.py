@@ -19,13 +19,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from hwp_bench.importers.shared.hand_tracks import HandTracks
-from hwp_bench.importers.shared.landmarks import read_landmarks
-from hwp_bench.importers.video.decode import probe, read_frames
-from hwp_bench.importers.video.video_settings import FrameRange
+from hwp_bench.importers.shared.landmarks import HandTracks, read_landmarks
+from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
 from hwp_bench.tracking import TrackerSettings, track_video
-from hwp_bench.tracking.model_files import load_models
-from hwp_bench.tracking.networks import LiteRtNetworks
+from hwp_bench.tracking.networks import LiteRtNetworks, load_models
 from hwp_bench.tracking.track_video import track_frames
 
 #: Calls of a network that are timed.

@@ -18,11 +18,11 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.hands import HandTemplate, load_template, pose_hand
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.importers.video import FitSettings, VideoImport
-from hwp_bench.importers.video.from_video import fit_video
+from hwp_bench.importers.video.api import fit_video
 from hwp_bench.importers.video.source import VideoSource, read_source
-from hwp_bench.sim.produce.production import render_capture
-from hwp_bench.sim.produce.tracker_geometry import curl, edge_on
-from hwp_bench.sim.scene.reader import parse_scene
+from hwp_bench.sim.produce.capture import render_capture
+from hwp_bench.sim.produce.tracker import curl, edge_on
+from hwp_bench.sim.scene_files import parse_scene
 
 #: Frames, rate and size of a simulated clip.
 FRAMES, FPS, SIZE = 240, 30.0, 256

@@ -18,8 +18,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from hwp_bench.importers.shared.hand_tracks import HandTracks, write_hand_tracks
-from hwp_bench.importers.shared.landmarks import read_landmarks
+from hwp_bench.importers.shared.landmarks import HandTracks, read_landmarks, write_hand_tracks
 from hwp_bench.importers.video import FitSettings, ImportedClip, VideoImport, import_video
 
 #: Shift of the mirror image to the left when it is apart, and to the right when it is nearest, px.
@@ -145,7 +144,7 @@ def main(arguments: list[str] | None = None) -> int:
             landmark_steps=90,
             contour_steps=20,
             contour_rounds=1,
-            texture_weight=0.0,
+            texture=False,
         )
     options = VideoImport(fit=fit, overwrite=True, sheet=args.folder / "sheet.png")
     clip = import_video(composed.video, composed.landmarks, args.folder / "capture", options)

@@ -18,13 +18,13 @@ import numpy as np
 
 from hwp_bench.capture import open_capture
 from hwp_bench.capture.splits import contiguous_split
-from hwp_bench.cli.overrides import overrides
+from hwp_bench.cli.options import overrides
 from hwp_bench.evaluation.scoring import Prediction, mean_scores, read_targets, score_predictions
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Avatar, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.run.worker import load_entry, render
-from hwp_bench.sim.produce.suites import ensure_captures, suite
+from hwp_bench.sim.produce.suites import ensure_suite, suite
 
 
 class _Quiet:
@@ -80,7 +80,7 @@ def main() -> None:
     )
     arguments = parser.parse_args()
     items = [item for item in suite(arguments.suite) if item.scene.id in arguments.captures]
-    captures = ensure_captures(items, free_view=False)
+    captures = ensure_suite(items, free_view=False)
     preset = read_manifest(find_method(arguments.method)).presets[arguments.preset]
     print("| settings |", " | ".join(item.scene.id for item in items), "| mean |")
     print("| --- |" + " ---: |" * (len(items) + 1), flush=True)

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from hwp_bench.capture import open_capture as open_capture
     from hwp_bench.results import Results as Results
     from hwp_bench.results import read_results as read_results
-    from hwp_bench.sim.produce.production import render_capture as render_capture
+    from hwp_bench.sim.produce.capture import render_capture as render_capture
 
 _HOMES = {
     "Capture": "hwp_bench.capture",
@@ -30,7 +30,7 @@ _HOMES = {
     "evaluate": "hwp_bench.api",
     "open_capture": "hwp_bench.capture",
     "read_results": "hwp_bench.results",
-    "render_capture": "hwp_bench.sim.produce.production",
+    "render_capture": "hwp_bench.sim.produce.capture",
     "score": "hwp_bench.api",
 }
 

@@ -26,8 +26,6 @@ class Perturbation:
     heading: str
     #: Its effect on a frame.
     description: str
-    #: Whether it acts on the whole frame (True) or on a part of it.
-    holistic: bool
 
 
 _ALL = (
@@ -37,7 +35,6 @@ _ALL = (
         title="Interaction",
         heading="Hand-object Interactions",
         description="An object that the hand holds or touches covers and shades part of it.",
-        holistic=False,
     ),
     Perturbation(
         name="complex_poses",
@@ -46,7 +43,6 @@ _ALL = (
         heading="Complex Poses",
         description="Fast articulation, self-occlusion and extreme angles; "
         "the estimated hand parameters are further off.",
-        holistic=False,
     ),
     Perturbation(
         name="illumination",
@@ -54,7 +50,6 @@ _ALL = (
         title="Illumination Changes",
         heading="Illumination Variations",
         description="Exposure, colour temperature, light direction or cast shadows change.",
-        holistic=True,
     ),
     Perturbation(
         name="motion_blur",
@@ -62,7 +57,6 @@ _ALL = (
         title="Motion Blur",
         heading="Motion Blur",
         description="Hand or camera move while the shutter is open.",
-        holistic=True,
     ),
 )
 
@@ -71,16 +65,7 @@ PERTURBATIONS: tuple[str, ...] = tuple(item.name for item in _ALL)
 
 
 def perturbation(name: str, *, where: str | None = None, field: str | None = None) -> Perturbation:
-    """Look a perturbation up by name.
-
-    Args:
-        name: its name.
-        where: the file that names it, for the message.
-        field: the field in it.
-
-    Raises:
-        BadInput: no perturbation has that name; the message lists the four.
-    """
+    """Look a perturbation up by name."""
     for item in _ALL:
         if item.name == name:
             return item
@@ -93,11 +78,7 @@ def perturbation(name: str, *, where: str | None = None, field: str | None = Non
 
 
 def check_severity(values: Iterable[int], *, where: str, field: str) -> tuple[int, ...]:
-    """Check the severities of one perturbation, one integer from 0 to 5 for each frame.
-
-    Raises:
-        BadInput: a value is not an integer or is out of range; the frame is named.
-    """
+    """Check the severities of one perturbation, one integer from 0 to 5 for each frame."""
     checked = []
     for frame, value in enumerate(values):
         if isinstance(value, bool) or not isinstance(value, int) or not 0 <= value <= MAX_SEVERITY:
@@ -128,126 +109,33 @@ class CatalogueEntry:
     perturbations: tuple[str, ...]
 
 
-_HOI, _CP, _IL, _MB = PERTURBATIONS
-_PHONE, _WEBCAM = "Mobile phone", "Webcam"
-# The paper's dataset table: hand, action, device, frames, perturbations.
-_CAPTURES = (
-    CatalogueEntry(
-        "capture0",
-        "single",
-        "Grabbing blocks",
-        _PHONE,
-        901,
-        (
-            _HOI,
-            _CP,
-        ),
-    ),
-    CatalogueEntry(
-        "capture1",
-        "single",
-        "Multiple gestures",
-        _PHONE,
-        742,
-        (
-            _CP,
-            _MB,
-        ),
-    ),
-    CatalogueEntry("capture2", "single", "Multiple gestures", _PHONE, 828, (_IL,)),
-    CatalogueEntry(
-        "capture3",
-        "single",
-        "Spinning a pen",
-        _PHONE,
-        1086,
-        (
-            _HOI,
-            _MB,
-        ),
-    ),
-    CatalogueEntry(
-        "capture4",
-        "interacting",
-        "Spinning a pen",
-        _WEBCAM,
-        1662,
-        (
-            _HOI,
-            _MB,
-        ),
-    ),
-    CatalogueEntry(
-        "capture5",
-        "interacting",
-        "Sticking stickers",
-        _WEBCAM,
-        1216,
-        (
-            _HOI,
-            _MB,
-        ),
-    ),
-    CatalogueEntry(
-        "capture6",
-        "interacting",
-        "Applying lotion",
-        _WEBCAM,
-        1524,
-        (
-            _HOI,
-            _CP,
-        ),
-    ),
-    CatalogueEntry(
-        "capture7",
-        "interacting",
-        "Multiple gestures",
-        _WEBCAM,
-        1360,
-        (
-            _CP,
-            _IL,
-        ),
-    ),
-    CatalogueEntry(
-        "capture8",
-        "interacting",
-        "Putting on a watch",
-        _WEBCAM,
-        1444,
-        (
-            _HOI,
-            _CP,
-            _MB,
-        ),
-    ),
-    CatalogueEntry(
-        "capture9",
-        "interacting",
-        "Scrolling on a phone",
-        _PHONE,
-        1533,
-        (
-            _HOI,
-            _CP,
-            _MB,
-        ),
-    ),
-    CatalogueEntry(
-        "capture10",
-        "interacting",
-        "Shuffling cards",
-        _PHONE,
-        1525,
-        (
-            _HOI,
-            _CP,
-            _MB,
-        ),
-    ),
+_BY_SHORT = {item.short: item.name for item in _ALL}
+
+
+def _capture(row: str) -> CatalogueEntry:
+    identifier, hands, device, count, shorts, action = row.split(maxsplit=5)
+    names = tuple(_BY_SHORT[short] for short in shorts.split("+"))
+    device = {"phone": "Mobile phone", "webcam": "Webcam"}[device]
+    return CatalogueEntry(identifier, hands, action, device, int(count), names)
+
+
+# The paper's dataset table: hands, device, frames, perturbations, action.
+_CAPTURES = """
+capture0  single      phone   901 hoi+cp    Grabbing blocks
+capture1  single      phone   742 cp+mb     Multiple gestures
+capture2  single      phone   828 il        Multiple gestures
+capture3  single      phone  1086 hoi+mb    Spinning a pen
+capture4  interacting webcam 1662 hoi+mb    Spinning a pen
+capture5  interacting webcam 1216 hoi+mb    Sticking stickers
+capture6  interacting webcam 1524 hoi+cp    Applying lotion
+capture7  interacting webcam 1360 cp+il     Multiple gestures
+capture8  interacting webcam 1444 hoi+cp+mb Putting on a watch
+capture9  interacting phone  1533 hoi+cp+mb Scrolling on a phone
+capture10 interacting phone  1525 hoi+cp+mb Shuffling cards
+"""
+_BY_ID = MappingProxyType(
+    {entry.id: entry for entry in map(_capture, _CAPTURES.strip().splitlines())}
 )
-_BY_ID = MappingProxyType({entry.id: entry for entry in _CAPTURES})
 
 
 def catalogue() -> Mapping[str, CatalogueEntry]:

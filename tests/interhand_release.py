@@ -12,7 +12,7 @@ import torch
 
 from hwp_bench.hands import HandTemplate, pose_hand
 from hwp_bench.hands.raster import draw_silhouette
-from hwp_bench.importers.interhand.annotations import LANDMARK_ROWS
+from hwp_bench.importers.interhand import LANDMARK_ROWS
 
 WIDTH, HEIGHT = 334, 512
 FRAMES = (7, 10, 13, 16, 19, 22, 25, 28, 31, 34, 37, 40)

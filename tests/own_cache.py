@@ -16,7 +16,7 @@ def compile_all() -> None:
     Processes of the suite would each do it otherwise, at the same time.
     """
     from hwp_bench.sim.render.frame import render_frame
-    from hwp_bench.sim.scene.reader import load_scene
+    from hwp_bench.sim.scene_files import load_scene
     from wildghand.fitting.method import ready_fit
 
     ready_fit("cpu")

@@ -13,18 +13,13 @@ from synthetic_clip import FOCAL, FPS, HEIGHT, WIDTH, SyntheticClip, make_clip
 
 from hwp_bench.hands.anchors import vertex_normals
 from hwp_bench.hands.raster import draw_faces, mix_corners
+from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands
 from hwp_bench.importers.shared.landmarks import Landmarks
-from hwp_bench.importers.shared.windows import CropWindows, cut, follow_hands
-from hwp_bench.importers.video.clip_model import posed_vertices
-from hwp_bench.importers.video.fit_clip import FittedClip, Footage, fit_landmarks
-from hwp_bench.importers.video.hand_pictures import HandPictures
-from hwp_bench.importers.video.picture_energy import PictureEnergy
-from hwp_bench.importers.video.texture_energy import TextureEnergy
-from hwp_bench.importers.video.video_settings import FitSettings
+from hwp_bench.importers.video.model import pose_vertices
+from hwp_bench.importers.video.pictures import HandPictures, PictureResidual, TextureResidual
+from hwp_bench.importers.video.solve import FitSettings, FittedClip, Footage, fit_landmarks
 
-SETTINGS = FitSettings(
-    start_steps=40, landmark_steps=80, contour_steps=50, picture_rounds=3, picture_steps=40
-)
+SETTINGS = FitSettings(start_steps=40, landmark_steps=80, contour_steps=50, picture_rounds=3)
 FRAMES, SIZE, HAND = 20, 160, 150.0
 #: What the paint is multiplied by in each channel.
 TINT = np.array([1.0, 0.8, 0.65], np.float32)
@@ -112,18 +107,18 @@ def _fit_to_errors() -> FittedClip:
 def pixel_error(fitted: FittedClip) -> float:
     """Mean distance of the vertices from their true places, px of the whole frame."""
     with torch.no_grad():
-        pixels = fitted.model.pixels(torch.as_tensor(posed_vertices(fitted.model))).numpy()
+        pixels = fitted.model.pixels(torch.as_tensor(pose_vertices(fitted.model))).numpy()
     return float(np.linalg.norm(pixels - footage()[0].vertex_pixels, axis=-1).mean())
 
 
 def assert_slopes_lead_down(
-    fitted: FittedClip, energies: Sequence[TextureEnergy | PictureEnergy]
+    fitted: FittedClip, energies: Sequence[TextureResidual | PictureResidual]
 ) -> None:
     """Two energies alike: zero where linearised, lower a step down the slope, bit for bit equal."""
     first, second = energies
     for energy in (first, second):
         energy.rematch(fitted.model)
-    posed = fitted.model.posed()
+    posed = fitted.model.pose()
     value = first(fitted.model, posed)
     assert float(value.detach()) == 0.0
     value.backward()
@@ -136,9 +131,9 @@ def assert_slopes_lead_down(
         assert float(first(fitted.model, posed)) == float(second(fitted.model, posed))
 
 
-def assert_says_nothing(fitted: FittedClip, energy: TextureEnergy | PictureEnergy) -> None:
+def assert_says_nothing(fitted: FittedClip, energy: TextureResidual | PictureResidual) -> None:
     """The energy is zero wherever the hand goes."""
     energy.rematch(fitted.model)
     with torch.no_grad():
         fitted.model.variables.turn.add_(0.1)
-    assert float(energy(fitted.model, fitted.model.posed()).detach()) == 0.0
+    assert float(energy(fitted.model, fitted.model.pose()).detach()) == 0.0

@@ -28,8 +28,8 @@ def landmark_import(steps: int, outline_steps: int) -> FitSettings:
         landmark_steps=steps,
         contour_steps=outline_steps,
         contour_rounds=1,
-        texture_weight=0.0,
-        picture_weight=0.0,
+        texture=False,
+        picture_rounds=0,
     )
 
 

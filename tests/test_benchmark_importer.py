@@ -12,8 +12,8 @@ from benchmarks.tracker_clips import KINDS, scene_text
 from hwp_bench.hands import load_template
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.importers.video import FitSettings
-from hwp_bench.sim.scene.reader import parse_scene
-from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy
+from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.scene_files import parse_scene
 
 
 def test_a_shift_is_found_in_space_and_in_the_image() -> None:
@@ -57,7 +57,7 @@ def test_harder_clips_show_what_their_names_say() -> None:
 
 
 def test_settings_keep_their_types() -> None:
-    settings = changed(FitSettings(), ["texture_weight=0", "contour_rounds=2"])
-    assert settings.texture_weight == 0.0
+    settings = changed(FitSettings(), ["texture=false", "contour_rounds=2"])
+    assert settings.texture is False
     assert settings.contour_rounds == 2
     assert isinstance(settings.contour_rounds, int)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.two_hands import VOTES, compose
-from hwp_bench.importers.shared.association import read_association
-from hwp_bench.importers.shared.landmarks import read_landmarks
+from hwp_bench.importers.shared.landmarks import read_association, read_landmarks
 from hwp_bench.importers.video.decode import probe
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "real_hand"

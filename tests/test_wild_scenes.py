@@ -12,9 +12,10 @@ import pytest
 
 import wildghand
 from benchmarks.scene_overlap import KINDS, counts, parts, shared
-from hwp_bench.sim.scene.reader import load_scene, scene_groups, scene_names
-from hwp_bench.sim.scene.schema import Lamp, Scene
-from hwp_bench.sim.scene.subject_anatomy import SubjectAnatomy
+from hwp_bench.sim.hand.off_template import SubjectAnatomy
+from hwp_bench.sim.light.lights import Lamp
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import load_scene, scene_groups, scene_names
 from hwp_bench.taxonomy import PERTURBATIONS
 
 PRIORS = Path(wildghand.__file__).parent / "priors"
@@ -109,7 +110,7 @@ def test_an_overlap_is_found_in_every_part() -> None:
         "room": replace(first, background=second.background),
         "light": replace(first, light=replace(first.light, lamps=second.light.lamps)),
         "object": replace(first, effects=second.effects),
-        "gestures": replace(first, track=replace(first.track, keys={"right": turned})),
+        "gestures": replace(first, track=replace(first.track, right=turned)),
     }
     assert tuple(made) == KINDS
     for kind, scene in made.items():

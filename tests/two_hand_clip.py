@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from synthetic_clip import HEIGHT, WALL, WIDTH, SyntheticClip, make_clip, write_video
 
-from hwp_bench.importers.shared.hand_tracks import HandTracks, write_hand_tracks
+from hwp_bench.importers.shared.landmarks import HandTracks, write_hand_tracks
 
 #: Errors of the landmarks (standard deviations): px in the image, m in space.
 IMAGE_NOISE, WORLD_NOISE = 1.0, 0.003

@@ -33,11 +33,9 @@ _._repr_mimebundle_  # notebooks call it
 _.up_direction  # viser reads it
 _.request_share_url  # viser's server calls it
 verbose  # viser's server passes it
-_.formatter_class  # argparse reads it
 _.channelnames  # OpenImageIO reads it
 _.camera_position  # pyvista reads it
 _.pareto  # read by the report's template
-_.holistic  # a fact of the paper's taxonomy, for readers of the API
 _.perfect  # a fact of a metric, which tests compare the score of the truth with
 _.gain_deviation  # the table CUES names it; getattr reads it
 _.residual_deviation  # a measured cue of the pre-pass, for tests and benchmarks
@@ -45,6 +43,7 @@ _.sharpness  # a measured cue of the pre-pass, for tests and benchmarks
 _.blur_deviation  # the table CUES names it; getattr reads it
 _.misplacement_deviation  # the table CUES names it; getattr reads it
 _.hidden_deviation  # the table CUES names it; getattr reads it
+_.memo  # pickle.Unpickler reads it
 _.found_inf  # torch's fused Adam reads it
 REACH_X  # a row of the rasterizer's records, named for the order of the rows
 _.thread_type  # the decoder reads how it may share its work

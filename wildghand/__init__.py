@@ -13,12 +13,12 @@ from hwp_bench.base.packages import lazy_names
 if TYPE_CHECKING:
     from wildghand.avatar.avatar import WildGHandAvatar as WildGHandAvatar
     from wildghand.avatar.files import load_avatar as load_avatar
-    from wildghand.from_video.api import fit as fit
+    from wildghand.from_video.make import fit as fit
     from wildghand.splat import rasterize as rasterize
 
 _HOMES = {
     "WildGHandAvatar": "wildghand.avatar.avatar",
-    "fit": "wildghand.from_video.api",
+    "fit": "wildghand.from_video.make",
     "load_avatar": "wildghand.avatar.files",
     "rasterize": "wildghand.splat",
 }

@@ -1,4 +1,4 @@
-"""Named arrays on disk (`.npz`) from others: no pickles, sizes bounded, shapes checked."""
+"""Named arrays from others: no pickles, sizes bounded, shapes checked; tables of tensors."""
 
 from __future__ import annotations
 
@@ -98,20 +98,8 @@ def take(
 ) -> np.ndarray:
     """Take one array out of a file and check it.
 
-    Args:
-        arrays: the arrays of the file.
-        name: which array.
-        shape: expected shape; None accepts any length.
-        where: the file, for the message.
-        dtype: type to return; floats must be finite.
-        most: largest absolute value.
-
-    Returns:
-        The array as `dtype`.
-
-    Raises:
-        BadInput: absent, of another shape or kind, not finite or too large; the first bad
-            row is named.
+    A length of None in its shape is any, floats must be finite and not beyond `most`; the first bad
+    row is named.
     """
     if name not in arrays:
         raise BadInput("is missing", where=where, field=name)
@@ -141,12 +129,7 @@ def read_tensors(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Tens
     """Read tensors by name; nothing else that a file may hold is made or run.
 
     Args:
-        path: a `.safetensors` file, or a checkpoint of torch, in its present format (then tensors
-            stay on the disk until they are used) or its former one.
         max_bytes: largest file that is read.
-
-    Raises:
-        BadInput: it is missing, larger, cannot be read, or is not a table of tensors.
     """
     import torch
 
@@ -171,11 +154,7 @@ def read_tensors(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Tens
 
 
 def evenly(count: int, most: int) -> np.ndarray:
-    """Choose among things in a row, from the first to the last.
-
-    Args:
-        count: how many there are, not negative.
-        most: how many are chosen at most, not negative; with 1 it is the first.
+    """Choose at most some of `count` things in a row, from the first to the last.
 
     Returns:
         (K,) int64, their numbers, ascending and all different; all of them where `count` is not

@@ -1,4 +1,4 @@
-"""Colour: sRGB and linear light, brightness, and the colour of a lamp."""
+"""Colour: sRGB and linear light, brightness, lamps, and light as a function of the normal."""
 
 from __future__ import annotations
 
@@ -33,7 +33,6 @@ def log_light(srgb: np.ndarray, floor: float) -> np.ndarray:
 
     Args:
         srgb: sRGB in [0, 1], any shape.
-        floor: added to linear light before the logarithm, so that noise in the dark stays small.
 
     Returns:
         float64 of the same shape.
@@ -43,9 +42,6 @@ def log_light(srgb: np.ndarray, floor: float) -> np.ndarray:
 
 def lamp_color(kelvin: float) -> np.ndarray:
     """Linear sRGB colour of a black body, scaled to luminance 1 and relative to 5500 K.
-
-    Args:
-        kelvin: 1500 to 15000.
 
     Source: a power law through the Planckian locus in linear sRGB, within 10 % of it.
     """

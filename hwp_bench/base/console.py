@@ -62,13 +62,8 @@ def encoding_of(stream: TextIO | None) -> str:
 def expressed(text: str, encoding: str) -> str:
     """Return a text as an encoding can hold it.
 
-    Args:
-        text: any text.
-        encoding: of a terminal, a pipe or a file.
-
-    Returns:
-        The text, with similar characters of ASCII for dashes, rules, arrows and signs that the
-        encoding lacks, and backslash escapes as Python's for every other character.
+    Similar characters of ASCII stand for dashes, rules, arrows and signs that it lacks, backslash
+    escapes as Python's for every other character.
     """
     try:
         text.encode(encoding)
@@ -105,9 +100,6 @@ def in_utf8_mode(program: str) -> None:
     with an accent cannot be text (ASCII), or is another name for libraries in C++ (Latin-1). The
     standard streams keep the encoding that they have. Nothing is done in UTF-8, where the user
     chose `-X utf8`, or where the process is not one of this program (a script, a test).
-
-    Args:
-        program: its name.
     """
     if sys.getfilesystemencoding().lower().replace("-", "") == "utf8" or os.name != "posix":
         return
@@ -162,11 +154,9 @@ def _fill_handles() -> None:
 
 
 def settle(stream: TextIO | None) -> OSError | None:
-    """Write out what a stream holds.
+    """Write out what a stream holds; return why it cannot be written, and then it is silent.
 
-    Returns:
-        None; or why it cannot be written, and then the stream is silent from now on, so that
-        Python does not complain when it ends.
+    So Python does not complain when it ends.
     """
     if stream is None or stream.closed:
         return None
@@ -249,10 +239,6 @@ def remaining(durations: Sequence[float], left: int) -> float | None:
 
     Args:
         durations: seconds of the jobs that have ended.
-        left: jobs that have not ended.
-
-    Returns:
-        The mean of the jobs that ran, times those left; None before the first has ended.
     """
     ran = [spent for spent in durations if spent >= FOUND * max(durations)]
     return left * sum(ran) / len(ran) if ran else None
@@ -263,13 +249,7 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
     """Show how far a piece of work is, with elapsed and remaining time.
 
     On a terminal a bar; elsewhere one line when the work ends, which says how much of it was done.
-
-    Args:
-        description: what is being done.
-        total: number of steps.
-
-    Yields:
-        A function that takes the number of steps that are done by now.
+    What is yielded takes the number of steps that are done by now.
     """
     start = time.perf_counter()
     outer = OUTER.get()
@@ -316,9 +296,6 @@ class JobsView:
     A context manager. Jobs that run one after another are told to `turn`. An engine that runs
     several at once calls `begin`, then `start`, `steps`, `end` and `drop` with the index of a job,
     from any thread.
-
-    Args:
-        quiet: show nothing.
     """
 
     def __init__(self, *, quiet: bool = False) -> None:
@@ -502,9 +479,6 @@ class StagesView:
         """Begin a stage.
 
         Args:
-            number: of the stage, from 1.
-            count: of all stages.
-            text: what is done.
             own: seconds that it is expected to take.
             later: seconds that those after it are expected to take.
         """

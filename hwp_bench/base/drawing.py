@@ -24,7 +24,6 @@ def labelled(tile: np.ndarray, text: str) -> np.ndarray:
 
     Args:
         tile: (H, W, 3) uint8.
-        text: what to write; cut to the tile's width.
     """
     strip = np.full((LABEL_HEIGHT, tile.shape[1], 3), PAPER, dtype=np.uint8)
     # The vector fonts of OpenCV know ASCII only.
@@ -44,7 +43,6 @@ def sheet(tiles: Sequence[np.ndarray], columns: int) -> np.ndarray:
 
     Args:
         tiles: (H, W, 3) uint8 images; smaller ones are centred in the largest cell.
-        columns: tiles in a row.
 
     Returns:
         (rows, columns, 3) uint8.
@@ -69,7 +67,6 @@ def outlined(
     Args:
         image: (H, W, 3) uint8.
         mask: (H, W) uint8, above 127 is inside.
-        colour: of the outline, RGB.
     """
     contours, _ = cv2.findContours(
         (mask > 127).astype(np.uint8), cv2.RETR_LIST, cv2.CHAIN_APPROX_NONE

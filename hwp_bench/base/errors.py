@@ -1,4 +1,4 @@
-"""The one root of every error that the toolkit raises on purpose.
+"""The one root of every error that the toolkit raises on purpose, its words, and checked arguments.
 
 A message says what is wrong, in which file and field, and what to do about it. The command
 line prints `str(error)` on one line and leaves with `error.exit_status`; any other exception
@@ -138,14 +138,7 @@ def bounded(items: Sequence[object], most: int = 12) -> str:
 
 
 def nearest(wrong: str, known: Iterable[str], *, most: int = 1, cutoff: float = 0.6) -> list[str]:
-    """Return the known names that are most like a wrong one, the closest first; often none.
-
-    Args:
-        wrong: what was given.
-        known: the names that there are.
-        most: how many are returned at most.
-        cutoff: how alike they must be, from 0 to 1.
-    """
+    """Return the known names that are most like a wrong one, the closest first; often none."""
     return difflib.get_close_matches(wrong[:200], list(known), n=most, cutoff=cutoff)
 
 
@@ -173,9 +166,6 @@ def check_name(path: str | os.PathLike[str]) -> None:
     """Refuse the name of a file or folder that is not UTF-8.
 
     Libraries that read and write files in C++ take such a name for another one.
-
-    Raises:
-        UsageError: the name holds bytes that are not UTF-8.
     """
     text = os.fspath(path)
     if not is_unicode(text):
@@ -193,11 +183,7 @@ def one_line(text: str, most: int = 1000) -> str:
 
 
 def whole_number(value: Any, field: str) -> int:
-    """Return an integer of Python or NumPy as Python's.
-
-    Raises:
-        UsageError: it is of another type, a boolean too.
-    """
+    """Return an integer of Python or NumPy as Python's."""
     if not isinstance(value, bool):
         try:
             return operator.index(value)
@@ -207,11 +193,7 @@ def whole_number(value: Any, field: str) -> int:
 
 
 def real_number(value: Any, field: str) -> float:
-    """Return a finite number of Python or NumPy as Python's.
-
-    Raises:
-        UsageError: it is of another type, a boolean too, or not finite.
-    """
+    """Return a finite number of Python or NumPy as Python's."""
     if isinstance(value, numbers.Real) and not isinstance(value, bool):
         try:
             number = float(value)
@@ -223,11 +205,7 @@ def real_number(value: Any, field: str) -> float:
 
 
 def place(value: Any, field: str) -> Path:
-    """Return a path that is given as text or as a path.
-
-    Raises:
-        UsageError: it is of another type, empty, or holds a zero byte.
-    """
+    """Return a path that is given as text or as a path."""
     if isinstance(value, str | os.PathLike):
         text = os.fspath(value)
         if isinstance(text, str) and text and "\0" not in text:
@@ -236,17 +214,7 @@ def place(value: Any, field: str) -> Path:
 
 
 def of_type(value: Any, kinds: type | tuple[type, ...], field: str, expected: str) -> Any:
-    """Return an argument that is of one of some types.
-
-    Args:
-        value: the argument.
-        kinds: the types.
-        field: its name.
-        expected: what these types are, for the message.
-
-    Raises:
-        UsageError: it is of another type.
-    """
+    """Return an argument that is of one of some types."""
     if isinstance(value, kinds):
         return value
     raise _wrong(value, field, expected)

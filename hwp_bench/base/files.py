@@ -95,12 +95,7 @@ def _room(path: Path) -> str:
 
 
 def _name_file(temporary: Path, path: Path, overwrite: bool) -> None:
-    """Give a written file its name; the system decides in one step whether the name is free.
-
-    Raises:
-        FileExistsError: something is there that may not be replaced.
-        OSError: the file cannot be named for another reason.
-    """
+    """Give a written file its name; the system decides in one step whether the name is free."""
     if not overwrite:
         try:
             os.link(temporary, path)
@@ -124,14 +119,8 @@ def _name_file(temporary: Path, path: Path, overwrite: bool) -> None:
 def disc_errors(where: str | os.PathLike[str]) -> Iterator[None]:
     """Turn what the system says of a full or closed disc into one error that names the place.
 
-    For work whose finished parts stay, so that the same call goes on.
-
-    Args:
-        where: the folder that the block writes to.
-
-    Raises:
-        HwpError: the disc took no more. Every other `OSError`, such as that of a closed pipe,
-            passes.
+    For work whose finished parts stay, so that the same call goes on. Every other `OSError`, such
+    as that of a closed pipe, passes.
     """
     try:
         yield
@@ -149,16 +138,7 @@ def disc_errors(where: str | os.PathLike[str]) -> Iterator[None]:
 def refuse_existing(
     path: str | os.PathLike[str], *, overwrite: bool = False, flag: str = ""
 ) -> None:
-    """Refuse to make a folder where something is, before work is done for it.
-
-    Args:
-        path: the folder to make.
-        overwrite: a folder that holds something may be replaced; a file may not.
-        flag: the option by which a person asks for that, for the message; empty where none is.
-
-    Raises:
-        UsageError: `path` is a file, or a folder that holds something.
-    """
+    """Refuse to make a folder where something is; `flag` is the option that replaces it."""
     path = Path(path)
     if path.is_file() or (path.is_dir() and any(path.iterdir()) and not overwrite):
         raise _exists(path, flag)
@@ -174,14 +154,9 @@ def check_places(
     """Refuse outputs that would destroy or mix with each other or an input, before work begins.
 
     Args:
-        outputs: files and folders that a command writes, by the option that names them.
-        inputs: those that it reads, by option or argument.
+        outputs, inputs: files and folders that a command writes and reads, by option.
         replaces: an output takes the place of what is there, so that it may not hold an input.
         makes_captures: an output is a capture, and may be where one is.
-
-    Raises:
-        UsageError: an output is named twice, lies in another one, is an input or lies in one, would
-            replace a folder that holds an input, or is not a capture and lies where one is.
     """
     made = _resolved(outputs)
     read = _resolved(inputs)
@@ -273,10 +248,6 @@ def _take_name(temporary: Path, path: Path, overwrite: bool, flag: str) -> None:
 
     Renaming a folder replaces an empty folder, and is refused where a file or a filled folder is.
     To look first and to rename then would lose what another process makes in between.
-
-    Raises:
-        UsageError: something is there that may not be replaced.
-        OSError: the folder cannot be renamed for another reason.
     """
     retired: list[Path] = []
     try:
@@ -333,15 +304,7 @@ def check_is_file(
     remedy: str | None = None,
     error: type[BadInput] = BadInput,
 ) -> None:
-    """Refuse all but a regular file, before something waits for a pipe or reads a device.
-
-    Args:
-        path: of an input; a link counts as what it leads to.
-        field, remedy, error: of the refusal.
-
-    Raises:
-        BadInput: (or `error`) there is nothing, a folder, a pipe, a socket or a device.
-    """
+    """Refuse all but a regular file, before something waits for a pipe or reads a device."""
     try:
         mode = path.stat().st_mode
     except (FileNotFoundError, NotADirectoryError) as missing:
@@ -378,13 +341,7 @@ def files_digest(root: Path, paths: Iterable[Path]) -> str:
 
 
 def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) -> Any:
-    """Read a JSON file from outside.
-
-    Raises:
-        BadInput: the file is missing, not a regular file, larger than `max_bytes`, not UTF-8, not
-            JSON, nested too deeply, or names a key twice in one object, or holds a number that is
-            infinite or absurdly large, or text that is not Unicode.
-    """
+    """Read a JSON file from outside."""
     path = Path(path)
     try:
         text = _read_bounded(path, max_bytes).decode()
@@ -489,11 +446,7 @@ def write_json(path: str | os.PathLike[str], value: Any) -> Path:
 
 
 def inside(root: str | os.PathLike[str], relative: str) -> Path:
-    """Join a path from outside to a folder, refusing whatever leads out of the folder.
-
-    Raises:
-        BadInput: `relative` is absolute, climbs with `..`, or passes a link that leaves `root`.
-    """
+    """Join a path from outside to a folder, refusing whatever leads out of the folder."""
     base = Path(root).resolve()
     target = (base / relative).resolve()
     if Path(relative).is_absolute() or not target.is_relative_to(base):
@@ -506,11 +459,7 @@ def inside(root: str | os.PathLike[str], relative: str) -> Path:
 
 
 def cache_root() -> Path:
-    """Return the folder for what can be made again: HWP_CACHE, else the user's cache folder.
-
-    Raises:
-        HwpError: the system does not say where the user's folders are.
-    """
+    """Return the folder for what can be made again: HWP_CACHE, else the user's cache folder."""
     try:
         if "HWP_CACHE" in os.environ:
             return Path(os.environ["HWP_CACHE"]).expanduser()

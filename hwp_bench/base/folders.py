@@ -25,15 +25,6 @@ def exclusive(folder: str | os.PathLike[str], *, wait: bool = False) -> Iterator
     """Hold a folder for this process; a killed process lets go of it by itself.
 
     On a file system without locks nothing is held: do not start two runs there.
-
-    Args:
-        folder: made if it does not exist. An empty lock file stays in it.
-        wait: wait for the other process instead of refusing. The lock file then lies next to the
-            folder, as `NAME.lock`, because the holder usually makes the folder as a whole; the
-            folder itself is not made.
-
-    Raises:
-        HwpError: another process holds it, or it cannot be written to.
     """
     from filelock import FileLock, Timeout
 
@@ -77,9 +68,6 @@ def scratch_folder(prefix: str) -> Iterator[Path]:
 
     Those of the same prefix that killed processes of this user have left are removed first. The
     system lets go of a killed process's lock, so that no folder in use is taken for one of them.
-
-    Args:
-        prefix: how its name begins; ends with a hyphen.
     """
     from filelock import FileLock
 
@@ -127,6 +115,10 @@ def _user(facts: os.stat_result) -> int:
 DEEPEST = 32
 
 
+# `shutil.rmtree` and `os.walk` call themselves for every level (before Python 3.12), so that a
+# folder nested a thousand deep ends them; and neither gets into one whose owner has closed it.
+
+
 def remove_tree(folder: str | os.PathLike[str]) -> None:
     """Remove a folder and everything in it; what is not there, or cannot be removed, is left.
 
@@ -149,9 +141,6 @@ def open_up(folder: Path) -> None:
     Links, pipes, sockets and devices are removed, and so is whatever lies deeper than `DEEPEST`.
     Files lose what gives rights to whoever runs them: set-user-id, set-group-id, capabilities.
     To be called when no process that writes there is left.
-
-    Args:
-        folder: of this user.
     """
     waiting = [(os.fspath(folder), 0)]
     while waiting:
@@ -201,8 +190,6 @@ def trim(folder: Path, suffix: str, max_bytes: int) -> None:
     """Remove the files that were used longest ago until the rest fits.
 
     Args:
-        folder: need not exist.
-        suffix: how the names of its files end; others are left alone.
         max_bytes: of all files together.
     """
     entries = []
@@ -246,12 +233,7 @@ def read_private(path: Path, max_bytes: int) -> bytes | None:
 
 
 def write_private(path: Path, data: bytes) -> bool:
-    """Write a file for this user alone, in a folder that is made for this user alone.
-
-    Returns:
-        Whether it was written: not if the folder belongs to somebody else, others may write to
-        it, or there is no room.
-    """
+    """Write a file for this user alone, in a folder that is made for this user alone."""
     try:
         path.parent.parent.mkdir(parents=True, exist_ok=True)
         path.parent.mkdir(mode=0o700, exist_ok=True)

@@ -1,17 +1,23 @@
-"""Digest of the sources of compiled functions: their module, and what it imports of the toolkit."""
+"""Functions that numba compiles to machine code, which is kept on disk.
+
+Numba's own cache asks for the path and the date of a module. So every new environment compiles
+again, and a change in an imported module goes unnoticed. Here the name of a file is a digest of all
+that the code depends on: a second installation of the same kernels finds it, and changed kernels
+have another name. Processes that compile at the same time write the same content.
+"""
 
 from __future__ import annotations
 
-import ast
 import contextlib
 import functools
 import gc
 import hashlib
 import os
 import pickle
+import re
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -25,94 +31,6 @@ from numba.core.serialize import dumps
 from hwp_bench.base.files import cache_root
 from hwp_bench.base.folders import read_private, trim, write_private
 from hwp_bench.base.packages import PACKAGES
-
-#: Packages whose imports are followed; versions stand for others.
-OURS = ("hwp_bench", "wildghand")
-#: Modules that compile, keep and load; they do not change what a kernel computes. How a kernel is
-#: compiled is part of its key.
-MACHINERY = ("hwp_bench.base.kernels", "hwp_bench.base.kernels")
-
-#: Source that is newer than this process may not be what was imported.
-_STARTED = time.time()
-
-
-@functools.cache
-def kernel_digest(module: str) -> str | None:
-    """Return the digest of all that a module's compiled functions are made from.
-
-    Args:
-        module: its dotted name.
-
-    Returns:
-        SHA-256 (hex) of the names and texts of the module and of what it imports of the toolkit,
-        directly or not; None if the module is not of the toolkit, or some text may differ from
-        what this process has imported.
-    """
-    if module.partition(".")[0] not in OURS or source_of(module) is None:
-        return None
-    digest = hashlib.sha256()
-    for name, path in kernel_modules(module).items():
-        status = path.stat()
-        if max(status.st_mtime, status.st_ctime) >= _STARTED:
-            return None
-        text = path.read_bytes()
-        digest.update(f"{name} {len(text)} ".encode())
-        digest.update(text)
-    return digest.hexdigest()
-
-
-def kernel_modules(module: str, root: Path = PACKAGES) -> dict[str, Path]:
-    """Return the files of a module and of all it imports of the toolkit, sorted by name.
-
-    Args:
-        module: a dotted name.
-        root: the folder that holds the packages.
-    """
-    found: dict[str, Path] = {}
-    pending = [module]
-    while pending:
-        name = pending.pop()
-        path = source_of(name, root)
-        if path is not None and name not in found and name not in MACHINERY:
-            found[name] = path
-            pending += _imports(path, name, root)
-    return dict(sorted(found.items()))
-
-
-def source_of(module: str, root: Path = PACKAGES) -> Path | None:
-    """Return the file of a module or package; None if there is none."""
-    place = root.joinpath(*module.split("."))
-    for path in (place.with_name(f"{place.name}.py"), place / "__init__.py"):
-        if path.is_file():
-            return path
-    return None
-
-
-def _imports(path: Path, module: str, root: Path) -> Iterator[str]:
-    """The toolkit's modules that a file imports, wherever in it."""
-    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
-    for source, member in _imported_names(path.read_bytes(), package):
-        # A name is a module of a package, or stands in the file itself.
-        inner = f"{source}.{member}"
-        yield inner if member and source_of(inner, root) else source
-
-
-@functools.cache
-def _imported_names(text: bytes, package: str) -> tuple[tuple[str, str], ...]:
-    """The toolkit's modules that a file of a package imports, each with a name in it or with none.
-
-    Parsing takes most of the time, and many kernels import the same files.
-    """
-    found = []
-    for node in ast.walk(ast.parse(text)):
-        if isinstance(node, ast.Import):
-            found += [(alias.name, "") for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            above = package.split(".")[: len(package.split(".")) - node.level + 1]
-            parts = [*(above if node.level else []), *([node.module] if node.module else [])]
-            found += [(".".join(parts), alias.name) for alias in node.names]
-    return tuple(pair for pair in found if pair[0].partition(".")[0] in OURS)
-
 
 #: Bytes of one function, and of all that are kept.
 MAX_BYTES, MAX_CACHE_BYTES = 64 * 2**20, 256 * 2**20
@@ -128,9 +46,100 @@ _SUFFIX = ".code"
 _SETTINGS = ("OPT", "LOOP_VECTORIZE", "SLP_VECTORIZE", "BOUNDSCHECK", "DEBUGINFO_DEFAULT")
 
 
+#: Packages whose functions are kept.
+_OURS = ("hwp_bench", "wildghand")
+#: Source that is newer than this process may not be what was imported.
+_STARTED = time.time()
+
+
 def code_folder() -> Path:
     """Return the folder where machine code is kept."""
     return Path(os.environ.get(KEPT) or cache_root() / "kernels")
+
+
+#: Untyped: the types that numba declares differ between its versions.
+_njit: Any = numba.njit
+
+
+def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator: compile a function on first use; the machine code is kept on disk.
+
+    It lies in the folder `kernels` of `HWP_CACHE`. Functions of other packages, and those that read
+    variables of a function around them, are compiled in every process. Bounds are not checked, and
+    a division by zero gives what NumPy gives.
+
+    Args:
+        options: further options of `numba.njit`, such as `nogil=True`.
+    """
+    # Nothing calls a kernel from C.
+    settings = {"boundscheck": False, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
+
+    def compile_function(function: Callable[..., Any]) -> Any:
+        dispatcher: Any = _njit(**settings)(function)
+        if hasattr(dispatcher, "signatures"):  # not if NUMBA_DISABLE_JIT is set
+            dispatcher._cache = MachineCode(function, settings)
+            dispatcher.compile = _without_collections(dispatcher.compile)
+        return dispatcher
+
+    return compile_function
+
+
+def helper(function: Callable[..., Any], **options: Any) -> Any:
+    """Decorator: compile a function for the compiled functions that call it.
+
+    Python cannot call it, and the disk does not keep it: its code is part of theirs. Wrappers for
+    callers outside would take a tenth of the time.
+    """
+    return _njit(
+        boundscheck=False,
+        error_model="numpy",
+        no_cpython_wrapper=True,
+        no_cfunc_wrapper=True,
+        **options,
+    )(function)
+
+
+def on_disk(dispatcher: Any) -> bool:
+    """Return whether the disk holds machine code of a compiled function, as far as can be told."""
+    cache = getattr(dispatcher, "_cache", None)
+    return isinstance(cache, MachineCode) and cache.on_disk()
+
+
+def _without_collections(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The same function; while it runs, Python looks for no garbage.
+
+    A compiler makes millions of objects that stay until it is done. Looking through them, and
+    through those of torch, again and again takes a sixth of its time.
+    """
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        on = gc.isenabled()
+        gc.disable()
+        try:
+            return function(*args, **options)
+        finally:
+            if on:
+                gc.enable()
+
+    return call
+
+
+@helper
+def dot(a: np.ndarray, b: np.ndarray) -> float:
+    """Scalar product of two vectors (3,).
+
+    The sum is written out: a library's order of summing depends on the processor.
+    """
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+@helper
+def cross(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
+    """Vector product of two vectors (3,), written into `out`, which is neither of them."""
+    out[0] = a[1] * b[2] - a[2] * b[1]
+    out[1] = a[2] * b[0] - a[0] * b[2]
+    out[2] = a[0] * b[1] - a[1] * b[0]
 
 
 class MachineCode:
@@ -138,10 +147,6 @@ class MachineCode:
 
     A file is the digest of its content, then a pickle of its key and of what numba needs. A file
     that is damaged, or that others could have written, is as good as none.
-
-    Args:
-        function: the Python function.
-        options: the options of `numba.njit` that it is compiled with.
     """
 
     def __init__(self, function: Callable[..., Any], options: dict[str, Any]) -> None:
@@ -208,6 +213,62 @@ class MachineCode:
         return [] if prefix is None else sorted(folder.glob(f"{prefix}-*{_SUFFIX}"))
 
 
+@functools.cache
+def kernel_digest(module: str) -> str | None:
+    """SHA-256 (hex) of a module and all that it imports of the toolkit, directly or not.
+
+    None if the module is not of the toolkit, or some text may differ from what this process has
+    imported.
+    """
+    files = kernel_modules(module)
+    digest = hashlib.sha256()
+    for name, path in files.items():
+        status = path.stat()
+        if max(status.st_mtime, status.st_ctime) >= _STARTED:
+            return None
+        text = path.read_bytes()
+        digest.update(f"{name} {len(text)} ".encode() + text)
+    return digest.hexdigest() if files else None
+
+
+def kernel_modules(module: str, root: Path = PACKAGES) -> dict[str, Path]:
+    """The files of a module and of all that it imports of the packages in a folder, by name.
+
+    What this file imports is left out: how a kernel is compiled is part of its key.
+    """
+    found: dict[str, Path] = {}
+    pending = [module] if module.partition(".")[0] in _OURS else []
+    while pending:
+        name = pending.pop()
+        path = _file(name, root)
+        if path is None or name in found:
+            continue
+        found[name] = path
+        for source, names in [] if name == __name__ else _imports(path.read_text("utf-8")):
+            # A name is a module of a package, or stands in the file itself.
+            inner = [
+                f"{source}.{part.split()[0]}"
+                for part in names.strip("( \n").split(",")
+                if part.strip()
+            ]
+            pending += [one if _file(one, root) else source for one in inner or [source]]
+    return dict(sorted(found.items()))
+
+
+#: Statements that import of the toolkit, at the top of a file or in a function.
+_IMPORT = re.compile(
+    rf"^ *(?:from|import) ((?:{'|'.join(_OURS)})[.\w]*)(?: import (\([^)]*|.*))?", re.MULTILINE
+)
+# Many kernels import the same files.
+_imports = functools.cache(_IMPORT.findall)
+
+
+def _file(module: str, root: Path) -> Path | None:
+    place = root.joinpath(*module.split("."))
+    files = (place.with_name(f"{place.name}.py"), place / "__init__.py")
+    return next((path for path in files if path.is_file()), None)
+
+
 def _folders() -> list[Path]:
     """Where machine code may lie: this user's cache, then one that is only read."""
     shared = os.environ.get(SHARED)
@@ -232,97 +293,3 @@ def _surroundings() -> tuple[str, ...]:
 
 def _hex(value: object) -> str:
     return hashlib.sha256(repr(value).encode()).hexdigest()[:20]
-
-
-#: Untyped: the types that numba declares differ between its versions.
-_njit: Any = numba.njit
-
-
-def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
-    """Decorator: compile a function on first use; the machine code is kept on disk.
-
-    It lies in the folder `kernels` of `HWP_CACHE` and is found by what it was made from
-    (`machine_code`). Functions of other packages, and those that read variables of a function
-    around them, are compiled in every process. Bounds are not checked, and a division by zero gives
-    what NumPy gives.
-
-    Args:
-        options: further options of `numba.njit`, such as `nogil=True`.
-    """
-    # Nothing calls a kernel from C.
-    settings = {"boundscheck": False, "error_model": "numpy", "no_cfunc_wrapper": True, **options}
-
-    def compile_function(function: Callable[..., Any]) -> Any:
-        dispatcher: Any = _njit(**settings)(function)
-        if hasattr(dispatcher, "signatures"):  # not if NUMBA_DISABLE_JIT is set
-            dispatcher._cache = MachineCode(function, settings)
-            dispatcher.compile = _without_collections(dispatcher.compile)
-        return dispatcher
-
-    return compile_function
-
-
-def helper(function: Callable[..., Any], **options: Any) -> Any:
-    """Decorator: compile a function for the compiled functions that call it.
-
-    Python cannot call it, and the disk does not keep it: its code is part of theirs. Wrappers for
-    callers outside would take a tenth of the time.
-
-    Args:
-        function: to compile.
-        options: further options of `numba.njit`.
-    """
-    return _njit(
-        boundscheck=False,
-        error_model="numpy",
-        no_cpython_wrapper=True,
-        no_cfunc_wrapper=True,
-        **options,
-    )(function)
-
-
-def on_disk(dispatcher: Any) -> bool:
-    """Return whether the disk holds machine code of a compiled function, as far as can be told."""
-    cache = getattr(dispatcher, "_cache", None)
-    return isinstance(cache, MachineCode) and cache.on_disk()
-
-
-def _without_collections(function: Callable[..., Any]) -> Callable[..., Any]:
-    """The same function; while it runs, Python looks for no garbage.
-
-    A compiler makes millions of objects that stay until it is done. Looking through them, and
-    through those of torch, again and again takes a sixth of its time.
-    """
-
-    @functools.wraps(function)
-    def call(*args: Any, **options: Any) -> Any:
-        with _no_collections():
-            return function(*args, **options)
-
-    return call
-
-
-@contextlib.contextmanager
-def _no_collections() -> Iterator[None]:
-    """Switches the collector off, if it is on, and on again."""
-    on = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if on:
-            gc.enable()
-
-
-@helper
-def dot(a: np.ndarray, b: np.ndarray) -> float:
-    """Scalar product of two vectors (3,)."""
-    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
-
-
-@helper
-def cross(a: np.ndarray, b: np.ndarray, out: np.ndarray) -> None:
-    """Vector product of two vectors (3,), written into `out`, which is neither of them."""
-    out[0] = a[1] * b[2] - a[2] * b[1]
-    out[1] = a[2] * b[0] - a[0] * b[2]
-    out[2] = a[0] * b[1] - a[1] * b[0]

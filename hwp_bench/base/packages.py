@@ -21,12 +21,6 @@ def data_folder(name: str) -> Path:
     """Return a folder of data that ships with the toolkit.
 
     In an installed wheel it lies inside the package `hwp_bench`, in a checkout next to it.
-
-    Args:
-        name: `baselines`, `leaderboard` or `splits`.
-
-    Raises:
-        HwpError: it is in neither place: the installation is broken.
     """
     for folder in (PACKAGES / "hwp_bench" / "_data" / name, PACKAGES / name):
         if folder.is_dir():
@@ -45,10 +39,6 @@ def lazy_names(
 
     Sub-packages use `lazy_loader`. The packages themselves do not: the launcher of the sandbox
     imports `hwp_bench` in an interpreter that has only the standard library.
-
-    Args:
-        package: its `__name__`.
-        homes: the module that holds each public name.
     """
 
     def __getattr__(name: str) -> Any:

@@ -1,4 +1,8 @@
-"""Where rays meet the faces that Embree names, by rules that hold on every processor.
+"""Rays against meshes by Embree, with the same hits on every processor.
+
+The package embreex builds a mesh from Python numbers, one coordinate at a time, which takes
+longer than Embree's own work on it. Here Embree reads the arrays themselves. Faces are those of
+embreex but where a ray passes along an edge; the tests compare them.
 
 Embree's own distance and place on a face come from approximate reciprocals, whose last bits differ
 between processors: captures that were rendered on an Intel and an AMD processor had other digests,
@@ -165,12 +169,8 @@ class EmbreeMesh:
     """One mesh, built where it is.
 
     Args:
-        loaded: what `library` returned.
         vertices: (V, 3) m.
         faces: (F, 3) vertex indices.
-
-    Raises:
-        HwpError: Embree refuses the mesh.
     """
 
     def __init__(self, loaded: Library, vertices: np.ndarray, faces: np.ndarray) -> None:
@@ -284,9 +284,6 @@ def ray_mesh(vertices: np.ndarray, faces: np.ndarray) -> EmbreeMesh | EmbreexMes
     Args:
         vertices: (V, 3) m.
         faces: (F, 3) vertex indices.
-
-    Raises:
-        HwpError: Embree refuses the mesh.
     """
     loaded = library()
     return EmbreexMesh(vertices, faces) if loaded is None else EmbreeMesh(loaded, vertices, faces)

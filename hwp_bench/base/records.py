@@ -1,8 +1,34 @@
-"""How `hwp_bench.base.records` has `msgspec` check a dataclass, and what it says when that fails.
+"""Frozen dataclasses from untrusted JSON or TOML: the one reader of every format.
 
-`strict_twin` turns a dataclass into a `msgspec.Struct` that refuses whatever the dataclass does not
-declare. `msgspec` decides whether a value is good; `explain` finds the place of a fault in a value
-that it refused, because its own messages name neither the key of a table nor the value.
+A format is a frozen dataclass; `parse_record` makes one out of a table that a file held::
+
+    @dataclass(frozen=True)
+    class Lamp:
+        name: Line                                     # one line of text, required
+        power: float = number(1.0, 0.0, 100.0)         # bounded; may be absent
+        kind: Literal["disc", "point"] = "disc"        # one of several words
+        place: tuple[float, float, float] = (0.0, 0.0, 0.0)
+        gains: list[Annotated[float, Meta(gt=0.0, lt=10.0)]] | None = None
+
+    lamp = parse_record(Lamp, table, where="scene.toml", field="lamps[0]", error=BadInput)
+
+Fields are str, int, float, bool, Literal, `list[X]`, `dict[str, X]`, `tuple[...]`, other
+dataclasses, any of these `| None`, or `Any` (whatever `check_json_values` lets through).
+`msgspec` does the checking, on a strict twin of the dataclass: a bool is not an int, an int is a
+float, NaN and infinity are refused, and so is text with control characters. Bounds are
+`msgspec.Meta` in an `Annotated` type, or the metadata of `number` and `choice`. A pattern in a
+`Meta` needs a `description`, which messages show, and must exclude control characters itself.
+
+A missing field takes its default, so that a format may get additional fields. A field that was
+taken out of a format stays readable when the class lists it::
+
+    removed_fields: ClassVar[tuple[str, ...]] = ("loss",)
+
+What no type can say belongs in `__post_init__`, which raises `UsageError(problem, field=name)`;
+the reader adds the file and the path.
+
+`msgspec` decides whether a value is good; `explain` finds the place of a fault in a value that it
+refused, because its own messages name neither the key of a table nor the value.
 """
 
 from __future__ import annotations
@@ -385,11 +411,7 @@ def without_schema(
     error: type[HwpError] = BadResult,
     remedy: str | None = None,
 ) -> dict[str, Any]:
-    """Check the version that a file states in its field `schema`; return the other fields.
-
-    Raises:
-        error: the value is not a table, or is of another version.
-    """
+    """Check the version that a file states in its field `schema`; return the other fields."""
     if not isinstance(value, dict):
         raise error("must be a JSON object", where=where)
     found = value.get("schema")
@@ -446,21 +468,7 @@ def check_json_values(
     depth: int = 16,
     null: bool = False,
 ) -> None:
-    """Refuse what JSON cannot hold: for values of type `Any` that are kept or digested.
-
-    Args:
-        value: numbers, texts, truth values, or lists or tables of such.
-        where: the file, for messages.
-        field: path of `value` in the file.
-        error: raised when something is wrong.
-        depth: deepest nesting that is accepted.
-        null: accept None, which JSON has and TOML has not.
-
-    Raises:
-        error: there is a date or other object, a number that is not finite or is absurdly large,
-            a text that is too long or holds a control character, or too deep a nesting; the field
-            is named.
-    """
+    """Refuse what JSON cannot hold: for values of type `Any` that are kept or digested."""
     problem = None
     check = partial(check_json_values, where=where, error=error, depth=depth - 1, null=null)
     if depth == 0:
@@ -509,19 +517,7 @@ def parse_toml(
     field: str | None = None,
     error: type[HwpError] = BadInput,
 ) -> dict[str, Any]:
-    """Make tables of TOML text.
-
-    Args:
-        text: the content of a file, or a value of a command line.
-        where: the file, for messages.
-        field: the field that the text is the value of.
-        error: raised when something is wrong.
-
-    Raises:
-        error: the text is too long, no Unicode or not TOML, nested too deeply, or holds an integer
-            of more than `MAX_BITS`. Its cause is a `tomllib.TOMLDecodeError` where the text is
-            merely not TOML.
-    """
+    """Make tables of TOML text."""
 
     def refuse(problem: str) -> HwpError:
         return error(problem, where=where, field=field)

@@ -126,12 +126,7 @@ def without_empty_columns(table: Table) -> Table:
 
 
 def format_table(table: Table, format_name: str) -> str:
-    """Return a table as text.
-
-    Args:
-        table: the table.
-        format_name: one of `FORMATS`.
-    """
+    """Return a table as text."""
     writers = {"md": to_markdown, "tex": to_latex, "csv": to_csv, "json": to_json}
     return writers[format_name](table)
 
@@ -287,10 +282,6 @@ def print_table(table: Table, width: int | None = None) -> None:
     """Print a table on standard output: styled on a terminal, plain text elsewhere.
 
     Where the encoding of standard output lacks rules and arrows, they are drawn in ASCII.
-
-    Args:
-        table: the table.
-        width: in characters; None takes that of the terminal, `COLUMNS`, or 80.
     """
     width = width or shutil.get_terminal_size((_WIDTH, 24)).columns
     styled = on_terminal(sys.stdout)
@@ -302,12 +293,6 @@ def draw_table(table: Table, width: int, *, styled: bool = False, encoding: str 
 
     The columns that name a row stand in front of every block of the others. Columns of one group
     stay together where they fit. Texts are folded; numbers never are.
-
-    Args:
-        table: the table.
-        width: in characters; a table whose narrowest form is wider is drawn wider.
-        styled: with the codes of a terminal; without them a character marks best values.
-        encoding: what it lacks is said in ASCII.
     """
     from rich.console import Console
 

@@ -4,20 +4,21 @@ Hand models and the official HWP release come as pickles, and a pickle can name 
 have it called. Here it can name numpy arrays and builtin containers; what the caller lists as
 stand-ins becomes an inert object that only keeps its state; everything else is refused by name.
 Not even numpy's own types are given out: array and element type are rebuilt by the functions
-below, because a crafted `numpy.dtype` state can make numpy take bytes for pointers.
+below, because a crafted `numpy.dtype` state can make numpy take bytes for pointers. What these
+files do not need is not read at all: sets, and keys of tables that are not texts or numbers, whose
+hashes can be chosen to be equal.
 """
 
 from __future__ import annotations
 
 import itertools
+import math
 import os
 import pickle
-import pickletools
-from collections import OrderedDict
-from collections.abc import Callable, Collection, Iterator, Sequence
-from functools import partial
+import struct
+from collections.abc import Callable, Collection, Iterator
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 
@@ -26,7 +27,6 @@ from hwp_bench.base.files import check_is_file
 
 #: Largest pickle that is read, in bytes; MANO has 4 MB, a released HWP capture some 100 MB.
 MAX_PICKLE_BYTES = 1024 * 1024 * 1024
-
 #: Most steps of a pickle: each can make an object of some 200 bytes.
 MAX_STEPS = 10_000_000
 #: Most numbers and characters that containers and arrays come to when whatever they share is
@@ -35,14 +35,10 @@ MAX_EXPANDED = 10_000_000
 #: Deepest nesting of containers and objects.
 MAX_DEPTH = 64
 
-# Most keys of tables and sets that are tuples or frozen sets: equal hashes can be chosen for them
-# (-1 and -2 have the same), and a table of n equal hashes takes n^2 steps.
-_MOST_ODD_KEYS = 1000
-# Deepest nesting while the steps are taken, where objects count twice or more: hashing a key calls
-# itself once a level without a bound of its own, until the stack of the process is full.
-_DEEPEST_STEPS = 4 * MAX_DEPTH
 # The hash of larger integers repeats.
 _LARGEST_INTEGER = 2**63
+# Axes of an array.
+_MOST_AXES = 32
 _BYTE_ORDERS = "<>|="
 _KINDS = "biufSU"
 
@@ -70,10 +66,6 @@ class StandIn:
         self.state = state
 
 
-# What has parts.
-_HOLDERS = (dict, list, tuple, set, frozenset, StandIn)
-
-
 def load_pickle(
     path: str | os.PathLike[str],
     *,
@@ -98,8 +90,8 @@ def load_pickle(
 
     Raises:
         UnsafePickle: the file names anything else; the error's field is that name.
-        BadInput: the file is missing, too large, truncated or damaged, or would be far larger in
-            memory: by what it shares, by keys of equal hashes, or by its depth.
+        BadInput: the file is missing, too large, truncated or damaged, holds what is not read here,
+            or would be far larger in memory: by what it shares, or by its depth.
     """
     path = Path(path)
     check_is_file(path)
@@ -108,24 +100,16 @@ def load_pickle(
         raise BadInput(f"holds {size} bytes, more than the {max_bytes} that are read", where=path)
     try:
         with path.open("rb") as stream:
-            _check_steps(_Exact(stream, size), max_steps, MAX_EXPANDED + size)
-            stream.seek(0)
-            loaded = _Unpickler(stream, path, stand_ins).load()
-            _check_expanded(loaded, MAX_EXPANDED + size)
-            return loaded
+            loaded = _Unpickler(_Exact(stream, size), path, stand_ins, max_steps).load()
+        _check_expanded(loaded, MAX_EXPANDED + size)
+        return loaded
     except HwpError:
         raise
     # A damaged pickle can raise any exception.
     except Exception as error:
-        raise BadInput(f"is not a readable pickle ({_reason(error)})", where=path) from error
-
-
-def _reason(error: Exception) -> str:
-    """Say in one line why a pickle cannot be read, whatever the error says."""
-    if isinstance(error, KeyError):
-        return f"it refers to object {error}, which is not there"
-    text = shown(" ".join(str(error).split()))[:200]
-    return text or f"a step of it fails with {type(error).__name__}"
+        text = shown(" ".join(str(error).split()))[:200]
+        reason = text or f"a step of it fails with {type(error).__name__}"
+        raise BadInput(f"is not a readable pickle ({reason})", where=path) from error
 
 
 class _Exact:
@@ -133,192 +117,136 @@ class _Exact:
 
     def __init__(self, stream: Any, size: int) -> None:
         self._stream = stream
-        self.size = size
+        self._size = size
         self.readline = stream.readline
-        self.tell = stream.tell
 
     def read(self, count: int) -> bytes:
-        """Read some bytes; none at the end of the file."""
-        left = self.size - self._stream.tell()
+        left = self._size - self._stream.tell()
         if count > max(left, 1):
             raise ValueError(f"it claims {count:,} bytes where {left:,} are left")
         return bytes(self._stream.read(count))
 
 
-def _check_steps(stream: _Exact, most: int, most_size: int) -> None:
-    """Refuse steps that no pickler writes, before any is taken.
+class _Memo(dict[int, Any]):
+    """Objects by the numbers that a pickler gives them, one after the other."""
 
-    Args:
-        stream: the pickle.
-        most: largest number of steps.
-        most_size: largest size of what is hashed, and of any object that is made.
-    """
-    shape = _Shape(most_size)
-    for count, (opcode, argument, _) in enumerate(pickletools.genops(cast("Any", stream))):
-        if count >= most:
-            raise ValueError(f"more than {most:,} steps")
-        # The reader makes room for the largest memo number.
-        if opcode.name in ("PUT", "BINPUT", "LONG_BINPUT") and (argument or 0) > count + 1:
-            raise ValueError(f"memo number {argument} after {count} steps")
-        if isinstance(argument, int) and abs(argument) > _LARGEST_INTEGER:
+    def __setitem__(self, number: int, value: Any) -> None:
+        if number > len(self) + 1:
+            raise ValueError(f"memo number {number} after {len(self)} objects")
+        super().__setitem__(number, value)
+
+
+#: Python's own reader, whose every step can be changed.
+_Reader: Any = pickle._Unpickler  # type: ignore[attr-defined]
+#: The steps that are taken: those of files of plain data.
+_STEPS = (
+    "PROTO FRAME STOP MARK POP POP_MARK DUP MEMOIZE PUT BINPUT LONG_BINPUT GET BINGET LONG_BINGET "
+    "NONE NEWTRUE NEWFALSE INT BININT BININT1 BININT2 LONG LONG1 LONG4 FLOAT BINFLOAT STRING "
+    "BINSTRING SHORT_BINSTRING UNICODE BINUNICODE SHORT_BINUNICODE BINUNICODE8 BINBYTES "
+    "SHORT_BINBYTES BINBYTES8 BYTEARRAY8 EMPTY_TUPLE TUPLE TUPLE1 TUPLE2 TUPLE3 EMPTY_LIST LIST "
+    "APPEND APPENDS EMPTY_DICT DICT SETITEM SETITEMS GLOBAL STACK_GLOBAL REDUCE NEWOBJ BUILD "
+    "PERSID BINPERSID"
+)
+
+
+class _Unpickler(_Reader):  # type: ignore[misc]
+    def __init__(
+        self, stream: _Exact, path: Path, stand_ins: Collection[str], max_steps: int
+    ) -> None:
+        super().__init__(stream, encoding="latin1")
+        self.memo = _Memo()
+        self.dispatch = self
+        self._left = self._most = max_steps
+        self._path = path
+        self._stand_ins = frozenset(stand_ins)
+        self._classes: dict[str, type[StandIn]] = {}
+
+    def __getitem__(self, code: int) -> Callable[[Any], None]:
+        """The function that takes the next step."""
+        self._left -= 1
+        if self._left < 0:
+            raise ValueError(f"more than {self._most:,} steps")
+        if code not in _DISPATCH:
+            raise ValueError(f"step {bytes([code])!r} is not one of plain data")
+        return _DISPATCH[code]
+
+    def integer(self, load: Callable[[Any], None]) -> None:
+        """Take a step that makes an integer of any size."""
+        load(self)
+        if abs(self.stack[-1]) > _LARGEST_INTEGER:
             raise ValueError("an absurdly large integer")
-        if opcode.name == "FRAME" and (argument or 0) > stream.size:
-            raise ValueError(f"it claims {argument:,} bytes of {stream.size:,}")
-        shape.take(opcode, argument)
+
+    def entries(self, load: Callable[[Any], None], keys: list[Any]) -> None:
+        """Take a step that sets entries of a table."""
+        if any(not isinstance(key, str | bytes | int | float | None) for key in keys):
+            raise ValueError("a key of a table is neither a text nor a number")
+        load(self)
+
+    def state(self, load: Callable[[Any], None]) -> None:
+        """Take a step that gives an object its state."""
+        if not isinstance(self.stack[-2], StandIn | _Dtype | _Array):
+            raise TypeError("a state of something that has none")
+        load(self)
+
+    def byte_array(self) -> None:
+        """Take a step that makes an array of bytes, whose room is made when they are there."""
+        (count,) = struct.unpack("<Q", self.read(8))
+        self.append(bytearray(self.read(count)))
+
+    def find_class(self, module: str, name: str) -> Any:
+        full = f"{module}.{name}"
+        if full in _ADMITTED:
+            return _ADMITTED[full]
+        if self._is_stand_in(module, full):
+            if full not in self._classes:
+                self._classes[full] = type("StandIn", (StandIn,), {"origin": full})
+            return self._classes[full]
+        raise UnsafePickle(
+            "this pickle asks for something that is not plain data",
+            where=self._path,
+            field=full,
+            remedy="Do not open this file with ordinary tools: it may run code.",
+        )
+
+    def persistent_load(self, pid: Any) -> Any:
+        raise UnsafePickle(
+            "this pickle refers to objects outside itself", where=self._path, field="persistent id"
+        )
+
+    def _is_stand_in(self, module: str, full: str) -> bool:
+        parents = module.split(".")
+        packages = {".".join(parents[: i + 1]) + ".*" for i in range(len(parents))}
+        return full in self._stand_ins or not packages.isdisjoint(self._stand_ins)
 
 
-class _Made:
-    """An object that a step will make: its depth and its size."""
-
-    __slots__ = ("depth", "hashed", "size")
-
-    def __init__(self, depth: int = 0, size: int = 1, *, hashed: bool = False) -> None:
-        self.depth = depth
-        self.size = size
-        #: Whether it is a tuple or frozen set, whose hash looks at every part.
-        self.hashed = hashed
+_CHECKED = ("BUILD", "SETITEM", "SETITEMS", "DICT")
 
 
-#: What begins a group of parts on the stack.
-_MARK = _Made()
+def _dispatch() -> dict[int, Callable[[Any], None]]:
+    """What takes each step."""
+    taken = {getattr(pickle, name)[0] for name in _STEPS.split()}
+    steps = {code: step for code, step in _Reader.dispatch.items() if code in taken}
+    for name in ("INT", "LONG", "LONG1", "LONG4"):
+        code = getattr(pickle, name)[0]
+        steps[code] = lambda reader, load=steps[code]: reader.integer(load)
+    build, one, many, table = (steps[getattr(pickle, name)[0]] for name in _CHECKED)
+    steps[pickle.BUILD[0]] = lambda reader: reader.state(build)
+    steps[pickle.SETITEM[0]] = lambda reader: reader.entries(one, reader.stack[-2:-1])
+    steps[pickle.SETITEMS[0]] = lambda reader: reader.entries(many, reader.stack[::2])
+    steps[pickle.DICT[0]] = lambda reader: reader.entries(table, reader.stack[::2])
+    steps[pickle.BYTEARRAY8[0]] = _Unpickler.byte_array
+    return steps
 
 
-class _Shape:
-    """Follows the steps of a pickle without taking them: how deep and large all becomes.
-
-    What is shared counts each time. A list or table that grows after it was put into another one
-    is followed no further: it has no hash, and `_check_expanded` measures it afterwards.
-    """
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._stack: list[_Made] = []
-        self._memo: dict[int, _Made] = {}
-        self._hashed = 0
-        self._odd_keys = 0
-
-    def take(self, opcode: pickletools.OpcodeInfo, argument: Any) -> None:
-        """Follow one step.
-
-        Raises:
-            ValueError: it takes what is not there, or makes something too deep or too large.
-        """
-        name = opcode.name
-        if name in _TUPLES:
-            self._make(self._some(_TUPLES[name]), hashed=True)
-        elif name in ("TUPLE", "FROZENSET"):
-            parts = self._group()
-            if name == "FROZENSET":
-                self._hash(parts)
-                self._odd_keys += 1
-            self._make(parts, hashed=True)
-        elif name in ("LIST", "DICT", "OBJ", "INST"):
-            parts = self._group()
-            if name == "DICT":
-                self._hash(parts[::2])
-            self._make(parts)
-        elif name in _ADDED:
-            many, first, step = _ADDED[name]
-            parts = self._group() if many else self._some(step)
-            self._hash(parts[first::step] if first is not None else [])
-            self._grow(parts)
-        elif name in ("REDUCE", "NEWOBJ", "NEWOBJ_EX"):
-            parts = self._some(3 if name == "NEWOBJ_EX" else 2)
-            # The function may make a set or table of them, and counts the odd keys itself.
-            self._hash(parts, odd=False)
-            self._make(parts)
-        elif name == "BUILD":
-            self._grow(self._some(1))
-        elif name in ("PUT", "BINPUT", "LONG_BINPUT"):
-            self._memo[argument] = self._top()
-        elif name == "MEMOIZE":
-            self._memo[len(self._memo)] = self._top()
-        elif name in ("GET", "BINGET", "LONG_BINGET"):
-            if argument not in self._memo:
-                raise ValueError(f"it refers to object {argument}, which is not there")
-            self._stack.append(self._memo[argument])
-        elif name == "MARK":
-            self._stack.append(_MARK)
-        elif name == "POP_MARK":
-            self._group()
-        elif name == "DUP":
-            self._stack.append(self._top())
-        else:
-            # Steps that only take something away or make something without parts.
-            self._some(len(opcode.stack_before))
-            self._stack += [_Made() for _ in opcode.stack_after]
-
-    def _top(self) -> _Made:
-        if not self._stack or self._stack[-1] is _MARK:
-            raise ValueError("a step takes more than is there")
-        return self._stack[-1]
-
-    def _some(self, count: int) -> list[_Made]:
-        if len(self._stack) < count:
-            raise ValueError("a step takes more than is there")
-        found = self._stack[len(self._stack) - count :]
-        del self._stack[len(self._stack) - count :]
-        return found
-
-    def _group(self) -> list[_Made]:
-        """Take the parts since the last mark, and the mark."""
-        found: list[_Made] = []
-        while self._stack:
-            part = self._stack.pop()
-            if part is _MARK:
-                return found[::-1]
-            found.append(part)
-        raise ValueError("a step takes more than is there")
-
-    def _make(self, parts: Sequence[_Made], *, hashed: bool = False) -> None:
-        made = _Made(1, hashed=hashed)
-        self._stack.append(made)
-        self._grow(parts)
-
-    def _grow(self, parts: Sequence[_Made]) -> None:
-        holder = self._top()
-        holder.depth = max([holder.depth, *(1 + part.depth for part in parts)])
-        holder.size += sum(part.size for part in parts)
-        if holder.depth > _DEEPEST_STEPS:
-            raise ValueError("it is nested too deeply")
-        if holder.size > self._most:
-            raise ValueError(f"it comes to more than {self._most:,} numbers and characters")
-
-    def _hash(self, keys: Sequence[_Made], *, odd: bool = True) -> None:
-        for key in keys:
-            self._hashed += key.size
-            self._odd_keys += odd and key.hashed
-        if self._hashed > _HASHED * self._most:
-            raise ValueError(f"its keys come to more than {_HASHED * self._most:,} values")
-        if self._odd_keys > _MOST_ODD_KEYS:
-            raise ValueError(f"more than {_MOST_ODD_KEYS:,} tuples and frozen sets as keys")
+_DISPATCH = _dispatch()
 
 
-#: Steps that make a tuple of the last values of the stack, with how many.
-_TUPLES = {"EMPTY_TUPLE": 0, "TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
-#: Steps that add to what is there: whether by a group, which of the parts is the first key (None:
-#: none is), and of how many parts each addition is.
-_ADDED: dict[str, tuple[bool, int | None, int]] = {
-    "APPEND": (False, None, 1),
-    "APPENDS": (True, None, 1),
-    "SETITEM": (False, 0, 2),
-    "SETITEMS": (True, 0, 2),
-    "ADDITEMS": (True, 0, 1),
-}
-# Times of the largest size that all keys together may come to.
-_HASHED = 4
+# What has parts.
+_HOLDERS = (dict, list, tuple, StandIn)
 
 
 def _check_expanded(loaded: Any, most: int) -> None:
-    """Refuse what numpy would copy into far more memory than the pickle takes.
-
-    Args:
-        loaded: the object.
-        most: largest sum of numbers and characters; what is shared counts each time.
-
-    Raises:
-        ValueError: it is larger, contains itself, or is nested too deeply.
-    """
+    """Refuse what numpy would copy into far more memory than the pickle takes."""
     # Size and depth of each container, from the inside out; None while its parts are looked at,
     # so that a part without one contains the container that it is in.
     known: dict[int, tuple[int, int] | None] = {}
@@ -360,81 +288,25 @@ def _leaf(item: Any) -> int:
     return len(item) if isinstance(item, str | bytes | bytearray) else 1
 
 
-class _Unpickler(pickle.Unpickler):
-    def __init__(self, stream: Any, path: Path, stand_ins: Collection[str]) -> None:
-        super().__init__(stream, encoding="latin1")
-        self._path = path
-        self._stand_ins = frozenset(stand_ins)
-        self._classes: dict[str, type[StandIn]] = {}
-        self._counted = 0
-
-    def find_class(self, module: str, name: str) -> Any:
-        full = f"{module}.{name}"
-        if full in _ADMITTED:
-            return _ADMITTED[full]
-        if full in _HASHING:
-            return _Function(partial(self._make_of_keys, _HASHING[full]))
-        if self._is_stand_in(module, full):
-            if full not in self._classes:
-                self._classes[full] = type("StandIn", (StandIn,), {"origin": full})
-            return self._classes[full]
-        raise UnsafePickle(
-            "this pickle asks for something that is not plain data",
-            where=self._path,
-            field=full,
-            remedy="Do not open this file with ordinary tools: it may run code.",
-        )
-
-    def _make_of_keys(self, kind: type, *arguments: Any) -> Any:
-        """Make a set or table, whose keys `_MOST_ODD_KEYS` bounds."""
-        if any(not isinstance(parts, list | tuple | set | frozenset | dict) for parts in arguments):
-            raise TypeError(f"a {kind.__name__} of something that is not a list")
-        for item in itertools.chain(*arguments):
-            key = item[:1] if kind is OrderedDict and isinstance(item, list | tuple) else [item]
-            self._counted += any(isinstance(part, tuple | frozenset) for part in key)
-        self._counted += kind is frozenset
-        if self._counted > _MOST_ODD_KEYS:
-            raise ValueError(f"more than {_MOST_ODD_KEYS:,} tuples and frozen sets as keys")
-        return kind(*arguments)
-
-    def persistent_load(self, pid: Any) -> Any:
-        raise UnsafePickle(
-            "this pickle refers to objects outside itself", where=self._path, field="persistent id"
-        )
-
-    def _is_stand_in(self, module: str, full: str) -> bool:
-        parents = module.split(".")
-        packages = {".".join(parents[: i + 1]) + ".*" for i in range(len(parents))}
-        return full in self._stand_ins or not packages.isdisjoint(self._stand_ins)
-
-
 class _Function:
-    """A function that a pickle may call but not change (a pickle can set attributes)."""
-
-    __slots__ = ("_function",)
-    _function: Callable[..., Any]
+    """A function that a pickle may call but not change: it takes no state."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
-        object.__setattr__(self, "_function", function)
+        self._function = function
 
     def __call__(self, *arguments: Any) -> Any:
         return self._function(*arguments)
-
-    def __setattr__(self, name: str, value: Any) -> None:
-        raise TypeError("a pickle may not change what it calls")
-
-    def __setstate__(self, state: Any) -> None:
-        raise TypeError("a pickle may not change what it calls")
 
 
 class _Dtype:
     """An element type as a pickle describes it, checked before numpy sees it."""
 
     def __init__(self, name: Any, align: Any = False, copy: Any = False) -> None:
-        dtype = np.dtype(str(name))
+        # A text first: of what is shared many times, a text would fill the memory.
+        dtype = np.dtype(name if isinstance(name, str) else "O")
         # An element of no bytes would make an array of any shape out of nothing.
         if dtype.kind not in _KINDS or dtype.itemsize == 0:
-            raise ValueError(f"array elements of type {name!r} are not plain numbers or text")
+            raise ValueError(f"array elements of type {dtype} are not plain numbers or text")
         self.dtype = dtype
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
@@ -458,14 +330,11 @@ class _Array(np.ndarray):
         _, shape, dtype, fortran, raw = state
         plain = _plain_dtype(dtype)
         data = raw.encode("latin1") if isinstance(raw, str) else _bytes_of(raw)
-        expected = plain.itemsize
-        for length in shape:
-            if not isinstance(length, int) or length < 0:
-                raise ValueError("an array's shape is not made of integers")
-            expected *= length
+        shape = _plain_shape(shape)
+        expected = plain.itemsize * math.prod(shape)
         if expected != len(data):
             raise ValueError(f"an array of shape {shape} holds {len(data)} bytes, not {expected}")
-        whole = (1, tuple(shape), plain, bool(fortran), data)
+        whole = (1, shape, plain, bool(fortran), data)
         super().__setstate__(whole)  # type: ignore[arg-type]
 
 
@@ -474,6 +343,13 @@ def _bytes_of(raw: Any) -> bytes:
     if not isinstance(raw, (bytes, bytearray)):
         raise TypeError(f"{type(raw).__name__} where bytes are expected")
     return bytes(raw)
+
+
+def _plain_shape(shape: Any) -> tuple[int, ...]:
+    sound = isinstance(shape, tuple | list) and len(shape) <= _MOST_AXES
+    if not sound or any(not isinstance(length, int) or length < 0 for length in shape):
+        raise ValueError("an array's shape is not made of integers")
+    return tuple(shape)
 
 
 def _plain_dtype(holder: Any) -> np.dtype[Any]:
@@ -500,7 +376,7 @@ def _scalar(dtype: Any, raw: Any = b"") -> Any:
 
 def _from_buffer(buffer: Any, dtype: Any, shape: Any, order: Any) -> np.ndarray:
     flat = np.frombuffer(bytearray(_bytes_of(buffer)), dtype=_plain_dtype(dtype))
-    return flat.reshape(shape, order="F" if order == "F" else "C").view(_Array)
+    return flat.reshape(_plain_shape(shape), order="F" if order == "F" else "C").view(_Array)
 
 
 def _encode(text: Any, codec: Any = "latin1") -> bytes:
@@ -547,9 +423,3 @@ def _admitted() -> dict[str, Any]:
 
 
 _ADMITTED = _admitted()
-# What takes the hash of what it is made of.
-_HASHING: dict[str, type] = {
-    "collections.OrderedDict": OrderedDict,
-    **{f"{module}.set": set for module in ("builtins", "__builtin__")},
-    **{f"{module}.frozenset": frozenset for module in ("builtins", "__builtin__")},
-}

@@ -38,15 +38,6 @@ def refuse_changed(capture: Capture, kinds: Iterable[str] = ("frames", "masks"))
 
     A score stands under the digest of its capture, so that the pixels behind it must be those.
     Every image of the kinds is decoded: about 2 ms for a frame of 256 x 256 px.
-
-    Args:
-        capture: the capture.
-        kinds: images that are looked at, keys of `IMAGE_FOLDERS`; estimated hand parameters and
-            cameras always are.
-
-    Raises:
-        BadImage: an image is missing or damaged.
-        BadCapture: a part was changed after the capture was written; it is named.
     """
     found = {
         "hands": arrays_digest(hand_arrays(capture.hands)),
@@ -65,15 +56,7 @@ def refuse_changed(capture: Capture, kinds: Iterable[str] = ("frames", "masks"))
 
 
 def images_digest(capture: Capture, kind: str) -> str:
-    """Return the digest over the decoded images of one kind.
-
-    Args:
-        capture: the capture.
-        kind: a key of `IMAGE_FOLDERS`.
-
-    Raises:
-        BadImage: an image is missing or damaged.
-    """
+    """Return the digest over the decoded images of one kind."""
     read = image_reader(capture, kind)
     with ThreadPoolExecutor(max_workers=os.cpu_count()) as pool:
         return combine(pool.map(lambda frame: pixel_digest(read(frame)), range(len(capture))))
@@ -421,8 +404,6 @@ def contact_sheet(capture: Capture, *, count: int = 24, edge: int = 256) -> np.n
     """Draw frames of a capture, evenly spaced, each with its mask and hands.
 
     Args:
-        capture: the capture.
-        count: number of frames.
         edge: larger side of a frame on the sheet, px.
 
     Returns:

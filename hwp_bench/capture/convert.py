@@ -44,21 +44,7 @@ def convert_hand(
     target: HandTemplate,
     settings: FittingSettings | None = None,
 ) -> tuple[HandParameters, ConversionError]:
-    """Express a hand in another hand model.
-
-    Args:
-        hand: parameters that belong to `source`.
-        source: the hand model that they are given in.
-        target: the hand model to convert to, of the same side.
-        settings: steps and weights of the fit.
-
-    Returns:
-        Parameters that belong to `target`, and how far they are from the source's hand.
-
-    Raises:
-        UsageError: the templates are of different sides.
-        BadInput: no frame is valid.
-    """
+    """Express a hand in another hand model."""
     if source.side != target.side:
         raise UsageError(f"a {source.side} hand is not a {target.side} hand", field="target")
     tensors = source.to_torch(torch.float64)
@@ -94,7 +80,6 @@ def with_one_shape(
     """Give all frames the median shape, and move each so that its vertices stay in place.
 
     Args:
-        template: the hand model.
         pose: (F, 16, 3) axis-angle rad, the pose itself (no mean pose to be added).
         betas: (F, 10), one for each frame, as per-frame estimators give them.
         transl: (F, 3) m.
@@ -103,9 +88,6 @@ def with_one_shape(
     Returns:
         Parameters with one shape, and (F,) the mean distance of the vertices from where the
         frame's own shape has them, mm; NaN where not valid.
-
-    Raises:
-        ShapeMismatch: the arrays do not describe the same frames.
     """
     if betas.shape != (len(pose), 10):
         raise ShapeMismatch(f"shape is {betas.shape}, expected ({len(pose)}, 10)", field="betas")
@@ -136,23 +118,7 @@ def convert_capture(
     overwrite: bool = False,
     settings: FittingSettings | None = None,
 ) -> dict[str, ConversionError]:
-    """Write a capture again with its hands in another hand model; images stay as they are.
-
-    Args:
-        capture: the capture.
-        out: the capture folder to make.
-        source: the model to convert to, as `load_template` takes it.
-        overwrite: replace an existing folder.
-        settings: steps and weights of the fit.
-
-    Returns:
-        The error of the conversion, by side.
-
-    Raises:
-        UsageError: `out` exists, or the hand model does not exist.
-        BadHandModel: the template that the capture names cannot be loaded.
-        BadInput: the template that is loaded is not the capture's.
-    """
+    """Write a capture again with its hands in another hand model; images stay as they are."""
     info = capture.info
     made, errors = {}, {}
     for side, hand in capture.hands.items():
@@ -181,17 +147,7 @@ FORMATS = (".glb", ".obj", ".ply", ".stl")
 
 
 def hand_meshes(capture: Capture, frame: int, *, truth: bool = False) -> dict[str, trimesh.Trimesh]:
-    """Return the posed meshes of the hands in one frame, by side, in world coordinates, m.
-
-    Args:
-        capture: the capture.
-        frame: the frame.
-        truth: take the true parameters, which simulated captures know, instead of the estimates.
-
-    Raises:
-        UsageError: there is no such frame, or the capture does not know the truth.
-        BadInput: the hand model that is installed here is another than the capture's.
-    """
+    """Return the posed meshes of the hands in one frame, by side, in world coordinates, m."""
     poses = capture.hand_poses(frame)
     hands = capture.hands
     if truth:
@@ -214,16 +170,7 @@ def hand_meshes(capture: Capture, frame: int, *, truth: bool = False) -> dict[st
 
 
 def write_meshes(meshes: dict[str, trimesh.Trimesh], path: str | os.PathLike[str]) -> Path:
-    """Write meshes into one file, whose ending says the format.
-
-    Args:
-        meshes: by name.
-        path: a file that ends in one of `FORMATS`; replaced if it exists.
-
-    Raises:
-        UsageError: the ending is not a known format.
-        HwpError: the file cannot be written.
-    """
+    """Write meshes into one file, whose ending says the format."""
     path = Path(path)
     if path.suffix.lower() not in FORMATS:
         raise UsageError(

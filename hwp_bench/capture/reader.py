@@ -228,12 +228,7 @@ class Capture:
 
 
 def digest_at(root: Path, info: CaptureInfo) -> str:
-    """Return the digest of the capture in a folder, as `Capture.digest`.
-
-    Args:
-        root: the folder; it need not be sound.
-        info: its description.
-    """
+    """Return the digest of the capture in a folder, as `Capture.digest`."""
     whole = info.to_json()
     lacking = "true_masks" in whole["digests"] and not (root / IMAGE_FOLDERS["true_masks"]).is_dir()
     return sha256_json({"capture": whole, "masks": "estimated"} if lacking else whole)
@@ -287,20 +282,7 @@ def identify_hand_model(source: str, hands: str) -> HandModelId:
 def load_matching_template(
     model: HandModelId, sides: Sequence[str], side: str, *, where: str | os.PathLike[str]
 ) -> HandTemplate:
-    """Load the template of one side of the model that parameters were made with.
-
-    Args:
-        model: hand model that the capture (or avatar) names; the digest is that of the
-            first of its sides.
-        sides: the hands that it has, in its order.
-        side: the hand to load.
-        where: the capture or avatar, for the message.
-
-    Raises:
-        BadCapture: the digest is that of another hand than the first.
-        BadInput: the model that is installed here is another one: by name or by content.
-        UsageError, BadHandModel: it cannot be loaded.
-    """
+    """Load the template of one side of the model that parameters were made with."""
     first = load_template(model.source, sides[0])
     if first.name != model.name:
         raise BadInput(

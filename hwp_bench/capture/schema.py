@@ -189,11 +189,7 @@ class CaptureInfo:
 
 
 def check_id(identifier: str, where: str) -> None:
-    """Refuse a capture id that could not be a folder's name everywhere.
-
-    Raises:
-        BadCapture: it has other characters than letters, digits, `.`, `_`, `-`, or is too long.
-    """
+    """Refuse a capture id that could not be a folder's name everywhere."""
     if not _ID.fullmatch(identifier):
         raise BadCapture(
             f"{identifier!r} is not a capture id",
@@ -262,10 +258,6 @@ def check_cameras(Ks: np.ndarray, viewmats: np.ndarray, *, where: str) -> None:
     Args:
         Ks: (F, 3, 3) intrinsics, px.
         viewmats: (F, 4, 4) world to camera.
-        where: the file, for the message.
-
-    Raises:
-        BadInput: what `Cameras` lists; the frame is named.
     """
     arrays = {"Ks": np.asarray(Ks), "viewmats": np.asarray(viewmats)}
     count = len(arrays["Ks"])
@@ -297,11 +289,7 @@ def check_cameras(Ks: np.ndarray, viewmats: np.ndarray, *, where: str) -> None:
 
 
 def read_cameras(path: str | os.PathLike[str], frame_count: int) -> Cameras:
-    """Read `cameras.npz`.
-
-    Raises:
-        BadInput: missing, damaged, or not `frame_count` sound cameras.
-    """
+    """Read `cameras.npz`."""
     arrays = read_npz(path)
     Ks = take(arrays, "Ks", (frame_count, 3, 3), where=path)
     viewmats = take(arrays, "viewmats", (frame_count, 4, 4), where=path)
@@ -317,15 +305,7 @@ def write_cameras(path: str | os.PathLike[str], cameras: Cameras) -> None:
 def read_hands(
     path: str | os.PathLike[str], sides: tuple[str, ...], frame_count: int
 ) -> dict[str, HandParameters]:
-    """Read `hands.npz`: for each side `{side}_pose`, `_betas`, `_transl`, `_valid`.
-
-    Returns:
-        Parameters by side, in the order of `sides`.
-
-    Raises:
-        BadInput: missing, damaged, of another length, not finite or beyond `LARGEST`; the array is
-            named.
-    """
+    """Read `hands.npz`: for each side `{side}_pose`, `_betas`, `_transl`, `_valid`."""
     arrays = read_npz(path)
     return {
         side: HandParameters(
@@ -369,7 +349,13 @@ _FARTHEST = 1.0
 
 
 def write_subject_mesh(path: str | os.PathLike[str], templates: Mapping[str, HandTemplate]) -> None:
-    """Write the rest hands of a subject by side, to be read with `read_subject_mesh`."""
+    """Write the rest hands of a subject by side: `truth/template.npz`.
+
+    A subject may be another person than every shape of the hand model. Of a subject with the hand
+    model's triangles, the file holds the surface, the joints it bends about, and its skinning; the
+    rest of a template is the hand model's. It is truth with the capture and no part of its digest:
+    it follows from the scene.
+    """
     arrays = {
         f"{side}_{field}": getattr(template, field).astype(np.float32)
         for side, template in templates.items()
@@ -379,19 +365,7 @@ def write_subject_mesh(path: str | os.PathLike[str], templates: Mapping[str, Han
 
 
 def read_subject_mesh(path: str | os.PathLike[str], model: HandTemplate) -> HandTemplate:
-    """Read one hand of a subject.
-
-    Args:
-        path: the file.
-        model: the hand model, of the hand's side.
-
-    Returns:
-        A template with the model's name and triangles that no shape parameter changes.
-
-    Raises:
-        BadInput: missing, damaged, too large, not of the model's vertices, not finite, farther
-            than 1 m away, or its skinning weights are negative or do not sum to 1.
-    """
+    """Read one hand of a subject."""
     arrays = read_npz(path, max_bytes=_MAX_BYTES)
     count, side = len(model.vertices), model.side
     vertices = take(arrays, f"{side}_vertices", (count, 3), where=path)

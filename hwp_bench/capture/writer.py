@@ -198,19 +198,7 @@ def rewrite_capture(
     *,
     overwrite: bool = False,
 ) -> None:
-    """Copy a capture with other hands. True hands are left out: they are of the old model.
-
-    Args:
-        capture: what is copied: frames, masks and known truth images.
-        out: the capture folder to make.
-        info: description of the new capture.
-        hands: its parameters by side.
-        overwrite: replace an existing folder.
-
-    Raises:
-        UsageError: `out` exists.
-        BadImage: an image of the capture is missing or damaged.
-    """
+    """Copy a capture with other hands. True hands are left out: they are of the old model."""
     with CaptureWriter(out, info, hands, capture.cameras, overwrite=overwrite) as writer:
         for frame in range(len(capture)):
             writer.frame(frame, capture.frame(frame))

@@ -3,7 +3,6 @@ from .anchors import anchor_frames as anchor_frames
 from .anchors import anchor_normals as anchor_normals
 from .anchors import anchor_positions as anchor_positions
 from .anchors import anchor_uv as anchor_uv
-from .anchors import anchors_from_vertices as anchors_from_vertices
 from .anchors import sample_surface as sample_surface
 from .anchors import to_trimesh as to_trimesh
 from .anchors import vertex_normals as vertex_normals

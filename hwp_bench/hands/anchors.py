@@ -96,23 +96,6 @@ def sample_surface(
     return SurfaceAnchors(face_index, _square_to_triangle(square))
 
 
-def anchors_from_vertices(template: HandTemplate) -> SurfaceAnchors:
-    """Make one anchor on every vertex, in the order of the vertices.
-
-    Raises:
-        UsageError: a vertex belongs to no face.
-    """
-    count = len(template.vertices)
-    first = np.full(count, -1, dtype=np.int64)
-    flat = template.faces.reshape(-1)
-    first[flat[::-1]] = np.arange(len(flat))[::-1]
-    if (first < 0).any():
-        raise UsageError(
-            f"vertex {int(np.argmin(first))} belongs to no face", field="template.faces"
-        )
-    return SurfaceAnchors(first // 3, np.eye(3)[first % 3])
-
-
 def anchor_positions(
     vertices: torch.Tensor, faces: torch.Tensor, anchors: SurfaceAnchors
 ) -> torch.Tensor:
@@ -202,7 +185,6 @@ def unit_or(vectors: torch.Tensor, fallback: torch.Tensor) -> torch.Tensor:
 
     Args:
         vectors: (..., 3).
-        fallback: broadcastable to `vectors`.
     """
     squared = (vectors * vectors).sum(dim=-1, keepdim=True)
     usable = squared > _TINY
@@ -280,7 +262,6 @@ class HandSurfaces:
     """The surfaces of a capture's hands, cut into cells: the places that frames have in common.
 
     Args:
-        templates: by side.
         patch_size: edge of a cell, m.
     """
 
@@ -331,11 +312,9 @@ class HandSurfaces:
         """Draw the hands in some frames, in their order.
 
         Args:
-            hands: parameters of every frame, by side.
             Ks: (F, 3, 3) px.
             viewmats: (F, 4, 4).
             frames: (R,) which frames.
-            size: height and width of the images.
         """
         before: tuple[int, np.ndarray] | None = None
         for start in range(0, len(frames), _CHUNK):

@@ -71,21 +71,7 @@ def fit_hand(
     start: HandParameters,
     settings: FittingSettings | None = None,
 ) -> FittedHand:
-    """Fit pose, one shape and translation, by Adam from a start; all frames at once.
-
-    Args:
-        template: the hand that is fitted.
-        targets: the known points; frames where `start.valid` is false are not fitted.
-        start: where the fit begins; its `valid` is kept.
-        settings: steps and weights.
-
-    Returns:
-        The fitted hand with its errors.
-
-    Raises:
-        BadInput: no frame is valid, or no points are known.
-        DidNotConverge: the fit left the finite numbers.
-    """
+    """Fit pose, one shape and translation, by Adam from a start; all frames at once."""
     settings = settings or FittingSettings()
     if not start.valid.any() or (targets.landmarks is None and targets.skin is None):
         raise BadInput("no frame is valid, or no points are known", field="targets")

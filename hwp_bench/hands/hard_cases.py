@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, TypeAlias
 
 import torch
 from torch import Tensor
@@ -19,99 +20,48 @@ from hwp_bench.hands.articulation import axis_angle_to_matrix
 from hwp_bench.hands.skinning import PosedHand, pose_hand, project
 from hwp_bench.hands.sources import load_template
 from hwp_bench.hands.template import TemplateTensors
-from hwp_bench.stability import Case, Context, Measured
+from hwp_bench.stability import Case, Measured
 
 #: Largest distance of a vertex from its oracle, m, in float64 and in float32.
 EXACT, ROUNDED = 1e-12, 2e-6
 #: Largest relative L2 distance of a float32 gradient from that of float64.
 GRADIENT_TOLERANCE = 1e-4
-#: Half an ulp at 1 of each narrow type: what a result of that type may be off, as a share.
-_NARROW = {torch.float16: 2.0**-11, torch.bfloat16: 2.0**-8}
+#: Narrow types, and what a result may be off as a share: 8 times half an ulp at 1.
+_NARROW = (("float16", 8 * 2.0**-11), ("bfloat16", 8 * 2.0**-8))
+_ROTATIONS = "vertices and gradients finite, every joint's motion a rotation"
 
-_Entry = tuple[str, str, Callable[[Context], Measured]]
+_Run: TypeAlias = Callable[..., Measured]
 _Arguments = tuple[Tensor, Tensor, Tensor]
+_CASES: list[Case] = []
 
 
 def cases() -> list[Case]:
     """Every hard case of the hand model."""
-    return [
-        Case(name, "hands", must_hold, run)
-        for entries in (_turns, _shapes, _layouts, _cameras, _pairs)
-        for name, must_hold, run in entries()
-    ]
+    return list(_CASES)
 
 
-def _turns() -> Iterator[_Entry]:
-    for turns in (1, 2, 100):
-        yield (
-            f"joints turned by {turns} x 360 degrees more",
-            f"vertices to {EXACT:g} m of those without the turns",
-            functools.partial(_run_turns, turns),
-        )
-    yield "a wrist turned by exactly 360 degrees", "the mesh of pose 0", _run_whole_turn
-    for size in (1e6, 1e19, 1e25, 3e38):
-        yield (
-            f"pose of {size:g} rad",
-            "vertices and gradients finite, every joint's motion a rotation",
-            functools.partial(_run_huge_pose, size, torch.float32),
-        )
-    for size in (1e154, 1e300):
-        yield (
-            f"pose of {size:g} rad in float64",
-            "vertices and gradients finite, every joint's motion a rotation",
-            functools.partial(_run_huge_pose, size, torch.float64),
-        )
+def _case(name: str, must_hold: str, *values: Any) -> Callable[[_Run], _Run]:
+    """Decorator: a case, or one for each value, which stands in its words and is its argument."""
+
+    def add(run: _Run) -> _Run:
+        for value in values or ((),):
+            given = value if isinstance(value, tuple) else (value,)
+            words = name.format(*given), must_hold.format(*given)
+            call = functools.partial(run, *given)
+            _CASES.append(Case(words[0], "hands", words[1], lambda context, call=call: call()))
+        return run
+
+    return add
 
 
-def _shapes() -> Iterator[_Entry]:
-    for beta in (20.0, -20.0):
-        yield (
-            f"every beta at {beta:+g}",
-            f"to {ROUNDED:g} m, gradients to {GRADIENT_TOLERANCE:g} of float64",
-            functools.partial(_run_against_float64, beta),
-        )
-        yield (
-            f"one beta at {beta:+g}",
-            f"vertices at rest move {beta:g} times as far as with 1",
-            functools.partial(_run_linear, beta),
-        )
-
-
-def _layouts() -> Iterator[_Entry]:
-    yield "transposed, strided and expanded arguments", "the same bits", _run_strided
-    yield "no frame", "empty arrays of the right shapes, gradients 0", _run_no_frame
-    yield "one frame of many", f"to {EXACT:g} m of the frame in a batch", _run_single
-    for dtype, share in _NARROW.items():
-        yield (
-            f"a template in {_name(dtype)}",
-            f"to {8 * share:g} of the extent of float64's result",
-            functools.partial(_run_narrow, dtype),
-        )
-        yield (
-            f"{_name(dtype)} arguments on a float32 template",
-            "one message that names the argument, both types and the remedy",
-            functools.partial(_run_mixed, dtype),
-        )
-
-
-def _cameras() -> Iterator[_Entry]:
-    yield (
-        "a hand behind the camera",
-        "depths negative; the pixels of the hand reflected through the camera's centre",
-        _run_behind,
-    )
-    yield "a hand around the camera's centre", "pixels and gradients finite", _run_around
-
-
-def _pairs() -> Iterator[_Entry]:
-    yield (
-        "left and right hand in one place",
-        f"each other's mirror image to {EXACT:g} m",
-        _run_pair,
-    )
-
-
-def _run_turns(turns: int, context: Context) -> Measured:
+@_case(
+    "joints turned by {} x 360 degrees more",
+    f"vertices to {EXACT:g} m of those without the turns",
+    1,
+    2,
+    100,
+)
+def _run_turns(turns: int) -> Measured:
     template, (pose, betas, transl) = _template(), _arguments()
     angles = pose.norm(dim=-1, keepdim=True)
     turned = pose * ((angles + 2.0 * math.pi * turns) / angles)
@@ -121,7 +71,8 @@ def _run_turns(turns: int, context: Context) -> Measured:
     return Measured(off <= EXACT, f"off by {off:.0e} m")
 
 
-def _run_whole_turn(context: Context) -> Measured:
+@_case("a wrist turned by exactly 360 degrees", "the mesh of pose 0")
+def _run_whole_turn() -> Measured:
     template, (pose, betas, transl) = _template(), _arguments()
     none = torch.zeros_like(pose)
     whole = none.clone()
@@ -132,7 +83,10 @@ def _run_whole_turn(context: Context) -> Measured:
     return Measured(off <= EXACT, f"off by {off:.0e} m")
 
 
-def _run_huge_pose(size: float, dtype: torch.dtype, context: Context) -> Measured:
+@_case("pose of {:g} rad", _ROTATIONS, *((size, "float32") for size in (1e6, 1e19, 1e25, 3e38)))
+@_case("pose of {:g} rad in float64", _ROTATIONS, *((size, "float64") for size in (1e154, 1e300)))
+def _run_huge_pose(size: float, name: str) -> Measured:
+    dtype = getattr(torch, name)
     pose, betas, transl = (value.to(dtype) for value in _arguments())
     # Largest entry `size`, so that it can be the type's largest number.
     pose = (pose / pose.abs().amax(dim=-1, keepdim=True) * size).requires_grad_()
@@ -146,7 +100,13 @@ def _run_huge_pose(size: float, dtype: torch.dtype, context: Context) -> Measure
     return Measured(passed, f"{'' if finite else 'not finite, '}R R^T off by {error:.0e}")
 
 
-def _run_against_float64(beta: float, context: Context) -> Measured:
+@_case(
+    "every beta at {:+g}",
+    f"to {ROUNDED:g} m, gradients to {GRADIENT_TOLERANCE:g} of float64",
+    20.0,
+    -20.0,
+)
+def _run_against_float64(beta: float) -> Measured:
     made = []
     for dtype in (torch.float32, torch.float64):
         pose, betas, transl = (value.float().to(dtype) for value in _arguments())
@@ -166,7 +126,8 @@ def _run_against_float64(beta: float, context: Context) -> Measured:
     return Measured(passed, f"off by {off:.0e} m, gradients {gradient:.0e}")
 
 
-def _run_linear(beta: float, context: Context) -> Measured:
+@_case("one beta at {:+g}", "vertices at rest move {:g} times as far as with 1", 20.0, -20.0)
+def _run_linear(beta: float) -> Measured:
     template = _template()
     pose, transl = torch.zeros(1, 16, 3).double(), torch.zeros(1, 3).double()
     worst = 0.0
@@ -178,7 +139,8 @@ def _run_linear(beta: float, context: Context) -> Measured:
     return Measured(worst <= EXACT, f"off by {worst:.0e} m")
 
 
-def _run_strided(context: Context) -> Measured:
+@_case("transposed, strided and expanded arguments", "the same bits")
+def _run_strided() -> Measured:
     template, (pose, betas, transl) = _template(), _arguments()
     plain = pose_hand(template, pose, betas.expand(len(pose), -1).contiguous(), transl)
     strided = pose_hand(
@@ -191,7 +153,8 @@ def _run_strided(context: Context) -> Measured:
     return Measured(same, f"off by {_distance(plain, strided):g} m")
 
 
-def _run_no_frame(context: Context) -> Measured:
+@_case("no frame", "empty arrays of the right shapes, gradients 0")
+def _run_no_frame() -> Measured:
     pose, betas, transl = (value.clone() for value in _arguments())
     leaves = [pose[:0].requires_grad_(), betas.requires_grad_(), transl[:0].requires_grad_()]
     posed = pose_hand(_template(), *leaves)
@@ -201,7 +164,8 @@ def _run_no_frame(context: Context) -> Measured:
     return Measured(passed, f"landmarks {shapes[0]}, motions {shapes[1]}")
 
 
-def _run_single(context: Context) -> Measured:
+@_case("one frame of many", f"to {EXACT:g} m of the frame in a batch")
+def _run_single() -> Measured:
     template, (pose, betas, transl) = _template(), _arguments()
     many = pose_hand(template, pose, betas, transl).vertices
     one = torch.cat([
@@ -212,7 +176,9 @@ def _run_single(context: Context) -> Measured:
     return Measured(off <= EXACT, f"off by {off:.0e} m")
 
 
-def _run_narrow(dtype: torch.dtype, context: Context) -> Measured:
+@_case("a template in {}", "to {1:g} of the extent of float64's result", *_NARROW)
+def _run_narrow(name: str, share: float) -> Measured:
+    dtype = getattr(torch, name)
     given = tuple(value.to(dtype) for value in _arguments())
     posed = pose_hand(_template(dtype), *given)
     # The same numbers, so that what the type cannot hold does not count.
@@ -222,11 +188,17 @@ def _run_narrow(dtype: torch.dtype, context: Context) -> Measured:
     wide = {name: value.double() for name, value in tensors.items() if value.is_floating_point()}
     truth = pose_hand(replace(narrow, **wide), pose, betas, transl)
     off = _distance(posed, truth) / float(truth.vertices.abs().max())
-    passed = posed.vertices.dtype == dtype and off <= 8.0 * _NARROW[dtype]
+    passed = posed.vertices.dtype == dtype and off <= share
     return Measured(passed, f"off by {off:.0e} of the extent")
 
 
-def _run_mixed(dtype: torch.dtype, context: Context) -> Measured:
+@_case(
+    "{} arguments on a float32 template",
+    "one message that names the argument, both types and the remedy",
+    *(name for name, _ in _NARROW),
+)
+def _run_mixed(name: str) -> Measured:
+    dtype = getattr(torch, name)
     pose, betas, transl = (value.float() for value in _arguments())
     try:
         pose_hand(_template(torch.float32), pose.to(dtype), betas, transl)
@@ -236,7 +208,11 @@ def _run_mixed(dtype: torch.dtype, context: Context) -> Measured:
     return Measured(False, "no message")
 
 
-def _run_behind(context: Context) -> Measured:
+@_case(
+    "a hand behind the camera",
+    "depths negative; the pixels of the hand reflected through the camera's centre",
+)
+def _run_behind() -> Measured:
     pose, betas, transl = _arguments()
     transl = transl + torch.tensor([0.05, -0.02, 0.6])
     vertices = pose_hand(_template(), pose, betas, transl).vertices
@@ -248,7 +224,8 @@ def _run_behind(context: Context) -> Measured:
     return Measured(passed, f"off by {off:.0e} px, depth {float(behind.max()):.2g} m")
 
 
-def _run_around(context: Context) -> Measured:
+@_case("a hand around the camera's centre", "pixels and gradients finite")
+def _run_around() -> Measured:
     pose, betas, transl = _arguments()
     vertices = pose_hand(_template(), pose, betas, transl).vertices
     # One vertex exactly in the camera's plane, others on both sides of it.
@@ -261,7 +238,8 @@ def _run_around(context: Context) -> Measured:
     return Measured(passed, f"largest pixel {float(pixels.detach().abs().max()):.0e}")
 
 
-def _run_pair(context: Context) -> Measured:
+@_case("left and right hand in one place", f"each other's mirror image to {EXACT:g} m")
+def _run_pair() -> Measured:
     pose, betas, transl = _arguments()
     flip = torch.tensor([-1.0, 1.0, 1.0], dtype=torch.float64)
     right = pose_hand(_template(), pose, betas, transl)
@@ -301,7 +279,3 @@ def _distance(posed: PosedHand, truth: PosedHand) -> float:
             (posed.landmarks, truth.landmarks),
         )
     )
-
-
-def _name(dtype: torch.dtype) -> str:
-    return str(dtype).removeprefix("torch.")

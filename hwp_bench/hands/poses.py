@@ -42,11 +42,7 @@ def gestures() -> Mapping[str, np.ndarray]:
 
 
 def gesture(name: str) -> np.ndarray:
-    """Look a hand shape up.
-
-    Raises:
-        BadInput: no shape has that name; the message lists the known ones.
-    """
+    """Look a hand shape up."""
     try:
         return gestures()[name]
     except KeyError:
@@ -165,7 +161,6 @@ def posed_skeleton(rest: RestSkeleton, pose: np.ndarray, transl: np.ndarray) -> 
     """Pose a skeleton.
 
     Args:
-        rest: at rest.
         pose: (F, 16, 3) axis-angle rad.
         transl: (F, 3) m.
     """
@@ -207,12 +202,8 @@ def landmark_rows(
     """How landmarks move with the parameters, in units of their errors: (F, 105, 51).
 
     Args:
-        posed: in camera axes.
         image_spread: error of each landmark in the image, slopes: (F, 21), or one for all.
         space_spread: error of each in space against the hand's centre, m: (F, 21, 3), or one.
-
-    Returns:
-        For each landmark two rows of the image and three of space.
     """
     moves, points = movement(posed), posed.landmarks
     depth = points[..., 2]

@@ -25,7 +25,6 @@ def draw_faces(
         pixels: (V, 2) float, px; pixel centres at +0.5.
         depth: (V,) float, m along the viewing axis.
         faces: (T, 3) int, either orientation.
-        size: height and width of the image.
 
     Returns:
         (H, W) int32 face, -1 where there is none; (H, W, 2) float32 barycentric coordinates of

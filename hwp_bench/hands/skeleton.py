@@ -55,11 +55,7 @@ def landmark_order() -> tuple[int, ...]:
 
 
 def finger_joints(finger: str) -> tuple[int, int, int]:
-    """The three joints of a finger, base to tip.
-
-    Args:
-        finger: one of `FINGERS`.
-    """
+    """The three joints of a finger, base to tip."""
     first = JOINT_NAMES.index(f"{finger}1")
     return first, first + 1, first + 2
 
@@ -89,10 +85,6 @@ def palm_directions(joints: np.ndarray, side: str) -> PalmDirections:
 
     Args:
         joints: (16, 3) rest joints, MANO order.
-        side: "right" or "left"; the palm of one is the back of the other.
-
-    Raises:
-        BadHandModel: wrist and knuckles lie on one line.
     """
     index, middle, little = (
         JOINT_NAMES.index(f"{name}1") for name in ("index", "middle", "little")
@@ -108,11 +100,7 @@ def palm_directions(joints: np.ndarray, side: str) -> PalmDirections:
 
 
 def unit(vectors: np.ndarray) -> np.ndarray:
-    """(..., 3) vectors scaled to length one.
-
-    Raises:
-        BadHandModel: a vector has no direction, because joints or segments coincide.
-    """
+    """(..., 3) vectors scaled to length one."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
     if length.min() < 1e-9:
         raise BadHandModel(

@@ -50,15 +50,6 @@ def load_mano(path: str | os.PathLike[str], side: str) -> HandTemplate:
     The left file's shape basis has the wrong sign in x as published. It is corrected, unless the
     right file in the same folder shows that it has been corrected already.
 
-    Args:
-        path: the folder that holds MANO_RIGHT.pkl and MANO_LEFT.pkl, or one of the files.
-        side: "right" or "left".
-
-    Raises:
-        BadHandModel: the file is missing or is not a MANO hand; the error names the field.
-        UnsafePickle: the file asks for something that is not plain data.
-        BadInput: the file is damaged.
-
     Source: Romero et al., "Embodied Hands" (SIGGRAPH Asia 2017); the sign of the left hand is
     issue 48 of the `smplx` repository.
     """
@@ -106,7 +97,6 @@ def two_chart_uv(
         vertices: (V, 3) rest vertices, m.
         faces: (F, 3).
         joints: (16, 3) rest joints.
-        side: "right" or "left".
 
     Returns:
         uv: (T, 2) in [0, 1], origin at the bottom left.
@@ -289,11 +279,7 @@ def _free_template() -> HandTemplate:
 
 
 def read_free(path: Path) -> HandTemplate:
-    """Read a right hand that `tools.extract_hand` wrote.
-
-    Raises:
-        BadInput: missing, damaged, or not such arrays.
-    """
+    """Read a right hand that `tools.extract_hand` wrote."""
     arrays = read_npz(path)
 
     def floats(name: str, *shape: int | None) -> np.ndarray:

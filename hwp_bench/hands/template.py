@@ -1,4 +1,4 @@
-"""A hand template: the rest mesh, how it changes with shape and pose, and its skeleton."""
+"""A hand template: rest mesh, shape, pose, skeleton; its open end, subdivision, and MANO-HD."""
 
 from __future__ import annotations
 
@@ -135,11 +135,7 @@ def make_template(
     """Check the parts of a template, fix their types, and compute its digest.
 
     Args:
-        where: the file that the parts came from, for error messages.
         (others): the fields of `HandTemplate`.
-
-    Raises:
-        BadHandModel: a part has the wrong shape, is not finite, or points outside its range.
     """
     vertices = np.asarray(vertices)
     count = vertices.shape[0] if vertices.ndim == 2 else 0
@@ -302,9 +298,6 @@ def mano_hd(template: HandTemplate) -> HandTemplate:
     The pass replaces everything that a vertex carries (position, bases, weights) by the mean
     over the vertex and its neighbours, so that smoothing a shaped mesh and shaping the smoothed
     mesh are the same.
-
-    Args:
-        template: MANO at 778 vertices.
     """
     fine = subdivide(template, MANO_HD_TIMES)
     edges = unique_edges(fine.faces)[0]

@@ -1,4 +1,10 @@
-"""LPIPS in plain torch: two backbones, no torchvision (Zhang et al., CVPR 2018, version 0.1)."""
+"""LPIPS in plain torch (Zhang et al., CVPR 2018, version 0.1), and where its weights lie.
+
+Nothing is downloaded. The backbone is the torchvision checkpoint in the torch hub cache or a
+file given by path; the linear layers come from the `lpips` package (or torchmetrics, which
+ships the same bytes) or a file given by path. A file that is not byte for byte the published
+one is refused: the number would not be LPIPS.
+"""
 
 from __future__ import annotations
 
@@ -118,11 +124,7 @@ class Lpips:
         ]
 
     def __call__(self, prediction: np.ndarray, target: np.ndarray) -> float:
-        """LPIPS of two (H, W, 3) float images in [0, 1], sRGB; 0 for identical images.
-
-        Raises:
-            ShapeMismatch: shapes differ, or are too small for the backbone.
-        """
+        """LPIPS of two (H, W, 3) float images in [0, 1], sRGB; 0 for identical images."""
         import torch
 
         check_same_shape(prediction, target)
@@ -234,12 +236,7 @@ def lpips_available(net: str, files: LpipsFiles | None = None) -> str | None:
 
 
 def find_weights(net: str, files: LpipsFiles | None = None) -> tuple[Path, Path]:
-    """The backbone and the linear file of a network.
-
-    Raises:
-        MissingDependency: one is not there; says where it is looked for.
-        UsageError: no such network.
-    """
+    """The backbone and the linear file of a network."""
     if net not in BACKBONE_FILES:
         raise UsageError(
             f"LPIPS has no network {net!r}", field="net", remedy="There are alex and vgg."

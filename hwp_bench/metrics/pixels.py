@@ -1,6 +1,18 @@
-"""The pixels that scoring looks at: the images that it accepts, the scored region and its box.
+"""The formulas of scoring: which pixels, PSNR, SSIM (Wang et al., 2004), oriented distance.
 
 Images are 8-bit sRGB, (H, W, 3), and all of one size.
+
+The oriented distance is a perceptual distance that needs no downloaded weights. It is not LPIPS.
+Its form is that of LPIPS (channels normalised at every pixel, differences squared, averaged
+over space and scales), but the channels are a fixed bank of oriented filters and local means
+instead of a trained network: it knows edges, texture, brightness and colour, and nothing of
+what an image shows. `docs/protocol.md` prints how it orders degradations next to SSIM.
+
+The filters are second derivatives of a Gaussian and their Hilbert partners, steerable to any angle
+from seven separable filters (Freeman and Adelson, The design and use of steerable filters, IEEE
+TPAMI 13(9), 1991, tables III to VI). Even and odd responses together give the energy, which does
+not change where inside a wave the pixel sits: a structure that moves by a fraction of its own width
+stays nearly the same.
 """
 
 from __future__ import annotations

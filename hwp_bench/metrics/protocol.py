@@ -1,4 +1,4 @@
-"""The two scoring protocols as data: every choice that can move a number, by name.
+"""The two scoring protocols and the table of metrics as data: every choice that moves a number.
 
 The code that scores reads its settings from here, and results store `Protocol.as_dict()`, so
 that a number can be traced to the settings that made it.

@@ -382,6 +382,9 @@ class Aggregate:
 def aggregate(captures: Iterable[CaptureScores]) -> Aggregate:
     """Average frame scores; nothing is dropped, and NaN and infinity are refused.
 
+    Sums are exact before they are rounded once (`math.fsum`), so the order of captures and frames
+    never changes a digit.
+
     Args:
         captures: the scored captures; each lists every frame that was scored.
 

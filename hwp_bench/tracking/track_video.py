@@ -1,4 +1,4 @@
-"""From a video to the landmarks of its hands."""
+"""From a video to the landmarks of its hands, and a sheet that shows them."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
 from hwp_bench.base.console import progress
+from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.errors import HwpError, UsageError
-from hwp_bench.importers.shared.hand_tracks import HandTracks, write_hand_tracks
+from hwp_bench.importers.shared.landmarks import LANDMARK_EDGES, HandTracks, write_hand_tracks
 from hwp_bench.importers.video.decode import (
+    FrameRange,
     Reading,
     VideoInfo,
     probe,
     read_frames,
     warn_of_damage,
 )
-from hwp_bench.importers.video.video_settings import FrameRange
-from hwp_bench.tracking.assemble import Collected
-from hwp_bench.tracking.model_files import load_models
-from hwp_bench.tracking.networks import HandNetworks, LiteRtNetworks
-from hwp_bench.tracking.tracker import HandTracker, TrackerSettings
+from hwp_bench.tracking.networks import HandNetworks, LiteRtNetworks, load_models
+from hwp_bench.tracking.tracker import Collected, HandTracker, TrackerSettings
 
 
 class NoHandSeen(HwpError):
@@ -34,18 +34,15 @@ class NoHandSeen(HwpError):
 
 @dataclass(frozen=True, eq=False)
 class TrackedVideo:
-    """The hands of a video.
+    """The hands of a video."""
 
-    Attributes:
-        video: the file.
-        hands: in every frame.
-        seconds: of tracking.
-        reading: what came of reading the video.
-    """
-
+    #: The file.
     video: VideoInfo
+    #: In every frame.
     hands: HandTracks
+    #: Of tracking.
     seconds: float
+    #: What came of reading the video.
     reading: Reading
 
     def facts(self) -> dict[str, Any]:
@@ -140,3 +137,63 @@ def track_frames(
         if update is not None:
             update(collected.frames)
     return collected
+
+
+# --- A contact sheet of a video with the landmarks that were tracked in it
+
+#: Colours of a right and a left hand.
+COLOURS = {"right": (255, 160, 0), "left": (60, 200, 255)}
+#: Frames in a row of the sheet.
+_COLUMNS = 4
+_SHIFT = 4
+
+
+def landmark_sheet(tracked: TrackedVideo, *, count: int = 16, edge: int = 320) -> np.ndarray:
+    """Draw `count` frames, evenly spaced over a video, with their hands: (H, W, 3) uint8.
+
+    `edge` is the longer side of each frame, px.
+    """
+    frames = tracked.hands.score.shape[1]
+    stride = -(-frames // count)
+    left, top, right, bottom = _window(tracked.hands)
+    tiles: list[np.ndarray] = []
+    for index, frame in read_frames(tracked.video, FrameRange(stride=stride)):
+        if index < frames and len(tiles) < count:
+            part = np.ascontiguousarray(frame[top:bottom, left:right])
+            scale = edge / max(part.shape[:2])
+            part = cv2.resize(part, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+            drawn = draw_landmarks(part, tracked.hands, index, (left, top), scale)
+            tiles.append(labelled(drawn, str(index)))
+    return sheet(tiles, _COLUMNS)
+
+
+def _window(hands: HandTracks) -> tuple[int, int, int, int]:
+    """The part of the frame in which hands are seen: left, top, right, bottom, px."""
+    points = hands.image[hands.score > 0][:, :, :2].reshape(-1, 2)
+    low, high = points.min(axis=0), points.max(axis=0)
+    margin = 0.15 * float((high - low).max())
+    size = np.array(hands.size)
+    # At least 16 px of the frame, also where all landmarks lie outside of it.
+    low = np.clip(np.floor(low - margin), 0, np.maximum(size - 16, 0)).astype(int)
+    high = np.clip(np.ceil(high + margin), np.minimum(low + 16, size), size).astype(int)
+    return int(low[0]), int(low[1]), int(high[0]), int(high[1])
+
+
+def draw_landmarks(
+    image: np.ndarray, hands: HandTracks, frame: int, corner: tuple[int, int], scale: float
+) -> np.ndarray:
+    """Draw the hands of a frame on a part of it, (H, W, 3) uint8, which is returned.
+
+    `corner` is the part's upper left corner in the frame, px; `scale` the image's, relative to it.
+    """
+    for hand in range(len(hands.score)):
+        if not hands.seen(hand)[frame]:
+            continue
+        colour = COLOURS[hands.side(hand)]
+        points = (hands.image[hand, frame, :, :2] - corner) * scale - 0.5
+        places = [tuple(int(v) for v in point) for point in np.round(points * 2**_SHIFT)]
+        for start, end in LANDMARK_EDGES:
+            cv2.line(image, places[start], places[end], colour, 1, cv2.LINE_AA, _SHIFT)
+        for place in places:
+            cv2.circle(image, place, 2 << _SHIFT, colour, -1, cv2.LINE_AA, _SHIFT)
+    return image

@@ -8,15 +8,25 @@ newer Tasks of MediaPipe do.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.tracking.hand_landmarks import HAND_EDGE, SeenHand, place_reading
+from hwp_bench.importers.shared.landmarks import HandTracks
+from hwp_bench.tracking.detection import (
+    HAND_EDGE,
+    Region,
+    SeenHand,
+    cut_region,
+    decode,
+    overlap,
+    palm_input,
+    place_in_image,
+    suppress,
+)
 from hwp_bench.tracking.networks import HandNetworks
-from hwp_bench.tracking.palms import decode, palm_input, place_in_image, suppress
-from hwp_bench.tracking.regions import Region, cut_region, overlap
 
 #: Two regions with more overlap than this show one hand.
 _SAME_REGION = 0.5
@@ -46,14 +56,11 @@ class TrackerSettings:
 
 @dataclass(frozen=True, eq=False)
 class TrackedHand:
-    """A hand in a frame.
+    """A hand in a frame."""
 
-    Attributes:
-        track: number of the track, a stretch of frames without a gap; counts from 0.
-        hand: what was seen.
-    """
-
+    #: Number of the track, a stretch of frames without a gap; counts from 0.
     track: int
+    #: What was seen.
     hand: SeenHand
 
 
@@ -72,11 +79,7 @@ class HandTracker:
         self._tracks = 0
 
     def step(self, frame: np.ndarray) -> list[TrackedHand]:
-        """Find the hands of the next frame, (H, W, 3) uint8 RGB.
-
-        Returns:
-            At most `hands` of them. A hand that was seen in the last frame keeps its track.
-        """
+        """Find the hands of the next frame, (H, W, 3) uint8 RGB; known ones keep their tracks."""
         seen: list[tuple[TrackedHand, float]] = []
         for region, before in self._regions(frame):
             image = cut_region(frame, region, HAND_EDGE, outside_black=False)
@@ -84,7 +87,7 @@ class HandTracker:
             values = (reading.presence, reading.right)
             if not np.isfinite(values).all() or reading.presence < self._settings.min_presence:
                 continue
-            hand = place_reading(reading, region)
+            hand = reading.place_in(region)
             if not (np.isfinite(hand.image).all() and np.isfinite(hand.world).all()):
                 continue
             moved = np.inf if before is None else _distance(hand, before.hand)
@@ -151,3 +154,116 @@ def _is_sound(region: Region, frame: np.ndarray) -> bool:
         and -longest <= region.x <= width + longest
         and -longest <= region.y <= height + longest
     )
+
+
+# --- From tracks to hands: which stretches of frames belong to one hand, and which side it is
+#
+# A track ends where its hand is lost, and the next one has another number. The network says in
+# each frame whether it sees a right or a left hand. It errs in single frames, so that all frames
+# of a track vote together.
+
+#: A second hand is seen in at least this share of the frames that show the first; what is less is
+#: the first hand with a wrong side, or a mistake.
+_SECOND_HAND = 0.1
+#: Strongest vote of one frame, in units of probability away from 0.5.
+_VOTE = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class _Track:
+    """One track: its number, its frames, the rows of its hands, and what they vote for."""
+
+    number: int
+    frames: np.ndarray
+    rows: np.ndarray
+    votes: float
+
+
+class Collected:
+    """Everything that the tracker saw, in the order of the frames; 600 bytes for each hand."""
+
+    def __init__(self) -> None:
+        self._frame: list[int] = []
+        self._track: list[int] = []
+        self._image: list[np.ndarray] = []
+        self._world: list[np.ndarray] = []
+        self._scores: list[tuple[float, float]] = []
+        self.frames = 0
+
+    def add(self, hands: Sequence[TrackedHand]) -> None:
+        """Take the hands of the next frame."""
+        for one in hands:
+            self._frame.append(self.frames)
+            self._track.append(one.track)
+            self._image.append(one.hand.image.astype(np.float32))
+            self._world.append(one.hand.world.astype(np.float32))
+            self._scores.append((one.hand.presence, one.hand.right))
+        self.frames += 1
+
+    def hands(self, size: tuple[int, int], most: int) -> HandTracks | None:
+        """Join the tracks to 1 or 2 (`most`) hands; None where nothing was seen. `size`: px."""
+        if not self._frame:
+            return None
+        frame, track = np.array(self._frame), np.array(self._track, dtype=np.int32)
+        scores = np.clip(np.array(self._scores, dtype=np.float32), 0, 1)
+        image, world = np.stack(self._image), np.stack(self._world)
+        owner = _owners(frame, track, scores[:, 1], most)
+        count = int(owner.max()) + 1
+        shape = (count, self.frames)
+        made = HandTracks(
+            np.zeros((*shape, 21, 3), np.float32),
+            np.zeros((*shape, 21, 3), np.float32),
+            np.zeros(shape, np.float32),
+            np.full(shape, 0.5, np.float32),
+            np.full(shape, -1, np.int32),
+            size,
+        )
+        kept = owner >= 0
+        place = owner[kept], frame[kept]
+        made.image[place], made.world[place] = image[kept], world[kept]
+        made.score[place], made.right[place] = scores[kept, 0], scores[kept, 1]
+        made.track[place] = track[kept]
+        return made
+
+
+def _owners(frame: np.ndarray, track: np.ndarray, right: np.ndarray, most: int) -> np.ndarray:
+    """The hand of each row: 0 for the one that is seen most, 1 for the other, -1 for none."""
+    tracks = []
+    for number in np.unique(track):
+        rows = np.flatnonzero(track == number)
+        votes = float(np.clip(right[rows].astype(np.float64) - 0.5, -_VOTE, _VOTE).sum())
+        tracks.append(_Track(int(number), frame[rows], rows, votes))
+    sides = _by_side(tracks)
+    lengths = [sum(len(one.frames) for one in side) for side in sides]
+    first, second = sides if lengths[0] >= lengths[1] else sides[::-1]
+    if most == 1 or min(lengths) < _SECOND_HAND * max(lengths):
+        first, second = _joined(first, second), []
+    owner = np.full(len(frame), -1)
+    for hand, side in enumerate((first, second)):
+        for one in side:
+            owner[one.rows] = hand
+    return owner
+
+
+def _by_side(tracks: list[_Track]) -> tuple[list[_Track], list[_Track]]:
+    """Right and left tracks.
+
+    Two tracks of one frame are different hands, so that the surer one has the first choice.
+    """
+    sides: tuple[list[_Track], list[_Track]] = ([], [])
+    taken: tuple[set[int], set[int]] = (set(), set())
+    for one in sorted(tracks, key=lambda track: -abs(track.votes)):
+        frames = set(one.frames.tolist())
+        wanted = 0 if one.votes >= 0 else 1
+        for side in (wanted, 1 - wanted):
+            if not frames & taken[side]:
+                sides[side].append(one)
+                taken[side].update(frames)
+                break
+    return sides
+
+
+def _joined(first: list[_Track], second: list[_Track]) -> list[_Track]:
+    """One hand of two sides: tracks of the second fill frames in which the first is not seen."""
+    taken = {frame for one in first for frame in one.frames.tolist()}
+    return [*first, *(one for one in second if taken.isdisjoint(one.frames.tolist()))]

@@ -1,19 +1,60 @@
-"""`wildghand fit`."""
+"""`wildghand fit` and `wildghand pretrain`."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from wildghand.cli.serving import add_address, watching
-
 if TYPE_CHECKING:
     from wildghand.fitting.parallel import World
+    from wildghand.fitting.session import Watch
     from wildghand.from_video import MadeAvatar
+    from wildghand.viewer.server import Address
 
-_EXAMPLES = """examples:
+
+def add_address(parser: argparse.ArgumentParser) -> None:
+    """Add --host and --port."""
+    parser.add_argument(
+        "--host",
+        default="127.0.0.1",
+        metavar="ADDRESS",
+        help="address to serve at (default: 127.0.0.1, for this machine only)",
+    )
+    parser.add_argument(
+        "--port", type=int, default=8080, help="port; the next free one if it is taken"
+    )
+
+
+def address_of(args: argparse.Namespace) -> Address:
+    """Return what `add_address` read."""
+    from wildghand.viewer.server import Address
+
+    return Address(args.host, args.port)
+
+
+@contextlib.contextmanager
+def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[Watch | None]:
+    """Serve the page of a fit while the block runs, if it is `shown`.
+
+    Yields:
+        What the fit is given as `watch`.
+    """
+    if not shown:
+        yield None
+        return
+    from hwp_bench.base.console import notice
+    from wildghand.viewer.live import serve_fit
+
+    with serve_fit(address_of(args)) as served:
+        notice(f"The fit is shown at {served.url}")
+        yield served.watch
+
+
+_FIT_EXAMPLES = """examples:
   wildghand fit hand.mp4 -o my_hand
   wildghand fit hand.mp4 -o my_hand --quick
   wildghand fit my_capture -o my_avatar --seconds 60
@@ -30,9 +71,9 @@ GPU of its own.
 """
 
 
-def add_arguments(parser: argparse.ArgumentParser) -> None:
+def add_fit(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of the command."""
-    parser.epilog = _EXAMPLES
+    parser.epilog = _FIT_EXAMPLES
     parser.add_argument("source", type=Path, metavar="VIDEO|CAPTURE", help="what to fit")
     parser.add_argument(
         "-o", "--out", type=Path, help="avatar folder to make (default for a video: VIDEO_avatar)"
@@ -85,11 +126,11 @@ def add_arguments(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print JSON")
 
 
-def run(args: argparse.Namespace) -> int:
+def do_fit(args: argparse.Namespace) -> int:
     """Run the command, in one process or in those that torchrun started."""
     from hwp_bench.base.files import check_places
     from wildghand.fitting.parallel import run_in_world
-    from wildghand.from_video.api import is_video
+    from wildghand.from_video.make import is_video
     from wildghand.gaussians.fit_loop import choose_device
     from wildghand.model.settings import read_settings
 
@@ -148,7 +189,7 @@ def _capture(args: argparse.Namespace, world: World) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.methods.contract import Budget
     from wildghand.fitting.session import fit_capture
-    from wildghand.from_video.settings import with_quick
+    from wildghand.from_video.job import with_quick
 
     for option in ("side", "landmarks", "model", "hand-model"):
         if getattr(args, option.replace("-", "_")) is not None:
@@ -192,9 +233,83 @@ def _capture(args: argparse.Namespace, world: World) -> int:
 
 def _settings(args: argparse.Namespace) -> dict[str, Any]:
     """The overrides; a prior's path is the caller's, not the method's."""
-    from hwp_bench.cli.overrides import overrides
+    from hwp_bench.cli.options import overrides
 
     settings = overrides(args.set)
     if args.prior is not None:
         settings["prior"] = str(args.prior.resolve())
     return settings
+
+
+_PRETRAIN_EXAMPLES = """examples:
+  wildghand pretrain anna ben carl -o my_prior
+  wildghand pretrain simulated/* -o my_prior --steps 6000
+  wildghand fit dora -o dora_avatar --prior my_prior
+
+Give captures of several people, one or more of each, and none that a score will be taken on. A
+stopped run goes on when the same command is given again.
+"""
+
+
+def add_pretrain(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _PRETRAIN_EXAMPLES
+    parser.add_argument(
+        "captures", type=Path, nargs="+", metavar="CAPTURE", help="what to fit jointly"
+    )
+    parser.add_argument("-o", "--out", type=Path, required=True, help="prior to make, a folder")
+    parser.add_argument(
+        "--steps",
+        type=int,
+        help="optimizer steps over all captures (default: those of a fit for each capture)",
+    )
+    parser.add_argument("--seed", type=int, default=0, help="of everything random (default: 0)")
+    parser.add_argument(
+        "--set",
+        action="append",
+        default=[],
+        metavar="NAME=VALUE",
+        help="a setting of the fit (wildghand/model/settings.py); may be given again",
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing prior")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def do_pretrain(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
+    from hwp_bench.cli.options import overrides
+    from wildghand.pretrain.pretrain import pretrain
+    from wildghand.prior.prior import WEIGHTS
+
+    check_places({"--out": args.out}, {"CAPTURE": args.captures}, replaces=args.overwrite)
+    if args.steps is not None and args.steps < 1:
+        raise UsageError(f"is {args.steps}", field="--steps", remedy="Use 1 or more.")
+    if args.seed < 0:
+        raise UsageError(f"is {args.seed}", field="--seed", remedy="Use 0 or more.")
+    record = pretrain(
+        args.captures,
+        args.out,
+        settings=overrides(args.set),
+        steps=args.steps,
+        seed=args.seed,
+        overwrite=args.overwrite,
+    ).record
+    size = (args.out / WEIGHTS).stat().st_size
+    if args.json:
+        facts = {"prior": str(args.out), "captures": len(record.captures), "steps": record.steps}
+        print(json.dumps({**facts, "bytes": size, "weights": record.weights}))
+    else:
+        print(
+            f"{args.out}: {len(record.captures)} captures, {record.steps} steps, "
+            f"{size / 1e6:.1f} MB"
+        )
+    return 0
+
+
+#: What adds the arguments of a command, and what runs it and returns the status.
+COMMANDS = {
+    "fit": (add_fit, do_fit),
+    "pretrain": (add_pretrain, do_pretrain),
+}

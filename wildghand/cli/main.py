@@ -10,30 +10,24 @@ from hwp_bench.cli.program import Command, run_program
 
 def command_tree() -> Command:
     """Return every command of `wildghand`."""
+    fit, show, study = (f"wildghand.cli.{topic}" for topic in ("fit", "show", "study"))
     return Command(
         "anti-perturbation Gaussian hand avatars",
         commands={
-            "fit": Command("fit an avatar to a capture or a video", "wildghand.cli.fit"),
+            "fit": Command("fit an avatar to a capture or a video", f"{fit}:fit"),
             "pretrain": Command(
-                "fit one network to several captures, as a prior for fits",
-                "wildghand.cli.pretrain",
+                "fit one network to several captures, as a prior for fits", f"{fit}:pretrain"
             ),
-            "render": Command(
-                "draw an avatar along the poses of a capture", "wildghand.cli.render"
-            ),
-            "view": Command("pose an avatar in the browser", "wildghand.cli.view"),
-            "export": Command("write an avatar as Gaussians for viewers", "wildghand.cli.export"),
-            "page": Command(
-                "write an avatar as a page for browsers, one file", "wildghand.cli.page"
-            ),
-            "judge": Command(
-                "judge the frames of a capture: clean or perturbed", "wildghand.cli.judge"
-            ),
+            "render": Command("draw an avatar along the poses of a capture", f"{show}:render"),
+            "view": Command("pose an avatar in the browser", f"{show}:view"),
+            "export": Command("write an avatar as Gaussians for viewers", f"{show}:export"),
+            "page": Command("write an avatar as a page for browsers, one file", f"{show}:page"),
+            "judge": Command("judge the frames of a capture: clean or perturbed", f"{study}:judge"),
             "explain": Command(
-                "show what the biases took out of training frames", "wildghand.cli.explain"
+                "show what the biases took out of training frames", f"{study}:explain"
             ),
-            "completion": Command("print completion for a shell", "wildghand.cli.completion"),
-            "info": Command("show what renders here, and check it", "wildghand.cli.info"),
+            "completion": Command("print completion for a shell", f"{study}:completion"),
+            "info": Command("show what renders here, and check it", f"{study}:info"),
         },
     )
 

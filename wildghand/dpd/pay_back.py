@@ -7,7 +7,7 @@ import math
 import torch
 from torch import Tensor
 
-from wildghand.gaussians.frame_table import upload
+from wildghand.gaussians.training import upload
 
 #: Share of the newest residual of a frame in its running one.
 _RATE = 0.5

@@ -25,15 +25,14 @@ from wildghand.fitting.data import FitData
 from wildghand.fitting.fit import Component, Fit
 from wildghand.fitting.light import Shadows, best_of_each_part
 from wildghand.gaussians.attributes import CHANNELS, SIZES
-from wildghand.gaussians.laplacian import nearest_on_surface, rest_anchors
 from wildghand.gaussians.quaternions import quat_third_axis
+from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import KnownLight
 from wildghand.light.sphere import ring_around
 from wildghand.model.model import WildGHandModel
-from wildghand.network.sampling import PlaneSampler
-from wildghand.network.surface import Chart
+from wildghand.network.surface import Chart, PlaneSampler
 
 #: Frames that are read, spread over the clip: of each part the one that the pre-pass weighs most.
 FRAMES = 16

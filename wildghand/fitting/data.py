@@ -14,13 +14,14 @@ from torch import Tensor
 from hwp_bench.hands import HandTemplate
 from hwp_bench.hands.anchors import HandSurfaces
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.gaussians.frame_table import FrameTable, shares_of_255
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.training import (
+    FrameTable,
     TrainingClip,
     TrainingFrames,
     load_frames,
     load_validation_frames,
+    shares_of_255,
 )
 from wildghand.subject import SubjectShape
 from wildghand.subject.fit_subject import LEAST_CHOOSING, MOST_CHOOSING

@@ -12,7 +12,7 @@ from wildghand.dpd.dpd import draw_kept
 from wildghand.dpd.temporal_loss import TemporalTarget
 from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
 from wildghand.fitting.judging import Prepass
-from wildghand.gaussians.frame_table import upload
+from wildghand.gaussians.training import upload
 from wildghand.model import terms
 from wildghand.model.frames import RenderedFrames
 

@@ -23,7 +23,7 @@ from wildghand.fitting.data import FitData
 from wildghand.fitting.descent import Descent, Features
 from wildghand.fitting.parallel import World, digest_of
 from wildghand.gaussians.fit_loop import Loss, batches
-from wildghand.gaussians.frame_table import upload
+from wildghand.gaussians.training import upload
 from wildghand.model.frames import RenderedFrames
 from wildghand.model.model import make_model
 from wildghand.model.settings import WildGHandSettings

@@ -16,8 +16,7 @@ from hwp_bench.methods.contract import TrainingCapture
 from hwp_bench.methods.settings import source_path
 from wildghand.fitting.data import Judgement
 from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
-from wildghand.gaussians.frame_table import FrameTable, upload
-from wildghand.gaussians.training import TrainingFrames
+from wildghand.gaussians.training import FrameTable, TrainingFrames, upload
 from wildghand.model.frames import RenderedFrames
 from wildghand.pao.regions import PromptedHand, RegionCache, graph_cut_hands, mask_of, open_sam
 from wildghand.prepass import FrameAssessment, PrepassInput, judge_frames

@@ -16,16 +16,15 @@ from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
 from wildghand.fitting.components import make_fit
 from wildghand.gaussians.attributes import CHANNELS, Activation, RawAttributes
-from wildghand.gaussians.bags import sum_bags
-from wildghand.gaussians.closed_surface import off_surface
 from wildghand.gaussians.fit_loop import ready_device
 from wildghand.gaussians.perceptual import Vgg19
+from wildghand.gaussians.regularizers import off_surface, sum_bags
 from wildghand.gaussians.rig import AnchorPoses
-from wildghand.gaussians.shading_cpu import fill_harmonics
+from wildghand.gaussians.shading import fill_harmonics
 from wildghand.model.dress import dress
 from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.network import NetworkOutput, Refinement
-from wildghand.network.frame_heads_cpu import warm_up as warm_up_heads
+from wildghand.network.frame_heads import warm_up_heads as warm_up_heads
 from wildghand.plain.loop import run_fit
 from wildghand.sam import check_checkpoint
 from wildghand.shadows import Obstacles

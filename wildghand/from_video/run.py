@@ -1,16 +1,111 @@
-"""Runs the stages of a job: what is done already is kept, what has changed is made again."""
+"""Stages of a job, and how they are run: what is done is kept, what has changed is made again.
+
+The record of a job says which stages have ended, and with which facts, so that a stopped job goes
+on where it was.
+"""
 
 from __future__ import annotations
 
 import os
 import time
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Literal
 
 from hwp_bench.base.console import StagesView, notice
+from hwp_bench.base.errors import BadInput
+from hwp_bench.base.files import read_json, write_json
+from hwp_bench.base.records import Seconds, parse_record
 from wildghand.from_video.job import Job
-from wildghand.from_video.pace import Pace
-from wildghand.from_video.record import JobRecord, StageRecord, read_record, write_record
-from wildghand.from_video.stage import Stage
+
+#: Largest record that is read, bytes.
+_MAX_BYTES = 1 << 20
+
+
+class Stage(ABC):
+    """One stage of a job.
+
+    It is run when its facts differ from those of its last run, when that did not end, or when
+    what it makes is missing.
+    """
+
+    #: Short name, in the record and in messages.
+    name: str
+    #: What it does, as progress shows it.
+    title: str
+    #: Whether all processes run it, or the first one only.
+    together = False
+
+    @abstractmethod
+    def facts(self, job: Job) -> dict[str, str]:
+        """What its result depends on: digests and settings, by a name that a person understands.
+
+        The stages before it have ended when this is called.
+        """
+
+    @abstractmethod
+    def result(self, job: Job) -> Path:
+        """The file or folder that says that its result is there."""
+
+    @abstractmethod
+    def run(self, job: Job) -> None:
+        """Make the result; where the last run with the same facts was stopped, it may go on."""
+
+    @abstractmethod
+    def expected(self, job: Job) -> float:
+        """Seconds that it should take on two cores; stages before it may not have been run."""
+
+    def discard(self, job: Job) -> None:  # noqa: B027
+        """Remove what a stopped run left, because its facts are others; most leave nothing."""
+
+
+@dataclass(frozen=True)
+class StageRecord:
+    """One stage as it was run last."""
+
+    #: What its result depends on: digests and settings as texts, by name.
+    facts: dict[str, str]
+    #: Whether it ended; False for one that was begun.
+    done: bool = False
+    #: Seconds that it took.
+    seconds: Seconds = 0.0
+    #: Seconds of processor time that it took, on all cores together.
+    cpu_seconds: Seconds = 0.0
+
+    def changed(self, facts: Mapping[str, str]) -> list[str]:
+        """Names of the facts that are others now."""
+        return [one for one in {**facts, **self.facts} if facts.get(one) != self.facts.get(one)]
+
+
+@dataclass(frozen=True)
+class JobRecord:
+    """The stages of a job that were run, by name."""
+
+    schema: Literal["wildghand-stages/1"] = "wildghand-stages/1"
+    stages: dict[str, StageRecord] = field(default_factory=dict)
+
+
+def read_record(path: Path) -> JobRecord:
+    """Read the record; an empty one where there is no file."""
+    if not path.exists():
+        return JobRecord()
+    try:
+        value = read_json(path, max_bytes=_MAX_BYTES)
+        return parse_record(JobRecord, value, where=str(path), error=BadInput)
+    except BadInput as error:
+        raise BadInput(
+            error.problem,
+            where=error.where,
+            field=error.field,
+            remedy="Delete it, or give --overwrite, to make the avatar from the start.",
+        ) from error
+
+
+def write_record(path: Path, record: JobRecord) -> None:
+    """Write the record, whole or not at all."""
+    write_json(path, asdict(record))
 
 
 def run_stages(job: Job, stages: Sequence[Stage]) -> tuple[JobRecord, list[str]]:
@@ -37,51 +132,60 @@ def run_stages(job: Job, stages: Sequence[Stage]) -> tuple[JobRecord, list[str]]
     # An older version may have had other stages.
     names = [stage.name for stage in stages]
     record = JobRecord(stages={name: known[name] for name in names if name in known})
-    pace = Pace([stage.expected(job) for stage in stages])
+    expected, ran = [stage.expected(job) for stage in stages], dict[int, float]()
     kept: list[str] = []
     with StagesView() as view:
         for number, stage in enumerate(stages):
-            facts = stage.facts(job)
-            needed = not _is_done(job, stage, record, facts)
-            job.world.broadcast(float(needed))
-            if not needed:
+            facts, last = stage.facts(job), record.stages.get(stage.name)
+            reason = _reason_to_run(job, stage, last, facts)
+            job.world.broadcast(float(reason is not None))
+            if reason is None:
                 kept.append(stage.name)
                 continue
-            own, later = pace.left(number)
+            own, later = seconds_left(expected, ran, number)
             view.stage(number + 1, len(stages), stage.title, own=own, later=later)
             if kept and number == len(kept):
                 notice(f"Done before and kept: {', '.join(kept)}.")
-            _tell(stage, record, facts)
-            if record.changed(stage.name, facts) != []:
+            if reason:
+                notice(reason)
+            if last is None or last.changed(facts):
                 stage.discard(job)
-            record = record.having(stage.name, StageRecord(facts))
+            record.stages[stage.name] = StageRecord(facts)
             write_record(job.record, record)
             began, began_cpu = _now()
             stage.run(job)
             job.world.wait_for_main()
             ended, ended_cpu = _now()
-            pace.ran(number, ended - began)
-            ran = StageRecord(facts, True, ended - began, ended_cpu - began_cpu)
-            record = record.having(stage.name, ran)
+            ran[number] = ended - began
+            record.stages[stage.name] = StageRecord(facts, True, ran[number], ended_cpu - began_cpu)
             write_record(job.record, record)
     if len(kept) == len(stages):
         notice(f"{job.folder}: all is done already, and nothing has changed.")
     return record, kept
 
 
-def _is_done(job: Job, stage: Stage, record: JobRecord, facts: dict[str, str]) -> bool:
-    last = record.stages.get(stage.name)
-    return last is not None and last.done and last.facts == facts and stage.result(job).exists()
+def _reason_to_run(
+    job: Job, stage: Stage, last: StageRecord | None, facts: Mapping[str, str]
+) -> str | None:
+    """Say why a stage is run again; nothing the first time, None where it is done."""
+    if last is None:
+        return ""
+    if changed := last.changed(facts):
+        return f"{stage.title} again; changed since the last run: {', '.join(changed)}."
+    if not last.done:
+        return f"{stage.title} once more: the last run was stopped there."
+    if not stage.result(job).exists():
+        return f"{stage.title} once more: its result is missing."
+    return None
 
 
-def _tell(stage: Stage, record: JobRecord, facts: dict[str, str]) -> None:
-    """Say why a stage is run that was run before."""
-    changed, last = record.changed(stage.name, facts), record.stages.get(stage.name)
-    if changed:
-        notice(f"{stage.title} again; changed since the last run: {', '.join(changed)}.")
-    elif last is not None:
-        why = "its result is missing" if last.done else "the last run was stopped there"
-        notice(f"{stage.title} once more: {why}.")
+def seconds_left(
+    expected: Sequence[float], ran: Mapping[int, float], stage: int
+) -> tuple[float, float]:
+    """Seconds that a stage may take, and all after it, by those that `ran` took on this machine."""
+    planned = sum(expected[one] for one in ran)
+    factor = sum(ran.values()) / planned if planned > 0.0 else 1.0
+    return factor * expected[stage], factor * sum(expected[stage + 1 :])
 
 
 def _now() -> tuple[float, float]:

@@ -5,12 +5,18 @@ after their activation; `training` holds the frames and poses of a capture; `los
 and `laplacian` are terms of a loss; `fit_loop` has the parts of a fit's loop.
 """
 
-from wildghand.gaussians.anchored import AnchoredGaussians, PlacedGaussians, flat_gaussians
-from wildghand.gaussians.attributes import Activation, Attributes, RawAttributes
+from wildghand.gaussians.attributes import (
+    Activation,
+    AnchoredGaussians,
+    Attributes,
+    PlacedGaussians,
+    RawAttributes,
+    flat_gaussians,
+)
 from wildghand.gaussians.fit_loop import Guard, batches, choose_device, spent
-from wildghand.gaussians.laplacian import SurfaceLaplacian, surface_laplacian
 from wildghand.gaussians.losses import photometric_loss, ssim_map
 from wildghand.gaussians.perceptual import FilterBankLoss, Vgg19
+from wildghand.gaussians.regularizers import SurfaceLaplacian, surface_laplacian
 from wildghand.gaussians.rig import AnchorPoses, HandRig, make_rig
 from wildghand.gaussians.training import TrainingClip, TrainingFrames, load_frames
 

@@ -5,18 +5,155 @@ tensors that are mostly tiny. Here all tensors are cut into pieces that compiled
 on several threads. On other devices torch's own fused step does the work, and nothing is read back.
 """
 
+# Numba infers the types.
+# mypy: allow-untyped-defs
+
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
+from numba import carray, types
 from torch import Tensor
 
-from wildghand.gaussians.adam_kernels import PIECE, Pieces, add_squares, advance, update
+from hwp_bench.base.kernels import compiled
+from wildghand.splat.kernels.groups import GROUP, fill_exact, load1, total
+from wildghand.splat.kernels.jit import inline, next_job
+from wildghand.splat.kernels.vectors import (
+    Vector,
+    absolute,
+    bits,
+    fma,
+    intrinsic,
+    make_load,
+    square_root,
+    store,
+)
 from wildghand.splat.threads import even_jobs, run, thread_count
+
+#: Numbers in a piece, a job of one thread.
+PIECE = 16_384
+
+_LANES = 16
+_ALL = 2**_LANES - 1
+_load = make_load(Vector(types.float32, _LANES))
+# Rows of a table of addresses: parameters, gradients, first and second moments, counts of steps.
+_VALUES, _GRADIENT, _MEAN, _SQUARE, _STEPS = range(5)
+
+
+class Pieces(NamedTuple):
+    """T tensors, cut into P pieces that are worked on one by one."""
+
+    owner: np.ndarray  # (P,) int64, which tensor a piece is of
+    first: np.ndarray  # (P,) int64, where in the tensor it begins
+    last: np.ndarray  # (P,) int64, and where it ends
+
+
+@intrinsic
+def _floats(typingctx: Any, address: Any) -> Any:
+    """A number as the address of float32 values."""
+    kind = types.CPointer(types.float32)
+
+    def codegen(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+        return builder.inttoptr(args[0], context.get_value_type(kind))
+
+    return kind(address), codegen
+
+
+@compiled(nogil=True)
+def add_squares(worker, counters, ends, addresses, pieces, sums):
+    """Squares of each piece of the gradients, summed into float64 (P,); a job is a piece.
+
+    `addresses` is int64 (5, T): of parameters, gradients, moments and counts.
+    """
+    while True:
+        piece = next_job(worker, counters, ends)
+        if piece < 0:
+            break
+        start, stop = pieces.first[piece], pieces.last[piece]
+        values = carray(_floats(addresses[_GRADIENT, pieces.owner[piece]]), (stop,))
+        lanes = fill_exact(0.0)
+        whole = start + (stop - start) // GROUP * GROUP
+        for i in range(start, whole, GROUP):
+            (part,) = load1(values, i)
+            lanes = lanes + part * part
+        found = total(lanes)
+        for i in range(whole, stop):
+            found += np.float64(values[i]) * np.float64(values[i])
+        sums[piece] = found
+
+
+@compiled()
+def advance(addresses, rates, betas, factors):
+    """Count a step of every tensor, and find what depends on the count.
+
+    Into float32 (T, 2): minus the rate over the first bias correction, and the root of the second.
+    """
+    for tensor in range(len(rates)):
+        count = carray(_floats(addresses[_STEPS, tensor]), (1,))
+        count[0] += np.float32(1.0)
+        taken = np.float64(count[0])
+        factors[tensor, 0] = -rates[tensor] / (1.0 - betas[0] ** taken)
+        factors[tensor, 1] = math.sqrt(1.0 - betas[1] ** taken)
+
+
+@inline
+def _step(arrays, i, scale, rate, root, constants):
+    """One step of Adam on 16 numbers, rounded as in torch's kernel."""
+    values, gradient, mean, square = arrays
+    weight1, beta2, weight2, epsilon = constants
+    g, m, s = _load(gradient, i), _load(mean, i), _load(square, i)
+    # Where nothing has ever had a gradient nothing can change: most of an identity map is read by
+    # no Gaussian. A comparison with NaN is false.
+    if bits(absolute(g) + absolute(m) + s <= np.float32(0.0)) == _ALL:
+        return
+    g = g * scale
+    m = fma(g - m, weight1, m)
+    s = fma(g * weight2, g, s * beta2)
+    store(mean, i, m)
+    store(square, i, s)
+    store(values, i, _load(values, i) + m * rate / (square_root(s) / root + epsilon))
+
+
+@compiled(nogil=True)
+def update(worker, counters, ends, addresses, pieces, factors, scales, betas, epsilon):
+    """One step of Adam on every piece; float32 (T,) `scales` multiply the gradients."""
+    constants = (
+        np.float32(1.0 - betas[0]),
+        np.float32(betas[1]),
+        np.float32(1.0 - betas[1]),
+        np.float32(epsilon),
+    )
+    rest = np.zeros((4, _LANES), np.float32)
+    while True:
+        piece = next_job(worker, counters, ends)
+        if piece < 0:
+            break
+        tensor, start, stop = pieces.owner[piece], pieces.first[piece], pieces.last[piece]
+        scale, rate, root = scales[tensor], factors[tensor, 0], factors[tensor, 1]
+        values = carray(_floats(addresses[_VALUES, tensor]), (stop,))
+        gradient = carray(_floats(addresses[_GRADIENT, tensor]), (stop,))
+        mean = carray(_floats(addresses[_MEAN, tensor]), (stop,))
+        square = carray(_floats(addresses[_SQUARE, tensor]), (stop,))
+        whole = start + (stop - start) // _LANES * _LANES
+        for i in range(start, whole, _LANES):
+            _step((values, gradient, mean, square), i, scale, rate, root, constants)
+        if whole == stop:
+            continue
+        rest[:] = 0.0
+        for i in range(whole, stop):
+            k = i - whole
+            rest[_VALUES, k], rest[_GRADIENT, k] = values[i], gradient[i]
+            rest[_MEAN, k], rest[_SQUARE, k] = mean[i], square[i]
+        parts = rest[_VALUES], rest[_GRADIENT], rest[_MEAN], rest[_SQUARE]
+        _step(parts, 0, scale, rate, root, constants)
+        for i in range(whole, stop):
+            k = i - whole
+            values[i], mean[i], square[i] = rest[_VALUES, k], rest[_MEAN, k], rest[_SQUARE, k]
+
 
 # Added to the norm that the limit is divided by, as in torch.
 _LEAST_NORM = 1e-6
@@ -69,9 +206,8 @@ class ClippedAdam(torch.optim.Adam):
     def take_step(self, loss: Tensor) -> None:
         """Move everything that has a gradient.
 
-        Args:
-            loss: the scalar that the gradients are of. Not on the CPU, nothing changes where it is
-                not finite, and nobody waits to learn whether it is; on the CPU the caller knows.
+        Not on the CPU, nothing changes where the scalar `loss` is not finite, and nobody waits to
+        learn whether it is; on the CPU the caller knows.
         """
         if loss.device.type == "cpu":
             self._step_compiled()
@@ -138,12 +274,7 @@ def _laid_out_alike(parameter: Tensor) -> Tensor:
 
 
 class _Tables:
-    """Where tensors lie in memory, and how they are cut into pieces.
-
-    Args:
-        tensors: parameters, each with its count of steps and its moments.
-        betas, epsilon: see `ClippedAdam`.
-    """
+    """Where tensors lie in memory, and how they are cut into pieces."""
 
     def __init__(
         self,
@@ -175,13 +306,9 @@ class _Tables:
     def step(
         self, gradients: Sequence[Tensor], rates: np.ndarray, clipped: np.ndarray, limit: float
     ) -> None:
-        """Take a step.
+        """Take a step with T gradients, contiguous, and their (T,) learning rates.
 
-        Args:
-            gradients: of the T parameters, contiguous.
-            rates: (T,) learning rates.
-            clipped: (T,) bool, which count in the norm and are scaled.
-            limit: largest norm; 0: none.
+        (T,) `clipped` says which count in the norm and are scaled; a `limit` of 0 is none.
         """
         addresses, pieces = self._addresses, self._pieces
         addresses[0] = [parameter.data_ptr() for parameter, _ in self._held]
@@ -196,10 +323,3 @@ class _Tables:
             scales[clipped] = np.minimum(np.float32(1.0), limit / np.float32(norm + _LEAST_NORM))
         advance(addresses, rates, self._betas, self._factors)
         run(update, jobs, addresses, pieces, self._factors, scales, self._betas, self._epsilon)
-
-
-def warm_up() -> None:
-    """Make the kernels ready: compiled once on a machine, loaded later."""
-    values = torch.zeros(1, requires_grad=True)
-    values.grad = torch.zeros(1)
-    ClippedAdam([{"params": [values], "lr": 0.0}], 1.0).take_step(torch.zeros(()))

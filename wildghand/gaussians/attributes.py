@@ -1,16 +1,17 @@
-"""Attributes of N Gaussians before and after their activation."""
+"""Gaussians on anchors: raw attributes, activated ones, and their places in a frame."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from types import MappingProxyType
 
 import torch
 from torch import Tensor
 
-from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.base.errors import ShapeMismatch
+from wildghand.gaussians.quaternions import quat_multiply, quat_rotate
 
 #: Channels of each raw attribute, in the order in which they are concatenated.
 SIZES: Mapping[str, int] = MappingProxyType(
@@ -67,25 +68,14 @@ class RawAttributes:
         return RawAttributes(**{name: function(tensor) for name, tensor in self.items()})
 
     def concatenate(self) -> Tensor:
-        """Return all channels side by side.
-
-        Returns:
-            (..., N, 14), in the order of `SIZES`.
-        """
+        """All channels side by side: (..., N, 14), in the order of `SIZES`."""
         if self._joined is not None:
             return self._joined
         return torch.cat([tensor for _, tensor in self.items()], dim=-1)
 
     @classmethod
     def split(cls, channels: Tensor) -> RawAttributes:
-        """Take concatenated channels apart: the inverse of `concatenate`.
-
-        Args:
-            channels: (..., N, 14).
-
-        Raises:
-            ShapeMismatch: not 14 channels.
-        """
+        """Take (..., N, 14) channels apart: the inverse of `concatenate`."""
         if channels.ndim < 2 or channels.shape[-1] != CHANNELS:
             raise ShapeMismatch(
                 f"are {tuple(channels.shape)}, expected (..., N, {CHANNELS})", field="channels"
@@ -124,31 +114,8 @@ class Activation:
     #: Largest standard deviation, m; nor does a Gaussian as wide as a finger, and it costs time.
     max_scale: float = 1e-2
 
-    def __post_init__(self) -> None:
-        if not (math.isfinite(self.max_offset) and self.max_offset > 0.0):
-            raise UsageError(
-                f"is {self.max_offset}", field="max_offset", remedy="Use a length in m above 0."
-            )
-        if not math.isfinite(self.log_scale_bias):
-            raise UsageError(
-                f"is {self.log_scale_bias}", field="log_scale_bias", remedy="Use a finite number."
-            )
-        if not 0.0 < self.min_scale <= self.max_scale < math.inf:
-            raise UsageError(
-                f"are {self.min_scale} and {self.max_scale}",
-                field="min_scale, max_scale",
-                remedy="Use lengths in m above 0, the smaller one first.",
-            )
-
     def __call__(self, raw: RawAttributes) -> Attributes:
-        """Activate: bounded offsets and exponentials, unit quaternions, sigmoids.
-
-        Args:
-            raw: (..., N, k) each.
-
-        Returns:
-            Attributes with the same leading dimensions.
-        """
+        """Activate (..., N, k): bounded offsets and exponentials, unit quaternions, sigmoids."""
         return Attributes(
             # tanh(x / 2) = 2 (sigmoid(x) - 0.5)
             offsets=self.max_offset * torch.tanh(0.5 * raw.offsets),
@@ -161,3 +128,96 @@ class Activation:
             opacities=raw.logit_opacities.squeeze(-1).sigmoid(),
             colors=raw.logit_colors.sigmoid(),
         )
+
+
+#: Logits are kept within +-this at the start, so that their gradient has not died.
+MAX_LOGIT = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class AnchoredGaussians:
+    """The canonical attributes of N Gaussians, one set for every frame.
+
+    Each Gaussian has an anchor on the hand's surface. Its offset and orientation are expressed
+    in the anchor's frame, whose z axis is the surface normal; so they follow the skin.
+    """
+
+    #: (N, 3) m, from the anchor, in its frame.
+    offsets: torch.Tensor
+    #: (N, 3) natural logarithms of the standard deviations in m.
+    log_scales: torch.Tensor
+    #: (N, 4) orientation in the anchor's frame, (w, x, y, z), any length but 0.
+    quats: torch.Tensor
+    #: (N,) opacity before the sigmoid.
+    logit_opacities: torch.Tensor
+    #: (N, 3) sRGB colour before the sigmoid.
+    logit_colors: torch.Tensor
+
+    def __len__(self) -> int:
+        return len(self.offsets)
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """The tensors by name, in a fixed order."""
+        return {item.name: getattr(self, item.name) for item in fields(self)}
+
+    def place(self, positions: torch.Tensor, orientations: torch.Tensor) -> PlacedGaussians:
+        """Carry the Gaussians into B frames, without their colours.
+
+        `positions` are (B, N, 3) m, `orientations` (B, N, 4) unit quaternions, both of the anchors.
+        """
+        if positions.shape[1:] != (len(self), 3) or orientations.shape[1:] != (len(self), 4):
+            raise ShapeMismatch(
+                f"are {tuple(positions.shape)} and {tuple(orientations.shape)} "
+                f"for {len(self)} Gaussians",
+                field="positions, orientations",
+            )
+        quats = torch.nn.functional.normalize(self.quats, dim=-1)
+        return PlacedGaussians(
+            means=positions + quat_rotate(orientations, self.offsets),
+            quats=quat_multiply(orientations, quats),
+            scales=self.log_scales.exp(),
+            opacities=self.logit_opacities.sigmoid(),
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class PlacedGaussians:
+    """Gaussians in B frames, in the shapes that `wildghand.splat.rasterize` takes."""
+
+    #: (B, N, 3) m, world.
+    means: torch.Tensor
+    #: (B, N, 4) of length 1, world.
+    quats: torch.Tensor
+    #: (N, 3) m.
+    scales: torch.Tensor
+    #: (N,) in (0, 1).
+    opacities: torch.Tensor
+
+
+def flat_gaussians(
+    spacing: torch.Tensor,
+    colors: torch.Tensor,
+    *,
+    opacity: float,
+    width: float = 0.6,
+    thickness: float = 0.2,
+) -> AnchoredGaussians:
+    """Discs that lie on the surface and just cover it.
+
+    `spacing` is (N,) m to the neighbouring anchors, the unit of `width` along the surface and
+    `thickness` along the normal, both standard deviations; `colors` are (N, 3) or (3,) sRGB.
+    """
+    count = len(spacing)
+    sigmas = torch.log(spacing.clamp(min=1e-7))[:, None].repeat(1, 3)
+    sigmas[:, :2] += math.log(width)
+    sigmas[:, 2] += math.log(thickness)
+    quats = spacing.new_zeros(count, 4)
+    quats[:, 0] = 1.0
+    logits = torch.logit(colors.to(spacing), eps=1e-6).clamp(-MAX_LOGIT, MAX_LOGIT)
+    return AnchoredGaussians(
+        offsets=spacing.new_zeros(count, 3),
+        log_scales=sigmas,
+        quats=quats,
+        logit_opacities=spacing.new_full((count,), math.log(opacity / (1.0 - opacity))),
+        logit_colors=logits.expand(count, 3).clone(),
+    )

@@ -1,22 +1,109 @@
-"""Parts of the loop of every fit: its device, its budget, its batches, a guard on its loss."""
+"""Parts of the loop of every fit: device, budget, batches, threads, a guard on the loss."""
 
 from __future__ import annotations
 
 import contextlib
 import importlib.util
 import math
-from collections.abc import Iterator, Sequence
+import os
+import time
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any, Generic, Protocol, TypeVar
 
 import numpy as np
 import torch
 
 from hwp_bench.base.errors import DidNotConverge, MissingDependency
+from hwp_bench.base.numerics import count_is_chosen
 from hwp_bench.methods.contract import Budget, Report
-from wildghand.gaussians.adam import warm_up as warm_up_optimizer
-from wildghand.gaussians.photometric_cpu import warm_up as warm_up_loss
-from wildghand.gaussians.posing_cpu import warm_up as warm_up_posing
-from wildghand.splat.warmup import warm_up
+from wildghand.gaussians.adam import ClippedAdam
+from wildghand.gaussians.losses import LANES, photometric_loss
+from wildghand.gaussians.rig import warm_up_posing
+from wildghand.splat.numba_backend import warm_up
+from wildghand.splat.threads import at_most
+
+#: Least number of steps that are timed together.
+BLOCK = 8
+#: Blocks of each number of threads in a measurement; the fastest counts, as other work is uneven.
+TURNS = 2
+#: Blocks between two measurements.
+HELD = 32
+#: Share by which more threads must be faster to be taken.
+GAIN = 0.1
+
+
+def candidates(most: int) -> tuple[int, ...]:
+    """Numbers of threads that are compared: powers of two below `most`, and `most`."""
+    return (*(1 << power for power in range((most - 1).bit_length())), most)
+
+
+def fewest(seconds: Mapping[int, float]) -> int:
+    """The smallest number of threads that is less than `GAIN` slower than the fastest."""
+    best = min(seconds.values())
+    return min(number for number, value in seconds.items() if value * (1.0 - GAIN) <= best)
+
+
+class StepThreads:
+    """The choice for one fit among `numbers` of threads; one or none is not measured.
+
+    `shared` steps share work which one of them does; a block has all of them.
+    """
+
+    def __init__(self, numbers: tuple[int, ...] = (), shared: int = 1) -> None:
+        self._numbers = numbers
+        self._block = -(-BLOCK // shared) * shared
+        self._chosen = numbers[-1] if numbers else None
+        # What the coming blocks run on; None stands for one on the chosen number.
+        self._plan: list[int | None] = [None]
+        self._best: dict[int, float] = {}
+        self._steps, self._seconds = 0, 0.0
+
+    @classmethod
+    def of(cls, device: torch.device, shared: int = 1) -> StepThreads:
+        """The choice for a fit on a device, from all that torch has.
+
+        Nothing is chosen where a person or an engine has said how many (`OMP_NUM_THREADS`,
+        `MKL_NUM_THREADS`), and on a GPU.
+        """
+        if device.type != "cpu" or count_is_chosen(os.environ):
+            return cls()
+        return cls(candidates(torch.get_num_threads()), shared)
+
+    @property
+    def number(self) -> int | None:
+        """Threads of the next step; None: as many as torch has."""
+        return self._plan[0] or self._chosen
+
+    @contextmanager
+    def step(self) -> Iterator[None]:
+        """Run one step on the number of threads that is its turn."""
+        if len(self._numbers) < 2:
+            with at_most(self._chosen):
+                yield
+            return
+        began = time.perf_counter()
+        with at_most(self.number):
+            yield
+        self._seconds += time.perf_counter() - began
+        self._steps += 1
+        if self._steps == self._block:
+            self._end_block()
+
+    def _end_block(self) -> None:
+        number, seconds = self._plan.pop(0), self._seconds
+        self._steps, self._seconds = 0, 0.0
+        if number is not None:
+            self._best[number] = min(seconds, self._best.get(number, seconds))
+        if self._plan:
+            return
+        if number is None:
+            self._best = {}
+            self._plan = [*self._numbers * TURNS]
+        else:
+            self._chosen = fewest(self._best)
+            self._plan = [None] * HELD
+
 
 #: Steps over which the loss is averaged before it is judged.
 WINDOW = 50
@@ -27,6 +114,15 @@ MAX_RISE = 3.0
 Loss = float | torch.Tensor
 Snapshot = TypeVar("Snapshot", covariant=True)
 Kept = TypeVar("Kept")
+
+
+def _warm_up() -> None:
+    """Make the kernels of a loss and of a step ready: compiled once on a machine, loaded later."""
+    with torch.enable_grad():
+        row = torch.zeros(1, 1, LANES, 1, requires_grad=True)
+        loss = photometric_loss(row, row.detach(), torch.zeros(1, 1, LANES), 0.5)
+        loss.backward()
+    ClippedAdam([{"params": [row], "lr": 0.0}], 1.0).take_step(loss)
 
 
 def choose_device(name: str) -> torch.device:
@@ -48,23 +144,16 @@ def choose_device(name: str) -> torch.device:
 
 
 def ready_device(name: str) -> torch.device:
-    """Choose the device, and compile for it what a fit needs.
+    """Choose the device (see `choose_device`), and compile for it what a fit needs.
 
     Compiling takes some ten seconds, once on a machine. It is not a part of a fit, so this goes
     before its clock.
-
-    Args:
-        name: `auto`, `cpu` or `cuda`.
-
-    Raises:
-        MissingDependency: CUDA was asked for and is not there.
     """
     device = choose_device(name)
     if device.type == "cpu":
         warm_up()
-        warm_up_loss()
-        warm_up_optimizer()
         warm_up_posing()
+        _warm_up()
     return device
 
 
@@ -103,16 +192,7 @@ def spent(step: int, steps: int, budget: Budget, report: Report) -> float:
 
 
 def batches(count: int, batch: int, seed: int) -> Iterator[torch.Tensor]:
-    """Batches of row numbers without end: every row once before any comes again.
-
-    Args:
-        count: rows.
-        batch: rows in a batch.
-        seed: of their order.
-
-    Yields:
-        (batch,) int64.
-    """
+    """Batches of row numbers, (batch,) int64, without end: every row once before any again."""
     random = np.random.default_rng(seed)
     queue = np.empty(0, dtype=np.int64)
     while True:
@@ -179,11 +259,7 @@ class Guard(Generic[Kept]):
         return all(math.isfinite(loss) for loss in read_losses(self._losses))
 
     def best(self) -> Kept:
-        """The state with the lowest loss.
-
-        Raises:
-            DidNotConverge: the fit diverged before there was one.
-        """
+        """The state with the lowest loss; `DidNotConverge` if there was none."""
         if self._best is None:
             raise DidNotConverge(
                 f"the fit diverged within its first {WINDOW} steps",

@@ -46,14 +46,8 @@ class HandAvatar:
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw the hands that are given, in the order in which they were fitted.
 
-        Args:
-            hands: by side, at least one.
-            viewmats: (1, 4, 4) world to camera.
-            Ks: (1, 3, 3) px.
-            width, height: px.
-
-        Returns:
-            (1, H, W, 3) sRGB over black and (1, H, W, 1) coverage.
+        One camera: (1, 4, 4) and (1, 3, 3) px. Gives (1, H, W, 3) sRGB over black and (1, H, W, 1)
+        coverage.
         """
         raise NotImplementedError
 
@@ -79,11 +73,7 @@ class HandAvatar:
         return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
 
     def posed(self, hands: Mapping[str, HandPose]) -> PosedHands:
-        """Return the hands that are given as tensors, in the order in which they were fitted.
-
-        Raises:
-            UsageError: no hand, or one that was not fitted.
-        """
+        """The hands that are given as tensors, in the order in which they were fitted."""
         if set(hands) - set(self.sides) or not hands:
             raise UsageError(
                 f"asked for {sorted(hands)} of an avatar of {sorted(self.sides)}", field="hands"

@@ -6,15 +6,7 @@ import torch
 
 
 def quat_multiply(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
-    """Hamilton product: the rotation `right` followed by `left`.
-
-    Args:
-        left: (..., 4).
-        right: (..., 4), broadcast against `left`.
-
-    Returns:
-        (..., 4).
-    """
+    """Hamilton product of (..., 4), broadcast: the rotation `right` followed by `left`."""
     aw, ax, ay, az = left.unbind(-1)
     bw, bx, by, bz = right.unbind(-1)
     return torch.stack(
@@ -29,14 +21,7 @@ def quat_multiply(left: torch.Tensor, right: torch.Tensor) -> torch.Tensor:
 
 
 def quat_rotate(quats: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
-    """Rotate vectors.
-
-    Args:
-        quats: (..., 4) of length 1.
-        vectors: (..., 3), broadcast against `quats`.
-
-    Returns:
-        (..., 3).
+    """Rotate (..., 3) vectors by (..., 4) quaternions of length 1, broadcast.
 
     Source: v + 2 w (u x v) + 2 u x (u x v), with u the quaternion's vector part.
     """
@@ -47,14 +32,7 @@ def quat_rotate(quats: torch.Tensor, vectors: torch.Tensor) -> torch.Tensor:
 
 
 def quat_third_axis(quats: torch.Tensor) -> torch.Tensor:
-    """Where the z axis goes: the third column of the rotation matrix.
-
-    Args:
-        quats: (..., 4) of length 1.
-
-    Returns:
-        (..., 3) of length 1.
-    """
+    """Where (..., 4) of length 1 take the z axis: the third column of the rotation matrix."""
     w, x, y, z = quats.unbind(-1)
     return torch.stack(
         (2.0 * (x * z + w * y), 2.0 * (y * z - w * x), 1.0 - 2.0 * (x * x + y * y)), dim=-1
@@ -62,16 +40,10 @@ def quat_third_axis(quats: torch.Tensor) -> torch.Tensor:
 
 
 def matrix_to_quat(matrices: torch.Tensor) -> torch.Tensor:
-    """Unit quaternions of rotation matrices, exact at every angle.
+    """Unit quaternions of (..., 3, 3) rotations, exact at every angle.
 
-    Args:
-        matrices: (..., 3, 3) rotations.
-
-    Returns:
-        (..., 4), of which the largest entry in magnitude is positive.
-
-    Source: Shepperd, "Quaternion from rotation matrix": of the four equivalent formulas the one
-    that divides by the largest entry is taken.
+    The largest entry in magnitude is positive. Source: Shepperd, "Quaternion from rotation matrix":
+    of the four equivalent formulas the one that divides by the largest entry is taken.
     """
     m = matrices
     xx, yy, zz = m[..., 0, 0], m[..., 1, 1], m[..., 2, 2]

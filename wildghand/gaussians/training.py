@@ -1,8 +1,8 @@
-"""The training data of a fit in memory: the frames, and the posed hands and cameras in them."""
+"""The training data of a fit in memory: frames as tables, and the posed hands and cameras."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -14,8 +14,73 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.capture import Cameras
 from hwp_bench.hands import HandParameters
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.gaussians.frame_table import FrameTable, shares_of_255, upload
 from wildghand.gaussians.rig import AnchorPoses, HandRig
+
+#: Most memory of a table of frames, bytes: some 1,000 images of 176 px.
+TABLE_BYTES = 384 * 1024 * 1024
+
+# Frames whose numbers are made together.
+_CHUNK = 32
+
+
+class FrameTable:
+    """Numbers that belong to `count` frames and do not change: made once, when first asked for.
+
+    `make` takes rows, (B,) int64 on the CPU, and makes what belongs to them on the device. A table
+    of more than `cache_bytes`, `size` bytes a frame, is made batch by batch.
+    """
+
+    def __init__(
+        self,
+        make: Callable[[torch.Tensor], torch.Tensor],
+        count: int,
+        size: int,
+        device: torch.device,
+        cache_bytes: int = TABLE_BYTES,
+    ) -> None:
+        self._make = make
+        self._device = device
+        self._all = torch.arange(count if count * size <= cache_bytes else 0)
+        self._made: torch.Tensor | None = None
+
+    def __call__(self, rows: torch.Tensor) -> torch.Tensor:
+        """What belongs to (B,) rows: (B, ...); it must not be changed."""
+        if not len(self._all):
+            return self._make(rows)
+        if self._made is None:
+            self._made = self._make_all()
+        if len(rows) == 1:  # a view
+            return self._made[int(rows[0])][None]
+        return self._made[upload(rows, self._device)]
+
+    def _make_all(self) -> torch.Tensor:
+        """Fill the table part by part: joining finished parts would hold all of them twice."""
+        parts = self._all.split(_CHUNK)
+        first = self._make(parts[0])
+        made = first.new_empty(len(self._all), *first.shape[1:])
+        made[: len(first)] = first
+        for part in parts[1:]:
+            made[int(part[0]) : int(part[-1]) + 1] = self._make(part)
+        return made
+
+
+def soft_weights(masks: torch.Tensor, outside: float) -> torch.Tensor:
+    """Weights of pixels: 1 where the coverage is 1, `outside` where it is 0."""
+    return outside + (1.0 - outside) * masks
+
+
+def shares_of_255(values: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """8-bit numbers on the host as float32 shares of 255 on a device."""
+    return upload(values, device).float() / 255.0
+
+
+def upload(tensor: torch.Tensor, device: torch.device) -> torch.Tensor:
+    """Copy a tensor from the host without waiting for the device; the tensor itself for the CPU."""
+    if device.type == "cpu":
+        return tensor
+    held = tensor.pin_memory() if device.type == "cuda" else tensor
+    return held.to(device, non_blocking=True)
+
 
 #: Most memory that posed anchors are kept in, bytes; longer clips are posed step by step.
 CACHE_BYTES = 768 * 1024 * 1024
@@ -39,14 +104,7 @@ class TrainingFrames:
         return len(self.indices)
 
     def images_on(self, device: torch.device) -> FrameTable:
-        """What renderings are compared with: float32 images, black outside the mask.
-
-        Args:
-            device: where the table gives them out.
-
-        Returns:
-            a table of (H, W, 3).
-        """
+        """What renderings are compared with: (H, W, 3) float32, black outside the mask."""
 
         def make(rows: torch.Tensor) -> torch.Tensor:
             images = upload(self.images[rows], device).float() / 255.0
@@ -55,11 +113,7 @@ class TrainingFrames:
         return FrameTable(make, len(self), 4 * self.images[0].numel(), device)
 
     def masks_on(self, device: torch.device) -> FrameTable:
-        """Estimated coverage of the visible hand: a table of (H, W) float32 in [0, 1].
-
-        Args:
-            device: where the table gives it out.
-        """
+        """Estimated coverage of the visible hand: a table of (H, W) float32 in [0, 1]."""
         each = 4 * self.masks[0].numel()
         return FrameTable(
             lambda rows: shares_of_255(self.masks[rows], device), len(self), each, device
@@ -97,17 +151,9 @@ def load_frames(training: TrainingCapture) -> TrainingFrames:
 
 
 def load_validation_frames(training: TrainingCapture, most: int) -> TrainingFrames:
-    """Read validation frames that show a hand and whose parameters are valid.
+    """Read at most so many validation frames, evenly spread; there may be none.
 
-    Args:
-        training: what may be seen of the capture.
-        most: how many, evenly spread over those there are.
-
-    Returns:
-        The frames; there may be none. What is fitted too is left out.
-
-    Raises:
-        BadImage: an image is missing or damaged.
+    What is fitted too is left out.
     """
     apart = np.setdiff1d(training.validation, training.train)
     return _read_frames(training, apart[evenly(len(apart), most)])
@@ -193,12 +239,7 @@ class TrainingClip:
             self._cache = {side: self._pose(side, rows) for side in rigs}
 
     def hand(self, side: str, rows: torch.Tensor) -> AnchorPoses:
-        """The anchors of one hand in a batch, without gradient; they must not be changed.
-
-        Args:
-            side: which.
-            rows: (B,) int64 positions in `indices`.
-        """
+        """The anchors of one hand in (B,) rows, without gradient; they must not be changed."""
         if self._cache is None:
             return self._pose(side, rows)
         posed = self._cache[side]

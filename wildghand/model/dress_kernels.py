@@ -13,7 +13,7 @@ import math
 import numpy as np
 
 from hwp_bench.base.kernels import compiled
-from wildghand.splat.kernels.jobs import next_job
+from wildghand.splat.kernels.jit import next_job
 
 #: Gaussians that one thread takes at a time.
 PIECE = 512

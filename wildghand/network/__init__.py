@@ -1,7 +1,12 @@
 """The Gaussian prediction network, in two sizes: `compact` and `paper`."""
 
-from wildghand.network.network import HandFeatures, NetworkOutput, PredictionNetwork, Refinement
-from wildghand.network.parameters import parameter_groups
+from wildghand.network.network import (
+    HandFeatures,
+    NetworkOutput,
+    PredictionNetwork,
+    Refinement,
+    parameter_groups,
+)
 from wildghand.network.settings import NetworkSettings, network_settings
 from wildghand.network.surface import SurfacePoints, mirrored_anchors, surface_points
 

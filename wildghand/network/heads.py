@@ -1,27 +1,76 @@
-"""The four prediction heads. At the start each of them says what it is told to say."""
+"""The identity map and the four heads, each of which starts from what it is told to say."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import linear
 
-from wildghand.gaussians.attributes import CHANNELS, RawAttributes
-from wildghand.network.encoding import POSITION_CHANNELS
-from wildghand.network.identity import DIRECT_GAINS
+from wildghand.gaussians.attributes import CHANNELS, SIZES, RawAttributes, flat_gaussians
 from wildghand.network.settings import NetworkSettings
+from wildghand.network.surface import POSITION_CHANNELS, SurfacePoints
+
+# How far a raw attribute moves with its channel of the identity map. One rate of Adam moves all
+# channels alike, so these are the ratios of the rates at which attributes are best fitted.
+_GAINS = {
+    "offsets": 1.0,
+    "log_scales": 0.4,
+    "quats": 0.4,
+    "logit_opacities": 1.6,
+    "logit_colors": 1.0,
+}
+#: `_GAINS` for each of the 14 channels.
+DIRECT_GAINS = tuple(gain for name, gain in _GAINS.items() for _ in range(SIZES[name]))
+#: Share of the brightest sRGB that an albedo may start from, so that it can still grow.
+BRIGHTEST = 0.95
+
+
+class IdentityMap(nn.Module):
+    """One square of learnable features for each hand: the two halves of the paper's atlas.
+
+    A capture of one hand has one half only.
+    """
+
+    def __init__(self, settings: NetworkSettings, sides: Iterable[str]) -> None:
+        super().__init__()
+        self.resolution = settings.identity_resolution
+        self.maps = nn.ParameterDict()
+        for side in sides:
+            values = torch.randn(self.resolution**2, settings.identity_channels).clamp_(-1.0, 1.0)
+            values *= settings.identity_spread
+            if settings.direct:
+                values[:, :CHANNELS] = 0.0
+            self.maps[side] = nn.Parameter(values)
+
+    def forward(self, side: str) -> Tensor:
+        """Return a hand's half: (resolution^2, channels), row by row from the top."""
+        return self.maps[side]
+
+
+def initial_attributes(
+    settings: NetworkSettings, surface: SurfacePoints, log_scale_bias: float
+) -> RawAttributes:
+    """Flat discs of the hand's mean colour, as seen through the initial shadow coefficient.
+
+    `log_scale_bias` is what the activation adds to the log scales.
+    """
+    spacing = torch.full((len(surface),), float(surface.spacing))
+    albedo = (surface.color / settings.initial_shadow).clamp(0.0, BRIGHTEST)
+    discs = flat_gaussians(spacing, albedo, opacity=settings.initial_opacity)
+    return RawAttributes(
+        offsets=discs.offsets,
+        log_scales=discs.log_scales - log_scale_bias,
+        quats=discs.quats,
+        logit_opacities=discs.logit_opacities[:, None],
+        logit_colors=discs.logit_colors,
+    )
 
 
 def hidden(inputs: int, width: int, layers: int) -> nn.Sequential:
-    """Linear layers, each followed by a SiLU.
-
-    Args:
-        inputs: channels in.
-        width: of each layer.
-        layers: at least 1.
-    """
+    """Linear layers of `width`, each followed by a SiLU."""
     parts: list[nn.Module] = []
     for _ in range(layers):
         parts += [nn.Linear(inputs, width), nn.SiLU()]
@@ -36,13 +85,7 @@ def mlp(inputs: int, width: int, outputs: int, layers: int) -> nn.Sequential:
 
 
 class AttributeHead(nn.Module):
-    """Head (i): raw attributes from both branches.
-
-    Args:
-        settings: widths; `direct` adds the map's first channels to the attributes.
-        texture: channels of the texture features.
-        geometry: channels of the geometry features.
-    """
+    """Head (i): raw attributes from both branches; `direct` adds the map's first channels."""
 
     def __init__(self, settings: NetworkSettings, texture: int, geometry: int) -> None:
         super().__init__()
@@ -67,16 +110,11 @@ class AttributeHead(nn.Module):
     def forward(
         self, hidden: Tensor, x_g: Tensor, latent: Tensor, initial: Tensor
     ) -> RawAttributes:
-        """Predict.
+        """Raw attributes (B, N, k).
 
-        Args:
-            hidden: (N, width) of `texture`, from the texture features.
-            x_g: (B, N, Fg) geometry features.
-            latent: (N, I) identity features for the direct path; (N, 0) without it.
-            initial: (N, 14) raw attributes that are predicted at the start.
-
-        Returns:
-            (B, N, k).
+        `hidden` (N, width) is from the texture features, `x_g` (B, N, Fg) the geometry features,
+        `latent` (N, I) the identity features (I is 0 without the direct path), `initial` (N, 14)
+        the start.
         """
         change = self.attributes(hidden + self.geometry(x_g))
         canonical = initial.to(change.dtype)

@@ -1,8 +1,9 @@
-"""The Gaussian prediction network: identity map, two branches, four heads."""
+"""The Gaussian prediction network: identity map, two branches, four heads; and its parameters."""
 
 from __future__ import annotations
 
 import contextlib
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -11,14 +12,18 @@ from torch import Tensor, nn
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
 from wildghand.gaussians.attributes import Activation, RawAttributes
-from wildghand.network.compact import CompactGeometry, CompactTexture
-from wildghand.network.compact_frames import frame_heads
-from wildghand.network.encoding import POSITION_CHANNELS
-from wildghand.network.heads import AttributeHead, RefinementHead, ShadowHead, TemplateHead
-from wildghand.network.identity import IdentityMap, initial_attributes
-from wildghand.network.paper import PaperGeometry, PaperTexture
+from wildghand.network.branches import CompactGeometry, CompactTexture, PaperGeometry, PaperTexture
+from wildghand.network.frame_heads import frame_heads
+from wildghand.network.heads import (
+    AttributeHead,
+    IdentityMap,
+    RefinementHead,
+    ShadowHead,
+    TemplateHead,
+    initial_attributes,
+)
 from wildghand.network.settings import NetworkSettings, check_sides
-from wildghand.network.surface import Chart, SurfacePoints
+from wildghand.network.surface import POSITION_CHANNELS, Chart, SurfacePoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,11 +127,7 @@ class PredictionNetwork(nn.Module):
             self.register_buffer(f"initial_{side}", start.concatenate(), persistent=False)
 
     def initial(self, side: str) -> RawAttributes:
-        """The raw attributes, (N, k), that head (i) starts from.
-
-        Raises:
-            UsageError: no such hand.
-        """
+        """The raw attributes, (N, k), that head (i) starts from."""
         return RawAttributes.split(self._initial(side))
 
     def _initial(self, side: str) -> Tensor:
@@ -134,31 +135,11 @@ class PredictionNetwork(nn.Module):
         return self.get_buffer(f"initial_{side}")
 
     def texture(self, side: str) -> Tensor:
-        """Texture features x_t of a hand, the same in every frame.
-
-        Returns:
-            (N, Ft).
-
-        Raises:
-            UsageError: no such hand.
-        """
+        """Texture features x_t of a hand, (N, Ft), the same in every frame."""
         return self.texture_branch(self._chart(side), self.identity, side)
 
     def geometry(self, side: str, normals: Tensor, pose: Tensor) -> Tensor:
-        """Geometry features x_g of a hand.
-
-        Args:
-            side: the hand.
-            normals: (B, N, 3) of length 1, world: the posed surface's.
-            pose: (B, 16, 3) axis-angle, rad.
-
-        Returns:
-            (B, N, Fg).
-
-        Raises:
-            UsageError: no such hand.
-            ShapeMismatch: not N normals, or not as many poses as frames.
-        """
+        """Geometry features x_g, (B, N, Fg); see `forward`."""
         return self.geometry_branch(self._checked(side, normals, pose), normals, pose)
 
     def _checked(self, side: str, normals: Tensor, pose: Tensor) -> Chart:
@@ -175,11 +156,7 @@ class PredictionNetwork(nn.Module):
         return chart
 
     def features(self, side: str) -> HandFeatures:
-        """Everything that the frames of a hand share: what depends on texture features only.
-
-        Raises:
-            UsageError: no such hand.
-        """
+        """Everything that the frames of a hand share: what depends on texture features only."""
         with self._precision():
             x_t = self.texture(side)
             mean = x_t.mean(dim=0)
@@ -268,3 +245,95 @@ class PredictionNetwork(nn.Module):
         chart = self.charts[side]
         assert isinstance(chart, Chart)
         return chart
+
+
+def parameter_groups(network: PredictionNetwork) -> dict[str, list[nn.Parameter]]:
+    """Sort every parameter into one of five groups.
+
+    Returns:
+        `identity`: the identity map; `direct`: the matrix that adds it to the attributes (empty
+        without `direct`); `light`: the linear part of head (ii); `refinement`: head (iv);
+        `network`: all others. Groups and their members are in a fixed order.
+    """
+    groups: dict[str, list[nn.Parameter]] = {
+        "identity": [],
+        "direct": [],
+        "light": [],
+        "refinement": [],
+        "network": [],
+    }
+    prefixes = {
+        "identity.": "identity",
+        "attribute_head.direct.": "direct",
+        "shadow_head.light.": "light",
+        "refinement_head.": "refinement",
+    }
+    for name, parameter in network.named_parameters():
+        group = next((g for prefix, g in prefixes.items() if name.startswith(prefix)), "network")
+        groups[group].append(parameter)
+    return groups
+
+
+@dataclass(frozen=True)
+class LayerRow:
+    """A layer, or several of the same kind."""
+
+    #: Path in the network; `*` stands for the number of a repeated layer.
+    layer: str
+    #: Shapes of its weights, in the order in which torch holds them.
+    weights: str
+    #: Parameters of one of them.
+    each: int
+    #: How many there are.
+    times: int
+
+    @property
+    def parameters(self) -> int:
+        """Parameters of all of them."""
+        return self.each * self.times
+
+    @property
+    def part(self) -> str:
+        """Which part of the network it belongs to: the first name of the path."""
+        return self.layer.partition(".")[0]
+
+
+def parameter_table(network: PredictionNetwork) -> tuple[LayerRow, ...]:
+    """Every layer that learns, in order; repeated layers of equal shape share a row."""
+    counted: dict[tuple[str, str, int], int] = {}
+    for path, module in network.named_modules():
+        own = list(module.parameters(recurse=False))
+        if own:
+            layer = re.sub(r"\.\d+\.", ".*.", path)
+            weights = " + ".join("x".join(map(str, tensor.shape)) for tensor in own)
+            key = (layer, weights, sum(tensor.numel() for tensor in own))
+            counted[key] = counted.get(key, 0) + 1
+    return tuple(LayerRow(*key, times) for key, times in counted.items())
+
+
+def blank_network(settings: NetworkSettings) -> PredictionNetwork:
+    """A network of both hands without memory for its weights: enough to count them."""
+    dot = SurfacePoints(
+        uv=torch.full((1, 2), 0.5),
+        positions=torch.zeros(1, 3),
+        spacing=1e-3,
+        color=torch.full((3,), 0.5),
+    )
+    with torch.device("meta"):
+        return PredictionNetwork(settings, {"left": dot, "right": dot})
+
+
+#: Start of the names of identity maps in a network's state.
+MAPS = "identity.maps."
+
+
+def shapes_of(network: PredictionNetwork) -> dict[str, torch.Size]:
+    """Shapes of all weights of a network, and of the identity maps of both hands."""
+    shapes = {name: value.shape for name, value in network.state_dict().items()}
+    of_map = next(shape for name, shape in shapes.items() if name.startswith(MAPS))
+    return shapes | {f"{MAPS}{side}": of_map for side in ("right", "left")}
+
+
+def shapes_of_settings(settings: NetworkSettings) -> dict[str, torch.Size]:
+    """The same where there is no network yet; the first time takes a second."""
+    return shapes_of(blank_network(settings))

@@ -132,11 +132,7 @@ def network_settings(size: str = "compact", **changes: Any) -> NetworkSettings:
 
 
 def check_sides(sides: Mapping[str, Any]) -> None:
-    """Refuse a set of hands that is empty or names something else.
-
-    Raises:
-        UsageError: no hand, or one that is neither right nor left.
-    """
+    """Refuse a set of hands that is empty or names something else."""
     if not sides or set(sides) - set(SIDES):
         raise UsageError(
             f"are {sorted(map(str, sides))}"[:200], field="sides", remedy="Use right, left or both."

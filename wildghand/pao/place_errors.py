@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from wildghand.gaussians.frame_table import upload
+from wildghand.gaussians.training import upload
 from wildghand.pao.regions import ClipRegions
 from wildghand.pao.running_median import LEAST
 

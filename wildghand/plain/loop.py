@@ -15,8 +15,7 @@ import torch
 
 from hwp_bench.base.console import notice
 from hwp_bench.methods.contract import Avatar, Budget, Report
-from wildghand.gaussians.fit_loop import Guard, Loss, read_losses, repeatable, spent
-from wildghand.gaussians.step_threads import StepThreads
+from wildghand.gaussians.fit_loop import Guard, Loss, StepThreads, read_losses, repeatable, spent
 
 #: Fall of the mean loss from window to window, as a share, that still counts as progress.
 PROGRESS = 1e-3

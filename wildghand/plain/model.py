@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import torch
 
 from hwp_bench.hands import HandTemplate
-from wildghand.gaussians.anchored import AnchoredGaussians, flat_gaussians
+from wildghand.gaussians.attributes import AnchoredGaussians, flat_gaussians
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig, make_rig

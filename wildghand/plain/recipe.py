@@ -18,10 +18,15 @@ from hwp_bench.methods.contract import Avatar, Budget, Report, TrainingCapture
 from hwp_bench.methods.settings import choice, number, settings_from
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import batches, ready_device
-from wildghand.gaussians.frame_table import FrameTable, soft_weights
 from wildghand.gaussians.losses import photometric_loss
 from wildghand.gaussians.shading import MAX_DEGREE
-from wildghand.gaussians.training import TrainingClip, TrainingFrames, load_frames
+from wildghand.gaussians.training import (
+    FrameTable,
+    TrainingClip,
+    TrainingFrames,
+    load_frames,
+    soft_weights,
+)
 from wildghand.plain.loop import IterativeFit, run_fit
 from wildghand.plain.model import PlainAvatar, PlainModel, make_model
 from wildghand.splat.threads import denormals_flushed

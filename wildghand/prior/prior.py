@@ -21,7 +21,7 @@ from hwp_bench.capture.schema import HandModelId
 from hwp_bench.hands import load_template
 from wildghand.model.settings import WildGHandSettings
 from wildghand.network import NetworkSettings, PredictionNetwork, network_settings
-from wildghand.network.weight_shapes import MAPS, shapes_of, shapes_of_settings
+from wildghand.network.network import MAPS, shapes_of, shapes_of_settings
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,8 @@ import torch
 from torch import Tensor
 
 from hwp_bench.hands import TemplateTensors, pose_hand, vertex_normals
-from wildghand.gaussians.frame_table import upload
 from wildghand.gaussians.rig import HandRig
-from wildghand.gaussians.training import TrainingClip
+from wildghand.gaussians.training import TrainingClip, upload
 from wildghand.shadows.cast_light import SRGB, CastLight
 from wildghand.shadows.obstacles import Obstacles, obstacles_in_frames
 from wildghand.shadows.settings import ShadowSettings

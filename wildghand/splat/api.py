@@ -13,8 +13,7 @@ import torch
 
 from hwp_bench.base.errors import UsageError
 from wildghand.splat.conventions import MAX_COLOR
-from wildghand.splat.layout import check_options, flatten
-from wildghand.splat.scene import FlatScene, Options, unflattened
+from wildghand.splat.scene import FlatScene, Options, check_options, flatten, unflattened
 
 #: Values of `backend`.
 BACKENDS = ("auto", "numba", "gsplat", "reference")
@@ -51,11 +50,7 @@ def rasterize(
     `viewmats` (C, 4, 4) with `means` (C, N, 3) pairs each camera with Gaussians of its own, and
     `quats`, `scales`, `opacities` and `colors` may leave `...` out: all sets share them.
 
-    A Gaussian is culled, which leaves the image and all gradients finite and its own at zero, if
-    one of its values is not finite, its quaternion is zero, a colour exceeds
-    `conventions.MAX_COLOR`, its centre is not between the planes, its opacity is below 1/255,
-    or nothing of it is on screen. A camera that is not finite, or has no positive focal
-    length, sees nothing, and a background that no colour may have is black; both with a warning.
+    What is culled, and what a camera shows that cannot see, is in `docs/splatting.md`.
 
     Args:
         means: (..., N, 3) centres in world units.

@@ -27,9 +27,8 @@ _MAX_LENGTH = 1e15
 _LEAST_QUATERNION, _MAX_QUATERNION = 1e-36, 1e36
 #: gsplat divides by the depth of all that is not nearer than the near plane.
 _LEAST_NEAR_PLANE = 1e-6
-#: gsplat takes leading batch dimensions from this version on; before, sets of Gaussians that
-#: differ between images are drawn one after the other.
-_BATCHES_SINCE = (1, 5, 2)
+#: gsplat takes leading batch dimensions from this version on.
+_LEAST_VERSION = (1, 5, 2)
 
 
 def rasterize_gsplat(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
@@ -41,19 +40,25 @@ def rasterize_gsplat(scene: FlatScene) -> tuple[torch.Tensor, torch.Tensor, dict
     Raises:
         MissingDependency: gsplat is not installed, or cannot load its kernels.
 
-    Source: gsplat, `gsplat.rasterization` (Ye et al. 2024), version 1.4 or later.
+    Source: gsplat, `gsplat.rasterization` (Ye et al. 2024), version 1.5.2 or later.
     """
-    rasterization, batches = _gsplat()
+    rasterization = _gsplat()
     if not scene.gaussians:
         return _nothing(scene)
     tensors = _harmless(scene)
     groups = max(tensors[name].shape[0] for name in ("means", "quats", "scales", "opacities"))
-    if groups <= 1:
-        channels, alphas, meta = _draw(rasterization, scene, _single(tensors))
-    elif batches:
-        channels, alphas, meta = _draw(rasterization, scene, _batch(tensors, groups))
-    else:
-        channels, alphas, meta = _one_by_one(rasterization, scene, tensors, groups)
+    options = scene.options
+    channels, alphas, meta = rasterization(
+        **(_single(tensors) if groups <= 1 else _batch(tensors, groups)),
+        width=options.width,
+        height=options.height,
+        near_plane=max(options.near_plane, _LEAST_NEAR_PLANE),
+        far_plane=options.far_plane,
+        eps2d=options.eps2d,
+        packed=False,  # packing pays where cameras see little of a scene; they see whole hands
+        render_mode=options.render_mode,
+        rasterize_mode="antialiased" if options.antialiased else "classic",
+    )
     return channels.flatten(0, -4), alphas.flatten(0, -4), _info(scene, meta)
 
 
@@ -80,8 +85,6 @@ def _info(scene: FlatScene, meta: dict[str, Any]) -> dict[str, Any]:
     info = {}
     for name, tail in (("means2d", (count, 2)), ("depths", (count,)), ("radii", (count, 2))):
         value = meta[name]
-        if name == "radii" and value.ndim == meta["depths"].ndim:  # one radius, in older ones
-            value = value.unsqueeze(-1).expand(*value.shape, 2)
         # Where the shape is right already, this must be the very tensor whose gradient gsplat
         # makes, not a view of it.
         shape = (*scene.image_dims, *tail)
@@ -90,8 +93,8 @@ def _info(scene: FlatScene, meta: dict[str, Any]) -> dict[str, Any]:
     return info
 
 
-def _gsplat() -> tuple[Callable[..., Any], bool]:
-    """gsplat's function, and whether it takes batches."""
+def _gsplat() -> Callable[..., Any]:
+    """gsplat's function."""
     try:
         import gsplat
     except (ImportError, OSError) as error:
@@ -100,8 +103,14 @@ def _gsplat() -> tuple[Callable[..., Any], bool]:
             field="backend",
             remedy="Install it with `pip install gsplat`, or pass CPU tensors",
         ) from error
-    version = tuple(int(part) for part in re.findall(r"\d+", gsplat.__version__)[:3])
-    return gsplat.rasterization, version >= _BATCHES_SINCE
+    if tuple(int(part) for part in re.findall(r"\d+", gsplat.__version__)[:3]) < _LEAST_VERSION:
+        raise MissingDependency(
+            f"gsplat is {gsplat.__version__}, and the CUDA backend needs 1.5.2 or later",
+            field="backend",
+            remedy="Update it with `pip install -U gsplat`, or pass CPU tensors",
+        )
+    rasterization: Callable[..., Any] = gsplat.rasterization
+    return rasterization
 
 
 def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
@@ -135,11 +144,7 @@ def _harmless(scene: FlatScene) -> dict[str, torch.Tensor]:
 
 
 def _usable(scene: FlatScene) -> tuple[torch.Tensor, dict[str, torch.Tensor]]:
-    """Quaternions whose squares stay in float32, and what of all arguments is usable.
-
-    Returns:
-        (S, N, 4), and masks (S, N) by name.
-    """
+    """Quaternions (S, N, 4) whose squares stay in float32, and masks (S, N) of what is usable."""
     longest = _largest(scene.quats)
     turns = (longest >= _LEAST_QUATERNION) & (longest <= _MAX_QUATERNION)
     good = {
@@ -220,38 +225,3 @@ def _batch(tensors: dict[str, torch.Tensor], groups: int) -> dict[str, torch.Ten
         else:
             result[name] = tensor.expand(groups, *tensor.shape[1:])
     return result
-
-
-def _draw(
-    rasterization: Callable[..., Any], scene: FlatScene, tensors: dict[str, torch.Tensor]
-) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    options = scene.options
-    return rasterization(
-        **tensors,
-        width=options.width,
-        height=options.height,
-        near_plane=max(options.near_plane, _LEAST_NEAR_PLANE),
-        far_plane=options.far_plane,
-        eps2d=options.eps2d,
-        packed=False,  # packing pays where cameras see little of a scene; they see whole hands
-        render_mode=options.render_mode,
-        rasterize_mode="antialiased" if options.antialiased else "classic",
-    )
-
-
-def _one_by_one(
-    rasterization: Callable[..., Any],
-    scene: FlatScene,
-    tensors: dict[str, torch.Tensor],
-    groups: int,
-) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
-    batched = _batch(tensors, groups)
-    parts = [
-        _draw(rasterization, scene, {name: tensor[g] for name, tensor in batched.items()})
-        for g in range(groups)
-    ]
-    channels = torch.stack([part[0] for part in parts])
-    alphas = torch.stack([part[1] for part in parts])
-    names = ("means2d", "radii", "depths")
-    meta = {name: torch.stack([part[2][name] for part in parts]) for name in names}
-    return channels, alphas, meta

@@ -1,35 +1,329 @@
-"""The rasterizer's hard cases, for `hwp-bench stability` and for the tests.
-
-Three things can be asked of a scene: that it is drawn as the float64 reference draws it; that a bad
-Gaussian in it changes nothing; that all numbers stay finite.
-"""
+"""Scenes at the limits of arithmetic, and the result of drawing one."""
 
 from __future__ import annotations
 
 import functools
 import math
-from collections.abc import Callable, Iterator
+import warnings
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any
 
 import torch
 
 from hwp_bench.stability import Case, Context, Measured
-from wildghand.splat.hard_runs import (
-    GRADIENT_TOLERANCE,
-    GSPLAT_TOLERANCE,
-    IMAGE_TOLERANCE,
-    NEEDLE_TOLERANCE,
-    NO_CHANGE,
-    VICTIM,
-    run_bad_view,
-    run_doubled,
-    run_exact,
-    run_finite,
-    run_narrow,
-    run_no_effect,
-    run_reordered,
-    run_strided,
-)
-from wildghand.splat.hard_scenes import PER_GAUSSIAN, HardScene, hand_scene
+from wildghand.splat.api import rasterize
+
+#: Arguments that have a gradient.
+DIFFERENTIABLE = ("means", "quats", "scales", "opacities", "colors", "backgrounds", "viewmats")
+#: Arguments with one row for each Gaussian.
+PER_GAUSSIAN = DIFFERENTIABLE[:5]
+#: A pixel that comes nearer than this to a limit (as a ratio) is not compared: float32 and
+#: float64 may decide differently whether a splat that is just visible is drawn.
+MARGIN = 1e-5
+
+Arguments = dict[str, torch.Tensor]
+
+
+@dataclass(frozen=True)
+class HardScene:
+    """The arguments of one call, float64."""
+
+    arguments: Arguments
+    width: int = 40
+    height: int = 30
+    near_plane: float = 0.01
+    eps2d: float = 0.3
+
+    def changed(self, **arguments: torch.Tensor) -> HardScene:
+        """The same scene with other tensors."""
+        return HardScene(
+            {**self.arguments, **arguments}, self.width, self.height, self.near_plane, self.eps2d
+        )
+
+    def without(self, index: int) -> HardScene:
+        """The same scene without one Gaussian."""
+        keep = torch.arange(len(self.arguments["means"])) != index
+        return self.changed(**{name: self.arguments[name][keep] for name in PER_GAUSSIAN})
+
+
+@dataclass(frozen=True)
+class DrawnScene:
+    """The result of drawing a scene, in float64 on the CPU."""
+
+    image: torch.Tensor  # (C, H, W, D)
+    alpha: torch.Tensor  # (C, H, W, 1)
+    gradients: Arguments  # of every differentiable argument
+
+    @property
+    def finite(self) -> bool:
+        """Whether no number is NaN or infinite."""
+        tensors = (self.image, self.alpha, *self.gradients.values())
+        return all(bool(tensor.isfinite().all()) for tensor in tensors)
+
+
+def hand_scene(
+    count: int = 60,
+    width: int = 40,
+    height: int = 30,
+    cameras: int = 1,
+    distance: float = 0.4,
+    focal: float = 60.0,
+    seed: int = 0,
+) -> HardScene:
+    """A blob of the size of a hand (0.16 m), looked at by cameras side by side, 1 cm apart."""
+    generator = torch.Generator().manual_seed(seed)
+
+    def uniform(*shape: int) -> torch.Tensor:
+        return torch.rand(shape, generator=generator, dtype=torch.float64)
+
+    viewmats = torch.eye(4, dtype=torch.float64).repeat(cameras, 1, 1)
+    viewmats[:, 0, 3] = 0.01 * torch.arange(cameras)
+    viewmats[:, 2, 3] = distance
+    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    arguments = {
+        "means": (uniform(count, 3) - 0.5) * 0.16,
+        "quats": torch.randn(count, 4, generator=generator, dtype=torch.float64),
+        "scales": 0.004 + 0.012 * uniform(count, 3),
+        "opacities": 0.2 + 0.75 * uniform(count),
+        "colors": uniform(count, 3),
+        "viewmats": viewmats,
+        "Ks": K.double().repeat(cameras, 1, 1),
+        "backgrounds": uniform(cameras, 3),
+    }
+    # Values that float32 cannot hold must not count against the backend.
+    rounded = {name: tensor.float().double() for name, tensor in arguments.items()}
+    return HardScene(rounded, width, height)
+
+
+def draw(
+    scene: HardScene, backend: str, dtype: torch.dtype, weights: torch.Tensor | None = None
+) -> DrawnScene:
+    """Draws a scene and takes the gradients of a fixed random linear loss.
+
+    (C, H, W) `weights` multiply the loss of each pixel.
+    """
+    device = torch.device("cuda" if backend == "gsplat" else "cpu")
+    arguments = {
+        name: tensor.detach().to(device, dtype).requires_grad_(name in DIFFERENTIABLE)
+        for name, tensor in scene.arguments.items()
+    }
+    image, alpha, _ = _rasterize(scene, arguments, backend)
+    loss = (_noise(image.shape, 1).to(image) * image).sum(-1)
+    loss = loss + (_noise(alpha.shape, 2).to(alpha) * alpha).sum(-1)
+    if weights is not None:
+        loss = loss * weights.to(loss)
+    loss.sum().backward()
+    zero = torch.zeros(())
+    gradients = {
+        name: (zero.expand(tensor.shape) if tensor.grad is None else tensor.grad).cpu().double()
+        for name, tensor in arguments.items()
+        if name in DIFFERENTIABLE
+    }
+    return DrawnScene(image.detach().cpu().double(), alpha.detach().cpu().double(), gradients)
+
+
+def clear_pixels(scene: HardScene) -> torch.Tensor:
+    """1 for every pixel that may be compared, 0 for those within `MARGIN` of a limit. (C, H, W)."""
+    with torch.no_grad():
+        _, _, info = _rasterize(scene, scene.arguments, "reference")
+    return (info["margin"] > MARGIN).double()
+
+
+def _rasterize(
+    scene: HardScene, arguments: Arguments, backend: str
+) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "rasterize: ")
+        return rasterize(
+            **arguments,  # type: ignore[arg-type]
+            width=scene.width,
+            height=scene.height,
+            near_plane=scene.near_plane,
+            eps2d=scene.eps2d,
+            backend=backend,
+        )
+
+
+def difference(measured: torch.Tensor, truth: torch.Tensor) -> float:
+    """Relative L2 distance; absolute where the truth is zero."""
+    size = float(truth.norm())
+    return float((measured - truth).norm()) / (size if size > 0 else 1.0)
+
+
+def gradient_differences(
+    measured: Mapping[str, torch.Tensor], truth: DrawnScene
+) -> dict[str, float]:
+    """`difference` of every gradient."""
+    return {name: difference(measured[name], value) for name, value in truth.gradients.items()}
+
+
+def _noise(shape: torch.Size, seed: int) -> torch.Tensor:
+    generator = torch.Generator().manual_seed(seed)
+    return torch.randn(shape, generator=generator, dtype=torch.float64)
+
+
+#: Largest relative L2 distance from the float64 reference: image, gradients, and gradients of
+#: needles.
+IMAGE_TOLERANCE = 1e-5
+GRADIENT_TOLERANCE = 1e-4
+NEEDLE_TOLERANCE = 1e-3
+#: Gradients of gsplat in piles and at tiny focal lengths: it adds up in float32, in any order.
+GSPLAT_TOLERANCE = 1e-3
+#: Largest change of an image or gradient when a culled Gaussian is taken away.
+NO_CHANGE = 1e-6
+#: The Gaussian that is spoilt.
+VICTIM = 7
+
+
+def _draw(scene: HardScene, context: Context, weights: torch.Tensor | None = None) -> DrawnScene:
+    dtype = torch.float64 if context.backend == "reference" else torch.float32
+    return draw(scene, context.backend, dtype, weights)
+
+
+def _beside_float64(
+    scene: HardScene, context: Context, tolerance: float, dtype: torch.dtype | None = None
+) -> Measured:
+    """How far a drawing, and its gradients, are from the reference in the pixels that are clear."""
+    clear = clear_pixels(scene)
+    truth = draw(scene, "reference", torch.float64, clear)
+    if dtype is None:
+        drawing = _draw(scene, context, clear)
+    else:
+        drawing = draw(scene, context.backend, dtype, clear)
+    mask = clear.unsqueeze(-1)
+    image = max(
+        difference(drawing.image * mask, truth.image * mask),
+        difference(drawing.alpha * mask, truth.alpha * mask),
+    )
+    gradients = gradient_differences(drawing.gradients, truth)
+    worst = max(gradients, key=lambda name: gradients[name])
+    near = image <= IMAGE_TOLERANCE and gradients[worst] <= tolerance
+    passed = drawing.finite and (near or math.isinf(tolerance))
+    return Measured(passed, f"image {image:.0e}, gradients {gradients[worst]:.0e} ({worst})")
+
+
+def run_exact(scene: HardScene, own: float, gsplat: float, context: Context) -> Measured:
+    """As float64 draws it; gradients within `own`, those of gsplat within `gsplat`."""
+    return _beside_float64(scene, context, gsplat if context.backend == "gsplat" else own)
+
+
+def run_no_effect(scene: HardScene, context: Context) -> Measured:
+    """The spoilt Gaussian changes nothing and gets no gradient."""
+    drawing = _draw(scene, context)
+    without = _draw(scene.without(VICTIM), context)
+    keep = torch.arange(len(scene.arguments["means"])) != VICTIM
+    own = max(float(drawing.gradients[name][VICTIM].abs().max()) for name in PER_GAUSSIAN)
+    others = {
+        name: value[keep] if name in PER_GAUSSIAN else value
+        for name, value in drawing.gradients.items()
+    }
+    change = max(
+        difference(drawing.image, without.image),
+        difference(drawing.alpha, without.alpha),
+        *gradient_differences(others, without).values(),
+    )
+    passed = drawing.finite and own == 0.0 and change <= NO_CHANGE
+    finite = "" if drawing.finite else "not finite, "
+    return Measured(passed, f"{finite}its gradient {own:g}, change elsewhere {change:.0e}")
+
+
+def run_bad_view(scene: HardScene, context: Context) -> Measured:
+    """The second camera is bad and shows the background; the first one sees as ever."""
+    drawing = _draw(scene, context)
+    good = {
+        name: scene.arguments[name][:1] if name in ("viewmats", "Ks", "backgrounds") else tensor
+        for name, tensor in scene.arguments.items()
+    }
+    single = _draw(HardScene(good), context)
+    change = difference(drawing.image[:1], single.image)
+    bad = drawing.image[1]
+    if scene.arguments["backgrounds"].isfinite().all():
+        shown = difference(bad, scene.arguments["backgrounds"][1].float().double().expand_as(bad))
+    else:
+        shown = float(drawing.gradients["backgrounds"][1, 0].abs())  # black: no gradient there
+    passed = drawing.finite and change <= NO_CHANGE and shown <= NO_CHANGE
+    finite = "" if drawing.finite else "not finite, "
+    return Measured(passed, f"{finite}off by {shown:.0e}, change of the other {change:.0e}")
+
+
+def run_narrow(dtype: torch.dtype, context: Context) -> Measured:
+    """Arguments of a narrow type are drawn as the same numbers in float64."""
+    # The same numbers, so that what the type cannot hold does not count.
+    narrow = {name: value.to(dtype).double() for name, value in hand_scene().arguments.items()}
+    # Half an ulp of the type is added when a gradient is given back in it.
+    allowed = GRADIENT_TOLERANCE + torch.finfo(dtype).eps
+    return _beside_float64(HardScene(narrow), context, allowed, dtype)
+
+
+def run_strided(context: Context) -> Measured:
+    """Arguments that are not contiguous are drawn as contiguous ones."""
+    scene = hand_scene(cameras=2)
+    strided = {
+        name: value.movedim(-1, 0).contiguous().movedim(0, -1)
+        if value.ndim > 1
+        else torch.stack([value, value], dim=-1)[:, 0]
+        for name, value in scene.arguments.items()
+    }
+    plain, other = _draw(scene, context), _draw(scene.changed(**strided), context)
+    away = max(gradient_differences(other.gradients, plain).values())
+    # Its gradients are sums of atomic additions, which are not the same twice.
+    allowed = NO_CHANGE if context.backend == "gsplat" else 0.0
+    same = torch.equal(plain.image, other.image) and away <= allowed
+    image = difference(other.image, plain.image)
+    return Measured(same, f"image off by {image:.0e}, gradients by {away:.0e}")
+
+
+def run_doubled(context: Context) -> Measured:
+    """Two equal Gaussians cover what the formula of blending says."""
+    scene = hand_scene(count=1)
+    single = scene.changed(
+        means=torch.zeros(1, 3).double(),
+        scales=torch.full((1, 3), 0.02).float().double(),
+        opacities=torch.tensor([0.9]).double(),
+        backgrounds=torch.zeros(1, 3).double(),
+    )
+    pair = {name: single.arguments[name].repeat_interleave(2, dim=0) for name in PER_GAUSSIAN}
+    one, two = _draw(single, context), _draw(single.changed(**pair), context)
+    expected = 1.0 - (1.0 - one.alpha).square()
+    colors = single.arguments["colors"][0]
+    off = max(
+        difference(two.alpha, expected),
+        difference(two.image, expected * colors),
+    )
+    passed = two.finite and off <= IMAGE_TOLERANCE and float(one.alpha.max()) > 0.8
+    return Measured(passed, f"off by {off:.0e}, alpha of one up to {float(one.alpha.max()):.2f}")
+
+
+def run_reordered(context: Context) -> Measured:
+    """Two equal hands are drawn alike in either order."""
+    scene = hand_scene()
+    count = len(scene.arguments["means"])
+    # Hand after hand, and pair after pair.
+    apart, paired = torch.arange(count).repeat(2), torch.arange(count).repeat_interleave(2)
+    made = [
+        _draw(
+            scene.changed(**{name: scene.arguments[name][order] for name in PER_GAUSSIAN}), context
+        )
+        for order in (apart, paired)
+    ]
+    off = difference(made[0].image, made[1].image)
+    for name in PER_GAUSSIAN:
+        # The nearer of two equal Gaussians is the one of lower index, in both orders.
+        first = made[0].gradients[name].unflatten(0, (2, count))
+        second = made[1].gradients[name].unflatten(0, (count, 2)).transpose(0, 1)
+        off = max(off, difference(first, second))
+    passed = made[0].finite and made[1].finite and off <= GRADIENT_TOLERANCE
+    return Measured(passed, f"off by {off:.0e}")
+
+
+def run_finite(scene: HardScene, context: Context) -> Measured:
+    """All numbers are finite."""
+    drawing = _draw(scene, context)
+    sizes = [float(drawing.gradients[name].abs().max()) for name in DIFFERENTIABLE
+             if drawing.gradients[name].numel()]  # fmt: skip
+    return Measured(drawing.finite, f"largest gradient {max(sizes):.0e}")
+
 
 _FLOAT32 = torch.finfo(torch.float32)
 _SUBNORMAL = 1e-42
@@ -255,14 +549,10 @@ def _exact(
     tolerance: float = GRADIENT_TOLERANCE,
     gsplat: float | None = None,
 ) -> _Entry:
-    """A scene that is drawn as in float64.
+    """A scene that is drawn as in float64, gradients within `tolerance`.
 
-    Args:
-        name: of the case.
-        scene: what is drawn.
-        tolerance: of gradients.
-        gsplat: of its gradients, where its float32 does not hold `tolerance`; infinite: the image
-            is beyond it too, and its numbers must be finite, no more.
+    `gsplat` is for its gradients where its float32 does not hold that; infinite: the image is
+    beyond it too, and its numbers must be finite, no more.
     """
     must_hold = f"image to {IMAGE_TOLERANCE:g}, gradients to {tolerance:g} of float64, all finite"
     if gsplat is not None:

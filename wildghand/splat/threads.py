@@ -1,6 +1,6 @@
-"""Runs a kernel on several threads.
+"""Runs a kernel on several threads, and lends it memory.
 
-Kernels release the interpreter lock and share out their jobs themselves (see `kernels.jobs`), so
+Kernels release the interpreter lock and share out their jobs themselves (see `kernels.jit`), so
 any threads do. The best are those of torch's own OpenMP, which are there already. In a process
 that loaded torch before `hwp_bench` they spin for some milliseconds after an operation of torch,
 and threads of ours would have to compete with them for the cores. Where torch has no OpenMP, in a
@@ -16,9 +16,11 @@ from __future__ import annotations
 
 import ctypes
 import functools
+import math
 import multiprocessing
 import os
 import time
+from collections import defaultdict, deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -30,7 +32,7 @@ import numpy as np
 import torch
 
 from hwp_bench.base.numerics import flushes, set_flush
-from wildghand.splat.kernels.jobs import SPACING
+from wildghand.splat.kernels.jit import SPACING
 
 #: Work, in Gaussians or (Gaussian, tile) pairs, that outweighs waking a thread (some 0.1 ms).
 WORTH_A_THREAD = 4096
@@ -43,11 +45,9 @@ _TEAM_MEMBER = ctypes.CFUNCTYPE(None, ctypes.c_void_p)
 
 
 def thread_count(jobs: int, work: int | None = None) -> int:
-    """Threads worth using.
+    """Threads worth using for so many jobs that are like `work` Gaussians or pairs.
 
-    Args:
-        jobs: pieces into which the work is cut.
-        work: how many Gaussians or pairs it is; None if every job is worth a thread.
+    Without `work` every job is worth a thread.
     """
     worth = jobs if work is None else min(jobs, work // WORTH_A_THREAD)
     return max(1, min(torch.get_num_threads(), _MOST.get() or worth, worth))
@@ -58,9 +58,6 @@ def at_most(threads: int | None) -> Iterator[None]:
     """Bound the threads of kernels that are called while this holds; results stay the same.
 
     torch's own operations keep their number, on which their last bits depend.
-
-    Args:
-        threads: 1 or more; None: as many as torch has.
     """
     token = _MOST.set(threads)
     try:
@@ -75,12 +72,7 @@ def even_jobs(jobs: int, threads: int) -> np.ndarray:
 
 
 def weighted_jobs(before: np.ndarray, threads: int) -> np.ndarray:
-    """Equal shares of jobs of which some are longer.
-
-    Args:
-        before: (jobs + 1,) work of all jobs before each, and of all.
-        threads: how many shares.
-    """
+    """Equal shares of unequal jobs, by (jobs + 1,) work before each, and of all."""
     if threads == 1:
         return np.array([0, len(before) - 1])
     goals = np.arange(1, threads) * (before[-1] / threads)
@@ -99,17 +91,13 @@ def piece_count(count: int, piece: int) -> int:
 
 
 def run_pieces(kernel: Callable[..., Any], count: int, piece: int, work: int, *args: Any) -> None:
-    """Calls a kernel whose jobs are pieces of equal length, see `run`.
+    """Call a kernel of which job k is the things from `piece * k` on, at most `piece`."""
+    run_jobs(kernel, piece_count(count, piece), work, *args)
 
-    Args:
-        kernel: takes jobs; job k is the things from `piece * k` on, at most `piece`.
-        count: things.
-        piece: things of a job.
-        work: how many Gaussians or pairs all of it is like, see `thread_count`.
-        args: the same for all.
-    """
-    pieces = piece_count(count, piece)
-    run(kernel, even_jobs(pieces, thread_count(pieces, work)), *args)
+
+def run_jobs(kernel: Callable[..., Any], jobs: int, work: int, *args: Any) -> None:
+    """Call a kernel whose jobs are alike, see `run`; all are like `work` Gaussians or pairs."""
+    run(kernel, even_jobs(jobs, thread_count(jobs, work)), *args)
 
 
 def run(kernel: Callable[..., Any], ends: np.ndarray, *args: Any) -> None:
@@ -245,3 +233,59 @@ def _plain_threads(work: Callable[[int], None], threads: int) -> None:
 def _pool(process: int, threads: int) -> ThreadPoolExecutor:
     """The helpers of this process: threads do not survive a fork, so a child starts its own."""
     return ThreadPoolExecutor(threads, thread_name_prefix="splat")
+
+
+# Large buffers are used again: fresh memory costs a page fault for every 4 KiB, and a call of the
+# rasterizer needs some 10 MB for a moment, thousands of times. A buffer belongs to whoever leased
+# it until the last array that looks into it is gone; only then is it kept for the next lease. So
+# two calls never share memory, whatever the order in which they end.
+
+#: Bytes of idle buffers that are kept at most.
+MAX_IDLE = 256 << 20
+#: Buffers start on a cache line, which is also the widest vector.
+_ALIGNMENT = 64
+#: The C library keeps buffers below this many bytes by itself.
+_SMALL = 1 << 15
+
+_idle: defaultdict[int, deque[np.ndarray]] = defaultdict(deque)
+
+
+class _Lease:
+    """Owner of one buffer; numpy arrays that look into it hold it as their base."""
+
+    def __init__(self, memory: np.ndarray) -> None:
+        self._memory = memory
+
+    @property
+    def __array_interface__(self) -> dict[str, Any]:
+        return self._memory.__array_interface__
+
+    def __del__(self) -> None:
+        if idle_bytes is None or idle_bytes() + self._memory.nbytes > MAX_IDLE:  # or at exit
+            return
+        _idle[self._memory.nbytes].append(self._memory)
+
+
+def lease(shape: tuple[int, ...], kind: type[np.generic]) -> np.ndarray:
+    """An array of that shape, with whatever was there before in it; a large one on a cache line."""
+    size = math.prod(shape) * np.dtype(kind).itemsize
+    if size < _SMALL:
+        return np.empty(shape, kind)
+    room = _size_class(size)
+    try:
+        memory = _idle[room].pop()
+    except IndexError:
+        raw = np.empty(room + _ALIGNMENT, np.uint8)
+        memory = raw[-raw.ctypes.data % _ALIGNMENT :][:room]
+    return np.asarray(_Lease(memory))[:size].view(kind).reshape(shape)
+
+
+def idle_bytes() -> int:
+    """Bytes held for later leases."""
+    return sum(size * len(buffers) for size, buffers in list(_idle.items()))
+
+
+def _size_class(size: int) -> int:
+    """The next of a power of two times 1, 1.25, 1.5, 1.75: few sizes, at most 25 % waste."""
+    step = 1 << (size - 1).bit_length() - 3
+    return -(-size // step) * step

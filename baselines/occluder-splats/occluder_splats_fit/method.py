@@ -10,8 +10,8 @@ import torch
 
 from hwp_bench.methods.settings import choice, number
 from occluder_splats_fit.occluders import make_occluders, mask_boxes
-from wildghand.gaussians.frame_table import shares_of_255
 from wildghand.gaussians.losses import photometric_loss
+from wildghand.gaussians.training import shares_of_255
 from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 
 

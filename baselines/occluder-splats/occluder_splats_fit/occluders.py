@@ -8,7 +8,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 import torch
 
-from wildghand.gaussians.anchored import MAX_LOGIT
+from wildghand.gaussians.attributes import MAX_LOGIT
 from wildghand.splat import rasterize
 
 #: Depth at which occluders lie, m: nearer than any hand, beyond the rasterizer's near plane.

@@ -13,8 +13,8 @@ from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.model.model import WildGHandModel, make_model
 from wildghand.model.settings import read_settings
 from wildghand.network import NetworkSettings
-from wildghand.network.compact import CompactTexture
-from wildghand.network.identity import IdentityMap
+from wildghand.network.branches import CompactTexture
+from wildghand.network.heads import IdentityMap
 from wildghand.network.surface import Chart
 from wildghand.prior.prior import choose_prior
 

@@ -12,7 +12,7 @@ from hwp_bench.hands.anchors import anchor_uv
 from hwp_bench.methods.contract import Avatar
 from scan_texture_fit.model import ScanAvatar, ScanDrawing, ScanModel, ScanSettings
 from scan_texture_fit.unwrap import nearest_anchor, unwrap
-from wildghand.gaussians.laplacian import surface_laplacian
+from wildghand.gaussians.regularizers import surface_laplacian
 from wildghand.gaussians.rig import AnchorPoses, make_rig
 from wildghand.gaussians.training import TrainingClip
 from wildghand.model.terms import silhouette

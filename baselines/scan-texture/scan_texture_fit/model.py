@@ -13,7 +13,7 @@ from hwp_bench.methods.settings import number
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
-from wildghand.network.sampling import CellPooling, FixedGather, PlaneSampler
+from wildghand.network.surface import CellPooling, FixedGather, PlaneSampler
 from wildghand.plain.recipe import LoopSettings
 from wildghand.splat import rasterize
 

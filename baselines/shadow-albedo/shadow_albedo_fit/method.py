@@ -11,7 +11,7 @@ import torch
 
 from hwp_bench.methods.settings import number
 from shadow_albedo_fit.model import RADIUS, ShadowedModel
-from wildghand.gaussians.laplacian import SurfaceLaplacian, surface_laplacian
+from wildghand.gaussians.regularizers import SurfaceLaplacian, surface_laplacian
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading import MAX_DEGREE
 from wildghand.plain.model import PlainModel

@@ -15,10 +15,9 @@ import numpy as np
 
 from hwp_bench.base.console import track
 from hwp_bench.base.files import atomic_write
-from hwp_bench.sim.scene.looks import Looks
-from hwp_bench.sim.scene.schema import Subject
 from hwp_bench.sim.subject.atlas import painted_atlas
 from hwp_bench.sim.subject.hand import subject_hand
+from hwp_bench.sim.subject.subject import Looks, Subject
 
 #: People, and the number of the first one; no scene that ships has one of these.
 PEOPLE, FIRST_SEED = 240, 700_000

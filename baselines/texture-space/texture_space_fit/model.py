@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from texture_space_fit.skins import SkinSpace
-from wildghand.gaussians.anchored import AnchoredGaussians, flat_gaussians
+from wildghand.gaussians.attributes import AnchoredGaussians, flat_gaussians
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig

@@ -12,8 +12,7 @@ from torch import Tensor
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import HandTemplate, SurfaceAnchors, anchor_uv, load_template
-from wildghand.network.sampling import bilinear_taps
-from wildghand.network.surface import mirrored_anchors
+from wildghand.network.surface import bilinear_taps, mirrored_anchors
 
 #: Where `texture_space_fit.build` put it.
 FILE = Path(__file__).with_name("skins.npz")

@@ -21,7 +21,7 @@ from trimmed_fit.inliers import (
     pixel_errors,
     vote_loss,
 )
-from wildghand.gaussians.frame_table import FrameTable, upload
+from wildghand.gaussians.training import FrameTable, upload
 from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
 
 

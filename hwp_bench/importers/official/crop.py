@@ -24,8 +24,8 @@ import numpy as np
 from hwp_bench.base.console import progress
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import read_gray, read_rgb
-from hwp_bench.importers.official.release_records import OfficialRecords
-from hwp_bench.importers.shared.windows import cut, resample
+from hwp_bench.importers.official.records import OfficialRecords
+from hwp_bench.importers.shared.frames import cut, resample
 
 #: A mask pixel above this is hand, as in the released loader.
 MASK_THRESHOLD = 100
@@ -35,38 +35,26 @@ BOX_SCALE = 1.5
 
 @dataclass(frozen=True, eq=False)
 class CroppedFrame:
-    """One frame of the capture.
+    """One frame of the capture."""
 
-    Attributes:
-        image: (S, S, 3) uint8 sRGB.
-        mask: (S, S) uint8, 255 = hand.
-        K: (3, 3) px of the crop.
-        corner: (2,) px of the whole frame, top left corner of the crop.
-        side: edge of the crop, px of the whole frame.
-    """
-
+    #: (S, S, 3) uint8 sRGB.
     image: np.ndarray
+    #: (S, S) uint8, 255 = hand.
     mask: np.ndarray
+    #: (3, 3) px of the crop.
     K: np.ndarray
+    #: (2,) px of the whole frame, top left corner of the crop.
     corner: np.ndarray
+    #: Edge of the crop, px of the whole frame.
     side: float
 
 
 def crop_frames(
     records: OfficialRecords, size: int, *, compat: bool
 ) -> tuple[list[CroppedFrame], np.ndarray]:
-    """Read and crop every frame of a capture.
+    """Crop every frame of a capture; with (F, 2) half the size of the whole frames, px.
 
-    Args:
-        records: of the capture.
-        size: edge of the crops, px.
-        compat: crop as the released loader does.
-
-    Returns:
-        The crops, and (F, 2) half the size of the whole frames, px.
-
-    Raises:
-        BadInput: an image or a mask is unusable, or a frame has neither a box nor a hand.
+    `size` is the edge of the crops, px; `compat` crops as the released loader does.
     """
 
     def one(frame: int) -> tuple[CroppedFrame, tuple[float, float]]:
@@ -116,13 +104,9 @@ def tracked_joints(
 
 
 def box_of_landmarks(landmarks: np.ndarray) -> np.ndarray:
-    """The box that the release's pre-processing makes of joints.
+    """The box that the release's pre-processing makes of joints (N, 2) px of all hands.
 
-    Args:
-        landmarks: (N, 2) px, of all hands.
-
-    Returns:
-        (4,) int64 x1, y1, x2, y2: the joints' box, 1.5 times as large about its centre.
+    (4,) int64 x1, y1, x2, y2: the joints' box, 1.5 times as large about its centre.
     """
     low, high = landmarks.min(axis=0), landmarks.max(axis=0)
     centre, half = (low + high) / 2, (high - low) * BOX_SCALE // 2
@@ -163,8 +147,7 @@ def official_crop(
 ) -> CroppedFrame:
     """Crop as the released loader does; the top of the module lists its mistakes.
 
-    Args:
-        (all): as for `correct_crop`; of `box` the type matters, as in the loader.
+    Arguments as of `correct_crop`; of `box` the type matters, as in the loader.
     """
     import cv2
 

@@ -62,11 +62,7 @@ class Download:
 
 
 class HuggingFaceHub:
-    """The hub through `huggingface_hub`.
-
-    Raises:
-        MissingDependency: the package is not installed.
-    """
+    """The hub through `huggingface_hub`."""
 
     def __init__(self, repository: str = REPOSITORY) -> None:
         try:

@@ -1,4 +1,11 @@
-"""Make a capture of one folder of the official release."""
+"""Make a capture of one folder of the official release.
+
+Hands are MANO's as they are, or the free hand by fitting. The tracker poses the *right* MANO hand
+with the left hand's parameters, centres it on its middle knuckle, negates x, and adds `root_rel`
+and the translation. The left parameters are therefore those of a mirrored right hand: a rotation
+vector (x, y, z) becomes (x, -y, -z) in the left hand's own frame. The translation is taken from the
+stored vertices in closed form, so that no convention about the centre is assumed.
+"""
 
 from __future__ import annotations
 
@@ -10,30 +17,50 @@ from typing import Any
 
 import numpy as np
 
-from hwp_bench.base.errors import UsageError, bounded
+from hwp_bench.base.errors import BadInput, UsageError, bounded
 from hwp_bench.base.files import sha256_file
-from hwp_bench.base.images import is_blank
+from hwp_bench.base.images import is_blank, read_gray
 from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
 from hwp_bench.capture.schema import check_id
-from hwp_bench.hands import load_template
-from hwp_bench.importers.official.crop import CroppedFrame, crop_frames, tracked_joints
-from hwp_bench.importers.official.folders import OfficialFolder
-from hwp_bench.importers.official.hands import ImportedHand, import_hands
-from hwp_bench.importers.official.release_records import OfficialRecords, read_records
-from hwp_bench.importers.official.sides import choose_sides, unexpected
-from hwp_bench.importers.shared.overlay import (
-    ProjectedHand,
-    posed_sheet,
-    project_hand,
-    sheet_frames,
+from hwp_bench.hands import HandParameters, HandTemplate, load_template
+from hwp_bench.hands.fitting import FitTargets, fit_hand
+from hwp_bench.hands.sources import FINGERTIPS
+from hwp_bench.importers.official.crop import (
+    MASK_THRESHOLD,
+    CroppedFrame,
+    crop_frames,
+    tracked_joints,
 )
-from hwp_bench.importers.shared.writing import refuse_existing, write_capture
+from hwp_bench.importers.official.records import (
+    OfficialFolder,
+    OfficialRecords,
+    SideRecords,
+    read_records,
+)
+from hwp_bench.importers.shared.frames import cells
+from hwp_bench.importers.shared.output import (
+    ProjectedHand,
+    overlay_sheet,
+    pose_parameters,
+    project_hand,
+    refuse_existing,
+    sheet_frames,
+    write_capture,
+)
 from hwp_bench.taxonomy import catalogue
 
 #: Terms of the release; the capture made of it may not be given away under other terms.
 LICENCE = "as the official HWP release (its authors' terms)"
 #: Joints that miss the tracker's by more than this share of the frame cause a warning.
 FAR_JOINTS = 0.1
+#: Stored vertices that MANO misses by more than this (median frame, mm) mean that the file does
+#: not follow the convention that is assumed, or was made with another hand model.
+MAX_VERTEX_MM = 10.0
+# Rows of the 21 landmarks that are vertices: the finger tips.
+_TIP_ROWS = [4, 8, 12, 16, 20]
+# Fewest joints on the mask (mean share), and lead over the other hand, to decide; and number of
+# frames that are examined.
+_MIN_SHARE, _MIN_LEAD, _LOOKED_AT = 0.5, 0.1, 24
 
 
 @dataclass(frozen=True)
@@ -101,37 +128,31 @@ def import_official(
     check_id(folder.id, os.fspath(folder.path))
     refuse_existing(out, overwrite=options.overwrite)
     records = read_records(folder)
-    warnings = unexpected(folder, records)
-    sides, note = choose_sides(folder, records, options.hand)
+    warnings = _unexpected(folder, records)
+    sides, note = _choose_sides(folder, records, options.hand)
     warnings += note
     crops, centres = crop_frames(records, options.size, compat=options.official_compat)
-    hands = import_hands(
-        records,
-        sides,
-        centres,
-        options.model,
-        compat=options.official_compat,
-        where=os.fspath(folder.path),
-    )
+    hands = {side: _import_hand(records, side, centres, options, folder) for side in sides}
     blank = np.array([is_blank(crop.image) for crop in crops])
     if blank.any():
         numbers = records.numbers[blank].tolist()
         warnings.append(f"frames of one colour, as black ones, are not valid: {bounded(numbers)}")
-        hands = {side: _without(made, blank) for side, made in hands.items()}
+        hands = {side: made.without(blank) for side, made in hands.items()}
     cameras = Cameras(np.stack([c.K for c in crops]), np.tile(np.eye(4), (len(crops), 1, 1)))
     clips = {
         side: project_hand(load_template(options.model, side), made.hand, cameras)
         for side, made in hands.items()
     }
     tracked = tracked_joints(records, sides, crops, options.size)
-    facts = import_facts(folder, records, hands, clips, tracked, crops, warnings, options)
+    facts = _facts(folder, records, hands, clips, tracked, crops, warnings, options)
     info = _info(folder, records, sides, facts, options)
     shown = sheet_frames(len(crops))
 
     def sheet() -> np.ndarray:
         images = {frame: crops[frame].image for frame in shown}
         masks = {frame: crops[frame].mask for frame in shown}
-        return posed_sheet(clips, images, masks, tracked)
+        dots = {frame: tracked[frame] for frame in shown}
+        return overlay_sheet(list(clips.values()), images, masks, dots)
 
     write_capture(
         out,
@@ -144,11 +165,6 @@ def import_official(
         overwrite=options.overwrite,
     )
     return facts
-
-
-def _without(made: ImportedHand, frames: np.ndarray) -> ImportedHand:
-    """The same hand, not valid in some frames, (F,) bool."""
-    return replace(made, hand=replace(made.hand, valid=made.hand.valid & ~frames))
 
 
 def _info(
@@ -185,7 +201,7 @@ def _info(
     )
 
 
-def import_facts(
+def _facts(
     folder: OfficialFolder,
     records: OfficialRecords,
     hands: Mapping[str, ImportedHand],
@@ -197,9 +213,8 @@ def import_facts(
 ) -> dict[str, Any]:
     """Measure the hands against the records; what looks wrong is added to `warnings`.
 
-    Returns:
-        JSON: mean distance from the tracker's vertices (mm) and joints (px of the crop), share
-        of the vertices on the masks, and the warnings.
+    As JSON: mean distance from the tracker's vertices (mm) and joints (px of the crop), share of
+    the vertices on the masks, and the warnings.
     """
     gaps, on_mask = {}, {}
     for index, (side, clip) in enumerate(clips.items()):
@@ -234,8 +249,186 @@ def _vertices_on_masks(clip: ProjectedHand, crops: list[CroppedFrame], valid: np
     shares = []
     for frame in np.flatnonzero(valid):
         mask = crops[frame].mask
-        x, y = np.floor(clip.pixels[frame].T).clip(-1, 1e6).astype(int)
-        inside = (x >= 0) & (y >= 0) & (x < mask.shape[1]) & (y < mask.shape[0])
+        rows, columns, inside = cells(clip.pixels[frame], mask.shape)
         if inside.any():
-            shares.append(float((mask[y[inside], x[inside]] > 127).mean()))
+            shares.append(float((mask[rows[inside], columns[inside]] > 127).mean()))
     return float(np.mean(shares)) if shares else 0.0
+
+
+# --- Which hands a capture has
+
+
+def _unexpected(folder: OfficialFolder, records: OfficialRecords) -> list[str]:
+    """List contradictions to the paper or the format that still let the records be used."""
+    found = [f"unknown key {key!r} is not read" for key in records.unknown]
+    if records.reordered:
+        found.append("records were not in the order of their images; they are now")
+    entry = catalogue().get(folder.id)
+    if entry is None:
+        found.append(f"{folder.id} is not one of the paper's captures: perturbations unknown")
+        return found
+    if (entry.hands == "single") != folder.single:
+        found.append(f"the folder's name contradicts the paper: {folder.id} is {entry.hands}")
+    most = -(-entry.frame_count // (folder.subsample or 1))
+    if len(records.numbers) > most:
+        found.append(f"{len(records.numbers)} frames, where the paper's count gives {most}")
+    return found
+
+
+def _choose_sides(
+    folder: OfficialFolder, records: OfficialRecords, hand: str | None
+) -> tuple[tuple[str, ...], list[str]]:
+    """Decide which hands the capture has; with messages to the user about the choice.
+
+    The tracker writes both hands in every capture. Of a single-hand capture it
+    is the hand whose joints lie on the masks, unless `hand` names it.
+    """
+    entry = catalogue().get(folder.id)
+    note: list[str] = []
+    sides: tuple[str, ...] = tuple(records.sides)
+    if not (entry.hands == "single" if entry else folder.single):
+        if set(sides) != {"right", "left"}:
+            raise BadInput(
+                f"has the {', '.join(sides)} hand only, for a capture of two", where=folder.path
+            )
+        sides = ("right", "left")
+    elif hand is not None:
+        if hand not in sides:
+            raise BadInput(f"has no {hand} hand", where=folder.path, field="--hand")
+        sides = (hand,)
+    elif len(sides) == 2:
+        shares = {side: _share_on_mask(records, side) for side in sides}
+        side = max(shares, key=lambda name: shares[name])
+        listed = ", ".join(f"{name} {share:.2f}" for name, share in shares.items())
+        if shares[side] < _MIN_SHARE or shares[side] - min(shares.values()) < _MIN_LEAD:
+            raise BadInput(
+                "the masks do not show which hand is in the image (share of joints on them: "
+                f"{listed})",
+                where=folder.path,
+                remedy="Name the hand with --hand.",
+            )
+        sides, note = (side,), [f"{side} hand taken, by the share of joints on the masks: {listed}"]
+    for side in sides:
+        if not records.sides[side].valid.any():
+            raise BadInput(f"the {side} hand is not finite in any frame", where=folder.path)
+    return sides, note
+
+
+def _share_on_mask(records: OfficialRecords, side: str) -> float:
+    """Mean share of a hand's joints that lie on the mask, over a few frames."""
+    hand = records.sides[side]
+    frames = np.flatnonzero(hand.valid)
+    if not len(frames):
+        return 0.0
+    shares = []
+    for frame in frames[np.unique(np.linspace(0, len(frames) - 1, _LOOKED_AT).astype(int))]:
+        mask = read_gray(records.masks[frame]) > MASK_THRESHOLD
+        rows, columns, inside = cells(hand.landmarks[frame], mask.shape)
+        shares.append(np.mean(inside & mask[rows, columns]))
+    return float(np.mean(shares))
+
+
+# --- Hands
+
+
+@dataclass(frozen=True, eq=False)
+class ImportedHand:
+    """One hand in the capture's convention."""
+
+    #: Its parameters.
+    hand: HandParameters
+    #: (F,) mean distance from the tracker's vertices, mm; NaN where not valid.
+    error_mm: np.ndarray
+
+    def without(self, frames: np.ndarray) -> ImportedHand:
+        """The same hand, not valid in some frames, (F,) bool."""
+        return replace(self, hand=replace(self.hand, valid=self.hand.valid & ~frames))
+
+
+def _import_hand(
+    records: OfficialRecords,
+    side: str,
+    centres: np.ndarray,
+    options: OfficialImport,
+    folder: OfficialFolder,
+) -> ImportedHand:
+    """Take a hand over: MANO as it is, else the free hand fitted.
+
+    `centres` are (F, 2) px, half the frames' sizes.
+    """
+    hand = records.sides[side]
+    other = records.sides.get("left" if side == "right" else "right")
+    if options.official_compat and other is not None:
+        # The released loader lists pose and shape as (right, left) and the translations as (left,
+        # right): its network gets a hand with the other one's. Where the tracker gives both hands
+        # one translation, which it mostly does, nothing changes.
+        moved = hand.vertices - hand.camera[:, None] + other.camera[:, None]
+        both = hand.valid & other.valid
+        hand = replace(hand, vertices=moved, camera=other.camera, valid=both)
+    template = load_template(options.model, side)
+    if options.mano is not None:
+        mean = load_template(options.model, "right").mean_pose
+        return _mano_hand(hand, template, mean, where=folder.path)
+    knuckle = hand.camera + (records.root_rel if side == "left" else 0.0)
+    return _free_hand(hand, template, records.focal, centres, knuckle)
+
+
+def _own_rotations(pose: np.ndarray, side: str) -> np.ndarray:
+    """Rotation vectors (F, 16, 3) of a hand in its own frame, of the tracker's."""
+    return pose if side == "right" else pose * np.array([1.0, -1.0, -1.0])
+
+
+def _mano_hand(
+    records: SideRecords, template: HandTemplate, right_mean: np.ndarray, *, where: Path
+) -> ImportedHand:
+    """Take MANO's parameters over; one shape (the median) for the clip.
+
+    `right_mean` is the (45,) mean pose of the right MANO hand, which the tracker poses.
+    """
+    valid = records.valid
+    pose = np.where(valid[:, None, None], records.pose, 0.0)
+    pose[:, 1:] += right_mean.reshape(15, 3)
+    pose = _own_rotations(pose, template.side)
+    betas = np.median(records.shape[valid], axis=0)
+    unplaced = HandParameters(pose, betas, np.zeros((len(pose), 3)), valid)
+    gap = records.vertices - pose_parameters(template, unplaced).vertices.numpy()
+    transl = gap.mean(axis=1)
+    error = 1000.0 * np.linalg.norm(gap - transl[:, None], axis=-1).mean(axis=1)
+    median = float(np.median(error[valid]))
+    if median > MAX_VERTEX_MM:
+        raise BadInput(
+            f"the {template.side} MANO hand misses the stored vertices by {median:.1f} mm in the "
+            f"median frame, more than {MAX_VERTEX_MM:g}",
+            where=where,
+            field=f"verts3d_world_{template.side}",
+            remedy="Is --mano the MANO of mano_v1_2? Otherwise this file follows another "
+            "convention than the release; import it without --mano.",
+        )
+    return ImportedHand(replace(unplaced, transl=transl), np.where(valid, error, np.nan))
+
+
+def _free_hand(
+    records: SideRecords,
+    template: HandTemplate,
+    focal: np.ndarray,
+    centres: np.ndarray,
+    knuckle: np.ndarray,
+) -> ImportedHand:
+    """Fit the free hand to the tracker's vertices and joints; MANO itself is not needed.
+
+    `focal` (F,) and `centres` (F, 2) are px of the whole frame, `knuckle` (F, 3) m is the middle
+    one.
+    """
+    valid = records.valid
+    landmarks = np.full((len(valid), 21, 3), np.nan)
+    landmarks[:, _TIP_ROWS] = records.vertices[:, list(FINGERTIPS)]
+    landmarks[:, 9] = knuckle
+    offsets = (records.landmarks - centres[:, None]) / focal[:, None, None]
+    rays = np.concatenate([offsets, np.ones((*offsets.shape[:2], 1))], axis=2)
+    rays /= np.linalg.norm(rays, axis=2, keepdims=True)
+    pose = _own_rotations(np.where(valid[:, None, None], records.pose, 0.0), template.side)
+    unplaced = HandParameters(pose, np.zeros(10), np.zeros((len(pose), 3)), valid)
+    shift = knuckle - pose_parameters(template, unplaced).landmarks[:, 9].numpy()
+    start = replace(unplaced, transl=np.where(valid[:, None], shift, 0.0))
+    fitted = fit_hand(template, FitTargets(landmarks, rays, records.vertices[:, ::2]), start)
+    return ImportedHand(fitted.parameters, fitted.skin_mm)

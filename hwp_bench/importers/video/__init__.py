@@ -1,20 +1,17 @@
 """A video of one hand or two and the tracked landmarks: frames, fit, masks, capture."""
 
-from hwp_bench.importers.video.from_video import finished_import, import_video
-from hwp_bench.importers.video.imported_clip import ImportedClip
-from hwp_bench.importers.video.video_settings import (
-    FitSettings,
-    FrameRange,
-    VideoImport,
-    parse_frame_range,
-)
+from hwp_bench.importers.video.api import import_video, read_finished_import
+from hwp_bench.importers.video.clip import ImportedClip
+from hwp_bench.importers.video.decode import FrameRange, parse_frame_range
+from hwp_bench.importers.video.solve import FitSettings
+from hwp_bench.importers.video.source import VideoImport
 
 __all__ = [
     "FitSettings",
     "FrameRange",
     "ImportedClip",
     "VideoImport",
-    "finished_import",
     "import_video",
     "parse_frame_range",
+    "read_finished_import",
 ]

@@ -17,10 +17,50 @@ from hwp_bench.base.console import notice
 from hwp_bench.base.errors import BadInput, MissingDependency, UsageError, bounded, check_name
 from hwp_bench.base.files import check_is_file
 from hwp_bench.base.images import MAX_PIXELS, read_gray
-from hwp_bench.importers.shared.windows import CropWindows, cut, resample
-from hwp_bench.importers.video.contour import FIELD_SIZE
-from hwp_bench.importers.video.video_colours import Colours, colours_of, to_srgb
-from hwp_bench.importers.video.video_settings import FrameRange
+from hwp_bench.importers.shared.frames import CropWindows, cut, resample
+from hwp_bench.importers.video.colours import Colours, colours_of, to_srgb
+
+
+@dataclass(frozen=True)
+class FrameRange:
+    """The frames of a video that are used: start, start + stride, ... below stop."""
+
+    #: First frame, counted from 0.
+    start: int = 0
+    #: End, not included; None = to the end.
+    stop: int | None = None
+    #: Step.
+    stride: int = 1
+
+    def __post_init__(self) -> None:
+        if self.start < 0 or self.stride < 1 or (self.stop is not None and self.stop <= self.start):
+            raise UsageError(
+                f"{self.start}:{'' if self.stop is None else self.stop} with stride {self.stride} "
+                "selects no frames",
+                field="--frames",
+                remedy="Use A:B with 0 <= A < B, and a stride of at least 1.",
+            )
+
+    def indices(self, frame_count: int) -> np.ndarray:
+        """Return the selected indices of a video of `frame_count` frames, (F,) int64."""
+        stop = frame_count if self.stop is None else min(self.stop, frame_count)
+        return np.arange(self.start, stop, self.stride)
+
+
+def parse_frame_range(text: str | None, stride: int) -> FrameRange:
+    """Read `A:B`, `A:` or `:B`."""
+    if text is None:
+        return FrameRange(stride=stride)
+    head, colon, tail = text.partition(":")
+    try:
+        if not colon:
+            raise ValueError
+        return FrameRange(int(head or 0), int(tail) if tail else None, stride)
+    except ValueError as error:
+        raise UsageError(
+            f"{text!r} is not a range", field="--frames", remedy="Use A:B, A: or :B."
+        ) from error
+
 
 #: Containers that are read, each with FFmpeg's name of its reader and how its files begin.
 CONTAINERS = {
@@ -48,41 +88,35 @@ _MOVING, _LOOK = 3, 20_000
 
 @dataclass(frozen=True)
 class VideoInfo:
-    """Path, size and rate of a video.
+    """Path, size and rate of a video."""
 
-    Attributes:
-        path: the file.
-        width: pixels, after the rotation and the shape of pixels that the file asks for.
-        height: pixels.
-        fps: frames per second; 30 where the file does not state it.
-        stated_frames: number of frames that the container states, 0 where it states none.
-        codec: FFmpeg's name of what the frames are compressed by.
-        colours: how its samples are read, for a person.
-    """
-
+    #: The file.
     path: Path
+    #: Pixels, after the rotation and the shape of pixels that the file asks for.
     width: int
+    #: Pixels.
     height: int
+    #: Frames per second; 30 where the file does not state it.
     fps: float
+    #: Number of frames that the container states, 0 where it states none.
     stated_frames: int
+    #: FFmpeg's name of what the frames are compressed by.
     codec: str = "unknown"
+    #: How its samples are read, for a person.
     colours: str = "unknown"
 
 
 @dataclass(frozen=True)
 class Reading:
-    """What came of reading a video to its end.
+    """What came of reading a video to its end."""
 
-    Attributes:
-        frames: number of frames that were decoded.
-        stated: number that the container states, 0 where it states none.
-        ends_early: whether the file ends before the video does.
-        damaged: number of packets and frames that could not be decoded, or not whole.
-    """
-
+    #: Number of frames that were decoded.
     frames: int
+    #: Number that the container states, 0 where it states none.
     stated: int
+    #: Whether the file ends before the video does.
     ends_early: bool
+    #: Number of packets and frames that could not be decoded, or not whole.
     damaged: int
 
     def counted(self) -> str:
@@ -111,12 +145,7 @@ class Reading:
 
 
 def probe(path: str | os.PathLike[str]) -> VideoInfo:
-    """Open a video and decode its first frame.
-
-    Raises:
-        BadInput: the file is missing, empty or no video file, holds no video, its codec or its
-            colours cannot be read, or its frames are too large.
-    """
+    """Open a video and decode its first frame."""
     path = Path(path)
     with _opened(path) as video:
         _, frame, colours = next(video.frames(), (0, None, None))
@@ -140,42 +169,18 @@ def probe(path: str | os.PathLike[str]) -> VideoInfo:
 
 @dataclass(frozen=True, eq=False)
 class ClipImages:
-    """The frames of a clip at two resolutions.
+    """The frames of a clip at two resolutions."""
 
-    Attributes:
-        frames: (F, size, size, 3) uint8 RGB, as the capture stores them.
-        working: (F, S, S, 3) uint8 RGB, for cutting masks: the video's own resolution, at
-            most twice the stored one.
-    """
-
+    #: (F, size, size, 3) uint8 RGB, as the capture stores them.
     frames: np.ndarray
+    #: (F, S, S, 3) uint8 RGB, for cutting masks: the video's own resolution, at most twice the
+    #: stored one.
     working: np.ndarray
 
 
 def working_size(windows: CropWindows) -> int:
     """Edge of the working images, px."""
     return min(windows.side, 2 * windows.size)
-
-
-def check_memory(windows: CropWindows) -> None:
-    """Refuse a clip that would not fit into memory, before minutes of work.
-
-    Raises:
-        UsageError: the images would take more than the free memory.
-    """
-    import psutil
-
-    edge = working_size(windows)
-    # Colours at both resolutions, the mask, the distance field, and the posed vertices.
-    each = 3 * edge**2 + 4 * windows.size**2 + 2 * FIELD_SIZE**2 + 200_000
-    needed, free = len(windows.corners) * each, psutil.virtual_memory().available
-    if needed > free:
-        raise UsageError(
-            f"{len(windows.corners)} frames need about {needed / 1e9:.1f} GB of memory, "
-            f"{free / 1e9:.1f} GB are free",
-            field="--frames",
-            remedy="Take fewer frames with --frames or --stride, or a smaller --size.",
-        )
 
 
 def read_images(
@@ -188,9 +193,6 @@ def read_images(
     """Decode the video once and keep the window of every selected frame.
 
     `ended` is told as by `read_frames`.
-
-    Raises:
-        BadInput: the video ends early, goes on longer than the landmarks, or is damaged.
     """
     count, edge = len(windows.corners), working_size(windows)
     frames = np.zeros((count, windows.size, windows.size, 3), dtype=np.uint8)
@@ -221,19 +223,9 @@ def read_masks(
 ) -> np.ndarray:
     """Read the user's masks and cut the windows out of them.
 
-    Args:
-        folder: images of the video's size whose names end in the frame number (`000012.png`,
-            `frame_12.png`); above 127 is hand.
-        info: the video.
-        indices: (F,) frame numbers to read.
-        windows: of those frames.
-
-    Returns:
-        (F, S, S) uint8 at the working resolution, 255 = hand.
-
-    Raises:
-        BadInput: the folder is missing, or a frame has no mask.
-        BadImage: a mask is damaged or not of the video's size.
+    The folder has images of the video's size whose names end in the frame number (`000012.png`,
+    `frame_12.png`); above 127 is hand. Of F frames: (F, S, S) uint8 at the working resolution, 255
+    = hand.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -273,9 +265,6 @@ def read_frames(
 
     Yields:
         (index in the video, (H, W, 3) uint8 sRGB).
-
-    Raises:
-        BadInput: the size changes between frames, or the video ends before `selection.stop`.
     """
     with _opened(info.path) as video:
         index = 0

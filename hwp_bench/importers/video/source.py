@@ -1,64 +1,149 @@
-"""The inputs of a video import: read from outside, checked, and the sides of the hands found."""
+"""The inputs of a video import: what a person chooses, what is read, and whether it fits together.
+
+Landmarks of another convention are numbers like all others: a fit to them runs for minutes and
+follows no frame. Three things tell beforehand. The joints of a hand are near each other along its
+fingers, in one order only. Its landmarks in the image look like its landmarks in space, seen from
+the front. And skin has other colours than what is around it, so that landmarks that lie on a hand
+separate the colours on them from those around them better than any that lie elsewhere.
+"""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 
+import cv2
 import numpy as np
 
+from hwp_bench.base.arrays import evenly
 from hwp_bench.base.console import notice, progress
-from hwp_bench.base.errors import BadInput, UsageError
+from hwp_bench.base.errors import BadInput, UsageError, has_odd_characters
+from hwp_bench.base.records import MAX_TEXT
 from hwp_bench.capture.schema import MAX_FRAMES
-from hwp_bench.importers.shared.association import read_association, tracked_sides, tracked_votes
-from hwp_bench.importers.shared.landmarks import Landmarks, check_against_video, read_landmarks
-from hwp_bench.importers.shared.windows import CropWindows, follow_hands
+from hwp_bench.importers.shared.frames import CropWindows, cells, follow_hands
+from hwp_bench.importers.shared.landmarks import (
+    LANDMARK_EDGES,
+    Association,
+    Landmarks,
+    check_against_video,
+    read_association,
+    read_hand_tracks,
+    read_landmarks,
+)
 from hwp_bench.importers.video.decode import (
     ClipImages,
+    FrameRange,
     Reading,
     VideoInfo,
-    check_memory,
     probe,
+    read_frames,
     read_images,
     read_masks,
     warn_of_damage,
+    working_size,
 )
-from hwp_bench.importers.video.fit_clip import Footage
-from hwp_bench.importers.video.side_check import side_scores, warn_of_contradiction
-from hwp_bench.importers.video.video_settings import VideoImport
+from hwp_bench.importers.video.residuals import FIELD_SIZE
+from hwp_bench.importers.video.solve import (
+    FitSettings,
+    Footage,
+    side_scores,
+    warn_of_contradiction,
+)
 
 #: Sides of two hands, in the order in which a capture has them.
 BOTH = ("right", "left")
 
+#: The hands that can be asked for, as the person sees them; `auto` is what the landmarks show.
+CHOICES = ("auto", "right", "left", "both")
+
+
+@dataclass(frozen=True)
+class VideoImport:
+    """Choices of a video import; checked when made.
+
+    Raises:
+        UsageError: a choice makes no sense; it names the option.
+    """
+
+    #: Which hands are imported: one of `CHOICES`.
+    side: str = "auto"
+    #: Focal length in px of the whole frame, or None to estimate it.
+    focal: float | None = None
+    #: Folder with masks of the user's own, or None to compute them.
+    masks: Path | None = None
+    #: Edge of the stored square frames, px.
+    size: int = 256
+    #: The frames that are used.
+    frames: FrameRange = field(default_factory=FrameRange)
+    #: Id of the capture, or None for the name of the output folder.
+    id: str | None = None
+    #: Action of the hand.
+    action: str = "unknown"
+    #: Device that recorded the video.
+    device: str = "unknown"
+    #: Terms under which the frames may be used.
+    licence: str = "unknown"
+    #: Perturbations in the clip, as the user names them; their severities are unknown.
+    perturbations: tuple[str, ...] = ()
+    #: Hand model, as `load_template` takes it.
+    hand_model: str = "anny"
+    #: Frames whose tracker score is lower count as not detected.
+    min_score: float = 0.5
+    #: Further place for the overlay sheet, or None.
+    sheet: Path | None = None
+    #: Replace an existing capture.
+    overwrite: bool = False
+    #: Numbers of the fit.
+    fit: FitSettings = field(default_factory=FitSettings)
+
+    def __post_init__(self) -> None:
+        rules = (
+            ("--side", self.side in CHOICES, f"must be one of {', '.join(CHOICES)}"),
+            ("--focal", self.focal is None or 1 <= self.focal <= 1e6, "must be 1 to 1e6 px"),
+            ("--size", 32 <= self.size <= 2048, "must be 32 to 2048 px"),
+            ("--min-score", 0 <= self.min_score <= 1, "must be in [0, 1]"),
+            *self._text_rules(),
+        )
+        for option, good, problem in rules:
+            if not good:
+                raise UsageError(problem, field=option)
+
+    def _text_rules(self) -> Iterator[tuple[str, bool, str]]:
+        """The same bounds as in `capture.json`, which is written after all the work."""
+        texts = {name: getattr(self, name) for name in ("action", "device", "licence")}
+        for name, text in {**texts, "hand-model": self.hand_model}.items():
+            long = f"must have 1 to {MAX_TEXT:,} characters"
+            yield f"--{name}", 1 <= len(text) <= MAX_TEXT, long
+            yield f"--{name}", not has_odd_characters(text), "holds a control character"
+
+    def capture_id(self, out: str | os.PathLike[str]) -> str:
+        """Return the id of the capture that is written to `out`."""
+        return self.id or Path(out).absolute().name
+
 
 @dataclass(frozen=True, eq=False)
 class VideoSource:
-    """The inputs of an import.
-
-    Attributes:
-        video: the probed video.
-        landmarks_path: the tracker's file.
-        indices: (F,) frame numbers in the video.
-        hands: landmarks of those frames by side, the hand that is detected most first.
-        windows: where the hands are.
-        images: the frames.
-        own_masks: (F, S, S) uint8 or None.
-        swaps: how often the tracker had exchanged two hands, over the whole video.
-        doubles: number of frames in which it had put both on one hand.
-        reading: what came of reading the video to its end; None where a part was read.
-    """
+    """The inputs of an import."""
 
     video: VideoInfo
+    #: The tracker's file.
     landmarks_path: Path
+    #: (F,) frame numbers in the video.
     indices: np.ndarray
+    #: Landmarks of those frames by side, the hand that is detected most first.
     hands: Mapping[str, Landmarks]
+    #: Where the hands are.
     windows: CropWindows
     images: ClipImages
+    #: (F, S, S) uint8 or None.
     own_masks: np.ndarray | None
+    #: How often the tracker had exchanged two hands, over the whole video.
     swaps: int = 0
+    #: Number of frames in which it had put both on one hand.
     doubles: int = 0
+    #: What came of reading the video to its end; None where a part was read.
     reading: Reading | None = None
 
     @property
@@ -75,20 +160,16 @@ class VideoSource:
 def read_source(
     video: str | os.PathLike[str], landmarks: str | os.PathLike[str], options: VideoImport
 ) -> VideoSource:
-    """Read and check everything that the import needs from outside.
-
-    Raises:
-        BadInput: one of the files is unusable; file and field are named.
-        UsageError: an option makes no sense for these files.
-    """
+    """Read and check everything that the import needs from outside."""
     info = probe(video)
-    every = _read_hands(landmarks, options)
+    tracked = read_association(landmarks)
+    every = _read_hands(landmarks, tracked, options)
     # Containers may state a wrong number of frames. A whole video is counted as it is decoded.
     # The end of a part is never read, so the header is trusted.
     part = options.frames.stop is not None
     count = len(next(iter(every.values())).score)
     total = info.stated_frames if part and info.stated_frames else count
-    tracked = {
+    checked = {
         side: check_against_video(hand, total, info.width, info.height, landmarks)
         for side, hand in every.items()
     }
@@ -98,16 +179,23 @@ def read_source(
             f"{len(indices)} of {total} frames are selected, a capture has 3 to {MAX_FRAMES}",
             field="--frames",
         )
-    selected = {side: hand.select(indices) for side, hand in tracked.items()}
+    selected = {side: hand.select(indices) for side, hand in checked.items()}
     seen = {side: hand for side, hand in selected.items() if hand.detected.any()}
     if not seen:
         raise UsageError("no hand is detected in the selected frames", field="--frames")
     for side in selected.keys() - seen.keys():
         notice(f"The {side} hand is in none of the selected frames and is left out.")
     footage = Footage(info.width, info.height, info.fps / options.frames.stride, options.focal)
-    hands = _checked_sides(seen, landmarks, options, footage)
+    # The pictures are asked which hands they show, before minutes of work.
+    hands = {}
+    for given, hand in seen.items():
+        scores = side_scores(hand, options.hand_model, footage)
+        if given is not None:
+            votes = None if tracked is None else tracked.votes(given)
+            warn_of_contradiction(given, scores, votes, stated=options.side in BOTH)
+        hands[given or scores.better] = hand
     windows = follow_hands(list(hands.values()), footage.fps, options.size)
-    check_memory(windows)
+    _check_memory(windows)
     own = None if options.masks is None else read_masks(options.masks, info, indices, windows)
     endings: list[Reading] = []
     with progress("reading frames", len(indices)) as update:
@@ -115,20 +203,22 @@ def read_source(
     reading = endings[0] if endings else None
     if reading is not None:
         warn_of_damage(info, reading)
-    found = read_association(landmarks) if len(hands) == 2 else None
-    repaired = (0, 0) if found is None else (found.swaps, found.doubles)
+    two = tracked is not None and len(hands) == 2
+    repaired = (tracked.swaps, tracked.doubles) if tracked is not None and two else (0, 0)
     return VideoSource(
         info, Path(landmarks), indices, hands, windows, images, own, *repaired, reading
     )
 
 
-def _read_hands(path: str | os.PathLike[str], options: VideoImport) -> dict[str | None, Landmarks]:
+def _read_hands(
+    path: str | os.PathLike[str], tracked: Association | None, options: VideoImport
+) -> dict[str | None, Landmarks]:
     """Landmarks by side; the key is None where the file says nothing of it and nobody else."""
     sides: tuple[str | None, ...]
     if options.side in BOTH:
         sides = (options.side,)
     else:
-        sides = tracked_sides(path) or (None,)
+        sides = (None,) if tracked is None else tracked.sides
         if options.side == "both" and len(sides) < 2:
             raise BadInput(
                 "has landmarks of one hand",
@@ -139,18 +229,297 @@ def _read_hands(path: str | os.PathLike[str], options: VideoImport) -> dict[str 
     return {side: read_landmarks(path, min_score=options.min_score, side=side) for side in sides}
 
 
-def _checked_sides(
-    hands: Mapping[str | None, Landmarks],
-    path: str | os.PathLike[str],
-    options: VideoImport,
-    footage: Footage,
-) -> dict[str, Landmarks]:
-    """Ask the pictures which hands they show, before minutes of work."""
-    checked = {}
-    for side, hand in hands.items():
-        scores = side_scores(hand, options.hand_model, footage)
-        if side is not None:
-            votes = tracked_votes(path, side)
-            warn_of_contradiction(side, scores, votes, stated=options.side in BOTH)
-        checked[side or scores.better] = hand
-    return checked
+def _check_memory(windows: CropWindows) -> None:
+    """Refuse a clip that would not fit into memory, before minutes of work."""
+    import psutil
+
+    edge = working_size(windows)
+    # Colours at both resolutions, the mask, the distance field, and the posed vertices.
+    each = 3 * edge**2 + 4 * windows.size**2 + 2 * FIELD_SIZE**2 + 200_000
+    needed, free = len(windows.corners) * each, psutil.virtual_memory().available
+    if needed > free:
+        raise UsageError(
+            f"{len(windows.corners)} frames need about {needed / 1e9:.1f} GB of memory, "
+            f"{free / 1e9:.1f} GB are free",
+            field="--frames",
+            remedy="Take fewer frames with --frames or --stride, or a smaller --size.",
+        )
+
+
+# --- Whether the landmarks follow the convention that they are read by, and belong to the video
+
+#: A fit that follows the landmarks in a smaller share of the frames than this has failed.
+LEAST_FITTED = 0.1
+#: One that follows them in a smaller share than this is warned of.
+FEW_FITTED = 0.5
+#: So is a smaller mean overlap of mesh and mask; sound clips have 0.9 and more.
+LOW_OVERLAP = 0.85
+#: What landmarks must be, for messages.
+CONVENTION = (
+    "Landmarks are 21 joints in MediaPipe's order, one row for each frame of this video; `image` "
+    "in px of the whole frame, x to the right and y down; `world` in m, the same axes, z away "
+    "from the camera."
+)
+
+#: Other orders of the 21 joints: for each of ours, the row that holds it there.
+_ORDERS = {
+    # Wrist, index, middle, little, ring finger and thumb with three joints each, then the tips.
+    "MANO's order": (*(0, 13, 14, 15, 16, 1, 2, 3, 17, 4, 5, 6, 18, 10, 11, 12, 19, 7, 8, 9, 20),),
+    # Each finger from its tip to its base, the wrist last.
+    "InterHand2.6M's order": (
+        *(20, 3, 2, 1, 0, 7, 6, 5, 4, 11, 10, 9, 8, 15, 14, 13, 12, 19, 18, 17, 16),
+    ),
+}
+# Another order is believed if it makes the hand's bones together shorter than this share of what
+# ours makes them.
+_SHORTER = 0.8
+# Landmarks in space, seen from the front, as the image may have them: what multiplies x and y.
+_AXES = {
+    "x and y of {} are exchanged": ((0, 1), (1, 0)),
+    "y of {} points up": ((1, 0), (0, -1)),
+    "{} is mirrored": ((-1, 0), (0, 1)),
+    "{} is turned by 180 degrees": ((-1, 0), (0, -1)),
+    "{} is turned by a quarter": ((0, -1), (1, 0)),
+    "{} is turned by a quarter, the other way": ((0, 1), (-1, 0)),
+}
+# Correlation of landmarks in the image with those in space. Of sound ones it is 0.9 and more.
+_ALIKE, _UNLIKE = 0.8, 0.5
+# `world` is `image` over the image's size if both differ by less than this share of the hand.
+_EQUAL = 0.003
+# Frames whose colours are looked at.
+_LOOKED_AT = 12
+# Edge of the image that a hand is reduced to for that, px: its noise goes, its fingers stay.
+_HAND_EDGE = 80.0
+# Frames by which landmarks may come late or early.
+_SHIFTS = (1, 2, 3, 4, 6, 8, 10, 12, 15)
+# Landmarks lie elsewhere for certain if colours are then separated this well, with this share of
+# the errors, and better by this much (those of the next frame lie almost as well).
+_SEPARATED, _ERRORS, _BETTER, _BETTER_SHIFT = 0.85, 0.5, 0.1, 0.015
+# Places along each bone, and edges of the grid around the hand.
+_ALONG, _AROUND = 5, 24
+_PALM = ((0, 9), (0, 13), (1, 5), (5, 9), (9, 13), (13, 17))
+_BONES = np.array([*LANDMARK_EDGES, *_PALM])
+
+_Move = Callable[[np.ndarray], np.ndarray]
+
+
+def refuse_other_units(source: VideoSource) -> None:
+    """Refuse landmarks that are of another size of this video, or not in space at all."""
+    width, height = source.video.width, source.video.height
+    tracks = read_hand_tracks(source.landmarks_path)
+    if tracks is not None and tracks.size != (width, height):
+        raise BadInput(
+            f"was tracked at {tracks.size[0]}x{tracks.size[1]}, the video is {width}x{height}",
+            where=source.landmarks_path,
+            field="size",
+            remedy="Track exactly this video.",
+        )
+    for landmarks in source.hands.values():
+        image = landmarks.image[landmarks.detected] / (width, height)
+        world = landmarks.world[landmarks.detected][:, :, :2]
+        apart = _centred(image) - _centred(world)
+        if np.abs(apart).max() < _EQUAL * np.ptp(world, axis=1).max():
+            raise BadInput(
+                "holds `image` divided by the image's size: normalised landmarks, not metres",
+                where=source.landmarks_path,
+                field="world",
+                remedy="Use the tracker's world landmarks (MediaPipe: hand_world_landmarks).",
+            )
+
+
+def landmark_doubts(source: VideoSource) -> tuple[str, ...]:
+    """Say what the numbers and the pictures tell against landmarks; nothing if all is well."""
+    found: list[str] = []
+    for landmarks in source.hands.values():
+        order = doubts_of_order(landmarks)
+        place, lies_well = ([], False) if order else _doubts_of_pictures(source, landmarks)
+        # Where the image's are in place, those in space are wrong.
+        axes = doubts_of_axes(landmarks, "`world`" if lies_well else "`image` or `world`")
+        found += order or place or axes
+    return tuple(dict.fromkeys(found))
+
+
+def doubts_of_order(landmarks: Landmarks) -> list[str]:
+    """Say which order of joints makes a hand's bones shorter than ours makes them."""
+    found: dict[str, list[str]] = {}
+    for name in ("image", "world"):
+        points = getattr(landmarks, name)[landmarks.detected]
+        lengths = {order: _length(points[:, list(rows)]) for order, rows in _ORDERS.items()}
+        order = min(lengths, key=lambda one: lengths[one])
+        if lengths[order] < _SHORTER * _length(points):
+            found.setdefault(order, []).append(f"`{name}`")
+    return [
+        f"the joints of {' and '.join(names)} are in {order}, not in MediaPipe's"
+        for order, names in found.items()
+    ]
+
+
+def doubts_of_axes(landmarks: Landmarks, which: str = "`image` or `world`") -> list[str]:
+    """Say how the axes of the image differ from those of space, and in `which` array."""
+    image = _centred(landmarks.image[landmarks.detected])
+    world = _centred(landmarks.world[landmarks.detected][:, :, :2])
+    image, world = (
+        each / np.maximum(np.sqrt((each**2).sum(axis=(1, 2), keepdims=True)), 1e-12)
+        for each in (image, world)
+    )
+
+    def alike(axes: Sequence[Sequence[float]]) -> float:
+        return float((image * (world @ np.array(axes, float).T)).sum(axis=(1, 2)).mean())
+
+    as_given = alike(((1, 0), (0, 1)))
+    scores = {name: alike(axes) for name, axes in _AXES.items()}
+    best = max(scores, key=lambda name: scores[name])
+    if as_given < _UNLIKE and scores[best] > max(_ALIKE, as_given):
+        return [best.format(which)]
+    if as_given < _UNLIKE:
+        return ["`image` and `world` do not show the same hand in the same frames"]
+    return []
+
+
+def _doubts_of_pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[str], bool]:
+    """Say where a hand's landmarks would lie on it, and whether that is where they are."""
+    width, height = source.video.width, source.video.height
+    places: dict[str, _Move] = {
+        "x and y of `image` are exchanged": lambda p: p[..., ::-1],
+        "y of `image` points up": lambda p: p * (1, -1) + (0, height),
+        "`image` is mirrored": lambda p: p * (-1, 1) + (width, 0),
+        "`image` is turned by 180 degrees": lambda p: p * (-1, -1) + (width, height),
+        "`image` is of a video of half this size": lambda p: 2.0 * p,
+        "`image` is of a video of twice this size": lambda p: 0.5 * p,
+        "`image` is of a video of two thirds of this size": lambda p: 1.5 * p,
+        "`image` is of a video of one and a half times this size": lambda p: p / 1.5,
+    }
+    rows, pictures = _pictures(source, landmarks)
+    points = landmarks.image[rows]
+    as_given = _separation(pictures, points)
+    moved = {name: _separation(pictures, move(points)) for name, move in places.items()}
+    best = max(moved, key=lambda name: moved[name])
+    if _clearly(moved[best], as_given, _BETTER):
+        return [best], False
+    late = {
+        shift * sign: _separation_of_frames(pictures, landmarks, rows, shift * sign)
+        for shift in _SHIFTS
+        for sign in (1, -1)
+    }
+    shift = max(late, key=lambda one: late[one])
+    if _clearly(late[shift], as_given, _BETTER_SHIFT):
+        frames = abs(shift) * int(np.diff(source.indices).min())
+        when = "late" if shift > 0 else "early"
+        return [f"the landmarks come about {frames} frames too {when}"], False
+    return [], as_given > _SEPARATED
+
+
+def _clearly(better: float, as_given: float, least: float) -> bool:
+    errors = 1.0 - better < _ERRORS * (1.0 - as_given)
+    return errors and better > _SEPARATED and better - as_given > least
+
+
+def _pictures(source: VideoSource, landmarks: Landmarks) -> tuple[list[int], list[np.ndarray]]:
+    """Some frames in which a hand is seen, reduced, as (rows, pictures of floats in Lab)."""
+    seen = np.flatnonzero(landmarks.detected)
+    chosen = [int(row) for row in seen[evenly(len(seen), _LOOKED_AT)]]
+    numbers = {int(source.indices[row]): row for row in chosen}
+    extent = np.median(np.ptp(landmarks.image[seen], axis=1).max(axis=1))
+    blur = max(float(extent) / _HAND_EDGE, 0.5)
+    rows, pictures = [], []
+    first, last = min(numbers), max(numbers)
+    for number, image in read_frames(source.video, FrameRange(first, last + 1)):
+        if number in numbers:
+            soft = cv2.GaussianBlur(image, (0, 0), blur)
+            rows.append(numbers[number])
+            pictures.append(cv2.cvtColor(soft, cv2.COLOR_RGB2LAB))
+    return rows, pictures
+
+
+def _separation_of_frames(
+    pictures: Sequence[np.ndarray], landmarks: Landmarks, rows: Sequence[int], shift: int
+) -> float:
+    """Separation by the landmarks of later (or earlier) frames; 0 where too few are seen."""
+    other = np.array(rows) + shift
+    good = (other >= 0) & (other < len(landmarks.detected))
+    good[good] &= landmarks.detected[other[good]]
+    if good.sum() < max(len(rows) // 2, 3):
+        return 0.0
+    used = [picture for picture, one in zip(pictures, good, strict=True) if one]
+    return _separation(used, landmarks.image[other[good]])
+
+
+def _separation(pictures: Sequence[np.ndarray], points: np.ndarray) -> float:
+    """How well a line through colours tells those on (F, 21, 2) px from those around them.
+
+    Mean probability over the frames that a colour on the hand lies on its side of one around it:
+    0.5 by chance, 1 where all do.
+    """
+    found = []
+    for picture, hand in zip(pictures, points, strict=True):
+        along = np.linspace(0.0, 1.0, _ALONG)[:, None, None]
+        on = (hand[_BONES[:, 0]] * (1.0 - along) + hand[_BONES[:, 1]] * along).reshape(-1, 2)
+        size = np.ptp(hand, axis=0).max()
+        sides = [
+            np.linspace(hand[:, axis].min() - 0.45 * size, hand[:, axis].max() + 0.45 * size, n)
+            for axis, n in ((0, _AROUND), (1, _AROUND))
+        ]
+        grid = np.stack(np.meshgrid(*sides), axis=-1).reshape(-1, 2)
+        apart = np.linalg.norm(grid[:, None] - on[None], axis=-1).min(axis=1)
+        hand_colors, share = _colors(picture, on)
+        others, _ = _colors(picture, grid[apart > 0.18 * size])
+        if share < 0.5 or min(len(hand_colors), len(others)) < 20:
+            found.append(0.5)
+            continue
+        spread = (np.cov(hand_colors.T) + np.cov(others.T)) / 2 + 25.0 * np.eye(3)
+        way = np.linalg.solve(spread, hand_colors.mean(axis=0) - others.mean(axis=0))
+        told = (hand_colors @ way)[:, None] > (others @ way)[None]
+        found.append(share * float(told.mean()) + (1.0 - share) * 0.5)
+    return float(np.mean(found))
+
+
+def _colors(picture: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, float]:
+    """Colours at points inside of a picture, and the share of points that are."""
+    rows, columns, inside = cells(points, picture.shape)
+    found = picture[rows[inside], columns[inside]].astype(np.float64)
+    return found, inside.sum() / max(len(inside), 1)
+
+
+def _length(points: np.ndarray) -> float:
+    """Mean length of all bones together."""
+    bones = np.array(LANDMARK_EDGES)
+    apart = points[:, bones[:, 0]] - points[:, bones[:, 1]]
+    return float(np.linalg.norm(apart, axis=-1).sum(axis=1).mean())
+
+
+def _centred(points: np.ndarray) -> np.ndarray:
+    return np.asarray(points - points.mean(axis=1, keepdims=True))
+
+
+def refuse_unfitted(
+    fitted: Mapping[str, np.ndarray], source: VideoSource, doubts: Sequence[str]
+) -> None:
+    """Refuse a fit that follows (nearly) no frame of a hand, with what is likely wrong.
+
+    `fitted` are (F,) bool by side, frames in which the hand model follows the landmarks; `doubts`
+    what tells against them.
+    """
+    for side, good in fitted.items():
+        seen = source.hands[side].detected
+        count, total = int((good & seen).sum()), int(seen.sum())
+        if count >= max(LEAST_FITTED * total, 1):
+            continue
+        likely = f"; it seems that {'; '.join(doubts)}" if doubts else ""
+        others = [other for other in fitted if other != side]
+        alone = f" Or import the other hand alone: --side {others[0]}." if others else ""
+        raise BadInput(
+            f"no {side} hand can follow these landmarks: the hand model does in {count} of {total} "
+            f"frames{likely}",
+            where=source.landmarks_path,
+            remedy=CONVENTION + alone,
+        )
+
+
+def fit_warnings(fitted: Mapping[str, np.ndarray], seen: Mapping[str, np.ndarray]) -> list[str]:
+    """Say of which hands few frames are fitted, of those in which they are seen: (F,) bool each."""
+    return [
+        f"the {side} hand is fitted in {int(good.sum())} of the {int(seen[side].sum())} frames "
+        "that show it"
+        for side, good in fitted.items()
+        if good.sum() < FEW_FITTED * seen[side].sum()
+    ]

@@ -11,13 +11,7 @@ _LATTICE = 32
 
 
 def generator(seed: int, *purpose: str | int) -> np.random.Generator:
-    """Return a generator for one purpose.
-
-    Args:
-        seed: seed of the scene.
-        purpose: what the numbers are for, such as `("noise", frame)`. Equal seeds and purposes
-            give equal numbers in any process and any order.
-    """
+    """Return a generator for one purpose."""
     text = "/".join(str(part) for part in (seed, *purpose))
     words = np.frombuffer(hashlib.sha256(text.encode()).digest(), dtype=np.uint32)
     return np.random.default_rng(words.tolist())
@@ -28,14 +22,7 @@ def fractal_noise(
 ) -> np.ndarray:
     """Value noise summed over octaves.
 
-    Args:
-        points: (N, 3) places.
-        scale: size of the coarsest features, in the unit of the points.
-        rng: source of the lattice.
-        octaves: each halves the features and their height.
-
-    Returns:
-        (N,) with mean about 0 and standard deviation about 1.
+    Takes `points` (N, 3) places. Returns (N,) with mean about 0 and standard deviation about 1.
     """
     from scipy.ndimage import map_coordinates
 

@@ -1,10 +1,115 @@
-"""Surfaces and materials: everything that a ray can hit."""
+"""Surfaces that rays can hit: mesh arithmetic, materials, and building blocks of things."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from msgspec import Meta
+
+from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.hands.template import boundary_vertices
+
+if TYPE_CHECKING:
+    from scipy.sparse import csr_matrix
+
+
+def subdivision(faces: np.ndarray, vertex_count: int) -> tuple[csr_matrix, np.ndarray]:
+    """One midpoint subdivision, written as a matrix.
+
+    Takes `faces` (F, 3). Returns (V', V) sparse matrix that turns per-vertex values into those of
+    the finer mesh, the first V rows unchanged, and its (4F, 3) faces.
+    """
+    from scipy.sparse import csr_matrix
+
+    edges = np.sort(np.vstack([faces[:, [0, 1]], faces[:, [1, 2]], faces[:, [2, 0]]]), axis=1)
+    unique, inverse = np.unique(edges, axis=0, return_inverse=True)
+    middle = (vertex_count + inverse.reshape(3, -1).T).astype(faces.dtype)
+    a, b, c = faces.T
+    ab, bc, ca = middle.T
+    fine = np.stack([[a, ab, ca], [ab, b, bc], [ca, bc, c], [ab, bc, ca]], axis=0)
+    count = len(unique)
+    rows = np.concatenate([np.arange(vertex_count), np.repeat(vertex_count + np.arange(count), 2)])
+    columns = np.concatenate([np.arange(vertex_count), unique.reshape(-1)])
+    values = np.concatenate([np.ones(vertex_count), np.full(2 * count, 0.5)])
+    matrix = csr_matrix((values, (rows, columns)), shape=(vertex_count + count, vertex_count))
+    return matrix, fine.transpose(0, 2, 1).reshape(-1, 3)
+
+
+def smoothing(faces: np.ndarray, vertex_count: int, rounds: int) -> csr_matrix:
+    """Taubin smoothing as one matrix: rounds facets off without shrinking.
+
+    The boundary stays where it is.
+
+    Source: Taubin, "A signal processing approach to fair surface design" (lambda 0.5, mu -0.53).
+    """
+    from scipy.sparse import diags, identity
+
+    adjacency = _adjacency(faces, vertex_count)
+    degree = np.asarray(adjacency.sum(axis=1)).reshape(-1)
+    free = np.ones(vertex_count)
+    free[boundary_vertices(faces)] = 0.0
+    laplacian = diags(free) @ (diags(1.0 / np.maximum(degree, 1.0)) @ adjacency) - diags(free)
+    one = identity(vertex_count, format="csr")
+    step = (one - 0.53 * laplacian) @ (one + 0.5 * laplacian)
+    matrix = one
+    for _ in range(rounds):
+        matrix = step @ matrix
+    return matrix.tocsr()
+
+
+def smoothing_step(faces: np.ndarray, vertex_count: int, share: float) -> csr_matrix:
+    """(V, V) matrix that replaces a share of each value by the mean of its neighbours'."""
+    from scipy.sparse import diags, identity
+
+    adjacency = _adjacency(faces, vertex_count)
+    degree = np.asarray(adjacency.sum(axis=1)).reshape(-1)
+    mean = diags(1.0 / np.maximum(degree, 1.0)) @ adjacency
+    # A vertex without neighbours keeps its value.
+    keep = 1.0 - share * (degree > 0)
+    return (diags(keep) @ identity(vertex_count, format="csr") + share * mean).tocsr()
+
+
+def normal_operator(faces: np.ndarray, vertex_count: int) -> csr_matrix:
+    """(V, F) matrix that adds the faces' vectors up at their corners."""
+    from scipy.sparse import csr_matrix
+
+    rows = faces.reshape(-1)
+    columns = np.repeat(np.arange(len(faces)), 3)
+    return csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(vertex_count, len(faces)))
+
+
+def surface_normals(vertices: np.ndarray, faces: np.ndarray, operator: csr_matrix) -> np.ndarray:
+    """Unit normals at the vertices, weighted by area: (V, 3).
+
+    Takes `vertices` (V, 3), `faces` (F, 3).
+    """
+    a, b, c = (vertices[faces[:, corner]] for corner in range(3))
+    return unit(operator @ np.cross(b - a, c - a))
+
+
+def ease(x: np.ndarray | float) -> np.ndarray:
+    """From 0 to 1 with zero slope at both ends: 3 x^2 - 2 x^3, constant outside of 0 to 1."""
+    x = np.clip(x, 0.0, 1.0)
+    return x * x * (3.0 - 2.0 * x)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors at length 1; zero stays zero."""
+    length = np.sqrt(np.einsum("...i,...i->...", vectors, vectors))[..., None]
+    return vectors / np.maximum(length, 1e-12)
+
+
+def _adjacency(faces: np.ndarray, vertex_count: int) -> csr_matrix:
+    from scipy.sparse import csr_matrix
+
+    rows = np.concatenate([faces[:, i] for i in (0, 1, 2, 1, 2, 0)])
+    columns = np.concatenate([faces[:, i] for i in (1, 2, 0, 0, 1, 2)])
+    matrix = csr_matrix((np.ones(len(rows)), (rows, columns)), shape=(vertex_count,) * 2)
+    matrix.data[:] = 1.0
+    return matrix
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,3 +187,146 @@ def plain(color: tuple[float, float, float] | np.ndarray, **settings: float) -> 
     """A material of one linear colour."""
     albedo = np.asarray(color, dtype=np.float32).reshape(1, 1, 3)
     return Material(albedo=albedo, **settings)  # type: ignore[arg-type]
+
+
+def coat(color: Sequence[float] | np.ndarray, **settings: float) -> Material:
+    """A material of one sRGB colour."""
+    return plain(srgb_to_linear(np.array(color)), **settings)
+
+
+def picture_material(image: np.ndarray, gloss: float) -> Material:
+    """A material with the colours of a painted (H, W, 3) uint8 image."""
+    return Material(albedo=albedo(image), gloss=gloss)
+
+
+def shift(surface: Surface, place: tuple[float, float, float] | np.ndarray) -> Surface:
+    """A surface moved by (3,) m."""
+    move = np.eye(4)
+    move[:3, 3] = place
+    return transformed(surface, move)
+
+
+_Channel = Annotated[float, Meta(ge=0.0, le=1.0)]
+#: An sRGB colour, 0-1 each.
+Color = tuple[_Channel, _Channel, _Channel]
+
+
+def shape(
+    vertices: np.ndarray,
+    faces: np.ndarray,
+    corner_uv: np.ndarray,
+    material: Material,
+    *,
+    smooth: bool,
+) -> Surface:
+    """Make a surface that is not a hand.
+
+    Takes `vertices` (V, 3) m, `faces` (F, 3), `corner_uv` (F, 3, 2).
+    """
+    if not smooth:
+        vertices = vertices[faces].reshape(-1, 3)
+        faces = np.arange(len(vertices)).reshape(-1, 3)
+    normals = surface_normals(vertices, faces, normal_operator(faces, len(vertices)))
+    return Surface(
+        vertices=vertices,
+        normals=normals,
+        faces=faces,
+        corner_uv=corner_uv,
+        material=np.zeros(len(faces), dtype=np.int64),
+        materials=(material,),
+        hand=np.zeros(len(faces), dtype=bool),
+    )
+
+
+def box(size: tuple[float, float, float], material: Material) -> Surface:
+    """A box around the origin; each side shows the whole texture, +z upright."""
+    x, y, z = (edge / 2 for edge in size)
+    sides = (
+        ((-x, -y, z), (x, -y, z), (x, y, z), (-x, y, z)),
+        ((x, -y, -z), (-x, -y, -z), (-x, y, -z), (x, y, -z)),
+        ((x, -y, z), (x, -y, -z), (x, y, -z), (x, y, z)),
+        ((-x, -y, -z), (-x, -y, z), (-x, y, z), (-x, y, -z)),
+        ((-x, y, z), (x, y, z), (x, y, -z), (-x, y, -z)),
+        ((-x, -y, -z), (x, -y, -z), (x, -y, z), (-x, -y, z)),
+    )
+    vertices = np.array(sides, dtype=np.float64).reshape(-1, 3)
+    start = np.arange(6)[:, None] * 4
+    halves = np.array([[0, 1, 2], [0, 2, 3]])
+    faces = (start + halves[:, None]).reshape(-1, 3)
+    corners = np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]])
+    uv = np.concatenate(
+        [np.tile(corners[[0, 1, 2]], (6, 1, 1)), np.tile(corners[[0, 2, 3]], (6, 1, 1))]
+    )
+    return shape(vertices, faces, uv, material, smooth=False)
+
+
+def turned(profile: np.ndarray, material: Material, around: int = 28) -> Surface:
+    """A solid of revolution about z.
+
+    Takes `profile` (K, 2) rows of (radius, z) from one end to the other.
+    """
+    angles = np.linspace(0.0, 2.0 * np.pi, around + 1)
+    radius, z = profile[:, 0], profile[:, 1]
+    vertices = np.stack(
+        [
+            radius[:, None] * np.cos(angles),
+            radius[:, None] * np.sin(angles),
+            np.broadcast_to(z[:, None], (len(z), len(angles))),
+        ],
+        axis=-1,
+    ).reshape(-1, 3)
+    return grid(vertices, len(profile), around + 1, material, flip=z[-1] < z[0])
+
+
+def tube(spine: np.ndarray, radius: np.ndarray, material: Material, *, around: int = 12) -> Surface:
+    """A tube with closed ends around a curve that runs along neither x nor y for long.
+
+    Takes `spine` (K, 3) m, `radius` (K,) m at each of its points.
+    """
+    way = np.gradient(spine, axis=0)
+    way /= np.linalg.norm(way, axis=1, keepdims=True)
+    # The same axis everywhere, so that the tube does not twist.
+    still = np.array([1.0, 0.0, 0.0]) if abs(way[:, 0]).max() < 0.9 else np.array([0.0, 1.0, 0.0])
+    first = still - (way @ still)[:, None] * way
+    first /= np.linalg.norm(first, axis=1, keepdims=True)
+    second = np.cross(way, first)
+    angles = np.linspace(0.0, 2.0 * np.pi, around + 1)
+    rings = spine[:, None] + radius[:, None, None] * (
+        first[:, None] * np.cos(angles)[None, :, None]
+        + second[:, None] * np.sin(angles)[None, :, None]
+    )
+    first_end, last_end = (np.repeat(spine[None, None, k], around + 1, 1) for k in (0, -1))
+    closed = np.concatenate([first_end, rings, last_end])
+    return grid(closed.reshape(-1, 3), len(closed), around + 1, material)
+
+
+def grid(
+    vertices: np.ndarray, rows: int, columns: int, material: Material, *, flip: bool = False
+) -> Surface:
+    """A sheet of (rows, columns) vertices; v runs along the rows, u along the columns."""
+    row, column = np.meshgrid(np.arange(rows - 1), np.arange(columns - 1), indexing="ij")
+    a = (row * columns + column).ravel()
+    quads = np.stack([a, a + 1, a + columns + 1, a + columns], axis=1)
+    uv = np.stack([quads % columns / (columns - 1), quads // columns / (rows - 1)], axis=-1)
+    order = ([0, 1, 2], [0, 2, 3]) if not flip else ([0, 2, 1], [0, 3, 2])
+    faces = np.concatenate([quads[:, pick] for pick in order])
+    corner_uv = np.concatenate([uv[:, pick] for pick in order])
+    return shape(vertices, faces, corner_uv, material, smooth=True)
+
+
+def canvas(height: int, width: int, color: Color) -> np.ndarray:
+    """An image of one colour: (H, W, 3) uint8."""
+    image = np.empty((height, width, 3), dtype=np.uint8)
+    image[:] = ink(color)
+    return image
+
+
+def ink(color: Color) -> tuple[int, int, int]:
+    """A colour in 0-1 as OpenCV's brushes take it."""
+    red, green, blue = (round(255 * channel) for channel in color)
+    return red, green, blue
+
+
+def albedo(image: np.ndarray) -> np.ndarray:
+    """Linear reflectance of a painted (H, W, 3) uint8 image: float32."""
+    return srgb_to_linear(image / 255.0).astype(np.float32)

@@ -21,16 +21,17 @@ from hwp_bench.base.colors import linear_to_srgb
 from hwp_bench.base.console import track
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.files import atomic_write
-from hwp_bench.sim.effects.base import registered
-from hwp_bench.sim.effects.plan import hands_at, plan
+from hwp_bench.sim.effects import hands_at, plan_frame, registered
 from hwp_bench.sim.geometry.noise import generator
-from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.light.lights import steady_light
 from hwp_bench.sim.render.frame import carry_out
 from hwp_bench.sim.render.instant import Lens, render_instant
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.optics import intrinsics, steady_light, viewmat
-from hwp_bench.sim.scene.reader import parse_scene
-from hwp_bench.sim.scene.schema import EffectCall, Scene, Sensor, with_effects
+from hwp_bench.sim.scene.motion import intrinsics, viewmat
+from hwp_bench.sim.scene.scene import EffectCall, Scene, with_effects
+from hwp_bench.sim.scene_files import parse_scene
+from hwp_bench.sim.sensor import Sensor
 from hwp_bench.sim.subject.hand import MOVING
 
 #: What severity 1 to 5 means: mean PSNR over the hand in dB, or its covered share.
@@ -66,13 +67,7 @@ class Calibration:
 
 
 def calibrate(scene: Scene, call: EffectCall, size: int = SIZE) -> Calibration:
-    """Solve an effect's strengths for the stated losses.
-
-    Args:
-        scene: the scene.
-        call: one of its effects.
-        size: edge of the images in pixels.
-    """
+    """Solve an effect's strengths for the stated losses."""
     covering = call.kind == "hand_object_interaction"
     top = registered(call.kind).max_strength
     tried = top * (_TRIED_LINEAR if covering else _TRIED)
@@ -96,12 +91,7 @@ def calibrate(scene: Scene, call: EffectCall, size: int = SIZE) -> Calibration:
 
 
 def write_strengths(path: Path, calibrations: list[Calibration]) -> None:
-    """Write strengths into a scene file; the rest of it stays as it is.
-
-    Raises:
-        UsageError: the file does not exist.
-        BadInput: the file calls for no such effect, or would be damaged.
-    """
+    """Write strengths into a scene file; the rest of it stays as it is."""
     if not path.is_file():
         raise UsageError("does not exist", where=path)
     text = path.read_text(encoding="utf-8")
@@ -139,7 +129,7 @@ def _measure(
     def loss(strength: float) -> float:
         values = []
         for frame in frames:
-            recipe = plan(alone, frame, alone.frame_count, size, {call.kind: strength})
+            recipe = plan_frame(alone, frame, alone.frame_count, size, {call.kind: strength})
             result = carry_out(alone, recipe, size)
             hand = result.clean_coverage > 0.999
             if call.kind == "hand_object_interaction":
@@ -155,7 +145,7 @@ def _pose_loss(scene: Scene, frame: int, size: int, strength: float) -> float:
     """PSNR between a hand and the same hand in an erroneous pose, over the true hand."""
     cost = RenderCost()
     stage = Stage(scene, cost)
-    seconds = plan(scene, frame, scene.frame_count, size).seconds
+    seconds = plan_frame(scene, frame, scene.frame_count, size).seconds
     hands = hands_at(scene, seconds)
     angle, length = registered("complex_poses").estimate_error(strength)
     rng = generator(scene.seed, "calibration", frame)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import argparse
 import json
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import check_places
-from hwp_bench.sim.scene.reader import known_scenes, load_scene, meant_scenes, scene_path
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import known_scenes, load_scene, meant_scenes, scene_path
 
 if TYPE_CHECKING:
     from hwp_bench.run.engine import Engine
@@ -19,9 +20,9 @@ if TYPE_CHECKING:
 def list_scenes(args: argparse.Namespace) -> int:
     """Print the scenes, and what scenes can be made of."""
     from hwp_bench.hands.poses import gestures
-    from hwp_bench.sim.effects.base import ORDER
+    from hwp_bench.sim.effects import ORDER
     from hwp_bench.sim.produce.suites import suite, suite_names
-    from hwp_bench.sim.props.backdrop import backdrop_names
+    from hwp_bench.sim.props.backdrops import backdrop_names
     from hwp_bench.sim.props.objects import object_names
 
     scenes = [load_scene(name) for name in known_scenes()]
@@ -64,16 +65,16 @@ def print_plan(args: argparse.Namespace) -> int:
     from hwp_bench.base.console import print_document
     from hwp_bench.base.tables import to_markdown
     from hwp_bench.sim.produce.forecast import forecast, plan_table, share_table
-    from hwp_bench.sim.produce.subject_table import distances, subject_table
+    from hwp_bench.sim.produce.truth import distances, subject_table
 
     scenes = _scenes(args.scene)
     reports = [forecast(scene, args.frames, args.size, probe=not args.no_probe) for scene in scenes]
     off = {scene.id: hands for scene in scenes if (hands := distances(scene))}
     if args.json:
-        rows = [report.to_json() for report in reports]
+        rows = [asdict(report) for report in reports]
         for row in rows:
             for side, item in off.get(row["scene"], {}).items():
-                row.setdefault("subject", {})[side] = item.to_json()
+                row.setdefault("subject", {})[side] = asdict(item)
         print(json.dumps(rows, indent=1))
     else:
         tables = [plan_table(reports)] + ([] if args.no_probe else [share_table(reports)])
@@ -126,7 +127,8 @@ def render(args: argparse.Namespace) -> int:
 
 def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine) -> list[Path]:
     from hwp_bench.run.engine.options import needs_of
-    from hwp_bench.sim.produce.suites import RenderCapture, render_job, workers_each
+    from hwp_bench.sim.produce.capture import RenderRequest
+    from hwp_bench.sim.produce.suites import workers_each
 
     needs = needs_of(args)
     jobs = []
@@ -136,7 +138,7 @@ def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine
             raise UsageError(
                 "exists already", where=out, remedy="Choose another place or --overwrite."
             )
-        work = RenderCapture(
+        request = RenderRequest(
             scene,
             args.frames,
             args.size,
@@ -146,7 +148,7 @@ def _render_scenes(args: argparse.Namespace, scenes: list[Scene], engine: Engine
             overwrite=args.overwrite,
             free_view=args.free_view,
         )
-        jobs.append(render_job(work, out, needs))
+        jobs.append(request.job(out, needs))
     engine.run(jobs, lambda index: None)
     return [job.output for job in jobs]
 
@@ -156,23 +158,13 @@ def preview(args: argparse.Namespace) -> int:
     check_places({"--out": args.out}, {})
     scene = _changed(load_scene(args.scene), args.severity, args.subject)
     if args.stage:
-        from hwp_bench.sim.produce.stage_view import draw_stage
+        from hwp_bench.sim.produce.preview import draw_stage
 
         print(draw_stage(scene, Path(args.out)))
         return 0
-    from hwp_bench.sim.produce.strips import write_preview
+    from hwp_bench.sim.produce.preview import write_preview
 
     for path in write_preview(scene, Path(args.out), frame_count=args.frames, size=args.size):
-        print(path)
-    return 0
-
-
-def gallery(args: argparse.Namespace) -> int:
-    """Write the documentation's strips."""
-    check_places({"--out": args.out}, {})
-    from hwp_bench.sim.produce.strips import write_gallery
-
-    for path in write_gallery(Path(args.out)):
         print(path)
     return 0
 
@@ -219,7 +211,7 @@ def _scenes(names: list[str]) -> list[Scene]:
 
 
 def _changed(scene: Scene, severity: float | None, subject: int | None) -> Scene:
-    from hwp_bench.sim.scene.schema import with_severity, with_subject
+    from hwp_bench.sim.scene.scene import with_severity, with_subject
 
     if severity is not None:
         scene = with_severity(scene, severity)

@@ -5,22 +5,18 @@ from __future__ import annotations
 import time
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
 from hwp_bench.base.tables import Cell, Column, Table
-from hwp_bench.sim.effects.base import ORDER
-from hwp_bench.sim.effects.plan import FramePlan, plan
-from hwp_bench.sim.geometry.raycast import RenderCost
-from hwp_bench.sim.produce.extent import check_extent
-from hwp_bench.sim.produce.free_view import free_views, render_free
-from hwp_bench.sim.produce.video_encoding import through_h264
-from hwp_bench.sim.render.frame import carry_out
-from hwp_bench.sim.render.view import steady_gain
-from hwp_bench.sim.scene.free_view import FRAMES
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.effects import ORDER, FramePlan, plan_frame
+from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.produce.capture import check_extent
+from hwp_bench.sim.produce.free_view import FRAMES, free_views, render_free
+from hwp_bench.sim.render.frame import carry_out, steady_gain
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.sensor import through_h264
 
 # Joins the names of effects that act in the same frame.
 _PLUS = " + "
@@ -77,10 +73,6 @@ class Forecast:
                 shares[kind] = shares.get(kind, 0.0) + extra * weight / sum(weights)
         return shares
 
-    def to_json(self) -> dict[str, Any]:
-        """Return JSON values."""
-        return asdict(self)
-
 
 def forecast(
     scene: Scene, frame_count: int | None = None, size: int | None = None, *, probe: bool = True
@@ -89,20 +81,11 @@ def forecast(
 
     Frames are grouped by the effects that act in them. Of each group the frame with the median
     number of sub-frames is rendered once and its cost multiplied.
-
-    Args:
-        scene: the scene.
-        frame_count: frames over which it is spread; its own if None.
-        size: edge of the image in pixels; 256 if None.
-        probe: render the probes; without them nothing is predicted.
-
-    Raises:
-        UsageError: a number is out of range.
     """
     count = scene.frame_count if frame_count is None else frame_count
     edge = 256 if size is None else size
     check_extent(count, edge)
-    plans = [plan(scene, frame, count, edge) for frame in range(count)]
+    plans = [plan_frame(scene, frame, count, edge) for frame in range(count)]
     groups: dict[str, list[FramePlan]] = {}
     for item in plans:
         groups.setdefault(group_name(item), []).append(item)

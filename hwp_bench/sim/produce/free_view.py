@@ -8,9 +8,10 @@ that it measures the avatar alone.
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -19,23 +20,36 @@ from hwp_bench.base.errors import HwpError
 from hwp_bench.base.numerics import kd_tree
 from hwp_bench.capture import Cameras, Capture, CaptureInfo, CaptureWriter, open_capture
 from hwp_bench.capture.schema import FREE_VIEW, MAX_ID
+from hwp_bench.hands.poses import gestures, within_limits
 from hwp_bench.hands.skeleton import HandParameters
-from hwp_bench.sim.geometry.mesh import unit
-from hwp_bench.sim.geometry.raycast import RenderCost
-from hwp_bench.sim.produce.frames import eight_bit_coverage
-from hwp_bench.sim.render.view import render_view, steady_gain
-from hwp_bench.sim.scene.free_view import (
-    FRAMES,
-    camera_directions,
-    free_moments,
-    hand_axes,
-    looking_at,
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.geometry.surface import unit
+from hwp_bench.sim.light.lights import FOCUS_DISTANCE, focus_point
+from hwp_bench.sim.render.frame import eight_bit_coverage, render_view, steady_gain
+from hwp_bench.sim.scene.motion import (
+    HandMoment,
+    hand_parameters,
+    heading_matrix,
+    intrinsics,
+    parameters_of,
+    scene_hands,
+    track_moment,
 )
-from hwp_bench.sim.scene.motion import HandMoment, hand_parameters
-from hwp_bench.sim.scene.optics import FOCUS_DISTANCE, focus_point, intrinsics
-from hwp_bench.sim.scene.schema import Scene
-from hwp_bench.sim.subject.hand import scene_hands, template_vertices
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.subject.hand import template_vertices
 
+#: Frames of a clip.
+FRAMES = 24
+#: Half the angle of the cone about the forearm from which no camera looks, degrees: from there
+#: the sleeve hides the hand.
+FOREARM_CONE = 45.0
+#: Fewest gestures that a clip shows, where scenes use most of them.
+_FEWEST = 4
+# Standard deviation of joint angles and of the turn of the whole hand, degrees.
+_ANGLES, _TURN = 5.0, 15.0
+# Turn about the axis from one camera to the next, rad: no two azimuths meet.
+_GOLDEN = np.pi * (3.0 - np.sqrt(5.0))
 #: Version of the clips; one of another version is made again.
 VERSION = 1
 #: What `source.kind` of a clip says.
@@ -48,6 +62,113 @@ REACH = 0.47
 LEAST_HAND = 0.005
 # How often it moves at most, each time half of the way.
 _MOVES = 4
+
+
+def unseen_gestures(scene: Scene) -> tuple[str, ...]:
+    """Names of the hand shapes that the clip shows, in the order of `gestures.toml`.
+
+    They are those of which neither the track nor an effect has a key. Where too few are left,
+    effects' own count too, and then all.
+    """
+    track = {key.gesture for keys in scene.track.keys.values() for key in keys}
+    staged = {name for call in scene.effects for name in _named(call.settings)}
+    for used in (track | staged, track):
+        names = tuple(name for name in gestures() if name not in used)
+        if len(names) >= _FEWEST:
+            return names
+    return tuple(gestures())
+
+
+def _named(value: Any) -> Iterator[str]:
+    """The gestures that settings of an effect name, at any depth."""
+    if isinstance(value, Mapping):
+        if isinstance(value.get("gesture"), str):
+            yield value["gesture"]
+        value = tuple(value.values())
+    if isinstance(value, Sequence) and not isinstance(value, str):
+        for item in value:
+            yield from _named(item)
+
+
+def free_moments(scene: Scene, count: int = FRAMES) -> list[dict[str, HandMoment]]:
+    """The hands of every frame of the clip, by side.
+
+    Place and heading are the track's at times spread over the capture, with a turn of the whole
+    hand; joint angles are those of an unseen gesture, varied.
+    """
+    names = unseen_gestures(scene)
+    frames = []
+    orders = {
+        side: generator(scene.seed, "free gestures", side).permutation(len(names))
+        for side in scene.sides
+    }
+    for frame in range(count):
+        seconds = (frame + 0.5) / count * scene.duration
+        hands = {}
+        for side, order in orders.items():
+            rng = generator(scene.seed, "free pose", side, frame)
+            shape = gestures()[names[order[frame % len(names)]]]
+            moment = track_moment(scene, side, seconds)
+            hands[side] = replace(
+                moment,
+                angles=within_limits(shape + rng.normal(0.0, _ANGLES, shape.shape)),
+                heading=moment.heading + rng.normal(0.0, _TURN, 3),
+            )
+        frames.append(hands)
+    return frames
+
+
+def camera_directions(scene: Scene, count: int = FRAMES) -> np.ndarray:
+    """Directions from the hand to the camera of every frame: (count, 3) unit.
+
+    The z axis points along the fingers. Directions are spread evenly over the sphere without the
+    cone about the forearm: a Fibonacci lattice, turned and shuffled by the scene's seed.
+    """
+    rng = generator(scene.seed, "free cameras")
+    lowest = -np.cos(np.radians(FOREARM_CONE))
+    height = lowest + (1.0 - lowest) * (np.arange(count) + 0.5) / count
+    azimuth = _GOLDEN * np.arange(count) + rng.uniform(0.0, 2.0 * np.pi)
+    around = np.sqrt(1.0 - height**2)
+    lattice = np.stack([around * np.cos(azimuth), around * np.sin(azimuth), height], axis=1)
+    return lattice[rng.permutation(count)]
+
+
+def hand_axes(hands: Mapping[str, HandMoment]) -> np.ndarray:
+    """Axes of `camera_directions` in the world, as columns: (3, 3).
+
+    z points along the fingers, of both hands on the average, y is the back of the first hand as
+    far as it is perpendicular to them.
+    """
+    turns = [(side, heading_matrix(moment.heading, side)) for side, moment in hands.items()]
+    # At rest the fingers of the right hand point along -x, those of the left along +x.
+    fingers = [turn[:, 0] * (-1.0 if side == "right" else 1.0) for side, turn in turns]
+    along = np.sum(fingers, axis=0)
+    if np.linalg.norm(along) < 0.2:  # hands that point away from each other
+        along = fingers[0]
+    along = unit(along)
+    back = turns[0][1][:, 1]
+    back = back - (back @ along) * along
+    if np.linalg.norm(back) < 1e-6:
+        back = np.cross(along, np.eye(3)[np.argmin(np.abs(along))])
+    back = unit(back)
+    return np.stack([np.cross(back, along), back, along], axis=1)
+
+
+def looking_at(center: np.ndarray, eye: np.ndarray) -> np.ndarray:
+    """(4, 4) world to camera of a camera at `eye` that looks at `center`, both (3,) m.
+
+    The image stands upright (the world's y points down), whatever the direction.
+    """
+    forward = unit(center - eye)
+    down = np.array([0.0, 1.0, 0.0])
+    if abs(forward @ down) > 0.999:
+        down = np.array([0.0, 0.0, 1.0])
+    right = unit(np.cross(down, forward))
+    turn = np.stack([right, np.cross(forward, right), forward])
+    view = np.eye(4)
+    view[:3, :3] = turn
+    view[:3, 3] = -turn @ eye
+    return view
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,10 +186,6 @@ def free_views(scene: Scene, count: int = FRAMES) -> list[FreeView]:
 
     Two hands keep `GAP` between them. The camera looks at the middle of the hands from the
     distance of the scene's own camera, or from farther away where they would not fit.
-
-    Args:
-        scene: the scene.
-        count: frames.
     """
     directions = camera_directions(scene, count)
     return [
@@ -131,29 +248,17 @@ def has_free_view(capture: Path) -> bool:
 
 
 def add_free_view(scene: Scene, capture: Capture) -> None:
-    """Render the clip into a capture of this scene that has none.
-
-    Raises:
-        HwpError: it cannot be written.
-    """
+    """Render the clip into a capture of this scene that has none."""
     write_free_view(scene, capture.root / FREE_VIEW, capture.info, capture.hands)
 
 
 def write_free_view(
     scene: Scene, folder: Path, info: CaptureInfo, estimates: Mapping[str, HandParameters]
 ) -> None:
-    """Render the clip.
+    """Render the clip of a capture into a folder.
 
-    Args:
-        scene: the scene.
-        folder: where it goes; an existing clip is replaced.
-        info: description of the capture that it belongs to.
-        estimates: hand parameters that a method gets in that capture, by side. The clip has their
-            betas, because an avatar has one shape; angles are true, and the middle of the palm
-            is in its true place. `truth/hands.npz` has the true betas too.
-
-    Raises:
-        HwpError: it cannot be written.
+    It has the betas of the capture's estimates, because an avatar has one shape; angles are true,
+    and the middle of the palm is in its true place. `truth/hands.npz` has the true betas too.
     """
     cost = RenderCost()
     gain = steady_gain(scene, cost)
@@ -170,7 +275,8 @@ def write_free_view(
         viewmats=np.stack([item.view for item in views]),
     )
     betas = {side: hand.betas for side, hand in estimates.items()}
-    given, truth = (_parameters(scene, views, shapes) for shapes in (betas, None))
+    moments = [item.hands for item in views]
+    given, truth = (parameters_of(scene, moments, shapes) for shapes in (betas, None))
     with CaptureWriter(folder, _info(info, len(views)), given, cameras, overwrite=True) as writer:
         for frame, (_, rgb, coverage) in enumerate(pictures):
             writer.frame(frame, rgb)
@@ -189,8 +295,7 @@ def render_free(
     Where the hand is hidden, by the sleeve or by what is worn, the camera moves towards the
     fingers until some of it is seen.
 
-    Returns:
-        the frame with the camera that was taken, (S, S, 3) uint8 sRGB, (S, S) coverage 0-1.
+    Returns the frame with the camera that was taken, (S, S, 3) uint8 sRGB, (S, S) coverage 0-1.
     """
     for _ in range(_MOVES):
         rgb, coverage = render_view(scene, item.hands, item.view, size, gain, cost)
@@ -200,26 +305,6 @@ def render_free(
         towards = -item.view[2, :3] @ axes
         item = _view(scene, item.hands, unit(towards + np.array([0.0, 0.0, 1.0])))
     return item, rgb, coverage
-
-
-def _parameters(
-    scene: Scene, views: list[FreeView], betas: Mapping[str, np.ndarray] | None
-) -> dict[str, HandParameters]:
-    """Hand parameters of every frame, by side, with these betas or the true ones."""
-    found = {}
-    for side, subject in scene_hands(scene).items():
-        shape = subject.betas if betas is None else betas[side]
-        joints = subject.model_joints
-        if betas is not None:
-            joints = subject.model.joints + subject.model.joint_basis @ shape
-        rows = [hand_parameters(item.hands[side], side, joints, focus_point()) for item in views]
-        found[side] = HandParameters(
-            pose=np.stack([pose for pose, _ in rows]),
-            betas=shape,
-            transl=np.stack([transl for _, transl in rows]),
-            valid=np.ones(len(views), dtype=bool),
-        )
-    return found
 
 
 def _info(info: CaptureInfo, count: int) -> CaptureInfo:

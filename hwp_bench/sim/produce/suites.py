@@ -3,22 +3,17 @@
 from __future__ import annotations
 
 import os
-import threading
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from types import MappingProxyType
 
-from hwp_bench.base.errors import HwpError, UsageError
+from hwp_bench.base.errors import UsageError
 from hwp_bench.base.files import cache_root
-from hwp_bench.base.folders import exclusive
-from hwp_bench.run.engine import Engine, Job, LocalEngine, Needs
-from hwp_bench.run.engine.job import OnProgress
-from hwp_bench.sim.scene.reader import load_scene, scene_groups, scene_names
-from hwp_bench.sim.scene.schema import Scene
-
-#: Seconds between two counts of the frames that wait.
-_COUNT_SECONDS = 1.0
+from hwp_bench.run.engine import Engine, LocalEngine, Needs
+from hwp_bench.sim.produce.capture import RenderRequest, render_key
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import load_scene, scene_groups, scene_names
 
 
 @dataclass(frozen=True)
@@ -31,8 +26,6 @@ class SuiteItem:
     frame_count: int
     #: Edge of the image in pixels.
     size: int
-    #: Seed of the scene.
-    seed: int
 
 
 # One single-hand and one interacting capture for each perturbation: interaction 0 and 5,
@@ -88,13 +81,13 @@ def suite(name: str) -> tuple[SuiteItem, ...]:
     group = name if name in scene_groups() else ""
     scenes = [load_scene(capture) for capture in rule.captures or scene_names(group)]
     return tuple(
-        SuiteItem(scene, rule.frames or -(-scene.frame_count // rule.every), rule.size, scene.seed)
+        SuiteItem(scene, rule.frames or -(-scene.frame_count // rule.every), rule.size)
         for scene in scenes
     )
 
 
 def ensure_suite(
-    name: str,
+    name: str | Sequence[SuiteItem],
     cache: str | os.PathLike[str] | None = None,
     workers: int | None = None,
     *,
@@ -105,7 +98,7 @@ def ensure_suite(
     """Render the captures of a suite that are not in the cache yet.
 
     Args:
-        name: a suite.
+        name: a suite, or captures such as some of one.
         cache: folder of captures; the toolkit's cache if None.
         workers: processes for each render.
         engine: where captures are rendered; one after another in this process if None.
@@ -119,198 +112,35 @@ def ensure_suite(
         UsageError: there is no such suite.
         HwpError: a render failed; captures that were finished stay.
     """
-    return ensure_captures(
-        suite(name), cache, workers, engine=engine, needs=needs, free_view=free_view
-    )
-
-
-def ensure_captures(
-    items: Sequence[SuiteItem],
-    cache: str | os.PathLike[str] | None = None,
-    workers: int | None = None,
-    *,
-    engine: Engine | None = None,
-    needs: Needs | None = None,
-    free_view: bool = True,
-) -> list[Path]:
-    """Render captures that are not in the cache yet, such as some of a suite.
-
-    Args:
-        items: the captures.
-        cache: folder of captures; the toolkit's cache if None.
-        workers: processes for each render.
-        engine: where captures are rendered; one after another in this process if None.
-        needs: what one render takes of a machine.
-        free_view: also render free-view clips, which captures in the cache may lack.
-
-    Returns:
-        The capture folders, in the order of `items`.
-
-    Raises:
-        HwpError: a render failed; captures that were finished stay.
-    """
-    engine = engine or LocalEngine()
-    jobs = _render_jobs(items, cache, workers, engine, needs or Needs(), free_view=free_view)
+    engine, needs = engine or LocalEngine(), needs or Needs()
+    items = suite(name) if isinstance(name, str) else name
+    each = workers_each(workers, engine, needs)
+    jobs = [
+        RenderRequest(
+            item.scene, item.frame_count, item.size, workers=each, keep=True, free_view=free_view
+        ).job(_folder(item, cache), needs)
+        for item in items
+    ]
     if not all(job.finished() for job in jobs):
         engine.run(jobs, lambda index: None)
     return [job.output for job in jobs]
 
 
 def is_rendered(name: str, cache: str | os.PathLike[str] | None = None) -> bool:
-    """Whether every capture of a suite is in the cache.
-
-    Raises:
-        UsageError: there is no such suite.
-    """
-    jobs = _render_jobs(suite(name), cache, None, LocalEngine(), Needs(), free_view=True)
-    return all(job.finished() for job in jobs)
-
-
-def _render_jobs(
-    items: Sequence[SuiteItem],
-    cache: str | os.PathLike[str] | None,
-    workers: int | None,
-    engine: Engine,
-    needs: Needs,
-    *,
-    free_view: bool,
-) -> list[Job]:
-    from hwp_bench.sim.produce.production import render_key
-
-    root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
-    each = workers_each(workers, engine, needs)
-    jobs = []
-    for item in items:
-        key = render_key(item.scene, item.frame_count, item.size)
-        folder = root / f"{item.scene.id}-{item.frame_count}x{item.size}-{key[:12]}"
-        work = RenderCapture(
-            item.scene,
-            item.frame_count,
-            item.size,
-            item.seed,
-            workers=each,
-            keep=True,
-            free_view=free_view,
+    """Whether every capture of a suite is in the cache, with its free-view clip."""
+    return all(
+        RenderRequest(item.scene, item.frame_count, item.size, keep=True).is_whole(
+            _folder(item, cache)
         )
-        jobs.append(render_job(work, folder, needs))
-    return jobs
-
-
-@dataclass(frozen=True)
-class RenderCapture:
-    """Renders a capture, in any process on any machine; the fields are `render_capture`'s."""
-
-    #: The scene.
-    scene: Scene
-    #: Frames over which it is spread.
-    frame_count: int | None = None
-    #: Edge of the image in pixels.
-    size: int | None = None
-    #: Seed; the scene's own if None.
-    seed: int | None = None
-    #: Processes of one render; as many as are worth it if None.
-    workers: int | None = None
-    #: Whether linear layers are stored too.
-    exr: bool = False
-    #: Whether a capture that exists already is used as it is.
-    keep: bool = False
-    #: Whether one that is there is replaced.
-    overwrite: bool = False
-    #: Whether the free-view clip is rendered too.
-    free_view: bool = True
-
-    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
-        """Render; see `hwp_bench.run.engine.job.Work`."""
-        ended = threading.Event()
-        watch = threading.Thread(target=self._count, args=(output, on_progress, ended), daemon=True)
-        watch.start()
-        try:
-            self.render(output)
-        finally:
-            ended.set()
-            watch.join()
-
-    def render(self, output: Path) -> None:
-        """Render into a folder, or use the capture that exists there if `keep` says so.
-
-        The free-view clip of a capture that exists is rendered where it is missing.
-
-        Raises:
-            HwpError: as `render_capture`.
-        """
-        if not self.keep:
-            self._render(output)
-            return
-        with exclusive(output, wait=True):
-            if not is_capture(output):
-                self._render(output)
-            elif not self.complete(output):
-                from hwp_bench.capture import open_capture
-                from hwp_bench.sim.produce.free_view import add_free_view
-
-                add_free_view(self._scene(), open_capture(output))
-
-    def complete(self, output: Path) -> bool:
-        """Whether a folder holds a capture with all that is asked for."""
-        if not is_capture(output) or not self.free_view:
-            return is_capture(output)
-        from hwp_bench.sim.produce.free_view import has_free_view
-
-        return has_free_view(output)
-
-    def _scene(self) -> Scene:
-        return self.scene if self.seed is None else replace(self.scene, seed=self.seed)
-
-    def _render(self, output: Path) -> None:
-        from hwp_bench.sim.produce.production import render_capture
-
-        render_capture(
-            self.scene,
-            output,
-            frame_count=self.frame_count,
-            size=self.size,
-            seed=self.seed,
-            workers=self.workers,
-            overwrite=self.keep or self.overwrite,
-            exr=self.exr,
-            free_view=self.free_view,
-        )
-
-    def _count(self, output: Path, on_progress: OnProgress, ended: threading.Event) -> None:
-        """Report how many frames of the unfinished capture exist."""
-        total = self.frame_count or self.scene.frame_count
-        while not ended.wait(_COUNT_SECONDS):
-            on_progress(sum(1 for _ in output.parent.glob(f".{output.name}.*/*.npz")), total)
-
-
-def render_job(work: RenderCapture, output: Path, needs: Needs) -> Job:
-    """Return a render as a job of an engine.
-
-    Args:
-        work: what to render.
-        output: the capture folder to make.
-        needs: what it takes of a machine.
-    """
-    return Job(
-        text=work.scene.id,
-        # In turn, a render shows its own progress.
-        here=lambda on_progress: work.render(output),
-        work=work,
-        output=output,
-        finished=lambda: work.keep and work.complete(output),
-        needs=needs,
+        for item in suite(name)
     )
 
 
-def is_capture(folder: Path) -> bool:
-    """Whether a folder holds a capture that can be opened."""
-    from hwp_bench.capture import open_capture
-
-    try:
-        open_capture(folder)
-    except HwpError:
-        return False
-    return True
+def _folder(item: SuiteItem, cache: str | os.PathLike[str] | None) -> Path:
+    """Where a capture lies in the cache."""
+    root = Path(cache) if cache is not None else cache_root() / "sim" / "captures"
+    key = render_key(item.scene, item.frame_count, item.size)
+    return root / f"{item.scene.id}-{item.frame_count}x{item.size}-{key[:12]}"
 
 
 def workers_each(workers: int | None, engine: Engine, needs: Needs) -> int | None:

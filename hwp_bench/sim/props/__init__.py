@@ -1,1 +1,1 @@
-"""Objects and backdrops of a scene."""
+"""Objects that hands hold, backdrops, and what moves before them."""

@@ -1,4 +1,8 @@
-"""The time around a frame's middle: what moves while the shutter is open or rows are read.
+"""The camera over time: exposure and white balance that it sets itself, shutter, and rolling rows.
+
+The camera meters the scene as it is without perturbations, so that a frame and its clean version
+get the same gain, and removing an effect changes no other frame. It looks a few times a second;
+each look depends on its own time only, so that any process can meter any frame by itself.
 
 Rolling shutter: a point is seen in the row that is read when the point is there. So each vertex
 is put where it stands, relative to the camera, when its own row is read; one image of that
@@ -8,19 +12,121 @@ surface then shows every row at its own time, whatever hands, objects and camera
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from functools import lru_cache
 
 import numpy as np
 
-from hwp_bench.sim.effects.base import Shutter
-from hwp_bench.sim.effects.plan import FramePlan, hands_at, lights_at, objects_at
+from hwp_bench.base.colors import LUMINANCE
+from hwp_bench.sim.effects import FramePlan, Shutter, hands_at, lights_at, objects_at
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.geometry.surface import Surface, transformed
+from hwp_bench.sim.light.lights import FOCUS_DISTANCE, steady_light
 from hwp_bench.sim.render.instant import Lens, LinearImage, render_instant
 from hwp_bench.sim.render.stage import Body, Stage, between
-from hwp_bench.sim.scene.motion import HandMoment
-from hwp_bench.sim.scene.optics import FOCUS_DISTANCE, viewmat
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.motion import HandMoment, intrinsics, track_moment, viewmat
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.sensor import AutoControl
 from hwp_bench.sim.subject.hand import FINE, MOVING
+
+#: Edge of the image that is metered, px.
+EDGE = 24
+#: Looks in the time of one lag.
+LOOKS_PER_LAG = 2
+#: Lags that the camera remembers.
+MEMORY = 3
+#: Most that the exposure, and that red and blue against green, are moved, stops.
+REACH = (3.0, 1.0)
+#: Step of the white balance, stops.
+BALANCE_STEP = 1.0 / 32.0
+# Rates of the wandering, Hz, and how far red and blue wander against the exposure.
+_RATES = (0.05, 0.4)
+_BALANCE_WANDER = 0.5
+# Darkest mean of an image that is metered.
+_DARKEST = 1e-4
+
+
+def metered_gain(scene: Scene, auto: AutoControl, seconds: float, cost: RenderCost) -> np.ndarray:
+    """Factors on red, green and blue at a time: (3,).
+
+    What the looks ask for is averaged in stops with weights that fall by e in one lag.
+    """
+    tick = auto.lag / LOOKS_PER_LAG
+    last = int(np.floor(seconds / tick))
+    through = seconds / tick - last
+    before, now = (_remembered(scene, auto, look, tick, cost) for look in (last - 1, last))
+    stops = (1.0 - through) * before + through * now
+    stops += auto.wander * _wandering(scene, seconds) * [1.0, _BALANCE_WANDER, _BALANCE_WANDER]
+    exposure, red, blue = stops
+    red, blue = (BALANCE_STEP * np.round(value / BALANCE_STEP) for value in (red, blue))
+    return np.exp2(np.array([exposure + red, exposure, exposure + blue]))
+
+
+def _remembered(
+    scene: Scene, auto: AutoControl, look: int, tick: float, cost: RenderCost
+) -> np.ndarray:
+    """Stops of exposure, red and blue at a look: the mean over what is remembered."""
+    ages = np.arange(MEMORY * LOOKS_PER_LAG)
+    weights = np.exp(-ages / LOOKS_PER_LAG)
+    digest = scene.digest
+    wanted = [
+        _wanted(_seen(_Look(digest, max(look - int(age), 0), scene, tick, cost)), auto)
+        for age in ages
+    ]
+    mean: np.ndarray = weights @ np.array(wanted) / weights.sum()
+    return mean
+
+
+def _wanted(mean: np.ndarray, auto: AutoControl) -> np.ndarray:
+    """Stops of exposure, red and blue that an image with this mean (3,) asks for."""
+    mean = np.maximum(mean, _DARKEST)
+    exposure = np.log2(auto.level / float(mean @ LUMINANCE))
+    # Grey world: the mean of an image is taken for grey.
+    red, blue = np.log2(mean[1] / mean[0]), np.log2(mean[1] / mean[2])
+    most, least = REACH
+    return np.array(
+        [
+            auto.exposure * np.clip(exposure, -most, most),
+            auto.white_balance * np.clip(red, -least, least),
+            auto.white_balance * np.clip(blue, -least, least),
+        ]
+    )
+
+
+@dataclass(frozen=True)
+class _Look:
+    """One look at a scene; its digest and number name it."""
+
+    digest: str
+    number: int
+    scene: Scene = field(compare=False)
+    tick: float = field(compare=False)
+    cost: RenderCost = field(compare=False)
+
+
+@lru_cache(maxsize=256)
+def _seen(look: _Look) -> np.ndarray:
+    """Mean linear colour of the clean scene: (3,)."""
+    scene, seconds = look.scene, look.number * look.tick
+    # Its own time is that of the pass `auto`; rays are counted as everywhere.
+    cost = RenderCost(rays=look.cost.rays)
+    stage = Stage(scene, cost)
+    hands = {side: track_moment(scene, side, seconds) for side in scene.sides}
+    body = stage.traced(stage.surface(hands, MOVING))
+    lens = Lens(intrinsics(scene, EDGE), viewmat(scene, seconds), EDGE, 1, seconds=seconds)
+    image = render_instant(scene, lens, body, None, steady_light(scene.light), cost)
+    mean: np.ndarray = image.color.mean(axis=(0, 1))
+    return mean
+
+
+def _wandering(scene: Scene, seconds: float) -> np.ndarray:
+    """Three slow waves of unit variance: (3,)."""
+    rng = generator(scene.seed, "auto")
+    rates, phases = rng.uniform(*_RATES, (3, 4)), rng.uniform(0.0, 2.0 * np.pi, (3, 4))
+    waves: np.ndarray = np.sin(2.0 * np.pi * rates * seconds + phases).sum(axis=1) / np.sqrt(2.0)
+    return waves
+
 
 # The golden ratio's powers spread the sub-frames' rays evenly inside the pixel.
 _SPREAD = (0.7548776662466927, 0.5698402909980532)
@@ -37,12 +143,6 @@ def exposed(stage: Stage, window: Window, sky: dict[str, np.ndarray], lens: Lens
 
     Hands are posed at the opening, the middle and the closing of the shutter and move on
     parabolas between; each sub-frame casts one ray a pixel, at another place inside it.
-
-    Args:
-        stage: builds hands and objects.
-        window: the time that the shutter is open.
-        sky: what `Stage.seen_sky` says of the hands in the frame's middle.
-        lens: the camera in the frame's middle.
     """
     scene, recipe = window.scene, window.recipe
     lights = lights_at(scene, recipe)
@@ -130,13 +230,7 @@ class Window:
 
 
 class Rows:
-    """Hands, sleeves and objects for a sensor that reads its rows in turn.
-
-    Args:
-        stage: builds them.
-        window: the time around the frame.
-        sky: what `Stage.seen_sky` says of the hands in the frame's middle.
-    """
+    """Hands, sleeves and objects for a sensor that reads its rows in turn."""
 
     def __init__(self, stage: Stage, window: Window, sky: dict[str, np.ndarray]) -> None:
         self._stage = stage
@@ -186,10 +280,7 @@ def knots(
 ) -> Knots:
     """Take a surface at three instants, in the camera's axes.
 
-    Args:
-        surface_at: the surface at a time, world.
-        view_at: (4, 4) world to camera at a time.
-        reach: the times are -reach / 2, 0 and reach / 2.
+    Takes `view_at` (4, 4) world to camera at a time.
     """
     first, middle, last = (
         transformed(surface_at(time), view_at(time)) for time in (-reach / 2.0, 0.0, reach / 2.0)
@@ -200,15 +291,7 @@ def knots(
 def row_by_row(at: Knots, reach: float, time: float, readout: float, lens: Lens) -> Surface:
     """A surface with every vertex where it stands when its row is read.
 
-    Args:
-        at: the surface at three instants; it moves on parabolas between.
-        reach: time from the first of them to the last.
-        time: when the middle row is read, 0 at the second instant.
-        readout: time from the first row to the last, in the unit of the others.
-        lens: the camera, whose view is that of `time`.
-
-    Returns:
-        The surface in the world, to be seen through `lens` as if all rows were read at once.
+    Returns the surface in the world, to be seen through `lens` as if all rows were read at once.
     """
     moments = np.full((len(at[0].vertices), 1), time)
     for _ in range(_ROUNDS):

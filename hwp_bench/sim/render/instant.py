@@ -6,15 +6,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hwp_bench.sim.geometry.raycast import Hits, RenderCost, Tracer
-from hwp_bench.sim.props.backdrop import backdrop_colors
-from hwp_bench.sim.render.behind import draw_behind
-from hwp_bench.sim.render.lamps import lamp_light, room_light
-from hwp_bench.sim.render.samples import gather
-from hwp_bench.sim.render.shading import lit, shade
+from hwp_bench.sim.geometry.rays import Hits, RenderCost, Tracer
+from hwp_bench.sim.light.lights import Lights
+from hwp_bench.sim.light.samples import gather
+from hwp_bench.sim.light.shading import lamp_light, lit, room_light, shade
+from hwp_bench.sim.props.backdrops import backdrop_colors
+from hwp_bench.sim.props.behind import draw_behind
 from hwp_bench.sim.render.stage import Body
-from hwp_bench.sim.scene.optics import Lights, pixel_rays
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.motion import pixel_rays
+from hwp_bench.sim.scene.scene import Scene
 
 # Pixels around the projected hands that rays are cast for.
 _MARGIN = 2
@@ -56,22 +56,20 @@ class Lens:
 def render_instant(
     scene: Scene, lens: Lens, body: Body, things: Body | None, lights: Lights, cost: RenderCost
 ) -> LinearImage:
-    """Render one instant.
-
-    Args:
-        scene: for its backdrop.
-        lens: camera and sampling.
-        body: hands and sleeves.
-        things: objects, or None: then none is intersected.
-        lights: the light.
-        cost: is charged with time and rays.
-    """
+    """Render one instant."""
     with cost.time("backdrop"):
         directions = _directions(lens)
         color = backdrop_colors(scene.background, scene.seed, directions)
     if scene.behind.passes:
         with cost.time("behind"):
-            color = draw_behind(scene, directions, lens.seconds, color)
+            color = draw_behind(
+                scene.behind,
+                scene.subject.tone,
+                scene.camera.field_of_view,
+                directions,
+                lens.seconds,
+                color,
+            )
     with cost.time("backdrop"):
         color = color * lights.on_backdrop() * lights.exposure
         coverage = np.zeros((lens.size, lens.size))

@@ -1,1 +1,1 @@
-"""Scenes as checked data, and what follows from them at any time: hands, camera, light."""
+"""Scenes as checked data, and what follows from them at any time: hands and camera."""

@@ -1,1 +1,1 @@
-"""The hands of one person: surface, skin and sleeve."""
+"""One person: settings, skin, hands, arms, and what is worn."""

@@ -9,7 +9,6 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,11 +16,11 @@ import numpy as np
 from hwp_bench.base.arrays import read_npz
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.base.files import atomic_write, cache_root, sha256_json
-from hwp_bench.sim.geometry.mesh import surface_normals, unit
-from hwp_bench.sim.geometry.raycast import Tracer
-from hwp_bench.sim.scene.schema import Subject
-from hwp_bench.sim.subject.hand import SubjectHand, anatomy_at, subject_hand
-from hwp_bench.sim.subject.painting import painted
+from hwp_bench.sim.geometry.rays import Tracer
+from hwp_bench.sim.geometry.surface import unit
+from hwp_bench.sim.subject.hand import SubjectHand, subject_hand
+from hwp_bench.sim.subject.skin import painted
+from hwp_bench.sim.subject.subject import Subject
 
 #: Edge of the skin atlas in texels; about 0.25 mm of skin each.
 ATLAS = 1024
@@ -45,11 +44,7 @@ class SkinAtlas:
 
 @lru_cache(maxsize=2)
 def skin_atlas(subject: Subject) -> SkinAtlas:
-    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored.
-
-    Args:
-        subject: whose; `painting.of_side` where the hands look different.
-    """
+    """Paint a subject's skin, or read it from the cache. Both hands share it, mirrored."""
     hand = subject_hand(subject, "right")
     return kept(hand, subject, "", lambda: painted_atlas(hand, subject, ATLAS))
 
@@ -57,14 +52,7 @@ def skin_atlas(subject: Subject) -> SkinAtlas:
 def kept(
     hand: SubjectHand, subject: Subject, part: str, paint: Callable[[], SkinAtlas]
 ) -> SkinAtlas:
-    """Read a painting from the cache, or paint it and keep it where the cache can be written.
-
-    Args:
-        hand: on which it lies.
-        subject: whose skin.
-        part: what is painted besides the hand; empty for the hand itself.
-        paint: makes it.
-    """
+    """Read a painting from the cache, or paint it and keep it where the cache can be written."""
     person: list[Any] = [subject.seed, subject.tone, subject.age]
     looks = replace(subject.looks, rings=(), wrist=()).to_json()
     if looks:
@@ -86,24 +74,14 @@ def kept(
     atlas = paint()
     # Where the cache cannot be written, it is painted again next time.
     with contextlib.suppress(HwpError):
-        _store(path, atlas)
+        buffer = io.BytesIO()
+        np.savez(buffer, albedo=atlas.albedo, height=atlas.height, roughness=atlas.roughness)
+        atomic_write(path, buffer.getvalue())
     return atlas
 
 
-def _store(path: Path, atlas: SkinAtlas) -> None:
-    buffer = io.BytesIO()
-    np.savez(buffer, albedo=atlas.albedo, height=atlas.height, roughness=atlas.roughness)
-    atomic_write(path, buffer.getvalue())
-
-
 def painted_atlas(hand: SubjectHand, subject: Subject, edge: int) -> SkinAtlas:
-    """Paint the skin of a hand; nothing is kept.
-
-    Args:
-        hand: on which it lies.
-        subject: whose skin.
-        edge: of the textures, in texels.
-    """
+    """Paint the skin of a hand; nothing is kept."""
     from scipy.ndimage import distance_transform_edt
 
     flat = np.concatenate([hand.corner_uv, np.zeros((*hand.corner_uv.shape[:2], 1))], axis=2)
@@ -114,18 +92,12 @@ def painted_atlas(hand: SubjectHand, subject: Subject, edge: int) -> SkinAtlas:
     down = np.broadcast_to(np.array([0.0, 0.0, -1.0]), origins.shape)
     hits = tracer.first_hits(origins, down, "atlas")
     corners = hand.faces[hits.face]
-    template = hand.template
-
-    rest = hand.rest
-    normals = surface_normals(rest, hand.faces, hand.normal_sum)
 
     def spread(values: np.ndarray) -> np.ndarray:
         return np.einsum("nk,nkc->nc", hits.weights, values[corners])
 
-    weights = spread(hand.lift @ template.weights)
-    anatomy = anatomy_at(
-        template, hand.betas, spread(rest), unit(spread(normals)), weights, hand.joints
-    )
+    weights = spread(hand.lift @ hand.template.weights)
+    anatomy = hand.anatomy(spread(hand.rest), unit(spread(hand.rest_normals)), weights)
     skin = painted(anatomy, subject, fine=True)
     layers = np.zeros((edge * edge, 5), dtype=np.float32)
     layers[hits.ray] = np.column_stack([skin.albedo, skin.height, skin.roughness])

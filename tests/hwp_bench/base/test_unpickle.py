@@ -49,8 +49,7 @@ def test_arrays_and_containers_come_back(file: Path, protocol: int) -> None:
         "empty": np.zeros((0, 3)),
         "zero-dimensional": np.array(3.5),
         "scalar": np.float32(1.5),
-        "plain": [1, 2.5, None, True, "name", b"raw", (1, 2), {3}, frozenset([4])],
-        "ordered": OrderedDict(a=1),
+        "plain": [1, 2.5, None, True, "name", b"raw", (1, 2)],
         "buffer": bytearray(b"xyz"),
     }
     file.write_bytes(pickle.dumps(value, protocol=protocol))
@@ -267,10 +266,10 @@ def _circle() -> Any:
         ({i * (2**61 - 1): 0 for i in range(100)}, "absurdly large integer"),
         ({complex(-1000003 * i, i): 0 for i in range(2000)}, "not plain data"),
         (np.ones(3, complex), "not plain numbers"),
-        (set(itertools.product((-1, -2), repeat=11)), "more than 1,000"),
-        (dict.fromkeys(itertools.product((-1, -2), repeat=11)), "more than 1,000"),
-        (OrderedDict.fromkeys(itertools.product((-1, -2), repeat=11)), "more than 1,000"),
-        ([frozenset([i]) for i in range(2000)], "more than 1,000"),
+        (set(itertools.product((-1, -2), repeat=11)), "not (one of )?plain data"),
+        (dict.fromkeys(itertools.product((-1, -2), repeat=11)), "neither a text nor a number"),
+        (OrderedDict.fromkeys(itertools.product((-1, -2), repeat=11)), "not plain data"),
+        ([frozenset([i]) for i in range(2000)], "not (one of )?plain data"),
         (1 << 20_000, "absurdly large integer"),
     ],
     ids=[
@@ -337,7 +336,9 @@ for file in sorted(Path(sys.argv[1]).iterdir()):
     try:
         load_pickle(file, stand_ins=("chumpy.*",))
     except BadInput as error:
-        assert error.problem.endswith(")") and not error.problem.endswith("()"), error.problem
+        said = error.problem
+        named = error.field in ("builtins.set", "collections.OrderedDict")
+        assert named or (said.endswith(")") and not said.endswith("()")), said
     else:
         raise SystemExit(f"{file.name} was read")
 """

@@ -3,17 +3,24 @@
 from __future__ import annotations
 
 import json
+import tracemalloc
+from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
 from small_captures import CaptureMaker, cameras, hand_parameters, hand_picture
 
+from hwp_bench.base.arrays import read_npz, write_npz
 from hwp_bench.base.errors import BadCapture, BadInput, HwpError, ShapeMismatch, UsageError
-from hwp_bench.capture import Cameras, CaptureWriter, open_capture
+from hwp_bench.capture import Cameras, Capture, CaptureWriter, open_capture
 from hwp_bench.capture.check import check_capture, mesh_problems
-from hwp_bench.hands import HandTemplate, mirror_template
+from hwp_bench.capture.schema import read_subject_mesh, write_subject_mesh
+from hwp_bench.hands import HandTemplate, load_template, mirror_template
+from hwp_bench.hands.template import rebuilt
+from hwp_bench.metrics.score import Frame, score_frames
 
 
 @pytest.mark.parametrize("hands", ["right", "left", "both"])
@@ -280,3 +287,108 @@ def test_a_damaged_hand_template_is_reported(
     assert [finding.problem for finding in report.findings] == [
         "the right template has faces that turn in different directions"
     ]
+
+
+SIZE, FRAMES = 64, (50, 250)
+PIXELS = SIZE * SIZE * 4
+
+
+def read_and_score(capture: Capture) -> None:
+    def read(frame: int) -> Frame:
+        image = capture.frame(frame)
+        return Frame(image, image, capture.mask(frame))
+
+    frames = [partial(read, frame) for frame in range(len(capture))]
+    for _ in score_frames(frames, workers=1):
+        pass
+
+
+def peak(work: Callable[[], object]) -> int:
+    """Largest memory of Python and NumPy during the work, bytes."""
+    tracemalloc.start()
+    try:
+        work()
+        return tracemalloc.get_traced_memory()[1]
+    finally:
+        tracemalloc.stop()
+
+
+def grown(works: dict[int, Callable[[], object]]) -> float:
+    """Bytes that each further frame takes."""
+    works[FRAMES[0]]()  # what is loaded once is loaded now
+    few, many = (peak(works[count]) for count in FRAMES)
+    return (many - few) / (FRAMES[1] - FRAMES[0])
+
+
+@pytest.fixture
+def paths(make_capture: CaptureMaker) -> dict[int, Path]:
+    made = {n: make_capture(f"long{n}", frames=n, size=SIZE) for n in FRAMES}
+    return {count: capture.root for count, capture in made.items()}
+
+
+def test_reading_checking_and_scoring_keep_no_frame(paths: dict[int, Path]) -> None:
+    checks = {count: partial(check_capture, path) for count, path in paths.items()}
+    scores = {count: partial(read_and_score, open_capture(path)) for count, path in paths.items()}
+    assert grown(checks) < PIXELS / 4
+    assert grown(scores) < PIXELS / 4
+
+
+def test_writing_keeps_no_frame(make_capture: CaptureMaker, tmp_path: Path) -> None:
+    calls = iter(range(10))
+
+    def write(frames: int) -> None:
+        make_capture(f"w{frames}", frames=frames, size=SIZE, folder=tmp_path / str(next(calls)))
+
+    assert grown({count: partial(write, count) for count in FRAMES}) < PIXELS / 4
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    templates = {side: load_template("anny", side) for side in ("right", "left")}
+    grown = {
+        side: rebuilt(template, vertices=1.1 * template.vertices, joints=1.2 * template.joints)
+        for side, template in templates.items()
+    }
+    write_subject_mesh(tmp_path / "template.npz", grown)
+    return tmp_path / "template.npz"
+
+
+@pytest.mark.parametrize("side", ["right", "left"])
+def test_it_is_read_as_it_was_written(path: Path, side: str) -> None:
+    model = load_template("anny", side)
+    own = read_subject_mesh(path, model)
+    assert own.vertices == pytest.approx(1.1 * model.vertices, abs=1e-6)
+    assert own.joints == pytest.approx(1.2 * model.joints, abs=1e-6)
+    assert own.weights == pytest.approx(model.weights, abs=1e-6)
+    assert (own.side, own.name) == (side, model.name)
+    assert own.digest != model.digest
+    assert not own.shape_basis.any()
+    assert not own.joint_basis.any()
+
+
+@pytest.mark.parametrize(
+    ("field", "spoilt", "reason"),
+    [
+        ("vertices", lambda array: array[:-1], "has shape"),
+        ("vertices", lambda array: array * np.nan, "NaN"),
+        ("vertices", lambda array: array + 5.0, "1 m away"),
+        ("joints", lambda array: array - 5.0, "1 m away"),
+        ("weights", lambda array: 2.0 * array, "sum to 1"),
+        ("weights", lambda array: np.array([b"text"]), "has shape"),
+    ],
+)
+def test_a_damaged_file_is_refused(path: Path, field: str, spoilt, reason: str) -> None:
+    arrays = read_npz(path)
+    write_npz(path, arrays | {f"right_{field}": spoilt(arrays[f"right_{field}"])})
+    with pytest.raises(BadInput, match=reason):
+        read_subject_mesh(path, load_template("anny", "right"))
+
+
+def test_objects_and_missing_files_are_refused(path: Path) -> None:
+    model = load_template("anny", "right")
+    np.savez(path, right_vertices=np.array([{"a": 1}], dtype=object))
+    with pytest.raises(BadInput, match="not a readable array file"):
+        read_subject_mesh(path, model)
+    path.unlink()
+    with pytest.raises(BadInput, match="does not exist"):
+        read_subject_mesh(path, model)

@@ -49,7 +49,7 @@ def test_a_full_disc_is_named_when_captures_are_published(
     def refuse(source: object, target: object, **_: object) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), str(target))
 
-    monkeypatch.setattr("hwp_bench.publish.parts.shutil.copyfile", refuse)
+    monkeypatch.setattr("hwp_bench.commitments.publication.shutil.copyfile", refuse)
     assert main(["data", "publish", str(root), "-o", str(tmp_path / "out")]) == 1
     said = capsys.readouterr().err
     assert "No space left on device" in said
@@ -72,7 +72,7 @@ def test_a_cache_that_cannot_be_written_is_named(
 def test_a_subject_is_painted_without_a_cache(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hwp_bench.sim.scene.reader import load_scene
+    from hwp_bench.sim.scene_files import load_scene
     from hwp_bench.sim.subject.atlas import SkinAtlas, kept
 
     (tmp_path / "file").write_text("")
@@ -142,8 +142,8 @@ def test_complex_numbers_of_a_hand_model_are_refused(field: str, tmp_path: Path)
 
 
 def test_the_sheet_is_explained_with_the_words_on_it() -> None:
-    from hwp_bench.cli.data_show import _EXAMPLES
+    from hwp_bench.cli.data import _SHOW
     from hwp_bench.taxonomy import PERTURBATIONS, perturbation
 
     for name in PERTURBATIONS:
-        assert f"{perturbation(name).short}: " in _EXAMPLES
+        assert f"{perturbation(name).short}: " in _SHOW

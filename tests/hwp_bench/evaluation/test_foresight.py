@@ -39,7 +39,7 @@ def no_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
         raise Rendered
 
     monkeypatch.setenv("HWP_CACHE", str(tmp_path / "cache"))
-    monkeypatch.setattr("hwp_bench.sim.produce.suites.ensure_captures", stop)
+    monkeypatch.setattr("hwp_bench.sim.produce.capture.RenderRequest.render", stop)
     monkeypatch.chdir(tmp_path)
 
 

@@ -18,13 +18,13 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.cli.main import main
+from hwp_bench.commitments import open_sealed, publish
 from hwp_bench.evaluation.capture_evaluation import CaptureEvaluation
 from hwp_bench.evaluation.evaluate import EvaluationSettings, evaluate
 from hwp_bench.methods.contract import RunSettings
 from hwp_bench.methods.manifest import read_manifest
 from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.metrics import PROTOCOLS, metric, penalty
-from hwp_bench.publish import open_sealed, publish
 from hwp_bench.results import CaptureResult, read_results
 from hwp_bench.run.sandbox.confinement import Confinement
 

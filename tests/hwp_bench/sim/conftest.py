@@ -7,10 +7,11 @@ from collections.abc import Callable, Iterator
 import pytest
 from tiny_scene import SINGLE
 
-from hwp_bench.sim.render import person
-from hwp_bench.sim.scene.reader import parse_scene
-from hwp_bench.sim.scene.schema import Scene
-from hwp_bench.sim.subject import atlas, forearm
+from hwp_bench.sim.render import stage as person
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import parse_scene
+from hwp_bench.sim.subject import arms as forearm
+from hwp_bench.sim.subject import atlas
 
 
 @pytest.fixture
@@ -36,7 +37,7 @@ def small_paintings(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
     """
     kept = (atlas.skin_atlas, forearm.arm_atlas, person._skin, person._arm_skin)
     monkeypatch.setattr(atlas, "ATLAS", 256)
-    monkeypatch.setattr(forearm, "_TEXTURE", (64, 64))
+    monkeypatch.setattr(forearm, "_ARM_TEXELS", (64, 64))
     for function in kept:
         function.cache_clear()
     yield

@@ -20,10 +20,10 @@ from benchmarks.penetration import (
     self_penetration,
 )
 from hwp_bench.hands.poses import gestures
-from hwp_bench.sim.scene.motion import moment_of_key
-from hwp_bench.sim.scene.reader import load_scene, scene_names
-from hwp_bench.sim.scene.schema import HandKey
-from hwp_bench.sim.subject.hand import MOVING, SubjectHand, scene_hands
+from hwp_bench.sim.scene.motion import moment_of_key, scene_hands
+from hwp_bench.sim.scene.scene import HandKey
+from hwp_bench.sim.scene_files import load_scene, scene_names
+from hwp_bench.sim.subject.hand import MOVING, SubjectHand
 
 #: Deepest that any gesture presses a hand into itself, m: finger tips give way by a few
 #: millimetres where a real palm does.

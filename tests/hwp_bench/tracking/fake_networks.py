@@ -7,8 +7,7 @@ from collections.abc import Iterator
 import cv2
 import numpy as np
 
-from hwp_bench.tracking.hand_landmarks import HAND_EDGE, HandReading
-from hwp_bench.tracking.palms import PALM_EDGE, anchors
+from hwp_bench.tracking.detection import HAND_EDGE, PALM_EDGE, SeenHand, anchors
 
 #: Size of the pictures, (width, height), and the discs' radius, px.
 SIZE, RADIUS = (160, 120), 9
@@ -58,7 +57,7 @@ class FakeNetworks:
                 logits[row] = logit
         return values, logits
 
-    def hand(self, image: np.ndarray) -> HandReading:
+    def hand(self, image: np.ndarray) -> SeenHand:
         """Landmarks around the disc that is next to the middle."""
         assert image.shape == (HAND_EDGE, HAND_EDGE, 3)
         self.hand_calls += 1
@@ -66,12 +65,12 @@ class FakeNetworks:
         points = np.zeros((21, 3))
         found = sorted(_discs(image), key=lambda disc: np.hypot(disc[0] - 112, disc[1] - 112))
         if not found:
-            return HandReading(points, world, 0.01, 0.5)
+            return SeenHand(points, world, 0.01, 0.5)
         x, y, radius, right = found[0]
         points[:, :2] = np.array([x, y]) + LAYOUT * radius
         if self._wrong_every and self.hand_calls % self._wrong_every == 0:
             right = not right
-        return HandReading(points, world, 0.99, 0.95 if right else 0.05)
+        return SeenHand(points, world, 0.99, 0.95 if right else 0.05)
 
 
 def _discs(image: np.ndarray) -> Iterator[tuple[float, float, float, bool]]:

@@ -7,7 +7,7 @@ import pytest
 from fake_networks import LAYOUT, RADIUS, FakeNetworks, picture
 
 from hwp_bench.base.errors import UsageError
-from hwp_bench.importers.shared.hand_tracks import HandTracks
+from hwp_bench.importers.shared.landmarks import HandTracks
 from hwp_bench.tracking.track_video import track_frames
 from hwp_bench.tracking.tracker import TrackerSettings
 
@@ -94,7 +94,7 @@ def test_a_short_track_of_the_other_side_is_the_same_hand() -> None:
     def wrong_at_the_end(image: np.ndarray) -> object:
         reading = answer(image)
         late = networks.hand_calls > 27
-        return type(reading)(reading.points, reading.world, reading.presence, 0.1 if late else 0.9)
+        return type(reading)(reading.image, reading.world, reading.presence, 0.1 if late else 0.9)
 
     networks.hand = wrong_at_the_end  # type: ignore[assignment, method-assign]
     tracks = hands_of(clip, networks)

@@ -16,9 +16,7 @@ from fake_networks import LAYOUT, RADIUS, SIZE, FakeNetworks, picture
 from hwp_bench.base.arrays import write_npz
 from hwp_bench.base.errors import BadInput
 from hwp_bench.cli.main import main
-from hwp_bench.importers.shared.association import tracked_sides, tracked_votes
-from hwp_bench.importers.shared.hand_tracks import read_hand_tracks
-from hwp_bench.importers.shared.landmarks import read_landmarks
+from hwp_bench.importers.shared.landmarks import read_association, read_hand_tracks, read_landmarks
 from hwp_bench.tracking import track_video
 
 
@@ -50,7 +48,9 @@ def test_the_importer_reads_each_hand(video: Path, tmp_path: Path) -> None:
     np.testing.assert_array_equal(right.detected, np.arange(8) < 4)
     # A reader of version 1 finds the hand that is seen most.
     np.testing.assert_array_equal(read_landmarks(out, min_score=0.5).image, left.image)
-    assert tracked_sides(out) == ("left", "right")
+    found = read_association(out)
+    assert found is not None
+    assert found.sides == ("left", "right")
     read = read_hand_tracks(out)
     assert read is not None
     assert read.size == SIZE
@@ -61,15 +61,14 @@ def test_the_importer_reads_each_hand(video: Path, tmp_path: Path) -> None:
 def test_votes_of_the_hand_that_is_read(tmp_path: Path) -> None:
     video = write_video(tmp_path / "one.avi", [{"right": (60, 60)}] * 5)
     track_video(video, tmp_path / "one.npz", networks=FakeNetworks())
+    found = read_association(tmp_path / "one.npz")
+    assert found is not None
     for side in ("right", "left"):
-        assert tracked_votes(tmp_path / "one.npz", side) == pytest.approx(
-            {"right": 0.95, "left": 0.05}
-        )
+        assert found.votes(side) == pytest.approx({"right": 0.95, "left": 0.05})
     # Files of version 1 say nothing of sides.
     arrays = {"image": np.ones((1, 21, 3)), "world": np.ones((1, 21, 3)), "score": np.ones(1)}
     old = write_npz(tmp_path / "old.npz", arrays)
-    assert tracked_votes(old, "left") is None
-    assert tracked_sides(old) == ()
+    assert read_association(old) is None
     newer = write_npz(tmp_path / "newer.npz", {**arrays, "version": np.array([3])})
     with pytest.raises(BadInput, match="newer version"):
         read_hand_tracks(newer)

@@ -25,7 +25,7 @@ from wildghand.fitting.colors import (
 )
 from wildghand.fitting.evidence import FewShown
 from wildghand.fitting.fit import Fit
-from wildghand.gaussians.laplacian import nearest_on_surface, rest_anchors
+from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig, make_rig
 
 PLAIN: dict[str, Any] = {**UNJUDGED, "shadows.enabled": False, "start_colors": False}

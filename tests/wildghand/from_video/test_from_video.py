@@ -10,6 +10,7 @@ import json
 import shutil
 import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,16 +27,14 @@ import wildghand
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.base.images import read_rgb
 from hwp_bench.capture import open_capture
-from hwp_bench.importers.shared.hand_tracks import read_hand_tracks, write_hand_tracks
-from hwp_bench.tracking.model_files import HAND, PALM, models_folder
+from hwp_bench.importers.shared.landmarks import read_hand_tracks, write_hand_tracks
+from hwp_bench.tracking.networks import HAND, PALM, models_folder
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.from_video import VideoFit, make_avatar, sheet, turntable
-from wildghand.from_video.capture import import_options, stride
-from wildghand.from_video.job import Job
-from wildghand.from_video.settings import QUICK as QUICK_CHANGES
-from wildghand.from_video.settings import QUICK_FRAMES, with_quick
-from wildghand.from_video.stages import STAGES
+from wildghand.from_video import VideoFit, make_avatar, pictures
+from wildghand.from_video.job import QUICK as QUICK_CHANGES
+from wildghand.from_video.job import QUICK_FRAMES, Job, with_quick
+from wildghand.from_video.stages import STAGES, import_options, stride
 from wildghand.model.settings import read_settings
 
 pytestmark = pytest.mark.slow
@@ -51,7 +50,7 @@ SETTINGS: dict[str, Any] = {
 }
 #: An import that is only as good as the perfect landmarks of the clip.
 IMPORT = landmark_import(30, outline_steps=3)
-#: Edge, px, and frames of turntables that are drawn again; the first one has full size.
+#: Edge, px, and frames of the turntables: one of full size is most of a run's time.
 SMALL = 96, 12
 CLIP = Path(__file__).resolve().parents[4] / "shared" / "data" / "real_hand"
 
@@ -63,6 +62,14 @@ def choices(folder: Path, **changes: Any) -> VideoFit:
         "settings": SETTINGS,
     }
     return VideoFit(**{**given, **changes})
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_turntable() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in zip(("SIZE", "FRAMES"), SMALL, strict=True):
+            patch.setattr(pictures, name, value)
+        yield
 
 
 @pytest.fixture(scope="module")
@@ -82,13 +89,6 @@ def folder(made: Path, tmp_path: Path) -> Path:
     """A copy of it; the record has no paths."""
     shutil.copytree(made, tmp_path / "copy")
     return tmp_path / "copy"
-
-
-@pytest.fixture
-def small_turntable(monkeypatch: pytest.MonkeyPatch) -> None:
-    """One of full size is most of a run's time."""
-    for name, value in zip(("SIZE", "FRAMES"), SMALL, strict=True):
-        monkeypatch.setattr(turntable, name, value)
 
 
 def tensors(path: Path) -> dict[str, torch.Tensor]:
@@ -115,10 +115,10 @@ def test_the_folder_is_an_avatar_with_clip_and_sheet(made: Path, tmp_path: Path)
     views = []
     while (read := clip.read())[0]:
         views.append(read[1])
-    assert len(views) == 96
+    assert len(views) == SMALL[1]
     # The hand is there, and turns.
     assert all((view.max(axis=2) > 60).mean() > 0.05 for view in views)
-    assert np.abs(views[0].astype(int) - views[48]).mean() > 1
+    assert np.abs(views[0].astype(int) - views[SMALL[1] // 2]).mean() > 1
     assert read_rgb(out / "sheet.jpg").shape[0] > 1000
     # What other commands expect of an avatar.
     words = ["render", str(out), "--poses", str(out / "work" / "capture"), "--frames", "3:5"]
@@ -146,10 +146,8 @@ def test_the_same_command_keeps_everything(folder: Path, capsys) -> None:
     ],
 )
 def test_what_changed_is_named_and_made_again(
-    changes: dict[str, Any], again: list[str], named: str, folder: Path, capsys, request
+    changes: dict[str, Any], again: list[str], named: str, folder: Path, capsys
 ) -> None:
-    if "turntable" in again:
-        request.getfixturevalue("small_turntable")
     result = make_avatar(folder / "hand.avi", folder / "my_hand", choices(folder, **changes))
     assert [name for name in NAMES if name not in result.kept] == again
     assert f"changed since the last run: {named}." in capsys.readouterr().err
@@ -157,7 +155,6 @@ def test_what_changed_is_named_and_made_again(
     assert len(result.avatar.record.frames) == pytest.approx(fitted, abs=1)
 
 
-@pytest.mark.usefixtures("small_turntable")
 def test_another_video_of_the_same_name_is_noticed(folder: Path, capsys) -> None:
     clip = make_clip(COUNT, bend=0.2)
     write_video(folder / "hand.avi", [clip.picture(frame) for frame in range(COUNT)])
@@ -173,9 +170,9 @@ from pathlib import Path
 sys.path[:0] = sys.argv[4:]
 from test_from_video import SMALL, choices
 from wildghand.fitting import session
-from wildghand.from_video import capture, make_avatar, run, turntable
+from wildghand.from_video import make_avatar, pictures, run, stages
 folder, out, where = Path(sys.argv[1]), Path(sys.argv[2]), sys.argv[3]
-turntable.SIZE, turntable.FRAMES = SMALL
+pictures.SIZE, pictures.FRAMES = SMALL
 def die(*args, **more):
     os.kill(os.getpid(), signal.SIGKILL)
 if where == "fit":
@@ -186,9 +183,9 @@ if where == "fit":
             die()
     session.save_state = save_and_die
 elif where == "import":
-    capture.import_video = die
+    stages.import_video = die
 elif where == "turntable":
-    turntable.as_uint8 = die
+    pictures.as_uint8 = die
 elif where == "between":
     write = run.write_record
     def write_and_die(path, record):
@@ -200,7 +197,6 @@ make_avatar(folder / "hand.avi", out, choices(folder))
 """
 
 
-@pytest.mark.usefixtures("small_turntable")
 @pytest.mark.parametrize(
     ("where", "kept", "told"),
     [
@@ -258,9 +254,9 @@ def test_the_command(folder: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> N
     record["source"]["video"] |= {"ends_early": True, "warning": "ends early, after 12 of 24"}
     (capture / "capture.json").write_text(json.dumps(record))
     labels: list[str] = []
-    labelled = sheet.labelled
+    labelled = pictures.labelled
     monkeypatch.setattr(
-        sheet, "labelled", lambda tile, text: labels.append(text) or labelled(tile, text)
+        pictures, "labelled", lambda tile, text: labels.append(text) or labelled(tile, text)
     )
     (folder / "my_hand" / "sheet.jpg").unlink()
     assert main([*words, "-o", str(folder / "my_hand")]) == 0
@@ -271,7 +267,7 @@ def test_the_command(folder: Path, capsys, monkeypatch: pytest.MonkeyPatch) -> N
 def test_from_python(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a folder it goes next to the video, under the video's name."""
     monkeypatch.setattr(
-        "wildghand.from_video.api.VideoFit", functools.partial(VideoFit, importer=IMPORT)
+        "wildghand.from_video.make.VideoFit", functools.partial(VideoFit, importer=IMPORT)
     )
     (folder / "my_hand").rename(folder / "hand_avatar")
     avatar = wildghand.fit(
@@ -318,7 +314,6 @@ def test_wrong_calls_are_one_line(
     assert (folder / "taken" / "thesis.tex").exists()
 
 
-@pytest.mark.usefixtures("small_turntable")
 def test_two_hands_by_default(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """Oracle: the synthetic clip has a right and a left hand."""
     video, landmarks = write_two_hands(tmp_path, make_two_hands(COUNT), (5,), range(7, 9))
@@ -358,7 +353,7 @@ def test_without_the_tracker_or_the_network_one_line_says_so(
 
     with monkeypatch.context() as here:
         here.setenv("HWP_CACHE", str(folder / "cache"))
-        here.setattr("hwp_bench.tracking.model_files._open", offline)
+        here.setattr("hwp_bench.tracking.networks._open", offline)
         assert main(words) == 1
         told = capsys.readouterr().err
         assert "cannot be downloaded (network is unreachable)" in told
@@ -380,7 +375,6 @@ def test_a_video_without_a_hand(tmp_path: Path, capsys) -> None:
     assert "--landmarks" in told
 
 
-@pytest.mark.usefixtures("small_turntable")
 def test_a_real_hand(tmp_path: Path) -> None:
     """The whole chain on 16 frames of a real video. Oracle: its hand is known to be a right one."""
     video = CLIP / "human_hand_video.mp4"

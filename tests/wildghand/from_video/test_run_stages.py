@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -11,18 +10,58 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput, HwpError
-from wildghand.from_video.job import Job
-from wildghand.from_video.pace import Pace
-from wildghand.from_video.record import JobRecord, StageRecord, read_record, write_record
-from wildghand.from_video.run import run_stages
-from wildghand.from_video.settings import VideoFit
-from wildghand.from_video.stage import Stage
+from wildghand.from_video.job import Job, VideoFit
+from wildghand.from_video.run import (
+    JobRecord,
+    Stage,
+    StageRecord,
+    read_record,
+    run_stages,
+    seconds_left,
+    write_record,
+)
 
 NAMES = ("one", "two", "three")
 
 
+class _Step(Stage):
+    """Writes its input and the result of the stage before it to a file."""
+
+    def __init__(self, workshop: Workshop, name: str, before: str | None) -> None:
+        self.workshop, self.name, self.before = workshop, name, before
+        self.title = f"Doing {name}"
+
+    def _old(self) -> str:
+        return "" if self.before is None else self.workshop.result(self.before).read_text()
+
+    def facts(self, job: Job) -> dict[str, str]:
+        old = {} if self.before is None else {self.before: self._old()}
+        return {**old, f"input of {self.name}": self.workshop.inputs[self.name]}
+
+    def result(self, job: Job) -> Path:
+        return self.workshop.result(self.name)
+
+    def run(self, job: Job) -> None:
+        self.workshop.ran.append(self.name)
+        if self.workshop.stop_in == self.name:
+            raise KeyboardInterrupt
+        made = f"{self._old()}{self.name}:{self.workshop.inputs[self.name]};"
+        self.result(job).write_text(made)
+
+    def expected(self, job: Job) -> float:
+        return 1.0
+
+    def discard(self, job: Job) -> None:
+        self.workshop.discarded.append(self.name)
+
+
+class Failing(_Step):
+    def run(self, job: Job) -> None:
+        raise HwpError("no luck")
+
+
 class Workshop:
-    """Three stages: each writes its input and the result of the stage before it to a file."""
+    """Three stages, one on the other."""
 
     def __init__(self, folder: Path) -> None:
         self.job = Job(folder / "video.mp4", folder / "hand", VideoFit())
@@ -35,29 +74,7 @@ class Workshop:
         return self.job.work / name
 
     def stage(self, name: str, before: str | None) -> Stage:
-        def content() -> str:
-            old = "" if before is None else self.result(before).read_text()
-            return f"{old}{name}:{self.inputs[name]};"
-
-        def facts(job: Job) -> dict[str, str]:
-            old = {} if before is None else {before: self.result(before).read_text()}
-            return {**old, f"input of {name}": self.inputs[name]}
-
-        def run(job: Job) -> None:
-            self.ran.append(name)
-            if self.stop_in == name:
-                raise KeyboardInterrupt
-            self.result(name).write_text(content())
-
-        return Stage(
-            name=name,
-            title=f"Doing {name}",
-            facts=facts,
-            result=lambda job: self.result(name),
-            run=run,
-            expected=lambda job: 1.0,
-            discard=lambda job: self.discarded.append(name),
-        )
+        return _Step(self, name, before)
 
     @property
     def stages(self) -> list[Stage]:
@@ -139,12 +156,9 @@ def test_a_change_is_named(workshop: Workshop, capsys) -> None:
 
 
 def test_a_failing_stage_is_not_done(workshop: Workshop) -> None:
-    def fail(job: Job) -> None:
-        raise HwpError("no luck")
-
     workshop.job.work.mkdir(parents=True)
     with pytest.raises(HwpError, match="no luck"):
-        run_stages(workshop.job, [replace(workshop.stages[0], run=fail)])
+        run_stages(workshop.job, [Failing(workshop, "one", None)])
     assert workshop.go() == list(NAMES)
 
 
@@ -166,20 +180,19 @@ def test_a_damaged_record_is_one_line(content: str, tmp_path: Path) -> None:
 
 
 def test_a_record_is_read_as_it_was_written(tmp_path: Path) -> None:
-    record = JobRecord().having("one", StageRecord({"video": "0a"}, True, 1.5, 2.5))
+    stage = StageRecord({"video": "0a"}, True, 1.5, 2.5)
+    record = JobRecord(stages={"one": stage})
     write_record(tmp_path / "stages.json", record)
     assert read_record(tmp_path / "stages.json") == record
     assert read_record(tmp_path / "absent.json") == JobRecord()
     # The format is read by later versions.
     assert json.loads((tmp_path / "stages.json").read_text())["schema"] == "wildghand-stages/1"
-    assert record.changed("one", {"video": "0a"}) == []
-    assert record.changed("one", {"video": "0b", "side": "left"}) == ["video", "side"]
-    assert record.changed("two", {}) is None
+    assert stage.changed({"video": "0a"}) == []
+    assert stage.changed({"video": "0b", "side": "left"}) == ["video", "side"]
 
 
 def test_the_time_that_is_left_goes_by_what_was_measured() -> None:
     """Oracle: by hand. Stages that were kept say nothing of this machine."""
-    pace = Pace([10.0, 20.0, 30.0])
-    assert pace.left(1) == (20.0, 30.0)
-    pace.ran(1, 40.0)
-    assert pace.left(2) == (60.0, 0.0)
+    expected = [10.0, 20.0, 30.0]
+    assert seconds_left(expected, {}, 1) == (20.0, 30.0)
+    assert seconds_left(expected, {1: 40.0}, 2) == (60.0, 0.0)

@@ -8,8 +8,7 @@ import math
 import pytest
 import torch
 
-from wildghand.gaussians.adam import ClippedAdam
-from wildghand.gaussians.adam_kernels import PIECE
+from wildghand.gaussians.adam import PIECE, ClippedAdam
 
 #: Whole vectors, rests of them, a scalar, a channels-last weight, and several pieces.
 SHAPES = [(3,), (), (16, 5), (1,), (7, 33), (4, 4, 3, 3), (2 * PIECE + 5,), (9, 16)]

@@ -10,7 +10,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from hwp_bench.base.errors import ShapeMismatch
-from wildghand.gaussians.anchored import MAX_LOGIT, AnchoredGaussians, flat_gaussians
+from wildghand.gaussians.attributes import MAX_LOGIT, AnchoredGaussians, flat_gaussians
 
 
 def random_gaussians(count: int, seed: int = 0) -> AnchoredGaussians:

@@ -6,9 +6,8 @@ import pytest
 import torch
 
 from hwp_bench.hands import load_template
-from wildghand.gaussians.attribute_roughness import attribute_roughness
 from wildghand.gaussians.attributes import RawAttributes
-from wildghand.gaussians.laplacian import surface_laplacian
+from wildghand.gaussians.regularizers import attribute_roughness, surface_laplacian
 from wildghand.gaussians.rig import make_rig
 
 

@@ -7,7 +7,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.base.errors import ShapeMismatch, UsageError
+from hwp_bench.base.errors import ShapeMismatch
 from wildghand.gaussians.attributes import CHANNELS, SIZES, Activation, RawAttributes
 
 
@@ -71,18 +71,3 @@ def test_wrong_shapes_are_refused_by_name(name: str) -> None:
         RawAttributes(**parts)
     with pytest.raises(ShapeMismatch, match="channels"):
         RawAttributes.split(torch.zeros(3, CHANNELS + 1))
-
-
-@pytest.mark.parametrize(
-    "values",
-    [
-        {"max_offset": 0.0},
-        {"max_offset": float("nan")},
-        {"log_scale_bias": float("inf")},
-        {"min_scale": 0.0},
-        {"min_scale": 2.0, "max_scale": 1.0},
-    ],
-)
-def test_settings_of_the_activation_are_checked(values: dict[str, float]) -> None:
-    with pytest.raises(UsageError, match=next(iter(values))):
-        Activation(**values)

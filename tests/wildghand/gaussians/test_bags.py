@@ -7,9 +7,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildghand.gaussians.bags import sum_bags
-from wildghand.gaussians.shading import sh_basis, sh_count
-from wildghand.gaussians.shading_cpu import fill_harmonics
+from wildghand.gaussians.regularizers import sum_bags
+from wildghand.gaussians.shading import fill_harmonics, sh_basis, sh_count
 
 
 @settings(max_examples=40, deadline=None)

@@ -9,7 +9,7 @@ import torch
 from hwp_bench.base.errors import ShapeMismatch
 from hwp_bench.hands import load_template
 from hwp_bench.hands.anchors import anchor_positions
-from wildghand.gaussians.laplacian import SurfaceLaplacian, nearest_on_surface, surface_laplacian
+from wildghand.gaussians.regularizers import SurfaceLaplacian, nearest_on_surface, surface_laplacian
 from wildghand.gaussians.rig import HandRig, make_rig
 
 

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from hwp_bench.hands import SurfaceAnchors, TemplateTensors, load_template, pose_hand
 from hwp_bench.hands.anchors import anchor_frames, anchor_positions
-from wildghand.gaussians.posing_cpu import FollowCpu
 from wildghand.gaussians.quaternions import matrix_to_quat
-from wildghand.gaussians.rig import HandRig, make_rig
+from wildghand.gaussians.rig import FollowCpu, HandRig, make_rig
 
 
 def rig(correctives: bool) -> HandRig:

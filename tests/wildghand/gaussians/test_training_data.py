@@ -14,9 +14,14 @@ from painted import FRAMES, SIZE, TrainingMaker
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import write_image
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.gaussians.frame_table import FrameTable, soft_weights
 from wildghand.gaussians.rig import make_rig
-from wildghand.gaussians.training import TrainingClip, TrainingFrames, load_frames
+from wildghand.gaussians.training import (
+    FrameTable,
+    TrainingClip,
+    TrainingFrames,
+    load_frames,
+    soft_weights,
+)
 
 
 def invalidate(training: TrainingCapture, side: str, frames: list[int]) -> None:

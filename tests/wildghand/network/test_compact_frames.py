@@ -12,9 +12,13 @@ from wildghand.network import (
     NetworkOutput,
     PredictionNetwork,
     SurfacePoints,
-    compact_frames,
-    frame_heads_cpu,
     network_settings,
+)
+from wildghand.network import (
+    frame_heads as compact_frames,
+)
+from wildghand.network import (
+    frame_heads as frame_heads_cpu,
 )
 from wildghand.network import network as network_module
 

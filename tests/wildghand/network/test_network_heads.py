@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from wildghand.gaussians.attributes import CHANNELS
-from wildghand.network.encoding import POSITION_CHANNELS
 from wildghand.network.heads import AttributeHead, RefinementHead, ShadowHead, TemplateHead
 from wildghand.network.settings import network_settings
+from wildghand.network.surface import POSITION_CHANNELS
 
 SETTINGS = network_settings("compact", head_width=4, identity_channels=15)
 TEXTURE, GEOMETRY, COUNT, FRAMES = 17, 5, 3, 2

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from hwp_bench.base.errors import UsageError
-from wildghand.network.sampling import CellPooling, PlaneSampler, bilinear_taps
+from wildghand.network.surface import CellPooling, PlaneSampler, bilinear_taps
 
 
 def points(count: int, seed: int = 0) -> torch.Tensor:

@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-import pytest
 import torch
 
-from hwp_bench.base.errors import BadInput, ShapeMismatch
 from hwp_bench.hands import (
     HandTemplate,
     SurfaceAnchors,
@@ -16,7 +12,7 @@ from hwp_bench.hands import (
     load_template,
     sample_surface,
 )
-from wildghand.network import SurfacePoints, mirrored_anchors, surface_points
+from wildghand.network import mirrored_anchors, surface_points
 
 COLOR = torch.tensor([0.6, 0.45, 0.4])
 
@@ -47,24 +43,3 @@ def test_positions_fill_the_unit_box() -> None:
     points = surface_points(template, sample_surface(template, 3000), 1e-3, COLOR)
     assert points.positions.abs().max() <= 1.0
     assert points.positions.abs().amax(dim=0).min() > 0.9
-
-
-@pytest.mark.parametrize(
-    ("changes", "error"),
-    [
-        ({"uv": torch.zeros(3, 3)}, ShapeMismatch),
-        ({"positions": torch.zeros(2, 3)}, ShapeMismatch),
-        ({"uv": torch.zeros(0, 2), "positions": torch.zeros(0, 3)}, ShapeMismatch),
-        ({"color": torch.tensor([0.1, float("nan"), 0.1])}, BadInput),
-        ({"spacing": 0.0}, BadInput),
-        ({"spacing": float("inf")}, BadInput),
-    ],
-)
-def test_bad_surfaces_are_refused(changes: dict[str, Any], error: type[Exception]) -> None:
-    good: dict[str, Any] = {
-        "uv": torch.zeros(3, 2),
-        "positions": torch.zeros(3, 3),
-        "spacing": 1e-3,
-    }
-    with pytest.raises(error, match="|".join(changes)):
-        SurfacePoints(**{**good, "color": COLOR, **changes})

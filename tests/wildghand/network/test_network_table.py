@@ -7,7 +7,7 @@ import json
 import pytest
 
 from wildghand.cli.main import main
-from wildghand.network.parameters import blank_network, parameter_table
+from wildghand.network.network import blank_network, parameter_table
 from wildghand.network.settings import network_settings
 
 

@@ -277,7 +277,7 @@ def test_the_prior_that_ships_is_taken_where_it_fits(subjects: dict[str, Path]) 
 def test_the_prior_that_ships_saw_no_subject_and_no_scene_of_a_suite(
     subjects: dict[str, Path],
 ) -> None:
-    from hwp_bench.sim.scene.reader import load_scene, scene_names
+    from hwp_bench.sim.scene_files import load_scene, scene_names
 
     shipped = choose_prior(read_settings({}), open_capture(subjects["anna"]).info.hand_model)
     assert shipped is not None

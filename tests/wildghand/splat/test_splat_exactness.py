@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from wildghand.splat import rasterize
-from wildghand.splat.hard_scenes import HardScene, clear_pixels, difference, draw, hand_scene
+from wildghand.splat.hard_cases import HardScene, clear_pixels, difference, draw, hand_scene
 
 IMAGE = 1e-5
 GRADIENT = 1e-4

@@ -18,9 +18,8 @@ import torch
 from hwp_bench.base.errors import MissingDependency
 from wildghand.gaussians.fit_loop import choose_device
 from wildghand.splat import gsplat_backend, rasterize
-from wildghand.splat.hard_scenes import difference, draw, hand_scene
-from wildghand.splat.layout import flatten
-from wildghand.splat.scene import Options
+from wildghand.splat.hard_cases import difference, draw, hand_scene
+from wildghand.splat.scene import Options, flatten
 
 HAS_GPU = choose_device("auto").type == "cuda"
 
@@ -54,7 +53,6 @@ class StandIn(types.ModuleType):
     ) -> tuple[torch.Tensor, torch.Tensor, dict[str, Any]]:
         assert not packed
         batch, count, cameras = means.shape[:-2], means.shape[-2], viewmats.shape[-3]
-        assert self.__version__ >= "1.5.2" or not batch
         assert quats.shape == (*batch, count, 4)
         assert scales.shape == (*batch, count, 3)
         assert opacities.shape == (*batch, count)
@@ -113,7 +111,7 @@ def variant(name: str) -> dict[str, torch.Tensor]:
     return tensors
 
 
-@pytest.mark.parametrize("version", ["1.4.0", "1.5.3", "1.6.0+pt27cu128"])
+@pytest.mark.parametrize("version", ["1.5.3", "1.6.0+pt27cu128"])
 @pytest.mark.parametrize("name", VARIANTS)
 def test_arguments_are_mapped(monkeypatch: pytest.MonkeyPatch, version: str, name: str) -> None:
     tensors = variant(name)
@@ -123,8 +121,7 @@ def test_arguments_are_mapped(monkeypatch: pytest.MonkeyPatch, version: str, nam
     torch.testing.assert_close(alpha, expected_alpha)
     for key in ("means2d", "depths", "radii", "visible"):
         torch.testing.assert_close(info[key], truth[key])
-    one_by_one = version == "1.4.0" and name in ("sets", "paired", "shared scales")
-    assert len(module.calls) == (image.shape[0] if one_by_one else 1)
+    assert len(module.calls) == 1
 
 
 @pytest.mark.parametrize("mode", ["D", "ED", "RGB+D", "RGB+ED"])
@@ -190,7 +187,10 @@ def test_no_gaussians_are_not_handed_on(monkeypatch: pytest.MonkeyPatch) -> None
     assert info["means2d"].shape == (2, 0, 2)
 
 
-def test_a_missing_gsplat_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_old_or_missing_gsplat_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "gsplat", StandIn("1.4.0"))
+    with pytest.raises(MissingDependency, match=r"1\.4\.0, and the CUDA backend needs"):
+        gsplat_backend._gsplat()
     monkeypatch.setitem(sys.modules, "gsplat", None)
     with pytest.raises(MissingDependency, match="pip install gsplat"):
         gsplat_backend._gsplat()

@@ -13,12 +13,25 @@ import numba
 import numpy as np
 import pytest
 
-from wildghand.splat import stages, warmup
-from wildghand.splat.kernels import alpha, jit, lanes, project, rows, tiles
-from wildghand.splat.kernels.blend import blend
-from wildghand.splat.kernels.blend_backward import blend_backward
+from wildghand.splat import numba_backend as stages
+from wildghand.splat import numba_backend as warmup
+from wildghand.splat.kernels import (
+    groups as rows,
+)
+from wildghand.splat.kernels import (
+    jit,
+    project,
+    tiles,
+)
+from wildghand.splat.kernels import (
+    tiles as alpha,
+)
+from wildghand.splat.kernels import (
+    vectors as lanes,
+)
+from wildghand.splat.kernels.blend import blend, blend_backward
 from wildghand.splat.kernels.project import project as project_kernel
-from wildghand.splat.kernels.project_backward import project_backward
+from wildghand.splat.kernels.project import project_backward
 
 X86 = platform.machine().lower() in ("x86_64", "amd64")
 

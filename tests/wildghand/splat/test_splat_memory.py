@@ -10,11 +10,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from wildghand.splat import memory
+from wildghand.splat import threads as memory
 from wildghand.splat.kernels import jit
-from wildghand.splat.kernels.jobs import SPACING, next_job
-from wildghand.splat.memory import lease
-from wildghand.splat.threads import even_jobs, run, thread_count, weighted_jobs
+from wildghand.splat.kernels.jit import SPACING, next_job
+from wildghand.splat.threads import even_jobs, lease, run, thread_count, weighted_jobs
 
 
 @settings(max_examples=50, deadline=None)

@@ -13,7 +13,7 @@ import torch
 
 from hwp_bench.base.errors import HwpError, ShapeMismatch, UsageError
 from wildghand.splat import rasterize
-from wildghand.splat.hard_scenes import hand_scene
+from wildghand.splat.hard_cases import hand_scene
 
 SIZE = {"width": 40, "height": 30}
 LEAVES = ("means", "quats", "scales", "opacities", "colors", "viewmats", "backgrounds")

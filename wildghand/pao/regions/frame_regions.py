@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from hwp_bench.base.errors import ShapeMismatch, UsageError
-from wildghand.gaussians.frame_table import TABLE_BYTES, upload
+from wildghand.gaussians.training import TABLE_BYTES, upload
 
 #: Most labels of one image; they are stored as 16-bit numbers.
 MAX_LABELS = 65536

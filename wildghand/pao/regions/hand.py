@@ -25,9 +25,9 @@ def graph_cut_hands(
     Raises:
         ShapeMismatch: a silhouette that does not belong to its image.
 
-    Source: `hwp_bench.importers.video.segmentation`, which the video import uses.
+    Source: `hwp_bench.importers.video.masks`, which the video import uses.
     """
-    from hwp_bench.importers.video.segmentation import NARROW, Prompt, segment_clip
+    from hwp_bench.importers.video.masks import NARROW, Prompt, segment_clip
 
     if len(images) != len(silhouettes) or any(
         image.shape[:2] != drawn.shape for image, drawn in zip(images, silhouettes, strict=True)

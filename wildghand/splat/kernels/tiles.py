@@ -1,22 +1,69 @@
-"""How an image is cut up: tiles, blocks of pixels that fill one vector, and constants.
+"""What a tile of pixels sees of a splat: its row of numbers, its alpha, its channels.
 
 A splat is a small blob. A vector of pixels shaped as a block (4 x 4 rather than 16 x 1) misses
 it less often, so fewer lanes are wasted. Each tile has 16 blocks, so that one 16-lane vector
 says which blocks of a tile a splat can reach.
+
+Of each Gaussian tiles need one row of 16 float32, one cache line.
+
+A projected Gaussian is kept as its exponent is evaluated. With e the distance across pixel rows
+and u the distance along the row from the splat's centre line, both scaled,
+
+    log2(alpha) = log2(opacity) - e^2 - u^2
+    e = across * dy,   u = along * (dx + shear * dy)
+
+which is the Cholesky form of the inverse covariance. Both squares stay small wherever the splat
+is visible, so a needle hundreds of pixels long loses no digits in float32; the usual
+a dx^2 + 2 b dx dy + c dy^2 loses all of them. Centre and shear are pairs of float32 (value
+and rounding error) because the distance to a pixel is a difference of nearly equal numbers.
 """
+
+# Numba infers the types.
+# mypy: allow-untyped-defs
 
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import llvmlite.binding
 import numpy as np
+from llvmlite import ir
 from numba import types
-from numba.core import config
+from numba.core import cgutils, config
+from numba.extending import overload
 
 from wildghand.splat import conventions as rules
-from wildghand.splat.kernels.lanes import make_constant, make_fill, make_load
-from wildghand.splat.kernels.simd import Vector
+from wildghand.splat.kernels.jit import inline
+from wildghand.splat.kernels.vectors import (
+    Vector,
+    absolute,
+    add_exponent,
+    bits,
+    fma,
+    intrinsic,
+    make_constant,
+    make_fill,
+    make_load,
+    narrow,
+    negate,
+    prefetch,
+    select,
+    store,
+    store_sums,
+)
+
+#: Floats in a row.
+ROW = 16
+MEAN_X, MEAN_Y, MEAN_X_LOW, MEAN_Y_LOW, SHEAR, SHEAR_LOW, ALONG, ACROSS = range(8)
+#: log2 of the opacity.
+LOG2_OPACITY = 8
+#: Half the size in pixels of the box around the visible part.
+REACH_X, REACH_Y = 9, 10
+#: dy of the visible part's rightmost point; its leftmost has the opposite.
+TANGENT_Y = 11
+#: First row of tiles that it touches, and how many.
+FIRST_ROW, ROWS = 12, 13
 
 
 def _lanes() -> int:
@@ -64,3 +111,343 @@ block_row = make_constant(
 LOG2_MIN_ALPHA = np.float32(math.log2(rules.MIN_ALPHA))
 LOG2_MAX_ALPHA = np.float32(math.log2(rules.MAX_ALPHA))
 MIN_TRANSMITTANCE = np.float32(rules.MIN_TRANSMITTANCE)
+ZERO, ONE = np.float32(0.0), np.float32(1.0)
+#: Slack, in log2(alpha), of the test that skips blocks; only adds blocks that blend nothing.
+_SLACK = np.float32(1e-3)
+_HALF_WIDTH = np.float32((BLOCK_WIDTH - 1) / 2)
+_HALF_HEIGHT = np.float32((BLOCK_HEIGHT - 1) / 2)
+#: Entries that are prepared together.
+BATCH = 16
+#: The half of an entry that names its Gaussian (see `lists.fill_tiles`).
+GAUSSIAN = np.uint64(0xFFFFFFFF)
+_ROUND = np.float32(1.5 * 2**23)
+
+
+def _exp2_coefficients(degree: int = 5) -> list[np.float32]:
+    """Polynomial for 2^x on [-1/2, 1/2] with the smallest relative error (Lawson's iteration)."""
+    count = 400
+    x = 0.5 * np.cos(np.pi * (np.arange(count) + 0.5) / count)
+    powers, truth = np.vander(x, degree + 1, increasing=True), np.exp2(x)
+    weights = np.ones(count)
+    for _ in range(60):
+        root = np.sqrt(weights) / truth
+        fit = np.linalg.lstsq(powers * root[:, None], truth * root, rcond=None)[0]
+        error = np.abs(powers @ fit / truth - 1)
+        weights *= error
+        weights /= weights.sum()
+    return [np.float32(value) for value in fit]
+
+
+_E0, _E1, _E2, _E3, _E4, _E5 = _exp2_coefficients()
+
+
+@inline
+def exp2(x):
+    """2**x in every lane, to 3e-7; x in [-126, 126], anything elsewhere."""
+    shifted = x + _ROUND
+    fraction = x - (shifted - _ROUND)
+    power = fma(fraction, _E5, _E4)
+    power = fma(power, fraction, _E3)
+    power = fma(power, fraction, _E2)
+    power = fma(power, fraction, _E1)
+    power = fma(power, fraction, _E0)
+    return add_exponent(power, shifted)
+
+
+@inline
+def enter_tile(geom, row, tile_x, tile_y, offsets, to):
+    """A splat relative to a tile.
+
+    Writes u and e (see `geometry`) of the first pixel of each block to `offsets` from `to` on,
+    first all u, then all e.
+
+    Args:
+        geom, row: the splat.
+        tile_x, tile_y: centre of the tile's first pixel, px.
+        offsets: float32.
+        to: where to write.
+
+    Returns:
+        The blocks that the splat may reach, as bits; du/dy, by which u changes from one row of
+        pixels to the next.
+    """
+    along = geom[row + ALONG]
+    across = geom[row + ACROSS]
+    exact_along = np.float64(along)
+    x = np.float64(geom[row + MEAN_X]) - tile_x + np.float64(geom[row + MEAN_X_LOW])
+    y = np.float64(geom[row + MEAN_Y]) - tile_y + np.float64(geom[row + MEAN_Y_LOW])
+    shear = np.float64(geom[row + SHEAR]) + np.float64(geom[row + SHEAR_LOW])
+    exact_slope = exact_along * shear
+    start = -(exact_along * x + exact_slope * y)
+    u = narrow(block_column() * exact_along + (block_row() * exact_slope + start))
+    e = narrow((block_row() - y) * np.float64(across))
+    store(offsets, to, u)
+    store(offsets, to + BLOCKS, e)
+    # A block is a parallelogram in (u, e); its bounding box must meet the splat's disc.
+    slope = np.float32(exact_slope)
+    u_half = along * _HALF_WIDTH + abs(slope) * _HALF_HEIGHT
+    e_half = across * _HALF_HEIGHT
+    u_gap = absolute(u + (along * _HALF_WIDTH + slope * _HALF_HEIGHT)) - u_half
+    e_gap = absolute(e + e_half) - e_half
+    u_gap = select(u_gap > ZERO, u_gap, ZERO)
+    e_gap = select(e_gap > ZERO, e_gap, ZERO)
+    reach = geom[row + LOG2_OPACITY] - LOG2_MIN_ALPHA + _SLACK
+    return bits(fma(u_gap, u_gap, e_gap * e_gap) <= reach), slope
+
+
+@inline
+def enter_batch(
+    geom, base, entries, start, stop, last, tile_x, tile_y, alive, offsets, blocks, ids, slopes
+):
+    """`enter_tile` for the entries from `start` to `stop`, ahead of blending them.
+
+    Were each splat blended right away, the processor would guess wrongly how many blocks it has
+    and wait for this arithmetic every time.
+    """
+    for k in range(start, stop):
+        if k + BATCH < last:
+            prefetch(geom, (base + np.int64(entries[k + BATCH] & GAUSSIAN)) * ROW)
+        i = k - start
+        g = np.int64(entries[k] & GAUSSIAN)
+        inside, slope = enter_tile(geom, (base + g) * ROW, tile_x, tile_y, offsets, 2 * BLOCKS * i)
+        blocks[i] = inside & alive
+        ids[i] = g
+        slopes[i] = slope
+
+
+@inline
+def relative_pixels(geom, row, slope):
+    """u and e of the pixels of a block, relative to its first."""
+    u = fma(pixel_row(), slope, pixel_column() * geom[row + ALONG])
+    return u, pixel_row() * geom[row + ACROSS]
+
+
+@inline
+def log2_alpha(u, e, opacity):
+    """log2(alpha), before it is clamped."""
+    return fma(negate(u), u, fma(negate(e), e, opacity))
+
+
+@inline
+def clamped_alpha(power):
+    """Alpha from log2(alpha)."""
+    return exp2(select(power < LOG2_MAX_ALPHA, power, LOG2_MAX_ALPHA))
+
+
+@inline
+def alive_blocks(state, stride):
+    """The blocks of a tile that still have a pixel to blend, as bits.
+
+    The first vector of each block's `stride` floats is its transmittance, kept negative from
+    where the pixel takes nothing more.
+    """
+    alive = np.uint64(0)
+    for b in range(BLOCKS):
+        if bits(load_pixels(state, b * stride) > ZERO) != 0:
+            alive |= np.uint64(1) << np.uint64(b)
+    return alive
+
+
+@inline
+def scratch(size):
+    """float32 memory of one thread, on a cache line."""
+    memory = np.empty(size + 16, np.float32)
+    skip = (-(np.int64(memory.ctypes.data) >> 2)) & 15
+    return memory[skip : skip + size]
+
+
+@inline
+def place_of(x, y):
+    """Block and lane of a pixel of a tile."""
+    block = y // BLOCK_HEIGHT * BLOCK_COLUMNS + x // BLOCK_WIDTH
+    return block, y % BLOCK_HEIGHT * BLOCK_WIDTH + x % BLOCK_WIDTH
+
+
+# Work over colour channels, twice: unrolled in registers, or as a loop of any length. `channels`
+# says which. A tuple of D zeros fixes D when the kernel is compiled, and colours and gradients live
+# in registers: the path of RGB. A plain number is a loop over memory, one compiled kernel for every
+# D. The kernels are written once against the functions here.
+
+#: Sums over pixels that the geometry's gradient needs, besides one for each channel.
+MOMENTS = 6
+
+
+def _fixed(channels: Any) -> bool:
+    return isinstance(channels, types.BaseTuple)
+
+
+def count(channels):
+    """How many channels: a constant where they are fixed."""
+
+
+@overload(count)
+def _count(channels):
+    if _fixed(channels):
+        number = len(channels)
+        return lambda channels: number
+    return lambda channels: channels
+
+
+@intrinsic
+def _load_tuple(typingctx: Any, array: Any, index: Any, channels: Any) -> Any:
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        data = context.make_array(sig.args[0])(context, builder, args[0]).data
+        values = []
+        for k in range(channels.count):
+            at = builder.add(args[1], ir.Constant(args[1].type, k))
+            values.append(builder.load(builder.gep(data, [at])))
+        return context.make_tuple(builder, sig.return_type, values)
+
+    return types.UniTuple(array.dtype, channels.count)(array, types.intp, channels), codegen
+
+
+def fetch(colors, index, channels):
+    """The colour that starts at a flat index, to be handed to `paint` and `project`."""
+
+
+@overload(fetch)
+def _fetch(colors, index, channels):
+    if _fixed(channels):
+        return lambda colors, index, channels: _load_tuple(colors, index, channels)
+    return lambda colors, index, channels: index
+
+
+def paint(state, at, weight, colors, color, channels):
+    """Adds weight * colour to the channels of a block; `at` is its first channel's vector."""
+
+
+@overload(paint)
+def _paint(state, at, weight, colors, color, channels):
+    if _fixed(channels):
+
+        def fixed(state, at, weight, colors, color, channels):
+            for k in range(len(color)):
+                place = at + k * LANES
+                store(state, place, fma(weight, color[k], load_pixels(state, place)))
+
+        return fixed
+
+    def loop(state, at, weight, colors, color, channels):
+        for k in range(channels):
+            place = at + k * LANES
+            store(state, place, fma(weight, colors[color + k], load_pixels(state, place)))
+
+    return loop
+
+
+def project(state, at, colors, color, channels):
+    """Sum over channels of colour * upstream gradient, for the pixels of a block."""
+
+
+@overload(project)
+def _project(state, at, colors, color, channels):
+    if _fixed(channels):
+
+        def fixed(state, at, colors, color, channels):
+            total = load_pixels(state, at) * color[0]
+            for k in range(1, len(color)):
+                total = fma(load_pixels(state, at + k * LANES), color[k], total)
+            return total
+
+        return fixed
+
+    def loop(state, at, colors, color, channels):
+        total = fill_pixels(ZERO)
+        for k in range(channels):
+            total = fma(load_pixels(state, at + k * LANES), colors[color + k], total)
+        return total
+
+    return loop
+
+
+@intrinsic
+def _zero_tuple(typingctx: Any, channels: Any) -> Any:
+    kind = types.UniTuple(PIXELS, channels.count)
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        return context.make_tuple(builder, kind, [PIXELS.constant(0.0)] * channels.count)
+
+    return kind(channels), codegen
+
+
+@intrinsic
+def _gather_tuple(typingctx: Any, sums: Any, weight: Any, state: Any, at: Any) -> Any:
+    """sums[k] + weight * (vector k of state)."""
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> ir.Value:
+        data = context.make_array(sig.args[2])(context, builder, args[2]).data
+        vector = PIXELS.llvm
+        function = cgutils.get_or_insert_function(
+            builder.module,
+            ir.FunctionType(vector, [vector] * 3),
+            f"llvm.fma.v{PIXELS.lanes}f32",
+        )
+        values = []
+        for k, total in enumerate(cgutils.unpack_tuple(builder, args[0], sums.count)):
+            place = builder.add(args[3], ir.Constant(args[3].type, k * PIXELS.lanes))
+            pointer = builder.bitcast(builder.gep(data, [place]), ir.PointerType(vector))
+            upstream = builder.load(pointer, align=4)
+            values.append(builder.call(function, [args[1], upstream, total]))
+        return context.make_tuple(builder, sums, values)
+
+    return sums(sums, weight, state, types.intp), codegen
+
+
+def start_sums(sums, channels):
+    """Sums of a splat's colour gradient, at zero; `sums` is scratch for the loop."""
+
+
+@overload(start_sums)
+def _start_sums(sums, channels):
+    if _fixed(channels):
+        return lambda sums, channels: _zero_tuple(channels)
+
+    def loop(sums, channels):
+        for k in range(channels):
+            store(sums, k * LANES, fill_pixels(ZERO))
+        return sums
+
+    return loop
+
+
+def add_to_sums(sums, weight, state, at):
+    """Adds weight * upstream gradient of a block to the sums, and returns them."""
+
+
+@overload(add_to_sums)
+def _add_to_sums(sums, weight, state, at):
+    if isinstance(sums, types.BaseTuple):
+        return lambda sums, weight, state, at: _gather_tuple(sums, weight, state, at)
+
+    def loop(sums, weight, state, at):
+        for k in range(sums.size // LANES):
+            total = load_pixels(sums, k * LANES)
+            store(sums, k * LANES, fma(weight, load_pixels(state, at + k * LANES), total))
+        return sums
+
+    return loop
+
+
+def finish_sums(slots, at, moments, sums):
+    """Writes the sums over all lanes: the moments first, then each channel."""
+
+
+@overload(finish_sums)
+def _finish_sums(slots, at, moments, sums):
+    if isinstance(sums, types.BaseTuple):
+        return lambda slots, at, moments, sums: store_sums(slots, at, moments + sums)
+
+    def loop(slots, at, moments, sums):
+        store_sums(slots, at, moments)
+        place = at + MOMENTS
+        for k in range(sums.size // LANES):
+            store_sums(slots, place + k, (load_pixels(sums, k * LANES),))
+
+    return loop
+
+
+def slot_size(channels: int, fixed: bool) -> int:
+    """Floats that `finish_sums` writes for one splat in one tile."""
+    if fixed:
+        return -(-(MOMENTS + channels) // LANES) * LANES
+    return MOMENTS + channels - 1 + LANES

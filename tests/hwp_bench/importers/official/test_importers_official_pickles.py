@@ -14,8 +14,7 @@ import torch
 
 from hwp_bench.base.errors import BadInput, UnsafePickle
 from hwp_bench.cli.main import main
-from hwp_bench.importers.official.folders import find_file, find_folders
-from hwp_bench.importers.official.release_records import read_records
+from hwp_bench.importers.official.records import find_file, find_folders, read_records
 
 
 def read(folder: Path) -> Any:

@@ -7,8 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hwp_bench.importers.shared.association import associate
-from hwp_bench.importers.shared.hand_tracks import HandTracks
+from hwp_bench.importers.shared.landmarks import HandTracks, associate
 
 FRAMES = 60
 SHAPE = np.random.default_rng(0).uniform(-50, 50, (21, 2))

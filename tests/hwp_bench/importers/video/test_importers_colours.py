@@ -16,8 +16,7 @@ import pytest
 from encoded_video import pictures, write_pictures, write_samples
 
 from hwp_bench.base.errors import BadInput
-from hwp_bench.importers.video.decode import probe, read_frames
-from hwp_bench.importers.video.video_settings import FrameRange
+from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
 
 #: Weights of red and blue by the number of the matrix in H.273.
 WEIGHTS = {1: (0.2126, 0.0722), 5: (0.299, 0.114), 6: (0.299, 0.114), 9: (0.2627, 0.0593)}
@@ -186,7 +185,7 @@ def test_hdr(tmp_path: Path, marks, displays, codec: str, ending: str, full: boo
 
 def test_levels_of_hdr_are_those_of_the_recommendation() -> None:
     """BT.2408, table 1: reference white, 203 cd/m2, is 75 % HLG and 58 % PQ; the grey card, 26."""
-    from hwp_bench.importers.video.video_colours import hlg_scene_light, pq_light, rolled_off
+    from hwp_bench.importers.video.colours import hlg_scene_light, pq_light, roll_off
 
     assert 1000 * hlg_scene_light(np.array([0.75, 0.38])) ** 1.2 == pytest.approx(
         [203, 26], rel=0.02
@@ -194,7 +193,7 @@ def test_levels_of_hdr_are_those_of_the_recommendation() -> None:
     assert pq_light(np.array([0.58, 0.38])) == pytest.approx([203, 26], rel=0.04)
     # The curve ends at white, rises, and leaves what is darker than 87.8 cd/m2 alone.
     light = np.linspace(0, 1000 / 203, 2000)
-    bent = rolled_off(light)
+    bent = roll_off(light)
     assert bent[-1] == pytest.approx(1.0, abs=1e-6)
     assert (np.diff(bent) > 0).all()
     np.testing.assert_allclose(bent[light < 87.8 / 203], light[light < 87.8 / 203], atol=1e-9)

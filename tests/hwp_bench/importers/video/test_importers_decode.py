@@ -9,8 +9,7 @@ import pytest
 from synthetic_clip import write_video
 
 from hwp_bench.base.errors import BadInput, UsageError
-from hwp_bench.importers.video.decode import probe, read_frames
-from hwp_bench.importers.video.video_settings import FrameRange, parse_frame_range
+from hwp_bench.importers.video.decode import FrameRange, parse_frame_range, probe, read_frames
 
 COUNT = 12
 

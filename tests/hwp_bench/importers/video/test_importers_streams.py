@@ -20,8 +20,7 @@ from encoded_video import pictures, silence, write_pictures
 from hwp_bench.base.errors import BadInput
 from hwp_bench.base.images import read_gray
 from hwp_bench.cli.main import main
-from hwp_bench.importers.video.decode import Reading, VideoInfo, probe, read_frames
-from hwp_bench.importers.video.video_settings import FrameRange
+from hwp_bench.importers.video.decode import FrameRange, Reading, VideoInfo, probe, read_frames
 
 COUNT = 24
 #: H.264 whose frames stand alone, so that each that is in the file can be shown.

@@ -21,7 +21,7 @@ from hwp_bench.hands import pose_hand
 from hwp_bench.hands.raster import overlap
 from hwp_bench.importers.shared.landmarks import read_landmarks
 from hwp_bench.importers.video import FitSettings, ImportedClip, VideoImport, import_video
-from hwp_bench.importers.video.fit_clip import Footage, fit_landmarks, share_camera
+from hwp_bench.importers.video.solve import Footage, fit_landmarks, share_camera
 from hwp_bench.importers.video.source import read_source
 from hwp_bench.results import read_results
 
@@ -31,7 +31,7 @@ QUICK = FitSettings(
     landmark_steps=90,
     contour_steps=20,
     contour_rounds=1,
-    texture_weight=0.0,
+    texture=False,
     picture_rounds=2,
 )
 
@@ -129,14 +129,14 @@ def test_two_hands_get_one_focal_length(clip: TwoHandClip) -> None:
     ]
     with torch.no_grad():
         fits[0].model.variables.log_focal.add_(0.1)
-        before = [fit.model.posed().landmarks[:, 0] for fit in fits]
+        before = [fit.model.pose().landmarks[:, 0] for fit in fits]
         wrists = [fit.model.pixels(wrist) for fit, wrist in zip(fits, before, strict=True)]
     logs = [float(fit.model.variables.log_focal.detach()) for fit in fits]
     share_camera(fits, steps=0)
     for fit, wrist in zip(fits, wrists, strict=True):
         assert float(fit.model.variables.log_focal.detach()) == pytest.approx(np.mean(logs), 1e-5)
         with torch.no_grad():
-            moved = fit.model.pixels(fit.model.posed().landmarks[:, 0]) - wrist
+            moved = fit.model.pixels(fit.model.pose().landmarks[:, 0]) - wrist
         # The tracker's offset of the wrist is not on the ray of its joint.
         assert moved.abs().max() < 0.1
 

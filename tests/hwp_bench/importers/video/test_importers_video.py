@@ -27,16 +27,18 @@ from hwp_bench.capture.check import check_capture
 from hwp_bench.cli.main import main
 from hwp_bench.hands import load_template, pose_hand, project
 from hwp_bench.hands.raster import overlap
-from hwp_bench.importers.video.decode import probe, read_frames
-from hwp_bench.importers.video.from_video import import_video, without_blank_frames
-from hwp_bench.importers.video.imported_clip import IMPORTER_VERSION
-from hwp_bench.importers.video.source import read_source
-from hwp_bench.importers.video.video_settings import FitSettings, FrameRange, VideoImport
+from hwp_bench.importers.video.api import drop_blank_frames, import_video
+from hwp_bench.importers.video.clip import IMPORTER_VERSION
+from hwp_bench.importers.video.decode import FrameRange, probe, read_frames
+from hwp_bench.importers.video.solve import FitSettings
+from hwp_bench.importers.video.source import VideoImport, read_source
 
 FRAMES = 16
 QUICK = FitSettings(
     start_steps=60, landmark_steps=120, contour_steps=30, contour_rounds=1, picture_rounds=1
 )
+#: The same without texture and pictures, where the fit is not what is asked about.
+QUICKER = replace(QUICK, texture=False, picture_rounds=0)
 REAL = Path(__file__).resolve().parents[5] / "shared" / "data" / "real_hand"
 
 
@@ -163,7 +165,7 @@ def test_a_video_that_ends_early_is_recorded(
 def test_the_command_prints_the_numbers_and_saves_the_sheet(
     folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(FitSettings, "__init__", lambda self: _set(self, QUICK))
+    monkeypatch.setattr(FitSettings, "__init__", lambda self: _set(self, QUICKER))
     sheet = folder / "sheet.png"
     words = ["data", "import-video", str(folder / "hand.avi"), str(folder / "by_command")]
     words += ["--landmarks", str(folder / "hand.npz"), "--size", "96", "--frames", "6:16"]
@@ -194,7 +196,7 @@ def _set(settings: FitSettings, values: FitSettings) -> None:
 
 
 def test_own_masks_are_taken(folder: Path, clip: SyntheticClip) -> None:
-    options = VideoImport(size=96, fit=QUICK, focal=FOCAL, masks=folder / "masks")
+    options = VideoImport(size=96, fit=QUICKER, focal=FOCAL, masks=folder / "masks")
     result = import_video(folder / "hand.avi", folder / "hand.npz", folder / "own", options)
     capture = open_capture(folder / "own")
     assert capture.info.source["masks"] == "user"
@@ -263,7 +265,7 @@ def test_arguments_are_checked_before_any_work(
     message: str,
 ) -> None:
     monkeypatch.chdir(folder)
-    monkeypatch.setattr("hwp_bench.importers.video.from_video.read_source", None)
+    monkeypatch.setattr("hwp_bench.importers.video.api.read_source", None)
     given = ["data", "import-video", "hand.avi", "out", "--landmarks", "hand.npz"]
     assert main([*given, *words]) in (1, 2)
     said = capsys.readouterr().err
@@ -277,7 +279,7 @@ def test_black_frames_show_no_hand(
 ) -> None:
     pictures = [clip.picture(frame) * (frame not in (3, 9)) for frame in range(FRAMES)]
     video = write_video(tmp_path / "hand.avi", pictures)
-    source = without_blank_frames(read_source(video, folder / "hand.npz", VideoImport()))
+    source = drop_blank_frames(read_source(video, folder / "hand.npz", VideoImport()))
     assert "no hand is taken from frames of one colour: 3, 9." in capsys.readouterr().err
     np.testing.assert_array_equal(np.flatnonzero(~source.detected), [3, 5, 9])
 

@@ -22,8 +22,8 @@ from tiny_scene import SINGLE
 from hwp_bench.base.errors import BadInput, HwpError
 from hwp_bench.capture import open_capture
 from hwp_bench.cli.main import main
-from hwp_bench.sim.produce.production import render_capture
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.produce.capture import render_capture
+from hwp_bench.sim.scene.scene import Scene
 
 FRAMES, SIZE = 24, 32
 

@@ -11,12 +11,11 @@ import pytest
 
 from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture, open_capture
-from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.effects import plan_frame
+from hwp_bench.sim.produce.capture import frame_file, render_capture, render_key, true_hands
 from hwp_bench.sim.produce.estimates import EASY_ERROR, estimate_hands
-from hwp_bench.sim.produce.frames import frame_file
-from hwp_bench.sim.produce.production import render_capture, render_key, true_hands
 from hwp_bench.sim.produce.suites import ensure_suite, suite
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.scene import Scene
 
 SceneMaker = Callable[..., Scene]
 FRAMES, SIZE = 20, 40
@@ -30,7 +29,7 @@ def _pixels(capture: Capture) -> np.ndarray:
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_scene import SINGLE
 
-    from hwp_bench.sim.scene.reader import parse_scene
+    from hwp_bench.sim.scene_files import parse_scene
 
     path = tmp_path_factory.mktemp("sim") / "tiny"
     scene = parse_scene(SINGLE, where="tiny.toml")
@@ -95,10 +94,10 @@ def test_workers_change_nothing(rendered: Path, make_scene: SceneMaker, tmp_path
 def test_an_interrupted_render_goes_on(
     rendered: Path, make_scene: SceneMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hwp_bench.sim.produce import production
+    from hwp_bench.sim.produce import capture as production
 
     scene, out = make_scene(), tmp_path / "late"
-    honest, done = production.render_frames, []
+    honest, done = production.render_waiting, []
 
     def broken(*args: object, **settings: object) -> None:
         if len(done) == 7:
@@ -106,14 +105,14 @@ def test_an_interrupted_render_goes_on(
         done.append(1)
         honest(*args, **settings)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(production, "render_frames", broken)
+    monkeypatch.setattr(production, "render_waiting", broken)
     with pytest.raises(KeyboardInterrupt):
         render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     assert not out.exists()
     waiting = tmp_path / f".late.{render_key(scene, FRAMES, SIZE)[:16]}"
     assert sum(frame_file(waiting, frame).exists() for frame in range(FRAMES)) == 7
     frame_file(waiting, 3).write_bytes(b"cut short")
-    monkeypatch.setattr(production, "render_frames", honest)
+    monkeypatch.setattr(production, "render_waiting", honest)
     capture = render_capture(scene, out, frame_count=FRAMES, size=SIZE, workers=1, free_view=False)
     np.testing.assert_array_equal(_pixels(capture), _pixels(open_capture(rendered)))
     assert not waiting.exists()
@@ -136,7 +135,7 @@ def test_refusals(rendered: Path, make_scene: SceneMaker, tmp_path: Path) -> Non
 def test_layers_agree_with_the_geometry(rendered: Path) -> None:
     import OpenImageIO as oiio
 
-    from hwp_bench.sim.render.layers import CHANNELS
+    from hwp_bench.sim.render.frame import CHANNELS
 
     image = oiio.ImageBuf(str(rendered / "extra" / "exr" / "000019.exr"))
     assert tuple(image.spec().channelnames)[:3] == ("R", "G", "B")
@@ -159,7 +158,7 @@ def test_estimates_are_worse_where_it_is_harder(make_scene: SceneMaker) -> None:
             'kind = "complex_poses"\nepisodes = [[0.3, 0.4, 5]]\nright = [{ gesture = "claw" }]',
         )
     )
-    plans = [plan(scene, frame, 400, SIZE) for frame in range(400)]
+    plans = [plan_frame(scene, frame, 400, SIZE) for frame in range(400)]
     truth = true_hands(scene, plans)
     given = estimate_hands(scene, truth, plans)["right"]
     error = np.abs(given.pose - truth["right"].pose)[:, 1:].mean(axis=(1, 2))
@@ -179,19 +178,20 @@ def test_suites_name_existing_scenes() -> None:
     assert sum(item.frame_count for item in full) == 13821
     assert {item.size for item in full} == {256}
     for whole, lite in zip(full, suite("full-lite"), strict=True):
-        assert (lite.scene, lite.size, lite.seed) == (whole.scene, whole.size, whole.seed)
+        assert (lite.scene, lite.size) == (whole.scene, whole.size)
         assert 0 <= 12 * lite.frame_count - whole.frame_count < 12
 
 
 def test_a_suite_in_the_cache_is_not_rendered_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_scene: SceneMaker
 ) -> None:
-    from hwp_bench.sim.produce import production, suites
+    from hwp_bench.sim.produce import capture as production
+    from hwp_bench.sim.produce import suites
 
-    item = suites.SuiteItem(make_scene(), 10, 32, 5)
+    item = suites.SuiteItem(make_scene(), 10, 32)
     monkeypatch.setattr(suites, "suite", lambda name: (item,))
     (first,) = ensure_suite("smoke", tmp_path, workers=1)
-    monkeypatch.setattr(production, "render_frames", None)
+    monkeypatch.setattr(production, "render_waiting", None)
     assert ensure_suite("smoke", tmp_path) == [first]
 
 

@@ -13,8 +13,8 @@ from tiny_scene import SINGLE
 
 from hwp_bench.cli.main import main
 from hwp_bench.sim.produce.calibration import TARGETS, Calibration, calibrate, write_strengths
-from hwp_bench.sim.scene.reader import known_scenes, load_scene, scene_groups, scene_names
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import known_scenes, load_scene, scene_groups, scene_names
 
 SceneMaker = Callable[..., Scene]
 

@@ -17,17 +17,20 @@ from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.check import check_capture
 from hwp_bench.capture.schema import FREE_VIEW
 from hwp_bench.sim.produce import free_view
-from hwp_bench.sim.produce.free_view import GAP, REACH, free_views, has_free_view
-from hwp_bench.sim.produce.production import render_capture
-from hwp_bench.sim.scene.free_view import (
+from hwp_bench.sim.produce.capture import render_capture
+from hwp_bench.sim.produce.free_view import (
     FOREARM_CONE,
     FRAMES,
+    GAP,
+    REACH,
     camera_directions,
+    free_views,
+    has_free_view,
     looking_at,
     unseen_gestures,
 )
-from hwp_bench.sim.scene.reader import load_scene, scene_names
-from hwp_bench.sim.scene.schema import Scene, with_effects
+from hwp_bench.sim.scene.scene import Scene, with_effects
+from hwp_bench.sim.scene_files import load_scene, scene_names
 
 SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 10, 48
@@ -37,7 +40,7 @@ COUNT, SIZE = 10, 48
 def rendered(tmp_path_factory: pytest.TempPathFactory) -> Path:
     from tiny_scene import SINGLE
 
-    from hwp_bench.sim.scene.reader import parse_scene
+    from hwp_bench.sim.scene_files import parse_scene
 
     path = tmp_path_factory.mktemp("sim") / "tiny"
     scene = parse_scene(SINGLE, where="tiny.toml")
@@ -100,7 +103,7 @@ def test_gestures_are_those_that_the_scene_does_not_show(name: str) -> None:
 def test_two_hands_keep_apart_and_fit_into_the_image() -> None:
     from scipy.spatial import cKDTree
 
-    from hwp_bench.sim.scene.optics import intrinsics
+    from hwp_bench.sim.scene.motion import intrinsics
 
     scene = load_scene("capture6")
     for item in free_views(scene, 3):
@@ -161,26 +164,27 @@ def test_the_given_hands_explain_the_masks(rendered: Path) -> None:
 def test_the_clip_is_no_part_of_the_capture(
     rendered: Path, make_scene: SceneMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hwp_bench.sim.produce import production, suites
+    from hwp_bench.sim.produce import capture as production
+    from hwp_bench.sim.produce import suites
 
-    item = suites.SuiteItem(make_scene(), COUNT, SIZE, 5)
-    (bare,) = suites.ensure_captures([item], tmp_path, workers=1, free_view=False)
+    item = suites.SuiteItem(make_scene(), COUNT, SIZE)
+    (bare,) = suites.ensure_suite([item], tmp_path, workers=1, free_view=False)
     assert not (bare / FREE_VIEW).exists()
     assert open_capture(bare).digest == open_capture(rendered).digest
     assert open_capture(bare).free_view is None
     # A capture in the cache gets the clip, and is not rendered again.
-    monkeypatch.setattr(production, "render_frames", None)
-    assert suites.ensure_captures([item], tmp_path, workers=1) == [bare]
+    monkeypatch.setattr(production, "render_waiting", None)
+    assert suites.ensure_suite([item], tmp_path, workers=1) == [bare]
     assert _clip(bare).digest == _clip(rendered).digest
     # A clip of an older version is replaced, one of this version is not.
     metadata = bare / FREE_VIEW / "capture.json"
     value = read_json(metadata)
     write_json(metadata, {**value, "source": {**value["source"], "version": 0}})
     assert not has_free_view(bare)
-    suites.ensure_captures([item], tmp_path, workers=1)
+    suites.ensure_suite([item], tmp_path, workers=1)
     assert _clip(bare).digest == _clip(rendered).digest
     monkeypatch.setattr(free_view, "write_free_view", None)
-    suites.ensure_captures([item], tmp_path, workers=1)
+    suites.ensure_suite([item], tmp_path, workers=1)
 
 
 def test_effects_and_sensor_leave_the_clip_as_it_is(make_scene: SceneMaker) -> None:
@@ -200,7 +204,7 @@ def test_effects_and_sensor_leave_the_clip_as_it_is(make_scene: SceneMaker) -> N
 def test_a_hidden_hand_makes_the_camera_move(
     make_scene: SceneMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from hwp_bench.sim.scene.free_view import hand_axes
+    from hwp_bench.sim.produce.free_view import hand_axes
 
     scene = make_scene()
     (item, *_) = free_views(scene, 6)

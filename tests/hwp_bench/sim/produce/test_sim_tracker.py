@@ -14,16 +14,23 @@ import pytest
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template
 from hwp_bench.hands.poses import RestSkeleton, posed_skeleton, rest_skeleton, turned
-from hwp_bench.sim.effects.plan import plan
+from hwp_bench.sim.effects import plan_frame
+from hwp_bench.sim.light.lights import focus_point
+from hwp_bench.sim.produce.capture import true_hands
 from hwp_bench.sim.produce.estimates import estimate_hands
-from hwp_bench.sim.produce.production import true_hands
-from hwp_bench.sim.produce.tracker import ParameterErrors, parameter_errors
-from hwp_bench.sim.produce.tracker_geometry import curl, edge_on
-from hwp_bench.sim.produce.tracker_noise import HABIT, MEMORY, growth, landmark_noise, wandering
+from hwp_bench.sim.produce.tracker import (
+    HABIT,
+    MEMORY,
+    ParameterErrors,
+    curl,
+    edge_on,
+    growth,
+    landmark_noise,
+    parameter_errors,
+    wandering,
+)
 from hwp_bench.sim.scene.motion import hand_parameters, moment_of_key
-from hwp_bench.sim.scene.optics import focus_point
-from hwp_bench.sim.scene.schema import HandKey, Scene, with_effects
-from hwp_bench.sim.scene.tracking import Estimator
+from hwp_bench.sim.scene.scene import Estimator, HandKey, Scene, with_effects
 
 SceneMaker = Callable[..., Scene]
 FRAMES = 60
@@ -104,7 +111,7 @@ def estimated(make_scene: SceneMaker) -> Callable[..., tuple[np.ndarray, np.ndar
 
     def run(estimator: Estimator | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         scene = replace(with_effects(make_scene(), []), estimator=estimator)
-        plans = [plan(scene, frame, FRAMES, 48) for frame in range(FRAMES)]
+        plans = [plan_frame(scene, frame, FRAMES, 48) for frame in range(FRAMES)]
         truth = true_hands(scene, plans)
         given = estimate_hands(scene, truth, plans)["right"]
         return given.pose - truth["right"].pose, given.betas - truth["right"].betas, given.valid

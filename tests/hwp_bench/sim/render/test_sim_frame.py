@@ -5,20 +5,20 @@ Oracles: the scene without an effect (bit for bit), counts of rays, and energy c
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT, SINGLE
+from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
 from hwp_bench.base.tables import to_markdown
-from hwp_bench.sim.effects.plan import SUBFRAME_STEP, plan
+from hwp_bench.sim.effects import SUBFRAME_STEP, plan_frame
 from hwp_bench.sim.produce.forecast import forecast, plan_table
+from hwp_bench.sim.props.objects import build_object
 from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
-from hwp_bench.sim.scene.schema import Scene, Sensor, with_effects
+from hwp_bench.sim.scene.scene import Scene, with_effects
+from hwp_bench.sim.sensor import Sensor
 
 SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 48
@@ -90,12 +90,12 @@ def test_rays_are_those_of_the_passes(render: Callable[[int], SimulatedFrame]) -
 def test_subframes_follow_the_motion_on_the_screen(make_scene: SceneMaker) -> None:
     scene = make_scene()
     counts = [
-        plan(scene, BLUR, COUNT, 256, {"motion_blur": strength}).subframes
+        plan_frame(scene, BLUR, COUNT, 256, {"motion_blur": strength}).subframes
         for strength in (0.001, 0.02, 0.04, 0.08)
     ]
     assert counts == sorted(counts)
     assert counts[-1] >= 0.08 * 256 / SUBFRAME_STEP / 1.5
-    assert plan(scene, CLEAN, COUNT, 256).subframes == 1
+    assert plan_frame(scene, CLEAN, COUNT, 256).subframes == 1
 
 
 def test_blur_moves_light_but_makes_none(make_scene: SceneMaker) -> None:
@@ -141,21 +141,12 @@ def test_frames_depend_on_the_seed_alone(make_scene: SceneMaker) -> None:
     assert (first.rgb != other.rgb).any()
 
 
-def test_a_scene_without_objects_imports_none() -> None:
-    program = f"""
-import sys
-from hwp_bench.sim.scene.reader import parse_scene
-from hwp_bench.sim.scene.schema import with_effects
-from hwp_bench.sim.render.frame import render_frame
-scene = with_effects(parse_scene('''{SINGLE}''', where='tiny'), ['illumination'])
-render_frame(scene, {LIGHT}, {COUNT}, {SIZE})
-print(sorted(name for name in sys.modules if name.startswith('hwp_bench.sim.props.')))
-"""
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    )
-    # What gives out objects by name, and the backdrop; no module that builds an object.
-    assert done.stdout.strip() == "['hwp_bench.sim.props.backdrop', 'hwp_bench.sim.props.objects']"
+def test_a_scene_without_objects_builds_none(make_scene: SceneMaker) -> None:
+    build_object.cache_clear()
+    render_frame(with_effects(make_scene(), ["illumination"]), LIGHT, COUNT, SIZE)
+    assert build_object.cache_info().misses == 0
+    render_frame(make_scene(), OBJECT, COUNT, SIZE)
+    assert build_object.cache_info().misses > 0
 
 
 def test_the_forecast_is_the_sum_of_what_is_called_for(make_scene: SceneMaker) -> None:

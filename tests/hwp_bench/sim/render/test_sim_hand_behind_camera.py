@@ -13,13 +13,15 @@ import numpy as np
 import pytest
 from tiny_scene import BLUR, CLEAN, LIGHT, OBJECT
 
-from hwp_bench.sim.effects.plan import hands_at, plan
-from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.effects import hands_at, plan_frame
+from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.geometry.surface import Surface
+from hwp_bench.sim.light.lights import FOCUS_DISTANCE
 from hwp_bench.sim.render.frame import SUPERSAMPLING, SimulatedFrame, render_frame
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.optics import FOCUS_DISTANCE, intrinsics, pixel_rays, viewmat
-from hwp_bench.sim.scene.schema import Scene, Sensor
+from hwp_bench.sim.scene.motion import intrinsics, pixel_rays, viewmat
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.sensor import Sensor
 
 SceneMaker = Callable[..., Scene]
 COUNT, SIZE = 40, 12
@@ -75,7 +77,7 @@ def test_of_a_hand_around_the_camera_the_part_before_it_is_drawn(make_scene: Sce
     # Fingers point away from the camera, whose centre lies above the palm.
     scene = placed(make_scene, 0.05, -FOCUS_DISTANCE, tilt=50.0)
     result = render_frame(scene, CLEAN, COUNT, SIZE)
-    seconds = plan(scene, CLEAN, COUNT, SIZE).seconds
+    seconds = plan_frame(scene, CLEAN, COUNT, SIZE).seconds
     surface = Stage(scene, RenderCost()).surface(hands_at(scene, seconds))
     view = viewmat(scene, seconds)
     depths = surface.vertices @ view[2, :3] + view[2, 3]

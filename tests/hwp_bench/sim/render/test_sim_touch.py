@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from hwp_bench.sim.effects.plan import hands_at
-from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.effects import hands_at
+from hwp_bench.sim.geometry.rays import RenderCost
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.reader import load_scene, scene_names
-from hwp_bench.sim.subject.hand import MOVING, scene_hands
+from hwp_bench.sim.scene.motion import scene_hands
+from hwp_bench.sim.scene_files import load_scene, scene_names
+from hwp_bench.sim.subject.hand import MOVING
 
 INTERACTING = [name for name in scene_names() if load_scene(name).hands == "both"]
 #: Deepest that one hand may press into the other, m.

@@ -12,21 +12,21 @@ from tiny_scene import SINGLE
 from hwp_bench.base.errors import BadInput, UsageError
 from hwp_bench.capture.splits import contiguous_split
 from hwp_bench.sim.produce.suites import suite, suite_names
-from hwp_bench.sim.scene.episodes import clean_share, level, moments, severity
-from hwp_bench.sim.scene.reader import (
-    load_scene,
-    meant_scenes,
-    parse_scene,
-    scene_groups,
-    scene_names,
-)
-from hwp_bench.sim.scene.schema import (
+from hwp_bench.sim.scene.motion import clean_share, level, moments, severity
+from hwp_bench.sim.scene.scene import (
     CLEAN_FROM,
     MIN_CLEAN_SHARE,
     Scene,
     with_effects,
     with_severity,
     with_subject,
+)
+from hwp_bench.sim.scene_files import (
+    load_scene,
+    meant_scenes,
+    parse_scene,
+    scene_groups,
+    scene_names,
 )
 from hwp_bench.taxonomy import catalogue
 

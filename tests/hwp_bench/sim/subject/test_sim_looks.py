@@ -16,19 +16,18 @@ from hypothesis import strategies as st
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.hands.poses import FIRST_JOINT
-from hwp_bench.sim.effects.plan import hands_at, plan
-from hwp_bench.sim.geometry.mesh import surface_normals
-from hwp_bench.sim.geometry.raycast import RenderCost
+from hwp_bench.sim.effects import hands_at, plan_frame
+from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.hand.anatomy import Anatomy
 from hwp_bench.sim.render.frame import render_frame
 from hwp_bench.sim.render.stage import Stage
-from hwp_bench.sim.scene.looks import PLAIN, Glove, Looks, Polish, Ring, Tattoo, WristWear
-from hwp_bench.sim.scene.schema import Scene, Subject
-from hwp_bench.sim.subject.anatomy import Anatomy
-from hwp_bench.sim.subject.forearm import wrist_loop
-from hwp_bench.sim.subject.hand import anatomy_at, subject_hand
-from hwp_bench.sim.subject.painting import of_side, painted
-from hwp_bench.sim.subject.skin import sample_skin
-from hwp_bench.sim.subject.worn import ring_mounts
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.subject.arms import wrist_loop
+from hwp_bench.sim.subject.hand import subject_hand
+from hwp_bench.sim.subject.mounts import ring_mounts
+from hwp_bench.sim.subject.skin import of_side, painted, sample_skin
+from hwp_bench.sim.subject.subject import PLAIN, Looks, Subject
+from hwp_bench.sim.subject.wear import Glove, Polish, Ring, Tattoo, WristWear
 
 SceneMaker = Callable[..., Scene]
 PERSON = Subject(seed=11, tone=0.22, age=31.0)
@@ -39,10 +38,7 @@ RED = (0.8, 0.05, 0.1)
 def places() -> Anatomy:
     """The vertices of a rest hand, 1.4 mm apart."""
     hand = subject_hand(PERSON, "right")
-    template = hand.template
-    rest = hand.lift @ (template.vertices + template.shape_basis @ hand.betas)
-    normals = surface_normals(rest, hand.faces, hand.normal_sum)
-    return anatomy_at(template, hand.betas, rest, normals, hand.lift @ template.weights)
+    return hand.anatomy(hand.rest, hand.rest_normals, hand.lift @ hand.template.weights)
 
 
 def wearing(**looks: object) -> Subject:
@@ -180,7 +176,7 @@ def test_worn_things_are_in_frame_and_mask_as_documented(make_scene: SceneMaker)
     )
     scene = replace(make_scene(), subject=subject)
     worn = render_frame(scene, 36, 40, 48)
-    assert plan(scene, 36, 40, 48).passes[4:6] == ("bare_arm", "rings")
+    assert plan_frame(scene, 36, 40, 48).passes[4:6] == ("bare_arm", "rings")
     np.testing.assert_array_equal(worn.rgb, worn.clean)
     # A glove makes the hand thicker and counts as hand.
     assert 1.0 < worn.coverage.sum() / plain.coverage.sum() < 1.3

@@ -18,8 +18,8 @@ from synthetic_mano import write_mirrored_mano
 from hwp_bench.base.errors import BadHandModel
 from hwp_bench.capture import Capture
 from hwp_bench.hands import load_template, pose_hand, project
-from hwp_bench.sim.produce.production import render_capture
-from hwp_bench.sim.scene.schema import Scene
+from hwp_bench.sim.produce.capture import render_capture
+from hwp_bench.sim.scene.scene import Scene
 
 FRAMES, SIZE = 10, 64
 

@@ -1,0 +1,615 @@
+"""Captures of InterHand2.6M: the annotations of one camera of one sequence, and its images.
+
+Masks are silhouettes of the annotated hands: the data set has none. Parts of a hand that the other
+hand hides are inside the one mask of a capture. Sleeves and marks on the skin are in it too.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import BadInput, UsageError, bounded
+from hwp_bench.base.files import check_is_file, inside, read_json
+from hwp_bench.base.images import is_blank, read_rgb
+from hwp_bench.capture import Cameras, CaptureInfo, identify_hand_model
+from hwp_bench.capture.convert import with_one_shape
+from hwp_bench.capture.schema import MAX_FRAMES
+from hwp_bench.hands import HandParameters, HandTemplate, load_template
+from hwp_bench.hands.fitting import FitTargets, fit_hand
+from hwp_bench.hands.raster import draw_silhouette
+from hwp_bench.importers.shared.frames import CropWindows, cut, follow_hands, resample
+from hwp_bench.importers.shared.landmarks import Landmarks
+from hwp_bench.importers.shared.output import (
+    ProjectedHand,
+    overlay_sheet,
+    pose_parameters,
+    project_hand,
+    refuse_existing,
+    sheet_frames,
+    write_capture,
+)
+
+#: The hands that can be asked for.
+CHOICES = ("auto", "right", "left", "both")
+#: Fewest frames of a capture.
+FEWEST = 3
+#: Terms of the data set.
+LICENCE = "CC BY-NC 4.0 (InterHand2.6M)"
+#: Parts of the data set.
+SPLITS = ("train", "val", "test")
+#: Largest annotation file; the training part's `data` file has about 1 GB.
+MAX_BYTES = 3 * 1024 * 1024 * 1024
+#: The data set's joints of one hand in the order of our 21 landmarks (wrist, then each finger
+#: from its base to its tip): it lists thumb to little finger from tip to base, the wrist last.
+LANDMARK_ROWS = (20, 3, 2, 1, 0, 7, 6, 5, 4, 11, 10, 9, 8, 15, 14, 13, 12, 19, 18, 17, 16)
+# The file of MANO parameters, which comes apart from the others.
+_MANO = "MANO_NeuralAnnot"
+# First joint of each hand.
+_FIRST_JOINT = {"right": 0, "left": 21}
+_PATH = re.compile(r"(?:(train|val|test)/)?Capture(\d{1,4})/([A-Za-z0-9_.-]{1,80})/cam(\d{1,9})")
+
+
+@dataclass(frozen=True)
+class InterHandSequence:
+    """One camera of one sequence."""
+
+    #: Number of the capture.
+    capture: int
+    #: Name of the sequence.
+    name: str
+    #: Number of the camera.
+    camera: str
+    #: Part of the data set, or None: the first that has it.
+    split: str | None = None
+
+    @property
+    def id(self) -> str:
+        """Id of the HWP capture that is made of it."""
+        return f"interhand-{self.capture}-{self.name}-{self.camera}"
+
+    @property
+    def folder(self) -> str:
+        """Its folder in a part of the data set, without the camera."""
+        return f"Capture{self.capture}/{self.name}"
+
+
+#: The three sequences of the paper.
+PAPER_SEQUENCES: Mapping[str, InterHandSequence] = MappingProxyType(
+    {
+        "touchrom-15": InterHandSequence(21, "0390_dh_touchROM", "400015"),
+        "touchrom-16": InterHandSequence(21, "0390_dh_touchROM", "400016"),
+        "handscratch-16": InterHandSequence(21, "0286_handscratch", "400016"),
+    }
+)
+
+
+def find_sequence(name: str) -> InterHandSequence:
+    """Look up a sequence.
+
+    Args:
+        name: one of `PAPER_SEQUENCES`, or `[split/]CaptureN/SEQUENCE/camID` as the data set's
+            folders are named.
+
+    Raises:
+        UsageError: it is neither; the message lists the paper's.
+    """
+    if name in PAPER_SEQUENCES:
+        return PAPER_SEQUENCES[name]
+    match = _PATH.fullmatch(name.strip("/"))
+    if match is None or match.group(3).strip(".") == "":
+        raise UsageError(
+            f"{name!r} is not a sequence",
+            field="SEQUENCE",
+            remedy=f"Use {', '.join(PAPER_SEQUENCES)}, or CaptureN/SEQUENCE/camID.",
+        )
+    return InterHandSequence(int(match.group(2)), match.group(3), match.group(4), match.group(1))
+
+
+@dataclass(frozen=True)
+class InterHandImport:
+    """Choices of an import; checked when made.
+
+    Raises:
+        UsageError: a choice makes no sense.
+    """
+
+    #: MANO file or folder, or None to fit the free hand to the annotated joints.
+    mano: Path | None = None
+    #: Edge of the stored square frames, px.
+    size: int = 256
+    #: Frames per second of the annotated frames; the data set comes at 5 and at 30.
+    fps: float = 5.0
+    #: The hands that are imported: `right`, `left`, `both`, or `auto`: those that the data set
+    #: says the sequence shows.
+    side: str = "auto"
+    #: Replace an existing capture.
+    overwrite: bool = False
+
+    def __post_init__(self) -> None:
+        if self.side not in CHOICES:
+            raise UsageError(f"must be one of {', '.join(CHOICES)}", field="--side")
+        if not 32 <= self.size <= 2048:
+            raise UsageError("must be 32 to 2048 px", field="--size")
+        if not 0 < self.fps < 1000:
+            raise UsageError("must be above 0 and below 1000", field="--fps")
+
+    @property
+    def model(self) -> str:
+        """The hand model, as `load_template` takes it."""
+        return "anny" if self.mano is None else f"mano:{Path(self.mano).absolute()}"
+
+
+# --- Annotations
+
+
+@dataclass(frozen=True, eq=False)
+class ManoAnnotation:
+    """MANO parameters of one hand in every frame, world frame."""
+
+    #: (F, 16, 3) axis-angle rad, relative to MANO's mean pose.
+    pose: np.ndarray
+    #: (F, 10).
+    shape: np.ndarray
+    #: (F, 3) m.
+    transl: np.ndarray
+    #: (F,) bool, false where the data set has none.
+    valid: np.ndarray
+
+    def select(self, kept: np.ndarray) -> ManoAnnotation:
+        """Those of some frames, (F,) bool."""
+        return ManoAnnotation(
+            self.pose[kept], self.shape[kept], self.transl[kept], self.valid[kept]
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class InterHandRecords:
+    """The annotations of one camera of one sequence."""
+
+    #: Part of the data set.
+    split: str
+    #: (F,) frame numbers, ascending.
+    frames: np.ndarray
+    #: F image files.
+    images: tuple[Path, ...]
+    #: (width, height) px.
+    size: tuple[int, int]
+    #: The hands that some frame shows.
+    sides: tuple[str, ...]
+    #: (3, 3) px.
+    K: np.ndarray
+    #: (4, 4) world to camera, m.
+    viewmat: np.ndarray
+    #: (F, 21, 3) m, world, OpenPose order, by side; NaN where not valid.
+    joints: Mapping[str, np.ndarray]
+    #: MANO parameters by side.
+    mano: Mapping[str, ManoAnnotation]
+
+    def select(self, kept: np.ndarray) -> InterHandRecords:
+        """The annotations of some frames, (F,) bool."""
+        return replace(
+            self,
+            frames=self.frames[kept],
+            images=tuple(image for image, one in zip(self.images, kept, strict=True) if one),
+            joints={side: joints[kept] for side, joints in self.joints.items()},
+            mano={side: hand.select(kept) for side, hand in self.mano.items()},
+        )
+
+
+class _Annotations:
+    """The annotation files of the part of the data set that has a sequence."""
+
+    def __init__(self, root: str | os.PathLike[str], sequence: InterHandSequence) -> None:
+        self.root, self.sequence = Path(root), sequence
+        splits = (sequence.split,) if sequence.split else SPLITS
+        found = [one for one in splits if (self.root / "images" / one / sequence.folder).is_dir()]
+        if not found:
+            raise BadInput(
+                f"does not contain images/*/{sequence.folder}",
+                where=self.root,
+                remedy="Give the folder with images/ and annotations/ of InterHand2.6M.",
+            )
+        self.split = found[0]
+        self.images = self.root / "images" / self.split
+
+    def path(self, kind: str) -> Path:
+        """The file of a kind of annotations."""
+        name = f"InterHand2.6M_{self.split}_{kind}.json"
+        return self.root / "annotations" / self.split / name
+
+    def of_capture(self, kind: str) -> tuple[Path, dict[str, Any]]:
+        """The file of a kind, and what it says of the sequence's capture."""
+        path, capture = self.path(kind), str(self.sequence.capture)
+        value = read_json(path, max_bytes=MAX_BYTES)
+        found = value.get(capture) if isinstance(value, dict) else None
+        if not isinstance(found, dict):
+            raise BadInput("is missing", where=path, field=capture)
+        return path, found
+
+    def frames(self) -> list[dict[str, Any]]:
+        """The records of the annotated frames of the camera, by frame number."""
+        sequence, path = self.sequence, self.path("data")
+        data, where = read_json(path, max_bytes=MAX_BYTES), path.parent
+        if not isinstance(data, dict):
+            raise BadInput("is not a JSON object", where=path)
+        wanted = (str(sequence.capture), sequence.name, sequence.camera)
+        chosen = {
+            image.get("id"): image
+            for image in _objects(data, "images", where)
+            if (str(image.get("capture")), image.get("seq_name"), str(image.get("camera")))
+            == wanted
+        }
+        types = {
+            item.get("image_id"): item.get("hand_type")
+            for item in _objects(data, "annotations", where)
+            if item.get("image_id") in chosen
+        }
+        rows = []
+        for key, image in chosen.items():
+            row = {**image, "hand_type": types.get(key)}
+            for name in ("frame_idx", "width", "height"):
+                try:
+                    row[name] = int(row[name])
+                except (KeyError, TypeError, ValueError) as error:
+                    problem = f"image {key} does not have it"
+                    raise BadInput(problem, where=where, field=name) from error
+            if not isinstance(row.get("file_name"), str):
+                raise BadInput(f"image {key} does not have it", where=where, field="file_name")
+            if row["hand_type"] in ("right", "left", "interacting"):
+                rows.append(row)
+        if not 1 <= len(rows) <= MAX_FRAMES:
+            raise BadInput(
+                f"{len(rows)} annotated frames of {sequence.name}, camera {sequence.camera}",
+                where=where,
+                remedy="Is the sequence in this part of the data set?",
+            )
+        rows.sort(key=lambda row: row["frame_idx"])
+        if len({row["frame_idx"] for row in rows}) < len(rows):
+            raise BadInput(
+                f"lists a frame of {sequence.name} twice", where=where, field="frame_idx"
+            )
+        return rows
+
+    def camera(self) -> tuple[np.ndarray, np.ndarray]:
+        """Intrinsics (3, 3) px, and (4, 4) world to camera, m."""
+        path, capture = self.of_capture("camera")
+        sequence = self.sequence
+
+        def numbers(name: str, *shape: int) -> np.ndarray:
+            table = capture.get(name)
+            value = table.get(sequence.camera) if isinstance(table, dict) else None
+            return _numbers(value, shape, path, f"{sequence.capture}.{name}.{sequence.camera}")
+
+        position, rotation = numbers("campos", 3) / 1000.0, numbers("camrot", 3, 3)
+        focal, centre = numbers("focal", 2), numbers("princpt", 2)
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or focal.min() <= 0:
+            raise BadInput("is not a rotation, or a focal length is not above 0", where=path)
+        # Written with six digits, it is a rotation only to about 1e-6: take the nearest one.
+        left, _, right = np.linalg.svd(rotation)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = left @ right
+        viewmat[:3, 3] = -viewmat[:3, :3] @ position
+        K = np.array([[focal[0], 0, centre[0]], [0, focal[1], centre[1]], [0, 0, 1.0]])
+        return K, viewmat
+
+    def joints(self, keys: list[str], sides: tuple[str, ...]) -> dict[str, np.ndarray]:
+        """(F, 21, 3) m by side."""
+        path, capture = self.of_capture("joint_3d")
+        found = {side: np.full((len(keys), 21, 3), np.nan) for side in sides}
+        for index, key in enumerate(keys):
+            frame = capture.get(key)
+            if not isinstance(frame, dict):
+                continue
+            field = f"{self.sequence.capture}.{key}"
+            coords, valid = frame.get("world_coord"), frame.get("joint_valid")
+            world = _numbers(coords, (42, 3), path, f"{field}.world_coord") / 1000.0
+            flags = _numbers(valid, (42,), path, f"{field}.joint_valid", flat=True)
+            for side in sides:
+                rows = _FIRST_JOINT[side] + np.array(LANDMARK_ROWS)
+                # Joints that are not valid are filled with ones.
+                found[side][index] = np.where(flags[rows, None] > 0, world[rows], np.nan)
+        return found
+
+    def mano(
+        self, keys: list[str], sides: tuple[str, ...], *, needed: bool
+    ) -> dict[str, ManoAnnotation]:
+        """MANO parameters by side; none valid if they are not needed and not there."""
+        path = self.path(_MANO)
+        capture: dict[str, Any] = {}
+        if needed or path.exists():
+            path, capture = self.of_capture(_MANO)
+        made = {}
+        for side in sides:
+            pose, shape, transl = (np.zeros((len(keys), n)) for n in (48, 10, 3))
+            valid = np.zeros(len(keys), dtype=bool)
+            for index, key in enumerate(keys):
+                frame = capture.get(key)
+                hand = frame.get(side) if isinstance(frame, dict) else None
+                if hand is None:
+                    continue
+                field = f"{self.sequence.capture}.{key}.{side}"
+                if not isinstance(hand, dict):
+                    raise BadInput("is not a JSON object", where=path, field=field)
+                for name, target in (("pose", pose), ("shape", shape), ("trans", transl)):
+                    value, length = hand.get(name), (target.shape[1],)
+                    target[index] = _numbers(value, length, path, f"{field}.{name}", flat=True)
+                valid[index] = True
+            made[side] = ManoAnnotation(pose.reshape(-1, 16, 3), shape, transl, valid)
+        return made
+
+
+def _objects(data: dict[str, Any], name: str, where: Path) -> list[dict[str, Any]]:
+    value = data.get(name)
+    if not isinstance(value, list) or not all(isinstance(item, dict) for item in value):
+        raise BadInput("is not a list of objects", where=where, field=name)
+    return value
+
+
+def _numbers(
+    value: Any, shape: tuple[int, ...], where: Path, field: str, *, flat: bool = False
+) -> np.ndarray:
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise BadInput("is not a list of numbers", where=where, field=field) from error
+    array = array.reshape(-1) if flat else array
+    if array.shape != shape or not np.isfinite(array).all():
+        raise BadInput(f"is not a finite array of shape {shape}", where=where, field=field)
+    return array
+
+
+def read_annotations(
+    root: str | os.PathLike[str],
+    sequence: InterHandSequence,
+    side: str = "auto",
+    *,
+    mano: bool = True,
+) -> InterHandRecords:
+    """Read the annotations of one camera of one sequence.
+
+    `side` is `right`, `left` or `both`; `auto`: the hands that the sequence is said to show. MANO
+    parameters that are not needed (`mano`) are read where they are.
+    """
+    files = _Annotations(root, sequence)
+    rows = files.frames()
+    images = tuple(inside(files.images, re.sub(r"^/+", "", row["file_name"])) for row in rows)
+    for image in images:
+        check_is_file(image, remedy="Unpack the images of the sequence.")
+    types = {row["hand_type"] for row in rows}
+    shown = {"right", "left"} if "interacting" in types else types & {"right", "left"}
+    wanted = ("right", "left") if side in ("auto", "both") else (side,)
+    if side != "auto" and not shown >= set(wanted):
+        raise BadInput(
+            f"shows the {' and the '.join(sorted(shown)) or 'no'} hand only",
+            where=files.images / sequence.folder,
+            field="--side",
+        )
+    sides = tuple(side for side in wanted if side in shown)
+    sizes = {(row["width"], row["height"]) for row in rows}
+    if len(sizes) != 1 or not sides:
+        raise BadInput(
+            f"has frames of sizes {sorted(sizes)} and hands {sorted(types)}", where=files.images
+        )
+    K, viewmat = files.camera()
+    frames = np.array([row["frame_idx"] for row in rows])
+    keys = [str(frame) for frame in frames]
+    return InterHandRecords(
+        split=files.split,
+        frames=frames,
+        images=images,
+        size=sizes.pop(),
+        sides=sides,
+        K=K,
+        viewmat=viewmat,
+        joints=files.joints(keys, sides),
+        mano=files.mano(keys, sides, needed=mano),
+    )
+
+
+# --- The import
+
+
+def import_interhand(
+    root: str | os.PathLike[str],
+    sequence: InterHandSequence,
+    out: str | os.PathLike[str],
+    options: InterHandImport | None = None,
+) -> dict[str, Any]:
+    """Make a capture of one camera of one sequence.
+
+    Args:
+        root: the folder with `images/` and `annotations/`.
+        sequence: which one.
+        out: the capture folder to make.
+        options: choices; the defaults where None.
+
+    Returns:
+        Facts that measure the import: mean distance of the hand's joints from the annotated ones,
+        mm, and of the vertices from their place before all frames got one shape, mm.
+
+    Raises:
+        BadInput: a file or field is missing or damaged, or a hand has no annotation.
+        UsageError: `out` exists.
+    """
+    options = options or InterHandImport()
+    refuse_existing(out, overwrite=options.overwrite)
+    records = read_annotations(root, sequence, options.side, mano=options.mano is not None)
+    records, black = _without_black_frames(records, root)
+    count = len(records.frames)
+    facts: dict[str, Any] = {"frames": count, "hands": list(records.sides)}
+    if black:
+        facts["black_frames"] = black
+    templates = {side: load_template(options.model, side) for side in records.sides}
+    hands: dict[str, HandParameters] = {}
+    errors: dict[str, dict[str, Any]] = {}
+    for side, template in templates.items():
+        errors[side] = {}
+        if options.mano is not None:
+            hands[side], one_shape = _mano_hand(records.mano[side], template, side, root)
+            errors[side] = {"one_shape_mm": round(float(np.nanmean(one_shape)), 3)}
+        else:
+            hands[side] = _free_hand(records, template, side, root)
+        distance = _joint_distance(records.joints[side], template, hands[side])
+        errors[side] |= {"joints_mm": distance, "frames_valid": int(hands[side].valid.sum())}
+    viewmats = np.tile(records.viewmat, (count, 1, 1))
+
+    def projected(Ks: np.ndarray) -> list[ProjectedHand]:
+        cameras = Cameras(Ks, viewmats)
+        return [project_hand(templates[side], hands[side], cameras) for side in hands]
+
+    windows = _windows(projected(np.tile(records.K, (count, 1, 1))), options)
+    cameras = Cameras(windows.intrinsics(records.K), viewmats)
+    clips = projected(cameras.Ks)
+    facts |= {"errors": errors, "crop_px": windows.side, "split": records.split}
+    info = _info(records, sequence, facts, options)
+    shown = set(sheet_frames(count))
+    images: dict[int, np.ndarray] = {}
+    masks: dict[int, np.ndarray] = {}
+
+    def frames() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        for frame, (image, mask) in enumerate(_cropped_frames(records, clips, windows)):
+            if frame in shown:
+                images[frame], masks[frame] = image, mask
+            yield image, mask
+
+    def sheet() -> np.ndarray:
+        return overlay_sheet(clips, images, masks)
+
+    write_capture(out, info, hands, cameras, frames(), sheet, facts, overwrite=options.overwrite)
+    return facts
+
+
+def _without_black_frames(
+    records: InterHandRecords, root: str | os.PathLike[str]
+) -> tuple[InterHandRecords, list[int]]:
+    """Leave out frames whose image is black, as the data set has some (its issue 125)."""
+    height, width = records.size[::-1]
+    kept = np.array([not is_blank(read_rgb(path, (height, width))) for path in records.images])
+    black = [int(frame) for frame in records.frames[~kept]]
+    if kept.sum() < FEWEST:
+        raise BadInput(
+            f"{len(black)} of {len(kept)} images of the sequence are black, or of one colour",
+            where=root,
+            remedy="Get the images again, or another camera of the sequence.",
+        )
+    if black:
+        notice(
+            f"warning: {len(black)} of {len(kept)} frames are black, or of one colour, and are "
+            f"left out: {bounded(black)}."
+        )
+    return records.select(kept), black
+
+
+def _no_annotation(what: str, side: str, root: str | os.PathLike[str]) -> BadInput:
+    other = "left" if side == "right" else "right"
+    return BadInput(
+        f"the {side} hand has no {what} in any frame",
+        where=root,
+        remedy=f"Import the other hand alone: --side {other}.",
+    )
+
+
+def _mano_hand(
+    mano: ManoAnnotation, template: HandTemplate, side: str, root: str | os.PathLike[str]
+) -> tuple[HandParameters, np.ndarray]:
+    """MANO as annotated: relative to the mean pose, each hand with its own model."""
+    if not mano.valid.any():
+        raise _no_annotation("MANO parameters", side, root)
+    pose = mano.pose.copy()
+    pose[:, 1:] += template.mean_pose.reshape(15, 3)
+    return with_one_shape(template, pose, mano.shape, mano.transl, mano.valid)
+
+
+def _free_hand(
+    records: InterHandRecords, template: HandTemplate, side: str, root: str | os.PathLike[str]
+) -> HandParameters:
+    joints = records.joints[side]
+    # A hand is placed by its wrist and knuckles; without them it cannot be placed.
+    valid = np.isfinite(joints[:, [0, 5, 9, 17]]).all(axis=(1, 2))
+    if not valid.any():
+        raise _no_annotation("joints", side, root)
+    mano = records.mano[side]
+    pose = np.where(mano.valid[:, None, None], mano.pose, 0.0)
+    unplaced = HandParameters(pose, np.zeros(10), np.zeros((len(pose), 3)), valid)
+    shift = joints[:, 9] - pose_parameters(template, unplaced).landmarks[:, 9].numpy()
+    start = replace(unplaced, transl=np.where(valid[:, None], shift, 0.0))
+    return fit_hand(template, FitTargets(joints), start).parameters
+
+
+def _joint_distance(
+    joints: np.ndarray, template: HandTemplate, hand: HandParameters
+) -> float | None:
+    posed = pose_parameters(template, hand).landmarks.numpy()
+    gaps = np.linalg.norm(posed - joints, axis=-1)[hand.valid]
+    return round(1000.0 * float(np.nanmean(gaps)), 3) if np.isfinite(gaps).any() else None
+
+
+def _windows(clips: list[ProjectedHand], options: InterHandImport) -> CropWindows:
+    """One square of constant size that follows all hands in whole frames, as for a video."""
+    seen = np.any([clip.valid for clip in clips], axis=0)
+    points = []
+    for index, clip in enumerate(clips):
+        # A hand that is missing must not draw the window: the other one stands in for it.
+        other = clips[index - 1].pixels[:, :1]
+        points.append(np.where(clip.valid[:, None, None], clip.pixels, other))
+    image = np.concatenate(points, axis=1)
+    hand = Landmarks(image, np.zeros((len(image), 21, 3)), seen.astype(float), seen)
+    return follow_hands([hand], options.fps, options.size)
+
+
+def _info(
+    records: InterHandRecords,
+    sequence: InterHandSequence,
+    facts: Mapping[str, Any],
+    options: InterHandImport,
+) -> CaptureInfo:
+    shown = "both" if len(records.sides) == 2 else records.sides[0]
+    return CaptureInfo(
+        id=sequence.id,
+        hands=shown,
+        action=sequence.name,
+        device=f"InterHand2.6M camera {sequence.camera}",
+        fps=options.fps,
+        width=options.size,
+        height=options.size,
+        frame_count=len(records.frames),
+        hand_model=identify_hand_model(options.model, shown),
+        perturbations={},
+        source={
+            "kind": "InterHand2.6M",
+            "sequence": f"{records.split}/{sequence.folder}",
+            "camera": sequence.camera,
+            "frames": records.frames.tolist(),
+            "masks": "silhouette of the annotated hands",
+            "import": dict(facts),
+        },
+        licence=LICENCE,
+    )
+
+
+def _cropped_frames(
+    records: InterHandRecords, clips: list[ProjectedHand], windows: CropWindows
+) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Yield the cropped image and mask of every frame."""
+    width, height = records.size
+    whole_frame = np.full((height, width), 255, np.uint8)
+    for frame, path in enumerate(records.images):
+        corner = windows.corners[frame]
+        whole = read_rgb(path, (height, width))
+        mask = np.zeros((windows.size, windows.size), dtype=np.uint8)
+        for clip in clips:
+            if clip.valid[frame]:
+                mask |= draw_silhouette(clip.pixels[frame], clip.faces, windows.size)
+        # Outside the camera's frame no hand is visible.
+        in_frame = resample(cut(whole_frame, corner, windows.side), windows.size)
+        mask[in_frame < 255] = 0
+        yield resample(cut(whole, corner, windows.side), windows.size), mask

@@ -1,0 +1,416 @@
+"""A hand over a whole clip as the fit sees it: its start, its variables, and how they move it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from hwp_bench.hands import HandParameters, HandTemplate, pose_hand
+from hwp_bench.hands.articulation import axis_angle_to_matrix, cross_matrix, right_jacobian
+from hwp_bench.hands.skeleton import moved_joints
+from hwp_bench.hands.skinning import only_fingertips
+from hwp_bench.importers.shared.landmarks import PALM, Landmarks
+
+# The joint whose frame a landmark is fixed in: joints in their own, tips in the last joint's.
+_FRAME_OF = (0, 13, 14, 15, 15, 1, 2, 3, 3, 4, 5, 6, 6, 10, 11, 12, 12, 7, 8, 9, 9)
+#: Pixels in a unit of the anchor: Adam's step is about its learning rate, which this makes sane.
+ANCHOR_UNIT = 100.0
+
+
+@dataclass(frozen=True, eq=False)
+class ClipVariables:
+    """The variables of the fit; float32 leaf tensors.
+
+    The wrist is held as a place in the image and a log depth, because the image fixes the
+    first tightly and the second loosely.
+    """
+
+    #: (F, 3) rad, turns the hand further than its start, about the template's axes.
+    turn: torch.Tensor
+    #: (F, 15, 3) rad, finger joints.
+    fingers: torch.Tensor
+    #: (F, 2) the wrist in the image, from the principal point, in hundreds of px.
+    anchor: torch.Tensor
+    #: (F, 1) log of the wrist's depth in m.
+    log_depth: torch.Tensor
+    #: (10,) shape, the same in all frames.
+    betas: torch.Tensor
+    #: (21, 3) m, where the tracker puts a landmark, in the frame of its joint; constant.
+    offsets: torch.Tensor
+    #: () log of (hand in metres / world landmarks in metres); constant.
+    log_size: torch.Tensor
+    #: () log of the focal length in px.
+    log_focal: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class PosedClip:
+    """The hand in every frame, camera axes, metres."""
+
+    #: (F, 3, 3) template rest frame to camera.
+    rotation: torch.Tensor
+    #: (F, 3) where the rest frame's origin lies.
+    place: torch.Tensor
+    #: (F, 16, 4, 4) motion of each joint before `rotation` and `place`.
+    transforms: torch.Tensor
+    #: (F, 21, 3) landmarks, the tracker's offsets included.
+    landmarks: torch.Tensor
+    #: (F, 16, 3) pose with a root of zero, rad.
+    pose: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class SomeVertices:
+    """Vertices chosen in every frame, with what posing them needs; read once for many steps."""
+
+    #: (F, P) int64.
+    index: torch.Tensor
+    #: (F, P, 3) m, rest place without the shape: template and correctives.
+    rest: torch.Tensor
+    #: (F, P, 3, 10) m per unit of shape.
+    shape_basis: torch.Tensor
+    #: (F, P, 16) skinning weights.
+    weights: torch.Tensor
+
+
+class ClipModel:
+    """Poses a clip from its variables.
+
+    Args:
+        template: the hand.
+        start: rigid motion that the variables are relative to.
+        focal: px, the start of the focal length.
+        centre: (2,) principal point, px.
+    """
+
+    def __init__(
+        self, template: HandTemplate, start: RigidStart, focal: float, centre: np.ndarray
+    ) -> None:
+        self.template = template
+        self.tensors = template.to_torch(torch.float32)
+        self.start_rotation = torch.as_tensor(start.rotation, dtype=torch.float32)
+        self.world = torch.as_tensor(start.world, dtype=torch.float32)
+        self.centre = torch.as_tensor(centre, dtype=torch.float32)
+        self._tips = only_fingertips(self.tensors)
+        anchor = start.wrist[:, :2] / start.wrist[:, 2:] * focal / ANCHOR_UNIT
+        frames = len(start.wrist)
+
+        def leaf(value: object) -> torch.Tensor:
+            return torch.as_tensor(value, dtype=torch.float32).clone().requires_grad_(True)
+
+        self.variables = ClipVariables(
+            turn=leaf(np.zeros((frames, 3))),
+            fingers=leaf(np.zeros((frames, 15, 3))),
+            anchor=leaf(anchor),
+            log_depth=leaf(np.log(start.wrist[:, 2:])),
+            betas=leaf(np.zeros(10)),
+            offsets=leaf(np.zeros((21, 3))),
+            log_size=leaf(0.0),
+            log_focal=leaf(np.log(focal)),
+        )
+
+    @property
+    def focal(self) -> torch.Tensor:
+        """() focal length, px."""
+        return self.variables.log_focal.exp()
+
+    def pose(self) -> PosedClip:
+        """Pose every frame; differentiable."""
+        free = self.variables
+        frames = len(free.turn)
+        pose = torch.cat([torch.zeros_like(free.fingers[:, :1]), free.fingers], dim=1)
+        rest = pose_hand(self._tips, pose, free.betas, pose.new_zeros(frames, 3))
+        rotation = self.start_rotation @ axis_angle_to_matrix(free.turn)
+        depth = free.log_depth.exp()
+        wrist = torch.cat([free.anchor * (ANCHOR_UNIT / self.focal) * depth, depth], dim=1)
+        place = wrist - (rotation @ rest.joints[:, 0, :, None])[..., 0]
+        turned = rest.transforms[:, list(_FRAME_OF), :3, :3] @ free.offsets[..., None]
+        return PosedClip(
+            rotation=rotation,
+            place=place,
+            transforms=rest.transforms,
+            landmarks=_moved(rest.landmarks + turned[..., 0], rotation, place),
+            pose=pose,
+        )
+
+    def choose(self, index: torch.Tensor) -> SomeVertices:
+        """Choose vertices (F, P) int64 of each frame; correctives stay as they are now."""
+        rest = self.tensors.vertices[index]
+        basis = self.tensors.pose_basis
+        if basis is not None:
+            with torch.no_grad():
+                turns = axis_angle_to_matrix(self.variables.fingers)
+                feature = (turns - torch.eye(3)).flatten(1)
+                rest = rest + torch.stack(
+                    [basis[some] @ row for some, row in zip(index, feature, strict=True)]
+                )
+        return SomeVertices(
+            index, rest, self.tensors.shape_basis[index], self.tensors.weights[index]
+        )
+
+    def vertices(self, posed: PosedClip, some: SomeVertices) -> torch.Tensor:
+        """Pose some vertices of each frame: (F, P, 3) m, camera axes."""
+        shaped = some.rest + some.shape_basis @ self.variables.betas
+        motion = posed.transforms[:, :, :3].flatten(start_dim=2)
+        blended = (some.weights @ motion).unflatten(-1, (3, 4))
+        skinned = (blended[..., :3] @ shaped[..., None])[..., 0] + blended[..., 3]
+        return _moved(skinned, posed.rotation, posed.place)
+
+    def pixels(self, points: torch.Tensor) -> torch.Tensor:
+        """Project (F, P, 3) m to (F, P, 2) px; points at the camera's plane stay finite."""
+        return points[..., :2] / points[..., 2:].clamp(min=1e-3) * self.focal + self.centre
+
+    def parameters(self, valid: np.ndarray) -> HandParameters:
+        """Return the clip as hand parameters, the root rotation continuous in time."""
+        with torch.no_grad():
+            posed = self.pose()
+            wrist = self.tensors.joints[0] + self.tensors.joint_basis[0] @ self.variables.betas
+            # `pose_hand` turns about the rest wrist, `posed` about the origin.
+            transl = posed.place + (posed.rotation @ wrist) - wrist
+        root = unwrap_rotations(posed.rotation.double().numpy())
+        pose = posed.pose.double().numpy().copy()
+        pose[:, 0] = root
+        return HandParameters(
+            pose=pose,
+            betas=self.variables.betas.detach().double().numpy().copy(),
+            transl=transl.double().numpy(),
+            valid=np.asarray(valid, dtype=bool),
+        )
+
+
+#: Frames posed at once, to bound memory with fine templates.
+_CHUNK = 64
+
+
+def pose_vertices(model: ClipModel, chunk: int = _CHUNK) -> np.ndarray:
+    """Return the vertices of every frame in the camera frame, (F, V, 3) float32 m."""
+    parameters = model.parameters(np.ones(len(model.variables.turn), dtype=bool))
+    betas = torch.as_tensor(parameters.betas, dtype=torch.float32)
+    pieces = []
+    with torch.no_grad():
+        for first in range(0, parameters.frame_count, chunk):
+            rows = slice(first, first + chunk)
+            pose = torch.as_tensor(parameters.pose[rows], dtype=torch.float32)
+            transl = torch.as_tensor(parameters.transl[rows], dtype=torch.float32)
+            pieces.append(pose_hand(model.tensors, pose, betas, transl).vertices)
+    return torch.cat(pieces).numpy()
+
+
+def unwrap_rotations(rotations: np.ndarray) -> np.ndarray:
+    """Axis-angle vectors (F, 3) rad of (F, 3, 3), without jumps by a full turn between frames."""
+    from scipy.spatial.transform import Rotation
+
+    vectors = Rotation.from_matrix(rotations).as_rotvec()
+    for frame in range(1, len(vectors)):
+        angle = np.linalg.norm(vectors[frame])
+        if angle < 1e-6:
+            continue
+        other = vectors[frame] * (1.0 - 2.0 * np.pi / angle)
+        before = vectors[frame - 1]
+        if np.linalg.norm(other - before) < np.linalg.norm(vectors[frame] - before):
+            vectors[frame] = other
+    return vectors
+
+
+def _moved(points: torch.Tensor, rotation: torch.Tensor, place: torch.Tensor) -> torch.Tensor:
+    return points @ rotation.mT + place[:, None]
+
+
+# --- The start: one rigid pose for each frame, in closed form
+
+
+@dataclass(frozen=True)
+class RigidStart:
+    """Rigid motion of a hand in F frames."""
+
+    #: (F, 3, 3) template rest frame to camera.
+    rotation: np.ndarray
+    #: (F, 3) m, the wrist joint in the camera frame.
+    wrist: np.ndarray
+    #: (F, 21, 3) m, the tracker's world landmarks turned into the camera frame.
+    world: np.ndarray
+
+
+def rigid_start(
+    landmarks: Landmarks, rest: np.ndarray, focal: float, centre: np.ndarray
+) -> RigidStart:
+    """Estimate the rigid pose of every frame from its world and image landmarks.
+
+    The tracker sees a crop around the hand and assumes that the camera looks straight at it,
+    so its world landmarks are first turned by the angle between the optical axis and the ray
+    through the hand. The rotation is the orthogonal Procrustes solution on the palm, the place
+    the least-squares solution of the pinhole equations, which are linear in it. Frames without
+    a detection are interpolated.
+
+    Args:
+        landmarks: of the clip.
+        rest: (21, 3) m, the template's landmarks at rest.
+        focal: px.
+        centre: (2,) principal point, px.
+    """
+    from scipy.spatial.transform import Rotation
+
+    seen = np.flatnonzero(landmarks.detected)
+    pixels = landmarks.image[seen]
+    turn = _ray_rotation(pixels.mean(axis=1), focal, centre)
+    world = np.einsum("fij,fkj->fki", turn, landmarks.world[seen])
+    palm = list(PALM)
+    rotation = _procrustes(rest[palm], world[:, palm])
+    wrist = _place(world - world[:, :1], (pixels - centre) / focal)
+    return RigidStart(
+        rotation=_interpolate_rotations(Rotation.from_matrix(rotation), seen, landmarks.score.size),
+        wrist=interpolate(wrist, seen, landmarks.score.size),
+        world=interpolate(world, seen, landmarks.score.size),
+    )
+
+
+def interpolate(values: np.ndarray, seen: np.ndarray, count: int) -> np.ndarray:
+    """Fill values (S, ...) of frames `seen`, ascending, to (F, ...): linearly, ends held."""
+    flat = values.reshape(len(seen), -1)
+    columns = [np.interp(np.arange(count), seen, column) for column in flat.T]
+    return np.stack(columns, axis=1).reshape(count, *values.shape[1:])
+
+
+def _interpolate_rotations(rotations: object, seen: np.ndarray, count: int) -> np.ndarray:
+    from scipy.spatial.transform import Slerp
+
+    if len(seen) == 1:
+        return np.repeat(rotations.as_matrix(), count, axis=0)  # type: ignore[attr-defined]
+    frames = np.clip(np.arange(count), seen[0], seen[-1])
+    return Slerp(seen, rotations)(frames).as_matrix()
+
+
+def _ray_rotation(pixels: np.ndarray, focal: float, centre: np.ndarray) -> np.ndarray:
+    """The smallest rotation that turns the optical axis to the ray through each pixel."""
+    from scipy.spatial.transform import Rotation
+
+    slope = (pixels - centre) / focal
+    angle = np.arctan(np.linalg.norm(slope, axis=1, keepdims=True))
+    axis = np.stack([-slope[:, 1], slope[:, 0], np.zeros(len(slope))], axis=1)
+    length = np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)
+    return Rotation.from_rotvec(axis / length * angle).as_matrix()
+
+
+def _procrustes(rest: np.ndarray, observed: np.ndarray) -> np.ndarray:
+    """Rotations (F, 3, 3) that take centred `rest` (P, 3) closest to `observed` (F, P, 3)."""
+    source = rest - rest.mean(axis=0)
+    target = observed - observed.mean(axis=1, keepdims=True)
+    left, _, right = np.linalg.svd(np.einsum("fpi,pj->fij", target, source))
+    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
+    return left @ right
+
+
+def _place(shape: np.ndarray, rays: np.ndarray) -> np.ndarray:
+    """Translations (F, 3) with (shape + t) on the rays: x (Z + tz) = X + tx, and so for y."""
+    one, zero = np.ones_like(rays[..., 0]), np.zeros_like(rays[..., 0])
+    rows_x = np.stack([one, zero, -rays[..., 0]], axis=-1)
+    rows_y = np.stack([zero, one, -rays[..., 1]], axis=-1)
+    matrix = np.concatenate([rows_x, rows_y], axis=1)
+    right = np.concatenate(
+        [
+            rays[..., 0] * shape[..., 2] - shape[..., 0],
+            rays[..., 1] * shape[..., 2] - shape[..., 1],
+        ],
+        axis=1,
+    )
+    place = np.einsum("fij,fj->fi", np.linalg.pinv(matrix), right)
+    # A flat or noisy frame may land at or behind the camera; the fit needs it in front.
+    extent = np.linalg.norm(shape, axis=-1).max(axis=1)
+    place[:, 2] = np.maximum(place[:, 2], np.maximum(1.5 * extent, 0.01))
+    return place
+
+
+# --- How vertices move in the image when the variables of their frame change
+
+#: Variables of one frame: turn 3, fingers 45, anchor 2, log depth 1.
+FRAME_VARIABLES = 51
+
+
+def frame_variables(variables: ClipVariables) -> torch.Tensor:
+    """Join what differs from frame to frame: (F, 51), differentiable."""
+    parts = (variables.turn, variables.fingers.flatten(1), variables.anchor, variables.log_depth)
+    return torch.cat(parts, dim=1)
+
+
+class SurfaceMotion:
+    """Derivatives of the vertices' pixels by the variables of their frame, in closed form.
+
+    Automatic differentiation would need one pass for each of thousands of pixels. Correctives
+    count as they are and not in how they change, as in `ClipModel.choose`.
+
+    Args:
+        model: the clip; read once, as it is now.
+    """
+
+    def __init__(self, model: ClipModel) -> None:
+        free, tensors = model.variables, model.tensors
+
+        def array(tensor: torch.Tensor) -> np.ndarray:
+            return np.asarray(tensor.detach().double().numpy())
+
+        with torch.no_grad():
+            posed = model.pose()
+            shaped = array(tensors.vertices + tensors.shape_basis @ free.betas)
+            self._joints = array(tensors.joints + tensors.joint_basis @ free.betas)
+        self._shaped = shaped
+        self._correctives = None if tensors.pose_basis is None else array(tensors.pose_basis)
+        self._transforms = array(posed.transforms)
+        self._rotation, self._place = array(posed.rotation), array(posed.place)
+        self._focal = float(model.focal.detach())
+        self._depth = np.exp(array(free.log_depth))[:, 0]
+        self._fingers = array(free.fingers)
+        self._turn_rates = right_jacobian(array(free.turn))
+        self._finger_rates = right_jacobian(self._fingers)
+        self._weights = array(tensors.weights)
+        self._below = moved_joints()
+
+    def by_variables(self, frame: int, vertices: np.ndarray) -> np.ndarray:
+        """Differentiate vertices' pixels of the whole frame.
+
+        Args:
+            frame: which frame.
+            vertices: (P,) which vertices.
+
+        Returns:
+            (P, 2, 51) px per unit of each of the `frame_variables`.
+        """
+        rotation, wrist = self._rotation[frame], self._joints[0]
+        motion = self._transforms[frame, :, :3]
+        weights = self._weights[vertices]
+        rest = np.append(self._rest(frame, vertices), np.ones((len(vertices), 1)), axis=1)
+        # (P, 16, 3): each joint's share of the vertex, then the share of all joints below each.
+        shares = weights[:, :, None] * np.einsum("kab,vb->vka", motion, rest)
+        below = np.einsum("jk,vka->vja", self._below, shares)
+        centres = np.einsum("kab,kb->ka", motion[:, :, :3], self._joints) + motion[:, :, 3]
+        arms = below - (weights @ self._below.T)[:, :, None] * centres
+        own = below[:, 0]
+        moved = np.zeros((len(vertices), 3, FRAME_VARIABLES))
+        moved[:, :, :3] = -rotation @ _cross(own - wrist) @ self._turn_rates[frame]
+        # The cross product of each of a joint's three axes with the arm from the joint.
+        x, y, z = np.moveaxis(rotation @ motion[1:, :, :3] @ self._finger_rates[frame], 1, 0)
+        u, v, w = np.einsum("ab,njb->anj", rotation, arms[:, 1:])[..., None]
+        fingers = np.stack([y * w - z * v, z * u - x * w, x * v - y * u], axis=1)
+        moved[:, :, 3:48] = fingers.reshape(len(vertices), 3, 45)
+        moved[:, 0, 48] = moved[:, 1, 49] = ANCHOR_UNIT / self._focal * self._depth[frame]
+        moved[:, :, 50] = self._place[frame] + rotation @ wrist
+        place = own @ rotation.T + self._place[frame]
+        depth = np.maximum(place[:, 2:], 1e-3)
+        slope = place[:, :2] / depth
+        return np.asarray(
+            (moved[:, :2] - slope[..., None] * moved[:, 2:]) * (self._focal / depth[..., None])
+        )
+
+    def _rest(self, frame: int, vertices: np.ndarray) -> np.ndarray:
+        rest = self._shaped[vertices]
+        if self._correctives is not None:
+            from scipy.spatial.transform import Rotation
+
+            turns = Rotation.from_rotvec(self._fingers[frame]).as_matrix() - np.eye(3)
+            rest = rest + self._correctives[vertices] @ turns.ravel()
+        return np.asarray(rest)
+
+
+def _cross(vectors: np.ndarray) -> np.ndarray:
+    return np.asarray(cross_matrix(torch.from_numpy(vectors)).numpy())

@@ -1,0 +1,447 @@
+"""The residuals of whole frames: the clip's own mean texture, and the hand drawn in its light."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+import torch
+
+from hwp_bench.hands.anchors import vertex_normals
+from hwp_bench.hands.raster import draw_faces, mix_corners
+from hwp_bench.importers.shared.frames import CropWindows, each_frame
+from hwp_bench.importers.video.model import (
+    FRAME_VARIABLES,
+    ClipModel,
+    PosedClip,
+    SurfaceMotion,
+    frame_variables,
+    pose_vertices,
+)
+from hwp_bench.importers.video.texture import (
+    LitTexture,
+    MeanTexture,
+    SeenTexels,
+    row_products,
+    sample,
+    smooth_within,
+)
+
+#: Pixels of a frame below which it says nothing.
+_LEAST_PIXELS = 50
+# m, how much deeper than the nearest surface a texel may lie and still be seen.
+_SEEN = 0.004
+# Cosine of the angle to the viewer from which a surface counts.
+_LEAST_FACING = 0.25
+# Rows in a product of matrices.
+_BLOCK = 24
+
+
+@dataclass(frozen=True, eq=False)
+class HandPictures:
+    """The frames of a clip as the fit of one hand sees them; S is the edge of the images."""
+
+    #: (F, S, S, 3) uint8 RGB.
+    images: np.ndarray
+    #: (F, S, S) uint8 coverage of the hand.
+    masks: np.ndarray
+    #: (F,) bool, frames that count.
+    usable: np.ndarray
+    #: Where the images lie in the whole frame.
+    windows: CropWindows
+    #: Size of the hand in the whole frame, px.
+    hand_size: float
+    #: (F, S, S) uint8 coverage of another hand, or None.
+    other: np.ndarray | None = None
+
+    @property
+    def ratio(self) -> float:
+        """Px of the images to one px of the whole frame."""
+        return float(self.images.shape[1] / self.windows.side)
+
+    @property
+    def frames(self) -> list[int]:
+        """The frames that count."""
+        return [int(frame) for frame in np.flatnonzero(self.usable)]
+
+    def place(self, model: ClipModel) -> tuple[np.ndarray, np.ndarray]:
+        """Place a model in the images: its vertices (F, V, 3) m, and (F, V, 2) px of them."""
+        vertices = pose_vertices(model)
+        with torch.no_grad():
+            pixels = model.pixels(torch.as_tensor(vertices)).numpy()
+        inside = (pixels - self.windows.corners[:, None]) * self.ratio
+        return vertices, inside.astype(np.float32)
+
+
+@dataclass(frozen=True, eq=False)
+class Drawn:
+    """The mesh of one frame: vertices (V, 3) m, their (V, 2) px, and what each pixel shows."""
+
+    vertices: np.ndarray
+    pixels: np.ndarray
+    faces: np.ndarray
+    #: (S, S) int32 nearest face, -1 where there is none.
+    face: np.ndarray
+    #: (S, S, 2) float32 barycentric coordinates.
+    mix: np.ndarray
+
+    @property
+    def inside(self) -> np.ndarray:
+        """(S, S) bool, where the mesh is."""
+        return np.asarray(self.face >= 0)
+
+    def mixed(self, values: np.ndarray) -> np.ndarray:
+        """Values of the vertices (V, C) at the pixels inside."""
+        inside = self.inside
+        return mix_corners(values, self.faces, self.face[inside], self.mix[inside])
+
+    def depth(self, outside: float) -> np.ndarray:
+        """(S, S) float32 m."""
+        depth = np.full(self.face.shape, outside, np.float32)
+        depth[self.inside] = self.mixed(self.vertices[:, 2:])[:, 0]
+        return depth
+
+
+@dataclass(frozen=True, eq=False)
+class Differences:
+    """A frame compared with what is expected of it, at P pixels; C channels."""
+
+    #: (P,) the face that each pixel shows, or that is nearest to it.
+    face: np.ndarray
+    #: (P, 2) barycentric coordinates as `draw_faces` returns them.
+    mix: np.ndarray
+    #: (P, C) the frame less what is expected.
+    error: np.ndarray
+    #: (P, C) how the picture changes to the right and downwards, by px of the images.
+    across: np.ndarray
+    down: np.ndarray
+    #: (P,) weights.
+    trust: np.ndarray
+
+
+class SurfaceResidual(ABC):
+    """Difference of every frame from what its hand's surface should look like, in second order.
+
+    `rematch` collects the surface with the model as it is and linearises the difference of each
+    pixel. Within a round of descent the energy is then a quadratic function of the variables of
+    each frame, zero where it was linearised, which costs next to nothing.
+
+    Args:
+        pictures: of the clip.
+        model: the clip.
+        weight: of the energy of as many pixels as the hand's size squared.
+    """
+
+    def __init__(self, pictures: HandPictures, model: ClipModel, weight: float) -> None:
+        self.pictures = pictures
+        self._faces = model.template.faces
+        #: Px of the images.
+        self._size = pictures.hand_size * pictures.ratio
+        # The energy of a whole hand is the same in images of any size.
+        self._weight = weight / self._size**2
+
+    @abstractmethod
+    def seen(self, frame: int, drawn: Drawn) -> Any:
+        """What a frame shows of the surface."""
+
+    @abstractmethod
+    def collect(self, frames: list[int], seen: Iterable[Any]) -> None:
+        """Join what the frames show."""
+
+    @abstractmethod
+    def differences(self, frame: int, drawn: Drawn) -> Differences | None:
+        """Compare a frame with what was collected; None if it says nothing."""
+
+    def draw(self, vertices: np.ndarray, pixels: np.ndarray) -> Drawn:
+        """Draw the mesh of a frame in its image."""
+        size = self.pictures.images.shape[1:3]
+        face, mix = draw_faces(pixels, vertices[:, 2], self._faces, (size[0], size[1]))
+        return Drawn(vertices, pixels, self._faces, face, mix)
+
+    def rematch(self, model: ClipModel) -> None:
+        """Collect the surface and linearise the differences, with the model as it is now."""
+        usable = self.pictures.frames
+        vertices, pixels = self.pictures.place(model)
+        motion = SurfaceMotion(model)
+
+        # Each frame is drawn twice: all drawings together would need 1 MB for each frame.
+        def seen(frame: int) -> Any:
+            return self.seen(frame, self.draw(vertices[frame], pixels[frame]))
+
+        def linear(frame: int) -> tuple[np.ndarray, np.ndarray] | None:
+            found = self.differences(frame, self.draw(vertices[frame], pixels[frame]))
+            if found is None:
+                return None
+            return linearize(motion, frame, self._faces, found, self.pictures.ratio)
+
+        self.collect(usable, each_frame(seen, usable))
+        self._start = frame_variables(model.variables).detach().clone()
+        curvature = np.zeros((len(self._start), FRAME_VARIABLES, FRAME_VARIABLES))
+        slope = np.zeros((len(self._start), FRAME_VARIABLES))
+        for frame, found in zip(usable, each_frame(linear, usable), strict=True):
+            if found is not None:
+                curvature[frame], slope[frame] = found
+        self._curvature = torch.as_tensor(curvature, dtype=torch.float32)
+        self._slope = torch.as_tensor(slope, dtype=torch.float32)
+
+    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        """Return the energy, a scalar; zero where it was linearised."""
+        step = frame_variables(model.variables) - self._start
+        bent = (self._curvature @ step[..., None])[..., 0]
+        return self._weight * (step * (0.5 * bent + self._slope)).sum()
+
+
+def linearize(
+    motion: SurfaceMotion, frame: int, faces: np.ndarray, found: Differences, ratio: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Differentiate half the weighed squared differences by the variables of their frame.
+
+    A surface that moves by u takes its picture with it, so that a pixel gets less of what is
+    ahead of it: the difference grows by the picture's slope times u.
+
+    Args:
+        motion: how vertices move in the whole frame.
+        frame: which frame.
+        faces: (T, 3) of the hand.
+        found: the differences.
+        ratio: px of the images to one px of the whole frame.
+
+    Returns:
+        Curvature (51, 51) and slope (51,).
+    """
+    shares = np.stack([1.0 - found.mix.sum(axis=1), found.mix[:, 0], found.mix[:, 1]], axis=1)
+    corners = faces[found.face].ravel()
+    count = int(faces.max()) + 1
+
+    def collected(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+        spread = shares * (found.trust * row_products(first, second))[:, None]
+        return np.bincount(corners, spread.ravel(), minlength=count)
+
+    across, down = found.across, found.down
+    xx, xy, yy = collected(across, across), collected(across, down), collected(down, down)
+    used = np.flatnonzero(xx + yy > 0)
+    rates = motion.by_variables(frame, used) * ratio
+    xx, xy, yy = (part[used, None] for part in (xx, xy, yy))
+    x, y = rates[:, 0], rates[:, 1]
+    weighed = np.stack([xx * x + xy * y, xy * x + yy * y], axis=1)
+    pull = np.stack([collected(part, found.error)[used] for part in (across, down)], axis=1)
+    return _summed(rates, weighed), np.einsum("pak,pa->k", rates, pull)
+
+
+def _summed(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Sum over P and 2 of the products of (P, 2, K) and (P, 2, K): (K, K).
+
+    In blocks that are too small for BLAS to start threads of its own next to those that frames
+    are worked on in; so the result does not depend on their number either.
+    """
+    rows = np.zeros((2, -(-2 * len(first) // _BLOCK) * _BLOCK, first.shape[2]))
+    for row, part in zip(rows, (first, second), strict=True):
+        row[: 2 * len(part)] = part.reshape(-1, part.shape[2])
+    left, right = rows.reshape(2, -1, _BLOCK, first.shape[2])
+    return np.asarray((left.transpose(0, 2, 1) @ right).sum(axis=0))
+
+
+@dataclass(frozen=True, eq=False)
+class View:
+    """A frame without its light, as the mesh lies in it."""
+
+    #: (S, S) bool, mesh and hand.
+    region: np.ndarray
+    #: (S, S) bool, region away from its border and from edges in depth.
+    core: np.ndarray
+    #: (S, S) float32 log grey, light and noise removed; zero outside of the region.
+    detail: np.ndarray
+    #: (S, S) float32 m; zero where no mesh is.
+    depth: np.ndarray
+    #: (T,) cosine of each face's angle to the viewer, 0 where it looks away.
+    facing: np.ndarray
+
+
+class TextureResidual(SurfaceResidual):
+    """Difference of each frame from the mean texture of all frames.
+
+    An outline cannot tell how a finger is turned about its axis, or a palm about an axis in the
+    image; wrinkles, nails and veins can.
+    """
+
+    #: Weight, and difference of a pixel that is still normal, log grey.
+    WEIGHT, SCALE = 770.0, 0.06
+    # Changes wider than this share of the hand's size count as light, not as texture.
+    _LIGHT_BREADTH = 0.05
+    # Grey level added before the logarithm: noise of the dark pixels counts less.
+    _DARK = 8.0
+    # Pixels next to an outline, or next to an edge in depth, m, mix two surfaces.
+    _BORDER = np.ones((5, 5), np.uint8)
+    _DEPTH_EDGE = 0.012
+
+    def __init__(self, pictures: HandPictures, model: ClipModel) -> None:
+        super().__init__(pictures, model, self.WEIGHT)
+        self.texture = MeanTexture(model.template)
+
+    def view(self, frame: int, drawn: Drawn) -> View:
+        """Take the light off a frame."""
+        inside, depth = drawn.inside, drawn.depth(0.0)
+        region = inside & (self.pictures.masks[frame] > 127)
+        nearest = cv2.erode(np.where(inside, depth, np.inf).astype(np.float32), self._BORDER)
+        core = cv2.erode(region.astype(np.uint8), self._BORDER) > 0
+        core &= cv2.dilate(depth, self._BORDER) - nearest <= self._DEPTH_EDGE
+        grey = cv2.cvtColor(self.pictures.images[frame], cv2.COLOR_RGB2GRAY)
+        logs = np.log(grey.astype(np.float32) + self._DARK)
+        detail = smooth_within(self._without_light(logs, region), region, 1.0)
+        return View(region, core, detail, depth, _facing(drawn.vertices, drawn.faces))
+
+    def seen(self, frame: int, drawn: Drawn) -> tuple[np.ndarray, np.ndarray]:
+        """Read a frame at each texel: (K,) log grey, and (K,) weights, zero where it is hidden."""
+        view, atlas = self.view(frame, drawn), self.texture.atlas
+        places = atlas.on_surface(drawn.pixels)
+        depths = atlas.on_surface(drawn.vertices[:, 2:])
+        facing = view.facing[atlas.face]
+        here = np.abs(sample(view.depth, places, cv2.INTER_NEAREST) - depths[:, 0]) < _SEEN
+        here &= (sample(view.core.astype(np.float32), places, cv2.INTER_NEAREST) > 0) & (
+            facing > _LEAST_FACING
+        )
+        return sample(view.detail, places), np.where(here, facing**2, 0.0)
+
+    def collect(self, frames: list[int], seen: Iterable[tuple[np.ndarray, np.ndarray]]) -> None:
+        """Form the mean texture."""
+        for values, weights in seen:
+            self.texture.add(values, weights)
+        self.texture.finish()
+
+    def expected(self, view: View, drawn: Drawn) -> tuple[np.ndarray, np.ndarray]:
+        """Draw the mean texture in a frame: (S, S) log grey, and (S, S) bool, whether it counts."""
+        inside = view.region
+        face = drawn.face[inside]
+        mean, known = np.zeros(inside.shape, np.float32), np.zeros(inside.shape, bool)
+        mean[inside], known[inside] = self.texture.expected(face, drawn.mix[inside])
+        known[inside] &= view.facing[face] > _LEAST_FACING
+        return mean, known & view.core
+
+    def differences(self, frame: int, drawn: Drawn) -> Differences | None:
+        """Compare a frame with the mean texture, light taken off both."""
+        view = self.view(frame, drawn)
+        expected, core = self.expected(view, drawn)
+        if np.count_nonzero(core) < _LEAST_PIXELS:
+            return None
+        error = self._without_light(view.detail - expected, core)[core]
+        # The mean of both images' gradients makes the step of second order.
+        # Benhimane and Malis, "Homography-based 2D visual tracking and servoing", 2007.
+        both = view.detail + expected
+        across, down = (
+            cv2.Scharr(both, cv2.CV_32F, *axis)[core] / 64.0 for axis in ((1, 0), (0, 1))
+        )
+        trust = 1.0 / (1.0 + (error / (2.0 * self.SCALE)) ** 2) ** 2 / self.SCALE**2
+        columns = (error[:, None], across[:, None], down[:, None])
+        return Differences(drawn.face[core], drawn.mix[core], *columns, trust)
+
+    def _without_light(self, values: np.ndarray, region: np.ndarray) -> np.ndarray:
+        """Subtract what changes over the breadth of light; zero outside of the region."""
+        light = smooth_within(values, region, self._LIGHT_BREADTH * self._size)
+        return np.where(region, values - light, 0.0).astype(np.float32)
+
+
+class PictureResidual(SurfaceResidual):
+    """Difference of each frame from the hand drawn in its colours and light.
+
+    Unlike the texture it compares whole pictures: with what is as broad as light, the borders of
+    fingers before a palm, and the hand's own border, beyond which both are black. Around another
+    hand nothing is compared.
+    """
+
+    #: Weight, and difference of a pixel that is still normal, sRGB in [0, 1].
+    WEIGHT, SCALE = 1000.0, 0.06
+    # Pixels next to a border mix two surfaces.
+    _BORDER = np.ones((3, 3), np.uint8)
+    # Both pictures are compared this far off hand and mask: their borders say where a hand ends.
+    _REACH = np.ones((5, 5), np.uint8)
+    # px, deviation of the Gaussian that both are smoothed by: a drawn border is a step.
+    _SMOOTH = 1.0
+
+    def __init__(self, pictures: HandPictures, model: ClipModel) -> None:
+        super().__init__(pictures, model, self.WEIGHT)
+        self.texture = LitTexture(model.template, len(pictures.images))
+
+    def seen(self, frame: int, drawn: Drawn) -> SeenTexels:
+        """The texels that a frame shows from the front, away from borders."""
+        depth = drawn.depth(np.inf)
+        hand = drawn.inside & (self.pictures.masks[frame] > 127)
+        core = cv2.erode(hand.astype(np.float32), self._BORDER)
+        atlas = self.texture.atlas
+        places, points = atlas.on_surface(drawn.pixels), atlas.on_surface(drawn.vertices)
+        normals = _unit(atlas.on_surface(_normals(drawn)))
+        facing = -row_products(normals, _unit(points))
+        nearest = sample(cv2.erode(depth, self._BORDER), places, cv2.INTER_NEAREST)
+        here = (facing > _LEAST_FACING) & (np.abs(nearest - points[:, 2]) < _SEEN)
+        shown = np.flatnonzero(here & (sample(core, places, cv2.INTER_NEAREST) > 0))
+        logs = np.log(self.pictures.images[frame].astype(np.float32) / 255.0 + LitTexture.DARK)
+        return SeenTexels(
+            texels=shown.astype(np.int32),
+            logs=sample(logs, places[shown]),
+            normals=normals[shown],
+            weights=facing[shown] ** 2,
+        )
+
+    def collect(self, frames: list[int], seen: Iterable[SeenTexels]) -> None:
+        """Fit colours and light."""
+        if frames:
+            self.texture.fit(dict(zip(frames, seen, strict=True)))
+
+    def differences(self, frame: int, drawn: Drawn) -> Differences | None:
+        """Compare a frame with the lit hand, both before black."""
+        inside, mask = drawn.inside, self.pictures.masks[frame]
+        if np.count_nonzero(inside) < _LEAST_PIXELS or not mask.any():
+            return None
+        expected = np.zeros((*inside.shape, 3), np.float32)
+        known = np.zeros(inside.shape, np.float32)
+        normals = _unit(drawn.mixed(_normals(drawn)))
+        expected[inside], known[inside] = self.texture.expected(
+            frame, drawn.face[inside], drawn.mix[inside], normals
+        )
+        coverage = mask.astype(np.float32) / 255.0
+        image = self.pictures.images[frame].astype(np.float32) / 255.0 * coverage[..., None]
+        expected, image = (cv2.GaussianBlur(one, (0, 0), self._SMOOTH) for one in (expected, image))
+        near = cv2.dilate((inside | (coverage > 0.5)).astype(np.uint8), self._REACH) > 0
+        if self.pictures.other is not None:
+            near &= cv2.dilate(self.pictures.other[frame], self._REACH) == 0
+        error = (image - expected)[near]
+        squared = row_products(error, error) / (3.0 * (2.0 * self.SCALE) ** 2)
+        # Pixels off the hand move as the nearest pixel on it: its border moves with it.
+        nearest = _nearest(inside)[near]
+        trust = known.ravel()[nearest] / (1.0 + squared) ** 2 / self.SCALE**2
+        # The mean of both pictures' slopes, as for the texture.
+        both = 0.5 * (image + expected)
+        across, down = (cv2.Scharr(both, cv2.CV_32F, *axis) / 32.0 for axis in ((1, 0), (0, 1)))
+        place = (drawn.face.ravel()[nearest], drawn.mix.reshape(-1, 2)[nearest])
+        return Differences(*place, error, across[near], down[near], trust)
+
+
+def _facing(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    first, second, third = (vertices[faces[:, corner]] for corner in range(3))
+    normal = np.cross(second - first, third - first)
+    middle = first + second + third
+    length = np.linalg.norm(normal, axis=1) * np.linalg.norm(middle, axis=1)
+    return np.asarray(np.maximum(-(normal * middle).sum(axis=1) / np.maximum(length, 1e-12), 0.0))
+
+
+def _normals(drawn: Drawn) -> np.ndarray:
+    faces = torch.as_tensor(drawn.faces, dtype=torch.int64)
+    return np.asarray(vertex_normals(torch.as_tensor(drawn.vertices), faces).numpy())
+
+
+def _nearest(inside: np.ndarray) -> np.ndarray:
+    """(S, S) number of the pixel inside that is nearest to each pixel; at least one is inside."""
+    _, labels = cv2.distanceTransformWithLabels(
+        (~inside).astype(np.uint8), cv2.DIST_L2, 3, labelType=cv2.DIST_LABEL_PIXEL
+    )
+    number = np.zeros(int(labels.max()) + 1, np.int64)
+    number[labels[inside]] = np.flatnonzero(inside)
+    return number[labels]
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    length = np.sqrt(row_products(vectors, vectors))
+    return np.asarray(vectors / np.maximum(length, 1e-9)[:, None])

@@ -1,0 +1,470 @@
+"""The residuals of the fit that need no pictures: landmarks, motion, anatomy, touch, and outlines.
+
+Each is a sum over frames of a robust function of an error over its scale, so that a scale is the
+size of an error that is still normal. The numbers stand at the residual that they belong to.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import torch
+
+from hwp_bench.hands import HandTemplate
+from hwp_bench.hands.articulation import anatomical_limits, joint_limit_penalty
+from hwp_bench.hands.raster import draw_silhouette
+from hwp_bench.hands.skeleton import FINGERS, finger_joints, palm_directions, unit
+from hwp_bench.hands.template import boundary_vertices
+from hwp_bench.importers.shared.frames import CropWindows, cells, each_frame
+from hwp_bench.importers.shared.landmarks import Landmarks
+from hwp_bench.importers.video.model import ClipModel, PosedClip, pose_vertices
+from hwp_bench.importers.video.texture import sample
+
+# --- Landmarks, motion, and what is known of hands
+
+#: Landmark error in the image, as a share of the hand's size in the image.
+IMAGE_SCALE = 0.012
+#: Error of centred world landmarks, m; the tracker's bones change by 5 mm between frames.
+WORLD_SCALE = 0.015
+# Weight of the world landmarks; they guide depth, the image decides the rest.
+_WORLD_WEIGHT = 0.5
+# Weight of the image landmarks in the first steps, relative to 1 of the world landmarks.
+_START_IMAGE_WEIGHT = 0.05
+# Acceleration of landmarks in space, m per (1/30 s)^2, and of joint angles, rad per (1/30 s)^2.
+_MOTION_SCALE, _TURNING_SCALE = 0.003, 0.06
+# Weight of both.
+_MOTION_WEIGHT = 0.3
+# Weight of the joint-limit penalty (rad^2 beyond the anatomical range).
+_LIMIT_WEIGHT = 300.0
+# Weight of the finger angles squared: it keeps undetermined angles near the rest pose.
+_POSE_WEIGHT = 0.02
+# Constant distance between the tracker's landmark and the model's joint, m.
+_OFFSET_SCALE = 0.004
+# Share of the frames that shape, offsets, scale and focal length priors weigh as much as: the
+# tracker's errors repeat from frame to frame, so a clip is worth far fewer views.
+_PRIOR_SHARE = 0.1
+# Uncertainty of the metres in the world landmarks, and of the default focal length (logs).
+_SIZE_SCALE, _FOCAL_SCALE = 0.05, 0.15
+
+
+class LandmarkResidual:
+    """Everything that does not need the images: landmarks, smoothness, anatomy, priors.
+
+    Args:
+        landmarks: of the clip; frames without a detection count only in the other terms.
+        model: the clip.
+        fps: frames per second; None where the frames are far apart, so that motion between them
+            is not smooth.
+        default_focal: px, the focal length that the prior favours; None = it is known.
+    """
+
+    def __init__(
+        self,
+        landmarks: Landmarks,
+        model: ClipModel,
+        fps: float | None,
+        default_focal: float | None,
+    ) -> None:
+        self.default_focal = default_focal
+        self.image = torch.as_tensor(landmarks.image, dtype=torch.float32)
+        self.weight = torch.as_tensor(
+            np.where(landmarks.detected, landmarks.score, 0.0), dtype=torch.float32
+        )[:, None]
+        self.world = model.world - model.world.mean(dim=1, keepdim=True)
+        self.image_scale = IMAGE_SCALE * landmarks.hand_size
+        self.limits = anatomical_limits(model.template)
+        self.contact = ContactResidual(model.template)
+        self.pace = None if fps is None else (30.0 / fps) ** 2
+        self.prior = _PRIOR_SHARE * float(landmarks.detected.sum())
+
+    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        """Return the energy, a scalar."""
+        image = (self.weight * geman_mcclure(self._image_error(model, posed))).sum()
+        return image + _WORLD_WEIGHT * self._world(model, posed) + self._rest(model, posed)
+
+    def from_afar(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        """Return the energy for the first steps, when most fingers are bent wrongly.
+
+        The world landmarks dominate, because only they show in which direction a finger bends. The
+        image landmarks only place the hand.
+        """
+        image = (self.weight * charbonnier(self._image_error(model, posed))).sum()
+        return _START_IMAGE_WEIGHT * image + self._world(model, posed) + self._rest(model, posed)
+
+    def weaken(self, weights: np.ndarray) -> None:
+        """Multiply the weights of landmarks by (F, 21) numbers: some are hidden."""
+        self.weight = self.weight * torch.as_tensor(weights, dtype=torch.float32)
+
+    def _image_error(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        return (((model.pixels(posed.landmarks) - self.image) / self.image_scale) ** 2).sum(dim=-1)
+
+    def _world(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        # Compared at the tracker's own scale: measured at the hand's, a hand that shrinks to
+        # nothing would fit best.
+        centred = posed.landmarks - posed.landmarks.mean(dim=1, keepdim=True)
+        error = centred * torch.exp(-model.variables.log_size) - self.world
+        squared = ((error / WORLD_SCALE) ** 2).sum(dim=-1)
+        return (self.weight * charbonnier(squared)).sum()
+
+    def _rest(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        return self._motion(model, posed) + self._priors(model, posed)
+
+    def _motion(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        energy = posed.landmarks.new_zeros(())
+        if self.pace is None:
+            return energy
+        for track, scale in (
+            (posed.landmarks, _MOTION_SCALE),
+            (model.variables.fingers, _TURNING_SCALE),
+        ):
+            if len(track) > 2:
+                bend = (track[2:] - 2.0 * track[1:-1] + track[:-2]) / (scale * self.pace)
+                energy = energy + charbonnier((bend**2).sum(dim=-1)).sum()
+        return _MOTION_WEIGHT * energy
+
+    def _priors(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        free = model.variables
+        anatomy = _LIMIT_WEIGHT * joint_limit_penalty(posed.pose, self.limits).sum()
+        anatomy = anatomy + self.contact(model, posed)
+        anatomy = anatomy + _POSE_WEIGHT * (free.fingers**2).sum()
+        constant = (free.betas**2).sum() + ((free.offsets / _OFFSET_SCALE) ** 2).sum()
+        constant = constant + (free.log_size / _SIZE_SCALE) ** 2
+        if self.default_focal is not None:
+            focal = (free.log_focal - float(np.log(self.default_focal))) / _FOCAL_SCALE
+            constant = constant + focal**2
+        return anatomy + 0.5 * self.prior * constant
+
+
+def geman_mcclure(squared: torch.Tensor, turn: float = 2.0) -> torch.Tensor:
+    """r^2 / (1 + r^2 / (4 turn^2)): quadratic for small r, constant for outliers.
+
+    Args:
+        squared: residual over scale, squared.
+        turn: residual, in scales, beyond which the pull fades.
+
+    Source: Geman and McClure, 1987, scaled to the second derivative of r^2.
+    """
+    return squared / (1.0 + squared / (4.0 * turn * turn))
+
+
+def charbonnier(squared: torch.Tensor) -> torch.Tensor:
+    """2 (sqrt(1 + r^2) - 1): quadratic for small r, linear beyond."""
+    return 2.0 * (torch.sqrt(1.0 + squared) - 1.0)
+
+
+# --- Fingers in fingers
+
+#: Share of the radii that counts: skin and flesh give way.
+FIRMNESS = 0.85
+# Overlap of fingers with each other or the palm that is still ordinary, m; and its weight.
+_CONTACT_SCALE, _CONTACT_WEIGHT = 0.003, 0.5
+# Slices along each finger segment and along each metacarpal.
+_FINGER_SLICES, _PALM_SLICES = 2, 3
+# A sphere of fewer vertices does not measure thickness.
+_LEAST_VERTICES = 4
+
+
+class ContactResidual:
+    """Squared overlap of spheres in a hand."""
+
+    def __init__(self, template: HandTemplate) -> None:
+        spheres = template_spheres(template)
+        pairs, distance = touching_pairs(spheres)
+        self.centres = torch.as_tensor(spheres.centres, dtype=torch.float32)
+        self.basis = torch.as_tensor(spheres.basis, dtype=torch.float32)
+        self.joints = torch.as_tensor(spheres.joints)
+        least = np.zeros((len(spheres.radii),) * 2)
+        least[tuple(pairs.T)] = distance
+        self.least = torch.as_tensor(least, dtype=torch.float32)
+
+    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        """Return the energy, a scalar."""
+        rest = self.centres + self.basis @ model.variables.betas
+        motion = posed.transforms[:, self.joints]
+        places = (motion[..., :3, :3] @ rest[..., None])[..., 0] + motion[..., :3, 3]
+        # Few pairs touch: find them without gradients, then treat only those.
+        with torch.no_grad():
+            frame, first, second = torch.nonzero(
+                torch.cdist(places, places) < self.least, as_tuple=True
+            )
+        apart = places[frame, first] - places[frame, second]
+        # A tiny length keeps the root's gradient finite for centres that meet.
+        length = torch.sqrt((apart**2).sum(dim=-1) + 1e-10)
+        overlap = (self.least[first, second] - length).clamp(min=0.0) / _CONTACT_SCALE
+        return _CONTACT_WEIGHT * (overlap**2).sum()
+
+
+@dataclass(frozen=True, eq=False)
+class Spheres:
+    """Spheres inside a template, each moving with one joint."""
+
+    #: (K, 3) m, rest place; the mean of the vertices around it.
+    centres: np.ndarray
+    #: (K, 3, 10) m per unit of shape.
+    basis: np.ndarray
+    #: (K,) m.
+    radii: np.ndarray
+    #: (K,) int64.
+    joints: np.ndarray
+    #: (K,) int64, index into `FINGERS`, or -1 in the palm.
+    fingers: np.ndarray
+    #: (K,) int64, 0 to 2 from a finger's base; 0 in the palm.
+    segments: np.ndarray
+
+
+def template_spheres(template: HandTemplate) -> Spheres:
+    """Place spheres in slices of the fingers and of the palm."""
+    owner = template.weights.argmax(axis=1)
+    found: list[tuple[np.ndarray, float, int, int, int]] = []
+    for finger, name in enumerate(FINGERS):
+        chain = finger_joints(name)
+        ends = [*template.joints[list(chain)], template.vertices[template.fingertips[finger]]]
+        for segment, joint in enumerate(chain):
+            start, axis = ends[segment], unit(ends[segment + 1] - ends[segment])
+            members = np.flatnonzero(owner == joint)
+            along = (template.vertices[members] - start) @ axis
+            for part in _slices(members, along, _FINGER_SLICES):
+                radial = template.vertices[part] - template.vertices[part].mean(axis=0)
+                radial = radial - np.outer(radial @ axis, axis)
+                radius = float(np.linalg.norm(radial, axis=1).mean())
+                found.append((part, radius, joint, finger, segment))
+    found += [(*sphere, 0, -1, 0) for sphere in _palm_spheres(template, owner == 0)]
+    parts, radii, joints, fingers, segments = zip(*found, strict=True)
+    return Spheres(
+        np.stack([template.vertices[part].mean(axis=0) for part in parts]),
+        np.stack([template.shape_basis[part].mean(axis=0) for part in parts]),
+        *(np.array(column) for column in (radii, joints, fingers, segments)),
+    )
+
+
+def touching_pairs(spheres: Spheres) -> tuple[np.ndarray, np.ndarray]:
+    """Choose the pairs that must not overlap: (P, 2) int64, and (P,) m, their least distance.
+
+    Left out are neighbours: spheres of one finger, a finger's first segment with the palm, and
+    the first segments of two fingers. The least distance is the firm part of both radii, or the
+    distance at rest where that is smaller.
+    """
+    first, second = np.triu_indices(len(spheres.radii), k=1)
+    base = spheres.segments == 0
+    allowed = (spheres.fingers[first] != spheres.fingers[second]) & ~(base[first] & base[second])
+    first, second = first[allowed], second[allowed]
+    firm = FIRMNESS * (spheres.radii[first] + spheres.radii[second])
+    rest = np.linalg.norm(spheres.centres[first] - spheres.centres[second], axis=1)
+    return np.stack([first, second], axis=1), np.minimum(firm, rest)
+
+
+def _palm_spheres(template: HandTemplate, palm: np.ndarray) -> list[tuple[np.ndarray, float]]:
+    """Slices along the four metacarpals; the radius is half the palm's thickness there."""
+    members = np.flatnonzero(palm)
+    wrist = template.joints[0]
+    knuckles = template.joints[[finger_joints(name)[0] for name in FINGERS[1:]]]
+    across = palm_directions(template.joints, template.side).palmar
+    rays = knuckles - wrist
+    offsets = template.vertices[members] - wrist
+    share = (offsets @ rays.T) / (rays**2).sum(axis=1)
+    off_axis = np.linalg.norm(offsets[:, None] - share[..., None] * rays, axis=-1)
+    nearest = off_axis.argmin(axis=1)
+    along = share[np.arange(len(members)), nearest]
+    found = []
+    for ray in range(len(rays)):
+        mine = (nearest == ray) & (along > 0.2)
+        for part in _slices(members[mine], along[mine], _PALM_SLICES):
+            height = template.vertices[part] @ across
+            found.append((part, float(np.abs(height - height.mean()).mean())))
+    return found
+
+
+def _slices(members: np.ndarray, along: np.ndarray, count: int) -> list[np.ndarray]:
+    """Divide vertices into slices of equal length along an axis."""
+    if len(members) == 0:
+        return []
+    edges = np.linspace(along.min(), along.max() + 1e-9, count + 1)
+    parts = [members[(along >= low) & (along < high)] for low, high in itertools.pairwise(edges)]
+    return [part for part in parts if len(part) >= _LEAST_VERTICES]
+
+
+# --- Outlines
+
+#: Edge of the images in which outlines are compared, px; distances interpolate well, so less
+#: than the crop's resolution is enough.
+FIELD_SIZE = 192
+#: How far an outline vertex looks for the mask's outline, as a share of the hand's size.
+REACH = 0.06
+# Outline error in the image, as a share of the hand's size in the image.
+_OUTLINE_SCALE = 0.007
+# Weight of one outline vertex; neighbours agree, so each counts little.
+_OUTLINE_WEIGHT = 0.2
+# Outline vertices of each frame.
+_OUTLINE_COUNT = 200
+# Vertices of the outline lie at most this far inside the silhouette, px of the field.
+_OUTLINE_WITHIN = 1.6
+# Step of the search along a normal, px of the field.
+_STEP = 0.5
+
+
+class OutlineResidual:
+    """Robust distance of outline vertices from the mask's outline, along their normals.
+
+    The vertices and their targets are chosen by `rematch` between rounds of descent
+    and held within a round (iterated closest points). The wrist's open end is not an outline of
+    the hand and never chosen.
+
+    Args:
+        fields: (F, S, S) signed distances of the masks of hand and forearm, from
+            `signed_distance`; zero fields have no effect.
+        usable: (F,) bool, frames that count.
+        windows: where the fields lie in the whole frame.
+        hand_size: size of the hand in the whole frame, px.
+        ignored: (F, FIELD_SIZE, FIELD_SIZE) bool, where the mask's outline is not this hand's: skin
+            meets skin there; None where nothing is.
+    """
+
+    def __init__(
+        self,
+        fields: np.ndarray,
+        usable: np.ndarray,
+        windows: CropWindows,
+        hand_size: float,
+        ignored: np.ndarray | None = None,
+    ) -> None:
+        self.fields = fields
+        self.ignored = ignored
+        self.usable = np.asarray(usable) & (np.abs(fields).max(axis=(1, 2)) > 0)
+        self.ratio = FIELD_SIZE / windows.side
+        self.corners = torch.as_tensor(windows.corners, dtype=torch.float32)[:, None]
+        self.scale = _OUTLINE_SCALE * hand_size * self.ratio
+        self.reach = REACH * hand_size * self.ratio
+
+    def rematch(self, model: ClipModel) -> None:
+        """Choose the outline vertices of the model as it is now, and their targets."""
+        faces = model.template.faces
+        candidates = np.setdiff1d(np.arange(len(model.template.vertices)), boundary_vertices(faces))
+        with torch.no_grad():
+            vertices = torch.as_tensor(pose_vertices(model))
+            pixels = self._in_field(model.pixels(vertices)).numpy()
+
+        def match(frame: int) -> Outline:
+            if not self.usable[frame]:
+                return Outline.nothing()
+            usable = candidates
+            if self.ignored is not None:
+                rows, columns, inside = cells(pixels[frame][candidates], self.ignored[frame].shape)
+                usable = candidates[~(inside & self.ignored[frame][rows, columns])]
+            return match_outline(pixels[frame], faces, usable, self.fields[frame], self.reach)
+
+        matches = list(each_frame(match, range(len(self.usable))))
+        self.normal = torch.as_tensor(np.stack([match.normal for match in matches]))
+        self.target = torch.as_tensor(np.stack([match.target for match in matches]))
+        self.outline = model.choose(torch.as_tensor(np.stack([match.index for match in matches])))
+
+    def __call__(self, model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        """Return the energy, a scalar."""
+        pixels = self._in_field(model.pixels(model.vertices(posed, self.outline)))
+        # A vertex without a match has a zero normal and a zero target.
+        distance = (pixels * self.normal).sum(dim=-1) - self.target
+        return _OUTLINE_WEIGHT * geman_mcclure((distance / self.scale) ** 2, turn=4.0).sum()
+
+    def _in_field(self, pixels: torch.Tensor) -> torch.Tensor:
+        return (pixels - self.corners) * self.ratio
+
+
+@dataclass(frozen=True, eq=False)
+class Outline:
+    """N outline vertices of one frame and the line that each is pulled to: normal . pixel = target.
+
+    Where nothing matched, normal and target are zero.
+    """
+
+    #: (N,) int64 vertices.
+    index: np.ndarray
+    #: (N, 2) float32, outward unit normals.
+    normal: np.ndarray
+    #: (N,) float32, px of the field.
+    target: np.ndarray
+
+    @classmethod
+    def nothing(cls) -> Outline:
+        """Return an outline that pulls nothing."""
+        return cls(
+            np.zeros(_OUTLINE_COUNT, dtype=np.int64),
+            np.zeros((_OUTLINE_COUNT, 2), dtype=np.float32),
+            np.zeros(_OUTLINE_COUNT, dtype=np.float32),
+        )
+
+
+def signed_distance(mask: np.ndarray) -> np.ndarray:
+    """Distance to the outline of a mask (S, S) uint8, positive outside.
+
+    (FIELD_SIZE, FIELD_SIZE) float16 in px of the field; zeros where the mask has no outline.
+    """
+    small = cv2.resize(mask, (FIELD_SIZE, FIELD_SIZE), interpolation=cv2.INTER_AREA)
+    inside = (small >= 128).astype(np.uint8)
+    if inside.all() or not inside.any():
+        return np.zeros((FIELD_SIZE, FIELD_SIZE), dtype=np.float16)
+    outer = cv2.distanceTransform(1 - inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    inner = cv2.distanceTransform(inside, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)
+    # Pixel centres next to the outline are half a pixel from it, on either side.
+    return (outer - inner - np.where(inside, -0.5, 0.5)).astype(np.float16)
+
+
+def match_outline(
+    pixels: np.ndarray, faces: np.ndarray, candidates: np.ndarray, field: np.ndarray, reach: float
+) -> Outline:
+    """Match the outline of a mesh with the outline of a mask.
+
+    Each vertex looks along its normal for the nearest place where the mask ends in the same
+    direction: a finger's left side never snaps to the right side of its neighbour, as it may
+    with the plainly nearest point.
+
+    Args:
+        pixels: (V, 2) vertices, px of the field.
+        faces: (F, 3) int.
+        candidates: (C,) vertices that may be chosen.
+        field: (FIELD_SIZE, FIELD_SIZE) signed distance of the mask.
+        reach: how far to look, px of the field.
+    """
+
+    def read(image: np.ndarray, at: np.ndarray) -> np.ndarray:
+        return sample(image, at, border=cv2.BORDER_REPLICATE)
+
+    own = signed_distance(draw_silhouette(pixels, faces, FIELD_SIZE)).astype(np.float32)
+    if not own.any():
+        return Outline.nothing()
+    chosen = _on_outline(pixels, own, candidates)
+    places = pixels[chosen].astype(np.float32)
+    smooth = cv2.GaussianBlur(own, (0, 0), 1.0)
+    gradient = np.stack(
+        [read(cv2.Sobel(smooth, cv2.CV_32F, *axis), places) for axis in ((1, 0), (0, 1))], axis=1
+    )
+    length = np.linalg.norm(gradient, axis=1, keepdims=True)
+    normals = gradient / np.maximum(length, 1e-6)
+    steps = np.arange(-reach, reach + _STEP, _STEP, dtype=np.float32)
+    along = places[:, None] + normals[:, None] * steps[:, None]
+    values = read(field.astype(np.float32), along.reshape(-1, 2)).reshape(len(chosen), -1)
+    leaves = (values[:, :-1] <= 0) & (values[:, 1:] > 0)
+    middle = np.abs(steps[:-1] + 0.5 * _STEP)
+    best = np.where(leaves, middle, np.inf).argmin(axis=1)
+    rows = np.arange(len(chosen))
+    matched = leaves[rows, best] & (length[:, 0] > 1e-6)
+    before, after = values[rows, best], values[rows, best + 1]
+    crossing = steps[best] + _STEP * before / np.minimum(before - after, -1e-6)
+    # A vertex that lies inside the mesh's own outline is to stay as far inside the mask's.
+    offset = crossing + read(own, places)
+    outline = Outline.nothing()
+    count = len(chosen)
+    outline.index[:count] = chosen
+    outline.normal[:count] = np.where(matched[:, None], normals, 0.0)
+    outline.target[:count] = np.where(matched, (normals * places).sum(axis=1) + offset, 0.0)
+    return outline
+
+
+def _on_outline(pixels: np.ndarray, own: np.ndarray, candidates: np.ndarray) -> np.ndarray:
+    """Candidates near the outline, at most _OUTLINE_COUNT, evenly thinned."""
+    rows, columns, inside = cells(pixels[candidates], own.shape)
+    chosen = candidates[inside & (own[rows, columns] >= -_OUTLINE_WITHIN)]
+    if len(chosen) > _OUTLINE_COUNT:
+        chosen = chosen[np.linspace(0, len(chosen) - 1, _OUTLINE_COUNT).astype(np.int64)]
+    return chosen

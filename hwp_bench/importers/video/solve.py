@@ -1,0 +1,378 @@
+"""Fitting a hand to a clip: landmarks, then the outline too, then whole pictures; and its side."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, fields
+
+import numpy as np
+import torch
+
+from hwp_bench.base.arrays import evenly
+from hwp_bench.base.console import notice
+from hwp_bench.base.errors import DidNotConverge
+from hwp_bench.hands import HandTemplate, load_template, pose_hand
+from hwp_bench.importers.shared.landmarks import LANDMARK_NAMES, SIDES, Landmarks
+from hwp_bench.importers.video.model import ClipModel, PosedClip, rigid_start
+from hwp_bench.importers.video.pictures import PictureResidual, SurfaceResidual
+from hwp_bench.importers.video.residuals import LandmarkResidual, OutlineResidual
+
+#: Likely focal length where none is given, as a share of the image's longer
+#: side: a horizontal field of view of 64 degrees, between a webcam and a phone's main camera.
+LIKELY_FOCAL = 0.8
+#: Steps of Adam in a round of whole pictures.
+PICTURE_STEPS = 40
+# Variables that are the same in all frames; they are held until every frame has found its pose.
+_CONSTANTS = ("betas", "offsets", "log_size", "log_focal")
+# Variables that the outline does not determine reliably.
+_HELD_BY_LANDMARKS = ("log_focal", "log_size")
+# Those that whole pictures would move to hide what else is wrong with them: the outline knows
+# how large a hand is and how far away.
+_HELD_BY_OUTLINE = (*_CONSTANTS, "log_depth")
+# First step of each variable, in its own unit; constants move slower than poses.
+_LEARNING_RATES = {
+    "turn": 0.02,
+    "fingers": 0.03,
+    "anchor": 0.03,
+    "log_depth": 0.01,
+    "betas": 0.02,
+    "offsets": 0.0003,
+    "log_size": 0.003,
+    "log_focal": 0.003,
+}
+# Factor on them once a clip follows its landmarks: only corrections are left.
+_REFINING = 0.3
+# The rate rises over the first steps and ends at this share.
+_WARM_UP, _LAST_RATE = 20, 0.02
+
+#: Called with the number of steps that are done.
+Update = Callable[[int], None]
+
+
+@dataclass(frozen=True)
+class FitSettings:
+    """How long the fit of a clip takes; its weights and scales stand beside the residuals."""
+
+    #: Steps of Adam from the rigid start, with the world landmarks dominant.
+    start_steps: int = 150
+    #: Steps of Adam after that, on all landmarks, robust against outliers.
+    landmark_steps: int = 450
+    #: Steps of Adam in each round against the masks.
+    contour_steps: int = 120
+    #: Rounds after each cutting of masks: find the mesh's outline, pull it to the mask's outline.
+    contour_rounds: int = 3
+    #: Whether the clip's mean texture joins when the outline fits.
+    texture: bool = True
+    #: Rounds after the outline's: draw the lit hand, lay it onto the frames; 0 leaves them out.
+    picture_rounds: int = 6
+
+
+@dataclass(frozen=True)
+class Footage:
+    """Size, rate and focal length of the frames."""
+
+    #: Whole frame, px.
+    width: int
+    height: int
+    #: Frames per second between the selected frames.
+    fps: float
+    #: Focal length in px, or None to estimate it.
+    focal: float | None
+
+    @property
+    def centre(self) -> np.ndarray:
+        """(2,) principal point, px: the middle of the frame."""
+        return np.array([self.width / 2.0, self.height / 2.0])
+
+    @property
+    def first_focal(self) -> float:
+        """The given or the likely focal length, px."""
+        return self.focal if self.focal is not None else LIKELY_FOCAL * max(self.width, self.height)
+
+
+@dataclass(frozen=True, eq=False)
+class FittedClip:
+    """A fit in progress: the model with its variables, and the residual that needs no images."""
+
+    model: ClipModel
+    landmarks: LandmarkResidual
+    settings: FitSettings
+
+
+@dataclass(frozen=True)
+class ReprojectionError:
+    """Distance between fitted and tracked landmarks in the detected frames, px."""
+
+    #: Over frames and the 21 landmarks.
+    mean: float
+    median: float
+    percentile_95: float
+    #: Name of the landmark with the largest mean, and its mean.
+    worst_landmark: str
+    worst_landmark_mean: float
+    #: Mean where the model's bare joints and finger tips are compared.
+    without_offsets: float
+    #: (F,) mean of each frame; NaN where no hand was detected.
+    by_frame: np.ndarray
+
+
+def start_model(landmarks: Landmarks, template: HandTemplate, footage: Footage) -> ClipModel:
+    """The clip with a rigid hand in every frame."""
+    rest = pose_hand(
+        template.to_torch(torch.float64),
+        torch.zeros(1, 16, 3, dtype=torch.float64),
+        torch.zeros(10, dtype=torch.float64),
+        torch.zeros(1, 3, dtype=torch.float64),
+    ).landmarks[0]
+    focal = footage.first_focal
+    start = rigid_start(landmarks, rest.numpy(), focal, footage.centre)
+    return ClipModel(template, start, focal, footage.centre)
+
+
+def fit_landmarks(
+    landmarks: Landmarks,
+    template: HandTemplate,
+    footage: Footage,
+    settings: FitSettings,
+    update: Update | None = None,
+) -> FittedClip:
+    """Fit pose, shape, place and (unless given) focal length to the landmarks of a clip."""
+    model = start_model(landmarks, template, footage)
+    prior = footage.first_focal if footage.focal is None else None
+    residual = LandmarkResidual(landmarks, model, footage.fps, prior)
+    hold = () if footage.focal is None else ("log_focal",)
+    descend(model, residual.from_afar, settings.start_steps, hold=_CONSTANTS, update=update)
+
+    def later(step: int) -> None:
+        if update is not None:
+            update(settings.start_steps + step)
+
+    descend(model, residual, settings.landmark_steps, hold=hold, update=later)
+    return FittedClip(model, residual, settings)
+
+
+def share_camera(hands: Sequence[FittedClip], *, steps: int) -> None:
+    """Give hands that one camera sees one focal length, in place, and fit their poses to it.
+
+    It is the mean of the logarithms of those that were fitted, weighted by frames. Places move
+    along their rays and stay in the image.
+    """
+    weights = [float(hand.landmarks.weight.sum()) for hand in hands]
+    logs = [float(hand.model.variables.log_focal.detach()) for hand in hands]
+    shared = float(np.average(logs, weights=weights))
+    for hand, own in zip(hands, logs, strict=True):
+        with torch.no_grad():
+            hand.model.variables.log_focal.fill_(shared)
+            hand.model.variables.log_depth.add_(shared - own)
+        descend(hand.model, hand.landmarks, steps, rate=_REFINING, hold=("log_focal",))
+
+
+def fit_outline(
+    fitted: FittedClip,
+    *residuals: OutlineResidual | SurfaceResidual,
+    update: Update | None = None,
+) -> None:
+    """Refine a fit, in place, so that the mesh's outline meets the masks' outline.
+
+    With a texture, what lies inside the outline meets the mean of all frames, too.
+    """
+    rounds, steps = fitted.settings.contour_rounds, fitted.settings.contour_steps
+    _refine(fitted, residuals, rounds, steps, _HELD_BY_LANDMARKS, update)
+
+
+def fit_picture(fitted: FittedClip, picture: PictureResidual, update: Update | None = None) -> None:
+    """Refine the poses of a fit, in place, so that the lit hand, as it is drawn, meets the frames.
+
+    Shape, size and distance of the hand stay.
+    """
+    rounds = fitted.settings.picture_rounds
+    _refine(fitted, [picture], rounds, PICTURE_STEPS, _HELD_BY_OUTLINE, update)
+
+
+def _refine(
+    fitted: FittedClip,
+    residuals: Sequence[OutlineResidual | SurfaceResidual],
+    rounds: int,
+    steps: int,
+    hold: tuple[str, ...],
+    update: Update | None,
+) -> None:
+    """Refine a fit, in place, by residuals that are matched to the images again in each round."""
+
+    def energy(model: ClipModel, posed: PosedClip) -> torch.Tensor:
+        value = fitted.landmarks(model, posed)
+        for residual in residuals:
+            value = value + residual(model, posed)
+        return value
+
+    for done in range(rounds):
+        for residual in residuals:
+            residual.rematch(fitted.model)
+        descend(fitted.model, energy, steps, rate=_REFINING, hold=hold)
+        if update is not None:
+            update((done + 1) * steps)
+
+
+def reprojection_error(fitted: FittedClip, landmarks: Landmarks) -> ReprojectionError:
+    """Measure how well the fit explains the tracked landmarks."""
+    model = fitted.model
+    with torch.no_grad():
+        pixels = model.pixels(model.pose().landmarks).numpy()
+        offsets = model.variables.offsets.clone()
+        model.variables.offsets.zero_()
+        bare = model.pixels(model.pose().landmarks).numpy()
+        model.variables.offsets.copy_(offsets)
+    seen = landmarks.detected
+    error = np.linalg.norm(pixels - landmarks.image, axis=-1)
+    by_landmark = error[seen].mean(axis=0)
+    worst = int(by_landmark.argmax())
+    return ReprojectionError(
+        mean=float(error[seen].mean()),
+        median=float(np.median(error[seen])),
+        percentile_95=float(np.percentile(error[seen], 95)),
+        worst_landmark=LANDMARK_NAMES[worst],
+        worst_landmark_mean=float(by_landmark[worst]),
+        without_offsets=float(np.linalg.norm(bare - landmarks.image, axis=-1)[seen].mean()),
+        by_frame=np.where(seen, error.mean(axis=1), np.nan),
+    )
+
+
+def descend(
+    model: ClipModel,
+    energy: Callable[[ClipModel, PosedClip], torch.Tensor],
+    steps: int,
+    *,
+    rate: float = 1.0,
+    hold: tuple[str, ...] = (),
+    update: Update | None = None,
+) -> None:
+    """Lower an energy over the model's variables but those of `hold`, in place, by Adam.
+
+    `rate` is a factor on all learning rates.
+    """
+    groups = [
+        {"params": [getattr(model.variables, field.name)], "lr": rate * _LEARNING_RATES[field.name]}
+        for field in fields(model.variables)
+        if field.name not in hold
+    ]
+    optimizer = torch.optim.Adam(groups, betas=(0.9, 0.99))
+
+    def schedule(step: int) -> float:
+        fall = 0.5 * (1.0 + math.cos(math.pi * step / max(steps, 1)))
+        return min(1.0, (step + 1) / _WARM_UP) * (_LAST_RATE + (1.0 - _LAST_RATE) * fall)
+
+    scheduler = torch.optim.lr_scheduler.LambdaLR(optimizer, schedule)
+    with _one_thread():
+        for step in range(steps):
+            optimizer.zero_grad(set_to_none=True)
+            loss = energy(model, model.pose())
+            if not math.isfinite(float(loss.detach())):
+                raise DidNotConverge(
+                    f"the fit of the hand left the finite numbers in step {step}",
+                    remedy="Check the landmarks; a focal length far off can do this too (--focal).",
+                )
+            loss.backward()
+            optimizer.step()
+            scheduler.step()
+            if update is not None:
+                update(step + 1)
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Hold torch to one thread: the operations here are too small to be parallel.
+
+    On a busy machine the threads of a small operation wait for each other, and a fit takes
+    several times as long.
+    """
+    threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(threads)
+
+
+# --- Which side a hand is of
+#
+# A hand and its mirror image look alike in outline. But fingers bend to one side only, and the
+# tracker's landmarks in space say to which: of the wrong side, the model with its joint limits
+# cannot follow them. The network's votes for a side do not enter, so that the two can be compared.
+
+#: One side fits better for certain if the other's error is larger by this factor.
+CLEAR = 1.15
+# Frames that are fitted, evenly spread over those with a detection.
+_SIDE_FRAMES = 12
+# Steps of Adam; the remaining error of a right and of a left hand has parted long before.
+_SIDE_STEPS = 60
+
+
+@dataclass(frozen=True)
+class SideScores:
+    """Mean distances between the tracker's landmarks in space and the fitted hand's, m."""
+
+    #: Fitted as a right hand, and as a left one.
+    right: float
+    left: float
+    #: Number of fitted frames.
+    frames: int
+
+    @property
+    def better(self) -> str:
+        """The side that fits better, `right` if both fit equally."""
+        return "right" if self.right <= self.left else "left"
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether one side fits better for certain."""
+        return max(self.right, self.left) > CLEAR * min(self.right, self.left)
+
+
+def side_scores(landmarks: Landmarks, hand_model: str, footage: Footage) -> SideScores:
+    """Fit a hand as a right and as a left one to some frames, and measure what remains."""
+    seen = np.flatnonzero(landmarks.detected)
+    chosen = evenly(len(seen), _SIDE_FRAMES)
+    few = landmarks.select(seen[chosen])
+
+    def remaining(side: str) -> float:
+        model = start_model(few, load_template(hand_model, side), footage)
+        # The frames are far apart, so that motion between them is not smooth.
+        residual = LandmarkResidual(few, model, None, footage.first_focal)
+        descend(model, residual.from_afar, _SIDE_STEPS, hold=_CONSTANTS)
+        with torch.no_grad():
+            fitted = model.pose().landmarks
+            centred = fitted - fitted.mean(dim=1, keepdim=True)
+            return float(torch.linalg.vector_norm(centred - residual.world, dim=-1).mean())
+
+    right, left = (remaining(side) for side in SIDES)
+    return SideScores(right, left, len(chosen))
+
+
+def warn_of_contradiction(
+    side: str, scores: SideScores, votes: Mapping[str, float] | None, *, stated: bool = True
+) -> bool:
+    """Warn, and say so, where a hand is imported as one of a side and the pictures show the other.
+
+    The fit decides where it is clear, else the network's votes, where the landmarks have them.
+    `stated`: a person has stated the side; else it is what the votes say.
+    """
+    voted = None if votes is None else max(SIDES, key=lambda side: votes[side])
+    shown = scores.better if scores.is_clear else voted
+    if shown is None or shown == side:
+        return False
+    voted_for = ""
+    if votes is not None:
+        voted_for = f"the tracker votes right {votes['right']:.2f}, left {votes['left']:.2f}"
+    if stated:
+        also = f"{voted_for}, and " if voted_for else ""
+        said = f"the hand is said to be a {side} one, but {also}"
+    else:
+        said = f"{voted_for} for a hand that is taken for a {side} one, but "
+    notice(
+        f"warning: {said}the hand model misses the landmarks by {1e3 * scores.right:.1f} mm as a "
+        f"right hand, {1e3 * scores.left:.1f} mm as a left one ({scores.frames} frames). With the "
+        "wrong side, palm and back are swapped. A mirrored video also looks like this."
+    )
+    return True

@@ -1,0 +1,1 @@
+"""Hands without a person: landmarks, other anatomies, and rigs from files."""

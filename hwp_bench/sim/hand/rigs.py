@@ -1,0 +1,404 @@
+"""Rigged hands from glTF files, brought into the hand model's joints, size and rest frame.
+
+The rig keeps its own mesh, skinning weights and texture. A left hand is made of a right one by
+mirroring, and the other way round. Meshes of any topology are taken, open or closed at the
+wrist, with a forearm or a whole body: see `rig_mesh`.
+
+Joints are known by name. Two schemes are known word by word: WebXR
+(`index-finger-phalanx-proximal`) and OpenXR as Godot writes it (`Index_Proximal_R`). Others are
+read from the words in a name: a finger, and a part or a number, as in Mixamo
+(`mixamorig:RightHandIndex1`), VRM and Unity (`rightIndexProximal`), SMPL-X and MANO
+(`right_index1`), Unreal (`index_01_r`), Rigify (`DEF-f_index.01.R`), Oculus (`b_r_index1`) and
+SteamVR (`finger_index_0_r`).
+"""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.base.errors import BadHandModel, UsageError
+from hwp_bench.hands import HandTemplate, mirror_template
+from hwp_bench.hands.skeleton import FINGERS, JOINT_COUNT, PARENTS, SHAPE_COUNT
+from hwp_bench.hands.template import make_template
+from hwp_bench.sim.hand.gltf import SkinnedMesh, paintable, read_skinned_mesh
+from hwp_bench.sim.hand.rig_mesh import RigMesh, kept, opened_at_wrist
+
+_THREE = ("proximal", "intermediate", "distal")
+#: Joints of the hand model, in its order, as WebXR names them.
+WEBXR = (
+    "wrist",
+    *(f"{x}-finger-phalanx-{y}" for x in ("index", "middle", "pinky", "ring") for y in _THREE),
+    *("thumb-metacarpal", "thumb-phalanx-proximal", "thumb-phalanx-distal"),
+)
+#: The same as OpenXR rigs name them, without the side's suffix.
+OPENXR = (
+    "wrist",
+    *(f"{x}_{y}" for x in ("index", "middle", "little", "ring") for y in _THREE),
+    *("thumb_metacarpal", "thumb_proximal", "thumb_distal"),
+)
+#: Words of a finger, in the hand model's order.
+_FINGERS = {
+    "index": ("index", "forefinger", "pointer"),
+    "middle": ("middle", "mid"),
+    "little": ("little", "pinky", "pinkie", "small"),
+    "ring": ("ring",),
+    "thumb": ("thumb",),
+}
+_SIDES = {"right": "right", "r": "right", "left": "left", "l": "left"}
+_PARTS = ("metacarpal", "meta", "proximal", "intermediate", "medial", "distal")
+# Words of joints beyond the last one, or of helpers.
+_ASIDE = frozenset(
+    (
+        *("tip", "end", "nub", "aux", "null", "ik", "pole", "target", "ctrl", "twist", "roll"),
+        "effector",
+    )
+)
+# Words of the rest of a body.
+_BODY = frozenset(
+    (
+        *("spine", "chest", "neck", "head", "jaw", "eye", "hip", "hips", "pelvis", "torso"),
+        *("leg", "upleg", "thigh", "calf", "knee", "foot", "toe", "ankle"),
+        *("breast", "shoulder", "clavicle", "upperarm"),
+    )
+)
+_WORD = re.compile(r"[A-Z]?[a-z]+|[A-Z]+(?![a-z])|\d+")
+
+
+def words(name: str) -> list[str]:
+    """The words and numbers in a name, in small letters: `RightHandIndex1` has four."""
+    return [word.lower() for word in _WORD.findall(name)]
+
+
+def side_of_name(name: str) -> str | None:
+    """`right` or `left` where a name says so."""
+    found = {_SIDES[word] for word in words(name) if word in _SIDES}
+    return found.pop() if len(found) == 1 else None
+
+
+def is_elsewhere(name: str, side: str | None) -> bool:
+    """Whether a joint belongs to the body or to the other hand."""
+    own = side_of_name(name)
+    return bool(_BODY & set(words(name))) or (side is not None and own not in (None, side))
+
+
+def hand_joints(names: list[str], wanted: str, where: str) -> tuple[list[int], str | None]:
+    """Find the joints of a hand.
+
+    Returns row in `names` of the hand model's 16 joints, and the side that the names tell, if any.
+    """
+    plain = [_plain(name.lower()) for name in names]
+    sides = {side_of_name(name) for name in names}
+    for scheme in (WEBXR, OPENXR):
+        if all(name in plain for name in scheme) and len(set(plain)) == len(plain):
+            own = {side_of_name(names[plain.index(name)]) for name in scheme}
+            return [plain.index(name) for name in scheme], own.pop() if len(own) == 1 else None
+    best: list[int | None] = []
+    told: str | None = None
+    for side in (wanted, None, "left" if wanted == "right" else "right"):
+        if side not in sides:
+            continue
+        found = _by_words(names, side)
+        if not best or best.count(None) > found.count(None):
+            best, told = found, side
+    found_all = [row for row in best if row is not None]
+    if best and len(found_all) == len(best):
+        return found_all, told
+    missing = [WEBXR[i] for i, row in enumerate(best) if row is None] or list(WEBXR)
+    raise BadHandModel(
+        f"{len(missing)} joints are missing, the first is {missing[0]!r}",
+        where=where,
+        field="skins[0].joints",
+        remedy="Names of WebXR, OpenXR, Mixamo, VRM, SMPL-X, Unreal and Rigify are understood.",
+    )
+
+
+def _by_words(names: list[str], side: str | None) -> list[int | None]:
+    fingers: dict[str, dict[str, int]] = {finger: {} for finger in _FINGERS}
+    wrists: list[tuple[bool, int, int]] = []
+    for row, name in enumerate(names):
+        said = words(name)
+        if side_of_name(name) != side or _ASIDE & set(said):
+            continue
+        finger = _finger(said)
+        if finger is not None:
+            part = _part(said, finger)
+            if part is not None:
+                fingers[finger].setdefault(part, row)
+        elif "wrist" in said or "hand" in said:
+            wrists.append(("wrist" not in said, len(said), row))
+    found: list[int | None] = [min(wrists)[2] if wrists else None]
+    for finger in _FINGERS:
+        found += _three(fingers[finger], thumb=finger == "thumb")
+    return found
+
+
+def _finger(said: list[str]) -> str | None:
+    for word in said:
+        for finger, known in _FINGERS.items():
+            if word in known:
+                return finger
+    return None
+
+
+def _part(said: list[str], finger: str) -> str | None:
+    """The part that a joint's name says, or its number."""
+    for word in reversed(said):
+        if word in _PARTS and word not in _FINGERS[finger]:
+            return word
+        if word.isdigit():
+            return str(int(word)) if len(word) < 4 else None
+    return None
+
+
+def _three(parts: dict[str, int], *, thumb: bool) -> list[int | None]:
+    """The three joints of a finger from its parts, or None for those that are missing."""
+    numbers = sorted(int(part) for part in parts if part.isdigit())
+    if numbers:
+        # A joint before the first three is a bone of the palm, one after them the tip.
+        start = 1 if 1 in numbers and 3 in numbers else 0
+        return [parts.get(str(start + step)) for step in range(3)]
+    middle = "intermediate" if "intermediate" in parts else "medial"
+    order = ("proximal", middle, "distal")
+    if thumb and middle not in parts:
+        order = ("metacarpal" if "metacarpal" in parts else "meta", "proximal", "distal")
+    return [parts.get(part) for part in order]
+
+
+def _plain(name: str) -> str:
+    for ending in ("_r", "_l", ".r", ".l", "_right", "_left"):
+        name = name.removesuffix(ending)
+    return name
+
+
+# The last bone ends in skin, not in a joint; smaller differences of its direction are not sure.
+_UNSURE = np.radians(6.0)
+
+
+def into_rest_pose(
+    vertices: np.ndarray,
+    weights: np.ndarray,
+    joints: np.ndarray,
+    tips: np.ndarray,
+    target: np.ndarray,
+    target_tips: np.ndarray,
+) -> tuple[np.ndarray, np.ndarray]:
+    """Turn every finger bone to where the hand model's points, by linear blend skinning.
+
+    Takes `vertices` (V, 3) m, `weights` (V, 16), `joints` (16, 3) m, `tips` (5, 3) m, `target` (16,
+    3) m, `target_tips` (5, 3) m. Returns (V, 3) vertices and (16, 3) joints; bones keep their
+    lengths.
+    """
+    ends, target_ends = _bone_ends(joints, tips), _bone_ends(target, target_tips)
+    turns = np.tile(np.eye(3), (JOINT_COUNT, 1, 1))
+    places = joints.copy()
+    for joint in range(1, JOINT_COUNT):
+        parent = PARENTS[joint]
+        places[joint] = places[parent] + turns[parent] @ (joints[joint] - joints[parent])
+        bone = turns[parent] @ (ends[joint] - joints[joint])
+        last = joint % 3 == 0
+        turns[joint] = (
+            _shortest_turn(bone, target_ends[joint] - target[joint], _UNSURE if last else 0.0)
+            @ turns[parent]
+        )
+    moved = np.zeros_like(vertices)
+    for joint in range(JOINT_COUNT):
+        there = (vertices - joints[joint]) @ turns[joint].T + places[joint]
+        moved += weights[:, joint, None] * there
+    return moved, places
+
+
+def _bone_ends(joints: np.ndarray, tips: np.ndarray) -> np.ndarray:
+    ends = np.vstack([joints[1:], joints[:1]])
+    ends[[15, 3, 6, 12, 9]] = tips
+    return ends
+
+
+def _shortest_turn(start: np.ndarray, end: np.ndarray, unsure: float) -> np.ndarray:
+    """Rotation between two directions: (3, 3); none below an angle in rad."""
+    from scipy.spatial.transform import Rotation
+
+    axis = np.cross(start, end)
+    length = float(np.linalg.norm(axis))
+    angle = float(np.arctan2(length, start @ end))
+    if length < 1e-15 or angle <= unsure:
+        return np.eye(3)
+    return Rotation.from_rotvec(axis / length * (angle - unsure)).as_matrix()
+
+
+#: Most triangles of a hand; images here are too small to show more.
+MAX_HAND_FACES = 250_000
+#: What a subject's `model` begins with: the path of a file follows, or the name of a rig that
+#: comes with the package.
+FROM_FILE, SHIPPED = "gltf:", "rig:"
+_FOLDER = Path(__file__).with_name("rig_files")
+# Joints of the palm, which the hand model does not have; the wrist takes their weights.
+_FOLDED = ("metacarpal", "palm")
+# Last joints of the fingers, in the order of `FINGERS`.
+_LAST = (15, 3, 6, 12, 9)
+
+
+def rig_path(model: str) -> str | None:
+    """The file of a subject's rig, or None where `model` names no rig."""
+    if model.startswith(FROM_FILE):
+        return model.removeprefix(FROM_FILE)
+    if not model.startswith(SHIPPED):
+        return None
+    known = {path.stem: str(path) for path in sorted(_FOLDER.glob("*.glb"))}
+    name = model.removeprefix(SHIPPED)
+    if name not in known:
+        raise UsageError(
+            f"there is no rig {name!r}",
+            field="subject.model",
+            remedy=f"Known: {', '.join(known)}; or gltf: and the path of a file.",
+        )
+    return known[name]
+
+
+def load_rig(path: str, side: str, model: HandTemplate) -> tuple[HandTemplate, np.ndarray | None]:
+    """Read a rigged hand.
+
+    Returns the rig as a template without shape parameters, open at the wrist only, and its base
+    colour, (H, W, 3) uint8 sRGB, or None if it has none.
+    """
+    file = read_skinned_mesh(Path(path))
+    index, told = hand_joints(file.joint_names, side, path)
+    places = file.joint_places[index]
+    own = told or side_of_name(Path(path).stem) or _side_by_curl(places)
+    template = _template(file, index, told, own, model, path)
+    if template.side != side:
+        template = mirror_template(template)
+    return template, file.sheet.texture
+
+
+def _side_by_curl(places: np.ndarray) -> str:
+    """The side of a hand by where its fingers curl.
+
+    Takes `places` (16, 3) of the hand model's joints in the rig.
+    """
+    back_if_right = np.cross(places[4] - places[0], places[1] - places[7])
+    curl = sum(places[i + 2] - places[i] for i in (1, 4, 7, 10, 13))
+    return "right" if curl @ back_if_right < 0 else "left"
+
+
+def _template(
+    file: SkinnedMesh,
+    index: list[int],
+    told: str | None,
+    side: str,
+    model: HandTemplate,
+    path: str,
+) -> HandTemplate:
+    flip = np.array([1.0 if model.side == side else -1.0, 1.0, 1.0])
+    target, target_tips = model.joints * flip, model.vertices[model.fingertips] * flip
+    places = file.joint_places[index]
+    turn, scale = _alignment(places, target, path)
+    joints = (places - places[0]) @ turn.T * scale + target[0]
+    mesh = _welded(file, index, told, scale)
+    vertices = (mesh.vertices - places[0] * scale) @ turn.T + target[0]
+    mesh = RigMesh(vertices, mesh.weights, mesh.faces, mesh.uv, mesh.face_uv)
+    forward = np.array([-1.0 if side == "right" else 1.0, 0.0, 0.0])
+    mesh = opened_at_wrist(mesh, joints, forward, path)
+    if len(mesh.faces) > MAX_HAND_FACES:
+        raise BadHandModel(
+            f"the hand has {len(mesh.faces)} triangles, at most {MAX_HAND_FACES}",
+            where=path,
+            remedy="Decimate the mesh.",
+        )
+    uv, face_uv = mesh.uv, mesh.face_uv
+    if file.sheet.texture is None:
+        uv, face_uv = paintable(uv, face_uv)
+    tips = _fingertips(mesh, joints, path)
+    vertices, joints = into_rest_pose(
+        mesh.vertices, mesh.weights, joints, mesh.vertices[tips], target, target_tips
+    )
+    return make_template(
+        name=f"gltf:{Path(path).name}",
+        side=side,
+        vertices=vertices,
+        faces=mesh.faces,
+        shape_basis=np.zeros((len(vertices), 3, SHAPE_COUNT)),
+        pose_basis=None,
+        joints=joints,
+        joint_basis=np.zeros((JOINT_COUNT, 3, SHAPE_COUNT)),
+        weights=mesh.weights,
+        mean_pose=np.zeros(3 * (JOINT_COUNT - 1)),
+        uv=uv,
+        face_uv=face_uv,
+        fingertips=tips,
+        where=path,
+    )
+
+
+def _welded(file: SkinnedMesh, index: list[int], told: str | None, scale: float) -> RigMesh:
+    """The file's mesh in metres with the hand model's weights, without the rest of a body.
+
+    Files repeat vertices along the texture's seams; a closed surface needs them once.
+    """
+    _, first, welded = np.unique(
+        np.round(file.vertices * scale, 6), axis=0, return_index=True, return_inverse=True
+    )
+    faces = welded.reshape(-1)[file.faces]
+    owner = np.zeros((len(file.joint_names), JOINT_COUNT))
+    owner[np.arange(len(owner)), _owners(file.joint_names, index, file.joint_parents)] = 1.0
+    elsewhere = np.array(
+        [is_elsewhere(name, told) and row not in index for row, name in enumerate(file.joint_names)]
+    )
+    shares = file.weights[first]
+    total = np.maximum(np.asarray(shares.sum(axis=1)).reshape(-1), 1e-9)
+    weights = np.asarray((shares @ owner) / total[:, None])
+    # A vertex that nothing moves stays with the palm.
+    weights[weights.sum(axis=1) < 0.5, 0] = 1.0
+    weights /= weights.sum(axis=1, keepdims=True)
+    away = np.asarray(shares @ elsewhere.astype(np.float64)) / total
+    solid = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    sheet = file.sheet
+    mesh = RigMesh(file.vertices[first] * scale, weights, faces, sheet.uv, sheet.faces)
+    return kept(mesh, solid & (away[faces].mean(axis=1) < 0.5))
+
+
+def _alignment(places: np.ndarray, target: np.ndarray, path: str) -> tuple[np.ndarray, float]:
+    """Rotation and scale that bring the rig's palm onto the hand model's.
+
+    Source: the Kabsch algorithm over the wrist and the four knuckles.
+    """
+    palm = [0, 1, 4, 7, 10]
+    a = places[palm] - places[palm].mean(axis=0)
+    b = target[palm] - target[palm].mean(axis=0)
+    size = float(np.linalg.norm(a))
+    if size < 1e-9:
+        raise BadHandModel("has all joints of its palm in one place", where=path)
+    u, _, vt = np.linalg.svd(b.T @ (a / size))
+    turn = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return turn, float(np.linalg.norm(b)) / size
+
+
+def _owners(names: list[str], index: list[int], parents: list[int]) -> list[int]:
+    """Joint of the hand model that each joint of the rig hands its weights to."""
+    owners = []
+    for joint, name in enumerate(names):
+        folded = any(part in name.lower() for part in _FOLDED)
+        ancestor = joint
+        while ancestor >= 0 and ancestor not in index:
+            ancestor = parents[ancestor]
+        if joint in index:
+            owners.append(index.index(joint))
+        elif folded or ancestor < 0:
+            owners.append(0)
+        else:
+            owners.append(index.index(ancestor))
+    return owners
+
+
+def _fingertips(mesh: RigMesh, joints: np.ndarray, path: str) -> np.ndarray:
+    """Vertices of the fingers' last segments that lie farthest along them: (5,)."""
+    tips = []
+    for finger, joint in zip(FINGERS, _LAST, strict=True):
+        weight = mesh.weights[:, joint]
+        if weight.max() < 0.01:
+            raise BadHandModel(f"no skin follows the last joint of the {finger}", where=path)
+        along = mesh.vertices @ (joints[joint] - joints[joint - 1])
+        tips.append(int(np.argmax(np.where(weight > 0.5 * weight.max(), along, -np.inf))))
+    return np.array(tips)

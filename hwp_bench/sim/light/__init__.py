@@ -1,0 +1,1 @@
+"""Light: its settings, points where rays meet surfaces, and shading."""

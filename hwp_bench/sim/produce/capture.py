@@ -1,0 +1,477 @@
+"""From a scene to a capture folder: frames in parallel, resumable, the same on any machine.
+
+Frames wait in one file each until their capture is whole; a render that was interrupted goes on
+where it stopped.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import shutil
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor, wait
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from hwp_bench.base.arrays import read_npz
+from hwp_bench.base.console import progress
+from hwp_bench.base.errors import BadInput, HwpError, UsageError, place, reason_of, whole_number
+from hwp_bench.base.files import atomic_write, canonical_json, sha256_json
+from hwp_bench.base.folders import exclusive
+from hwp_bench.capture import (
+    Cameras,
+    Capture,
+    CaptureInfo,
+    CaptureWriter,
+    HandModelId,
+    open_capture,
+)
+from hwp_bench.capture.schema import FREE_VIEW, SIMULATED
+from hwp_bench.hands.skeleton import HandParameters
+from hwp_bench.run.engine import Job, Needs
+from hwp_bench.run.engine.job import OnProgress
+from hwp_bench.run.engine.processes import THREADS, LocalJob, Stopped, WorkerLost, run_in_process
+from hwp_bench.sim.effects import FramePlan, hands_at, plan_frame
+from hwp_bench.sim.hand.rigs import rig_path
+from hwp_bench.sim.produce.estimates import confused_mask, estimate_hands, estimate_mask
+from hwp_bench.sim.produce.free_view import add_free_view, has_free_view, write_free_view
+from hwp_bench.sim.produce.truth import distances, write_truth
+from hwp_bench.sim.render.frame import eight_bit_coverage, render_frame, write_layers
+from hwp_bench.sim.scene.motion import intrinsics, parameters_of, scene_hands, viewmat
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.scene_files import load_scene
+from hwp_bench.sim.sensor import check_encoder, through_h264
+from hwp_bench.sim.subject.atlas import skin_atlas
+from hwp_bench.sim.subject.skin import of_side
+
+#: Version of the pixels that the renderer makes; part of every render key.
+RENDERER = 10
+#: Edge of an image where no other is given.
+DEFAULT_SIZE = 256
+#: Terms under which simulated captures may be used.
+LICENCE = "CC0-1.0"
+#: Smallest and largest number of frames; smallest and largest edge of one, px; most processes.
+FRAMES, SIZES, MAX_WORKERS = (10, 100_000), (32, 1024), 1024
+# Frames below which a second process costs more than it saves.
+_FRAMES_PER_WORKER = 10
+# Seconds between two counts of the frames that wait.
+_COUNT_SECONDS = 1.0
+_REMEDY = "Finished frames are kept; the same command continues from there."
+
+
+def check_extent(frame_count: int, size: int, workers: int | None = None) -> None:
+    """Refuse what cannot be rendered or planned, before anything takes memory for it."""
+    for name, value, low, high in (
+        ("frame_count", frame_count, *FRAMES),
+        ("size", size, *SIZES),
+        ("workers", 1 if workers is None else workers, 1, MAX_WORKERS),
+    ):
+        value = whole_number(value, name)
+        if not low <= value <= high:
+            raise UsageError(f"{value} is not in {low}..{high}", field=name)
+
+
+def render_key(scene: Scene, frame_count: int, size: int) -> str:
+    """Digest of everything that decides the pixels of a capture."""
+    return sha256_json([RENDERER, scene.digest, frame_count, size])
+
+
+@dataclass(frozen=True)
+class RenderRequest:
+    """A capture to render, in any process on any machine."""
+
+    #: The scene.
+    scene: Scene
+    #: Frames over which it is spread; its own if None.
+    frame_count: int | None = None
+    #: Edge of the square image in pixels; `DEFAULT_SIZE` if None.
+    size: int | None = None
+    #: Seed; the scene's own if None.
+    seed: int | None = None
+    #: Processes of one render; as many as are worth it if None.
+    workers: int | None = None
+    #: Whether linear layers are stored too.
+    exr: bool = False
+    #: Whether a capture that exists already is used as it is.
+    keep: bool = False
+    #: Whether one that is there is replaced.
+    overwrite: bool = False
+    #: Whether the free-view clip is rendered too.
+    free_view: bool = True
+
+    @property
+    def frames(self) -> int:
+        """Frames of the capture."""
+        return self.scene.frame_count if self.frame_count is None else self.frame_count
+
+    @property
+    def edge(self) -> int:
+        """Edge of its images, px."""
+        return DEFAULT_SIZE if self.size is None else self.size
+
+    def checked(self) -> RenderRequest:
+        """The request with its seed in the scene; refuses what cannot be rendered."""
+        scene = self.scene
+        if self.seed is not None:
+            if whole_number(self.seed, "seed") < 0:
+                raise UsageError(f"is {self.seed}", field="seed", remedy="Use 0 or more.")
+            scene = replace(scene, seed=self.seed)
+        check_extent(self.frames, self.edge, self.workers)
+        if scene.sensor.h264:
+            check_encoder(scene.id)
+        return replace(self, scene=scene, seed=None)
+
+    def job(self, output: Path, needs: Needs) -> Job:
+        """The render as a job of an engine."""
+        return Job(
+            text=self.scene.id,
+            # In turn, a render shows its own progress.
+            here=lambda on_progress: self.render(output),
+            work=self,
+            output=output,
+            finished=lambda: self.keep and self.is_whole(output),
+            needs=needs,
+        )
+
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
+        """Render; see `hwp_bench.run.engine.job.Work`."""
+        ended = threading.Event()
+        watch = threading.Thread(target=self._count, args=(output, on_progress, ended), daemon=True)
+        watch.start()
+        try:
+            self.render(output)
+        finally:
+            ended.set()
+            watch.join()
+
+    def render(self, output: Path) -> None:
+        """Render into a folder, or use the capture that exists there if `keep` says so.
+
+        The free-view clip of a capture that exists is rendered where it is missing.
+        """
+        if not self.keep:
+            _render(self.checked(), output)
+            return
+        with exclusive(output, wait=True):
+            if not _is_capture(output):
+                _render(replace(self.checked(), overwrite=True), output)
+            elif not self.is_whole(output):
+                add_free_view(self.checked().scene, open_capture(output))
+
+    def is_whole(self, output: Path) -> bool:
+        """Whether a folder holds a capture with all that is asked for."""
+        return _is_capture(output) and (not self.free_view or has_free_view(output))
+
+    def _count(self, output: Path, on_progress: OnProgress, ended: threading.Event) -> None:
+        """Report how many frames of the unfinished capture exist."""
+        while not ended.wait(_COUNT_SECONDS):
+            waiting = sum(1 for _ in output.parent.glob(f".{output.name}.*/*.npz"))
+            on_progress(waiting, self.frames)
+
+
+def _is_capture(folder: Path) -> bool:
+    """Whether a folder holds a capture that can be opened."""
+    try:
+        open_capture(folder)
+    except HwpError:
+        return False
+    return True
+
+
+def render_capture(
+    scene: Scene | str | Path,
+    out: str | os.PathLike[str],
+    *,
+    frame_count: int | None = None,
+    size: int | None = None,
+    seed: int | None = None,
+    workers: int | None = None,
+    overwrite: bool = False,
+    exr: bool = False,
+    free_view: bool = True,
+) -> Capture:
+    """Render a capture.
+
+    A render that was interrupted continues where it stopped: finished frames wait next to `out`
+    until the capture is whole.
+
+    Args:
+        scene: a scene, its name, or its file.
+        out: the capture folder to make.
+        frame_count: frames over which the scene is spread; the scene's own if None.
+        size: edge of the square image in pixels.
+        seed: replaces the scene's seed.
+        workers: processes; as many as are worth it if None.
+        overwrite: replace an existing folder.
+        exr: also store linear light, depth, normals, object ids and motion of every frame as
+            OpenEXR, under `extra/`.
+        free_view: also render the free-view clip, under `free/`.
+
+    Raises:
+        UsageError: `out` exists, or a number is out of range.
+        BadInput: the scene file is at fault.
+        HwpError: rendering failed, or `out` cannot be written.
+    """
+    if not isinstance(scene, Scene):
+        scene = load_scene(os.fspath(place(scene, "scene")))
+    request = RenderRequest(
+        scene,
+        frame_count,
+        size,
+        seed,
+        workers,
+        exr=exr,
+        overwrite=overwrite,
+        free_view=free_view,
+    ).checked()
+    out = place(out, "out")
+    _render(request, out)
+    return open_capture(out)
+
+
+def _render(request: RenderRequest, out: Path) -> None:
+    """Render a request that was checked."""
+    if out.exists() and not request.overwrite and (out.is_file() or any(out.iterdir())):
+        raise UsageError(
+            "exists already", where=out, remedy="Choose another place, or --overwrite."
+        )
+    key = render_key(request.scene, request.frames, request.edge)[:16]
+    waiting = out.absolute().parent / f".{out.name}.{key}{'-exr' if request.exr else ''}"
+    with exclusive(waiting, wait=True):
+        try:
+            waiting.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise HwpError(f"cannot be made ({reason_of(error)})", where=waiting) from error
+        try:
+            start = time.perf_counter()
+            _render_missing(request, waiting)
+            _assemble(request, waiting, out, time.perf_counter() - start)
+            shutil.rmtree(waiting, ignore_errors=True)
+        finally:
+            # Frames of a render that failed stay for the next start; nothing else does.
+            with contextlib.suppress(OSError):
+                waiting.rmdir()
+            with contextlib.suppress(OSError):
+                waiting.with_name(f"{waiting.name}.lock").unlink()
+
+
+def _render_missing(request: RenderRequest, waiting: Path) -> None:
+    scene = request.scene
+    missing = [frame for frame in range(request.frames) if _read_frame(waiting, frame) is None]
+    if not missing:
+        return
+    # Built once here, so that no two processes paint the same skin.
+    scene_hands(scene)
+    for side in scene.sides:
+        skin_atlas(of_side(scene.subject, side))
+    workers = request.workers
+    if workers is None:
+        workers = max(1, min(os.cpu_count() or 1, len(missing) // _FRAMES_PER_WORKER))
+    with progress(f"Rendering {scene.id}", len(missing)) as update:
+        if workers == 1:
+            RenderFrames(request, missing)({}, waiting, lambda done, total: update(done))
+            return
+        works = [RenderFrames(request, missing[first::workers]) for first in range(workers)]
+        _render_in_processes(works, waiting, update)
+        update(len(missing))
+
+
+@dataclass(frozen=True)
+class RenderFrames:
+    """Renders some frames of a request into a folder: the work of one process."""
+
+    #: What they are frames of.
+    request: RenderRequest
+    #: Numbers of the frames.
+    frames: Sequence[int]
+
+    def __call__(self, inputs: Mapping[str, Path], output: Path, on_progress: OnProgress) -> None:
+        """Render; see `hwp_bench.run.engine.job.Work`."""
+        for done, frame in enumerate(self.frames, start=1):
+            render_waiting(self.request, frame, output)
+            on_progress(done, len(self.frames))
+
+
+def frame_file(folder: Path, frame: int) -> Path:
+    """Path of a rendered frame; its linear layers have the same name as `.exr`."""
+    return folder / f"{frame:06d}.npz"
+
+
+def render_waiting(request: RenderRequest, frame: int, folder: Path) -> None:
+    """Render one frame into the folder where it waits for its capture."""
+    count, size = request.frames, request.edge
+    result = render_frame(request.scene, frame, count, size)
+    cost = {
+        "seconds": dict(result.cost.seconds),
+        "rays": dict(result.cost.rays),
+        "subframes": result.plan.subframes,
+    }
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        rgb=result.rgb,
+        clean=result.clean,
+        coverage=result.coverage.astype(np.float32),
+        clean_coverage=result.clean_coverage.astype(np.float32),
+        cost=np.frombuffer(json.dumps(cost).encode(), dtype=np.uint8),
+    )
+    path = frame_file(folder, frame)
+    if request.exr:
+        write_layers(path.with_suffix(".exr"), request.scene, result, count, size)
+    # Last: the frame counts as rendered only when all of it is there.
+    atomic_write(path, buffer.getvalue())
+
+
+def _read_frame(folder: Path, frame: int) -> dict[str, np.ndarray] | None:
+    """Read a rendered frame; None if it is missing or damaged."""
+    try:
+        return read_npz(frame_file(folder, frame))
+    except BadInput:
+        return None
+
+
+def _render_in_processes(
+    works: Sequence[RenderFrames], folder: Path, on_progress: Callable[[int], None]
+) -> None:
+    """Render frames in as many processes as there are works; if one fails, all are ended."""
+    stop = threading.Event()
+    done = [0] * len(works)
+
+    def run(index: int) -> None:
+        def count(steps: int, total: int) -> None:
+            done[index] = steps
+            on_progress(sum(done))
+
+        # One thread each: the processes share the processors.
+        job = LocalJob(works[index], {}, folder.absolute(), dict.fromkeys(THREADS, "1"))
+        try:
+            run_in_process(job, count, stop.is_set)
+        except BaseException:
+            stop.set()
+            raise
+
+    with ThreadPoolExecutor(len(works)) as pool:
+        futures = [pool.submit(run, index) for index in range(len(works))]
+        try:
+            while wait(futures, timeout=1.0).not_done:
+                pass  # a wait without end would not let Ctrl-C through on every system
+        finally:
+            stop.set()
+    for error in (future.exception() for future in futures):
+        if isinstance(error, WorkerLost):
+            problem = f"a rendering process was killed ({error})"
+            raise HwpError(problem, where=works[0].request.scene.id, remedy=_REMEDY) from error
+        if isinstance(error, HwpError):
+            raise type(error)(
+                error.problem,
+                where=error.where,
+                field=error.field,
+                remedy=error.remedy or _REMEDY,
+            ) from error
+        if error is not None and not isinstance(error, Stopped):
+            raise error
+
+
+def _assemble(request: RenderRequest, waiting: Path, out: Path, seconds: float) -> None:
+    """Make the capture of the frames that wait."""
+    scene, count, size = request.scene, request.frames, request.edge
+    plans = [plan_frame(scene, frame, count, size) for frame in range(count)]
+    truth = true_hands(scene, plans)
+    cameras = Cameras(
+        Ks=np.repeat(intrinsics(scene, size)[None], count, axis=0),
+        viewmats=np.stack([viewmat(scene, item.seconds) for item in plans]),
+    )
+    info = _info(scene, plans, size)
+    costs = []
+    estimates = estimate_hands(scene, truth, plans)
+    overwrite = request.overwrite
+    with CaptureWriter(out, info, estimates, cameras, overwrite=overwrite) as writer:
+        videos = [_video(scene, waiting, info, name) for name in ("rgb", "clean")]
+        for item in plans:
+            arrays = _waiting_frame(waiting, item.frame)
+            rgb, clean = arrays["rgb"], arrays["clean"]
+            if scene.sensor.h264:
+                rgb, clean = (next(video) for video in videos)
+            coverage = arrays["coverage"].astype(np.float64)
+            writer.frame(item.frame, rgb)
+            writer.clean(item.frame, clean)
+            writer.true_mask(item.frame, eight_bit_coverage(coverage))
+            clean_coverage = arrays["clean_coverage"].astype(np.float64)
+            writer.clean_mask(item.frame, eight_bit_coverage(clean_coverage))
+            mask = estimate_mask(scene, item, coverage, clean_coverage)
+            writer.mask(item.frame, confused_mask(scene, item, mask, coverage, rgb))
+            layers = frame_file(waiting, item.frame).with_suffix(".exr")
+            if layers.exists():
+                writer.extra(f"exr/{layers.name}", layers.read_bytes())
+            costs.append(json.loads(arrays["cost"].tobytes()))
+        writer.true_hands(truth)
+        write_truth(writer.folder, scene.subject, scene.sides)
+        writer.extra("scene.json", canonical_json(scene.to_json()))
+        if off := distances(scene):
+            rows = {side: asdict(distance) for side, distance in off.items()}
+            writer.extra("subject.json", canonical_json(rows))
+        writer.extra("cost.json", json.dumps({"wall_seconds": round(seconds, 3), "frames": costs}))
+        if request.free_view:
+            write_free_view(scene, writer.folder / FREE_VIEW, info, estimates)
+
+
+def _video(scene: Scene, waiting: Path, info: CaptureInfo, name: str) -> Iterator[np.ndarray]:
+    """The frames, or their clean versions, out of the video that the device stores.
+
+    It is encoded here, in one process, over the whole clip: frames that were rendered by any
+    number of processes in any order give the same stream.
+    """
+    images = (_waiting_frame(waiting, frame)[name] for frame in range(info.frame_count))
+    return through_h264(images, scene.sensor.h264, info.fps, scene.id)
+
+
+def _waiting_frame(waiting: Path, frame: int) -> dict[str, np.ndarray]:
+    arrays = _read_frame(waiting, frame)
+    if arrays is None:
+        frame_file(waiting, frame).unlink(missing_ok=True)
+        raise HwpError(
+            f"frame {frame} was damaged while it waited",
+            where=waiting,
+            remedy="Run the same command again; only this frame is rendered again.",
+        )
+    return arrays
+
+
+def true_hands(scene: Scene, plans: list[FramePlan]) -> dict[str, HandParameters]:
+    """The true hand parameters of every frame, by side."""
+    return parameters_of(scene, [hands_at(scene, item.seconds) for item in plans])
+
+
+def _info(scene: Scene, plans: list[FramePlan], size: int) -> CaptureInfo:
+    model = scene_hands(scene)[scene.sides[0]].model
+    known = "anny" if rig_path(scene.subject.model) is not None else scene.subject.model
+    return CaptureInfo(
+        id=scene.id,
+        hands=scene.hands,
+        action=scene.action,
+        device=scene.device,
+        fps=scene.fps * len(plans) / scene.frame_count,
+        width=size,
+        height=size,
+        frame_count=len(plans),
+        hand_model=HandModelId(name=model.name, digest=model.digest, source=known),
+        perturbations={
+            call.kind: tuple(item.severity[call.kind] for item in plans) for call in scene.effects
+        },
+        source={
+            "kind": SIMULATED,
+            "scene": scene.id,
+            "title": scene.title,
+            "scene_digest": scene.digest,
+            "seed": scene.seed,
+            "renderer": RENDERER,
+        },
+        licence=LICENCE,
+    )

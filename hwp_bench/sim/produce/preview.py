@@ -1,0 +1,160 @@
+"""Images of a scene for people: contact sheet, animation, and a 3D view from the side."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from hwp_bench.base.console import track
+from hwp_bench.base.errors import MissingDependency, UsageError
+from hwp_bench.base.files import atomic_write
+from hwp_bench.base.images import write_image
+from hwp_bench.sim.effects import hands_at, lights_at, objects_at, plan_frame
+from hwp_bench.sim.geometry.rays import RenderCost
+from hwp_bench.sim.geometry.surface import Surface
+from hwp_bench.sim.light.lights import focus_point
+from hwp_bench.sim.render.frame import SimulatedFrame, render_frame
+from hwp_bench.sim.render.stage import Stage
+from hwp_bench.sim.scene.motion import viewmat
+from hwp_bench.sim.scene.scene import Scene
+from hwp_bench.sim.subject.hand import MOVING
+from hwp_bench.taxonomy import perturbation
+
+
+def captioned(image: np.ndarray, text: str) -> np.ndarray:
+    """A copy of an image (H, W, 3) uint8 with a text in its upper left corner."""
+    import cv2
+
+    drawn = image.copy()
+    scale = len(image) / 420.0
+    for color, width in (((0, 0, 0), 3), ((255, 255, 255), 1)):
+        place = (4, int(36 * scale))
+        cv2.putText(drawn, text, place, cv2.FONT_HERSHEY_SIMPLEX, scale, color, width, cv2.LINE_AA)
+    return drawn
+
+
+#: Frames in a row of the sheet.
+SHEET_COLUMNS = 8
+
+
+#: Duration of a frame of the animation, ms.
+FRAME_MS = 140
+
+
+def write_preview(
+    scene: Scene, folder: Path, *, frame_count: int = 48, size: int = 160
+) -> tuple[Path, Path]:
+    """Write `ID-sheet.png` and `ID.gif`, each frame next to its clean version."""
+    if not 10 <= frame_count <= 400 or not 32 <= size <= 512:
+        raise UsageError("10 to 400 frames of 32 to 512 px are drawn", field="--frames, --size")
+    results = [
+        render_frame(scene, frame, frame_count, size)
+        for frame in track(range(frame_count), f"Rendering {scene.id}")
+    ]
+    sheet = write_image(folder / f"{scene.id}-sheet.png", strip(results, SHEET_COLUMNS))
+    return sheet, atomic_write(folder / f"{scene.id}.gif", _animation(results))
+
+
+def strip(results: list[SimulatedFrame], columns: int) -> np.ndarray:
+    """Frames in rows, left to right, each with its number and what perturbs it."""
+    cells = [_captioned(result) for result in results]
+    blank = np.zeros_like(cells[0])
+    cells += [blank] * (-len(cells) % columns)
+    rows = [
+        np.concatenate(cells[start : start + columns], axis=1)
+        for start in range(0, len(cells), columns)
+    ]
+    return np.concatenate(rows, axis=0)
+
+
+def _captioned(result: SimulatedFrame) -> np.ndarray:
+    severity = [
+        f"{perturbation(name).short}{value}"
+        for name, value in result.plan.severity.items()
+        if value
+    ]
+    return captioned(result.rgb, " ".join([str(result.plan.frame), *severity]))
+
+
+def _animation(results: list[SimulatedFrame]) -> bytes:
+    from PIL import Image
+
+    frames = [
+        Image.fromarray(np.concatenate([result.rgb, result.clean], axis=1)).quantize(128)
+        for result in results
+    ]
+    buffer = io.BytesIO()
+    frames[0].save(
+        buffer, format="GIF", save_all=True, append_images=frames[1:], duration=FRAME_MS, loop=0
+    )
+    return buffer.getvalue()
+
+
+#: Edge of the image in pixels.
+EDGE = 900
+# Moments of the camera's path that are drawn.
+_PATH = 200
+
+
+def draw_stage(scene: Scene, folder: Path) -> Path:
+    """Write `ID-stage.png`: the busiest frame of the scene, seen from the side."""
+    try:
+        import pyvista
+    except ImportError as error:
+        raise MissingDependency(
+            "the stage is drawn by pyvista", remedy="pip install 'hwp-bench[preview]'"
+        ) from error
+    plans = [plan_frame(scene, frame, 100, 256) for frame in range(100)]
+    recipe = max(plans, key=lambda item: ("objects" in item.passes, sum(item.severity.values())))
+    stage = Stage(scene, RenderCost())
+    hands = hands_at(scene, recipe.seconds)
+    things = stage.things(objects_at(scene, recipe, recipe.seconds), hands)
+    lights = lights_at(scene, recipe)
+    views = [viewmat(scene, moment * scene.duration) for moment in np.linspace(0.0, 1.0, _PATH)]
+    path = np.array([-view[:3, :3].T @ view[:3, 3] for view in views])
+    out = folder / f"{scene.id}-stage.png"
+    folder.mkdir(parents=True, exist_ok=True)
+    try:
+        plotter = pyvista.Plotter(off_screen=True, window_size=[EDGE, EDGE])
+        plotter.add_mesh(_mesh(stage.surface(hands, MOVING)), color="#d8a888", smooth_shading=True)
+        if things is not None:
+            plotter.add_mesh(_mesh(things.surface), color="#4477aa")
+        focus = focus_point()
+        lamp = focus + 0.25 * lights.direction
+        plotter.add_mesh(pyvista.Sphere(radius=0.012, center=lamp), color="#ffcc33", lighting=False)
+        plotter.add_mesh(pyvista.Line(lamp, focus), color="#ffcc33", line_width=2)
+        plotter.add_mesh(_frustum(scene), color="#666666", style="wireframe")
+        if scene.camera.handheld:
+            plotter.add_mesh(pyvista.lines_from_points(path), color="#cc3311", line_width=3)
+        eye = focus + np.array([1.25, -0.55, -0.45])
+        plotter.camera_position = [eye, focus + np.array([0.0, 0.05, -0.22]), (0.0, -1.0, 0.0)]
+        plotter.screenshot(str(out))
+        plotter.close()
+    except (RuntimeError, OSError) as error:
+        raise MissingDependency(
+            f"the stage cannot be drawn ({error})",
+            remedy="It needs OpenGL: a display, or a VTK build with OSMesa or EGL.",
+        ) from error
+    return out
+
+
+def _mesh(surface: Surface) -> Any:
+    import pyvista
+
+    count = len(surface.faces)
+    cells = np.column_stack([np.full(count, 3), surface.faces])
+    return pyvista.PolyData(surface.vertices, cells.reshape(-1))
+
+
+def _frustum(scene: Scene) -> Any:
+    import pyvista
+
+    slope = np.tan(np.radians(scene.camera.field_of_view) / 2.0)
+    far = 0.2 * np.array([[x * slope, y * slope, 1.0] for x in (-1, 1) for y in (-1, 1)])
+    points = np.vstack([np.zeros((1, 3)), far])
+    faces = [[0, 1, 2], [0, 2, 4], [0, 4, 3], [0, 3, 1]]
+    cells = np.array([[3, *face] for face in faces]).reshape(-1)
+    return pyvista.PolyData(points, cells)

@@ -1,0 +1,320 @@
+"""Commands that show an avatar: `render`, `view`, `export`, `page`."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from pathlib import Path
+
+from wildghand.cli.fit import add_address, address_of
+
+_RENDER_EXAMPLES = """examples:
+  wildghand render my_avatar --poses my_capture -o frames
+  wildghand render my_avatar --poses other_capture -o frames --frames 100:200 --background 255
+  wildghand render my_avatar --poses my_capture -o frames --video turn.mp4
+  wildghand render my_avatar --poses my_capture -o frames --overwrite   # in place of older frames
+
+The poses are those of a capture: its hand parameters and cameras. PNG files are named by frame.
+"""
+
+
+def add_render(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _RENDER_EXAMPLES
+    parser.add_argument("avatar", type=Path, help="avatar folder")
+    parser.add_argument(
+        "--poses", type=Path, required=True, metavar="CAPTURE", help="capture to take poses from"
+    )
+    parser.add_argument("-o", "--out", type=Path, required=True, help="folder of images to make")
+    parser.add_argument("--frames", metavar="A:B", help="frames A to B-1 only")
+    parser.add_argument(
+        "--background", type=int, default=0, metavar="GREY", help="0 black to 255 white"
+    )
+    parser.add_argument("--video", type=Path, metavar="MP4", help="also write a video")
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing folder")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def do_render(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
+    from hwp_bench.capture import open_capture
+    from wildghand.avatar.files import load_avatar
+    from wildghand.avatar.render import render_clip
+
+    if not 0 <= args.background <= 255:
+        raise UsageError(f"is {args.background}", field="--background", remedy="Use 0 to 255.")
+    inputs = {"AVATAR": args.avatar, "--poses": args.poses}
+    check_places({"--out": args.out, "--video": args.video}, inputs, replaces=args.overwrite)
+    avatar = load_avatar(args.avatar, hand=args.hand_model)
+    capture = open_capture(args.poses)
+    frames = _frames(args.frames, capture.info.frame_count)
+    facts = render_clip(
+        avatar,
+        capture,
+        frames,
+        args.out,
+        background=args.background,
+        video=args.video,
+        overwrite=args.overwrite,
+    )
+    if args.json:
+        print(json.dumps(facts))
+    else:
+        print(f"{args.out}: {facts['frames']} frames, {facts['frames_per_second']:.1f} a second")
+    return 0
+
+
+def _frames(text: str | None, count: int) -> range:
+    from hwp_bench.base.errors import UsageError
+
+    if text is None:
+        return range(count)
+    first, colon, last = text.partition(":")
+    try:
+        start, stop = int(first or 0), int(last or count) if colon else int(first) + 1
+    except ValueError:
+        start = stop = -1
+    if not 0 <= start < stop <= count:
+        raise UsageError(
+            f"{text!r} is not a part of {count} frames",
+            field="--frames",
+            remedy="Use A:B, as 0:10.",
+        )
+    return range(start, stop)
+
+
+_VIEW_EXAMPLES = """examples:
+  wildghand view my_avatar
+  wildghand view my_avatar --poses my_capture
+  wildghand view my_avatar --port 9000 --background 40 40 40
+
+Prints the address of a page and serves it until Ctrl-C. In the page the hand is turned with the
+mouse, and posed with sliders in degrees, with named poses, or by the motion of a capture. The page
+is for this machine only; --host 0.0.0.0 shows it to everybody who reaches the machine. It needs
+viser: pip install 'hwp-bench[view]'.
+"""
+
+
+def add_view(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _VIEW_EXAMPLES
+    parser.add_argument("avatar", type=Path, help="avatar folder")
+    parser.add_argument(
+        "--poses",
+        type=Path,
+        metavar="CAPTURE",
+        help="capture whose motion is played (default: the one that the avatar was made of, where "
+        "it lies with the avatar)",
+    )
+    add_address(parser)
+    parser.add_argument(
+        "--size", type=int, default=1024, metavar="PX", help="largest edge of a picture"
+    )
+    parser.add_argument(
+        "--background",
+        type=int,
+        nargs=3,
+        default=(255, 255, 255),
+        metavar=("R", "G", "B"),
+        help="colour behind the hand, 0 to 255 each (default: white)",
+    )
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def do_view(args: argparse.Namespace) -> int:
+    """Run the command; Ctrl-C ends it with status 0."""
+    import threading
+
+    from hwp_bench.capture import open_capture
+    from wildghand.avatar.files import load_avatar
+    from wildghand.viewer.posed_view import Motion, capture_of
+    from wildghand.viewer.server import require_viser
+    from wildghand.viewer.view import ViewSettings, serve_view
+
+    red, green, blue = args.background
+    settings = ViewSettings(args.size, (red, green, blue))
+    require_viser()
+    avatar = load_avatar(args.avatar, hand=args.hand_model)
+    poses = args.poses or capture_of(args.avatar)
+    motion = None if poses is None else Motion(avatar, open_capture(poses))
+    try:
+        with serve_view(avatar, motion, address_of(args), settings) as served:
+            facts = {"avatar": str(args.avatar), "url": served.url}
+            text = json.dumps(facts) if args.json else f"{args.avatar}: {served.url}"
+            print(text, flush=True)
+            threading.Event().wait()
+    except KeyboardInterrupt:
+        pass
+    return 0
+
+
+_EXPORT_EXAMPLES = """examples:
+  wildghand export my_avatar -o hand.ply
+  wildghand export my_avatar -o hand.spz --poses my_capture --frame 100
+  wildghand export my_avatar -o hand.ply --supersplat
+  wildghand export my_avatar -o splats.glb
+  wildghand export my_avatar -o hand.glb --mesh --poses my_capture
+
+The extension decides the format: .ply, Gaussians in the layout of 3DGS; .spz, the same in a tenth
+of the size; .glb, Gaussians as glTF (KHR_gaussian_splatting, a release candidate), or with --mesh
+a skinned mesh with 16 joints a hand, a texture and a motion. Lengths are metres.
+"""
+
+
+def add_export(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXPORT_EXAMPLES
+    parser.add_argument("avatar", type=Path, help="avatar folder")
+    parser.add_argument(
+        *("-o", "--out"), type=Path, required=True, metavar="FILE", help="file to write"
+    )
+    parser.add_argument(
+        "--mesh", action="store_true", help="a skinned mesh instead of Gaussians (.glb)"
+    )
+    parser.add_argument(
+        "--poses", type=Path, metavar="CAPTURE", help="capture to take a pose or a motion from"
+    )
+    parser.add_argument("--frame", type=int, help="its frame, for Gaussians (default: 0)")
+    parser.add_argument(
+        "--scale", type=float, default=1.0, help="units of the file in a metre (default: 1)"
+    )
+    parser.add_argument(
+        "--supersplat",
+        action="store_true",
+        help="for SuperSplat: opens upright, palm to the viewer, ten units in a metre (.ply)",
+    )
+    parser.add_argument(
+        "--harmonics",
+        type=int,
+        default=3,
+        metavar="DEGREE",
+        help="how finely colours of Gaussians change with the side they are seen from, 0 to 3 "
+        "(default: 3; 0: one colour each, and a third of the size)",
+    )
+    parser.add_argument(
+        "--texture",
+        type=int,
+        default=1024,
+        metavar="TEXELS",
+        help="edge of a mesh's texture (default: 1024)",
+    )
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace what exists")
+    parser.add_argument("--json", action="store_true", help="print counts as JSON")
+
+
+def do_export(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.base.errors import UsageError
+    from hwp_bench.base.files import check_places
+    from wildghand.export.formats import ExportSettings, check_target, export
+
+    settings = ExportSettings(
+        mesh=args.mesh,
+        scale=args.scale,
+        supersplat=args.supersplat,
+        harmonics=args.harmonics,
+        texture=args.texture,
+    )
+    check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
+    check_target(args.out, settings, overwrite=args.overwrite)
+    if args.frame is not None and (args.poses is None or args.mesh):
+        raise UsageError("needs --poses, and no --mesh", field="--frame")
+
+    import json
+
+    from hwp_bench.capture import open_capture
+    from wildghand.avatar.files import load_avatar
+
+    capture = None if args.poses is None else open_capture(args.poses)
+    avatar = load_avatar(args.avatar, hand=args.hand_model)
+    counts = export(
+        avatar, args.out, settings, capture=capture, frame=args.frame, overwrite=args.overwrite
+    )
+    if args.json:
+        print(json.dumps({"file": str(args.out), **counts}))
+    else:
+        print(f"{args.out}: " + ", ".join(f"{count} {name}" for name, count in counts.items()))
+    return 0
+
+
+_PAGE_EXAMPLES = """examples:
+  wildghand page my_avatar
+  wildghand page my_avatar --poses my_capture -o hand.html
+
+Writes one HTML file that works offline in a browser with WebGL2: the hand can be turned and posed.
+With the capture that was fitted its motion is played, too, and the page says how near it comes to
+the avatar's own drawing.
+"""
+
+
+def add_page(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _PAGE_EXAMPLES
+    parser.add_argument("avatar", type=Path, help="avatar folder")
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("avatar.html"),
+        metavar="FILE",
+        help="file to write (default: avatar.html)",
+    )
+    parser.add_argument(
+        "--poses",
+        type=Path,
+        metavar="CAPTURE",
+        help="capture that was fitted, for its motion (default: what a fit of a video left)",
+    )
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
+    parser.add_argument("--overwrite", action="store_true", help="replace an existing file")
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def do_page(args: argparse.Namespace) -> int:
+    """Run the command."""
+    import dataclasses
+    import json
+
+    from hwp_bench.base.files import check_places
+    from hwp_bench.capture import open_capture
+    from wildghand.page import write_page
+    from wildghand.viewer.posed_view import capture_of
+
+    check_places({"--out": args.out}, {"AVATAR": args.avatar, "--poses": args.poses})
+    place = args.poses or capture_of(args.avatar)
+    capture = None if place is None else open_capture(place)
+    facts = write_page(
+        args.avatar, args.out, capture=capture, hand=args.hand_model, overwrite=args.overwrite
+    )
+    if args.json:
+        print(json.dumps(dataclasses.asdict(facts)))
+        return 0
+    print(f"{args.out}: {facts.gaussians} Gaussians, {facts.bytes / 1e6:.2f} MB")
+    if facts.fidelity is not None:
+        print(
+            f"{facts.fidelity.baked:.1f} dB from the avatar's own drawing "
+            f"({facts.fidelity.joints_only:.1f} dB if it followed the joints alone)"
+        )
+    return 0
+
+
+#: What adds the arguments of a command, and what runs it and returns the status.
+COMMANDS = {
+    "render": (add_render, do_render),
+    "view": (add_view, do_view),
+    "export": (add_export, do_export),
+    "page": (add_page, do_page),
+}

@@ -1,0 +1,312 @@
+"""Commands that look into a fit or this machine: `judge`, `explain`, `info`, `completion`."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from hwp_bench.cli.program import add_shell_argument
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from hwp_bench.capture import Capture
+    from wildghand.prepass import FrameAssessment
+
+
+_JUDGE_EXAMPLES = """examples:
+  wildghand judge my_capture
+  wildghand judge my_capture -o judgement.json --picture judgement.png
+
+Estimates for every frame the probability that it is clean, and the severity (0-5) of each
+perturbation that the capture lists, or of all four if it lists none. Whether a frame is perturbed
+is much more certain than which perturbation it is; docs/prepass.md has the numbers. The capture is
+not changed.
+"""
+
+
+def add_judge(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _JUDGE_EXAMPLES
+    parser.add_argument("capture", type=Path, help="capture folder")
+    parser.add_argument("-o", "--out", type=Path, metavar="FILE", help="JSON file to write")
+    parser.add_argument(
+        "--picture", type=Path, metavar="FILE", help="PNG file to write: the estimates over time"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def do_judge(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.base.files import check_places, write_json
+    from hwp_bench.capture import open_capture
+
+    outputs = {"--out": args.out, "--picture": args.picture}
+    check_places(outputs, {"CAPTURE": args.capture})
+    capture = open_capture(args.capture)
+    assessment, levels = _judge(capture)
+    record = _record(capture, assessment, levels)
+    if args.out is not None:
+        write_json(args.out, record)
+    if args.picture is not None:
+        _draw_judged(assessment, levels, args.picture)
+    if args.json:
+        json.dump(record, sys.stdout, indent=1)
+        print()
+    else:
+        _print_judged(capture, assessment, levels)
+    return 0
+
+
+def _judge(capture: Capture) -> tuple[FrameAssessment, dict[str, np.ndarray]]:
+    import numpy as np
+
+    from hwp_bench.base.console import track
+    from wildghand.prepass import capture_input, estimated_severity, judge_frames
+
+    every = np.arange(len(capture))
+    assessment = judge_frames(capture_input(capture, every, track(every.tolist(), "Reading")))
+    levels = estimated_severity(assessment)
+    listed = capture.info.perturbations
+    return assessment, {kind: level for kind, level in levels.items() if kind in (listed or levels)}
+
+
+def _record(
+    capture: Capture, assessment: FrameAssessment, levels: dict[str, np.ndarray]
+) -> dict[str, Any]:
+    return {
+        "capture": capture.info.id,
+        "estimated": True,
+        "clean": [round(value, 4) for value in assessment.clean.tolist()],
+        "usable": assessment.usable.tolist(),
+        "severity": {kind: level.tolist() for kind, level in levels.items()},
+    }
+
+
+def _print_judged(
+    capture: Capture, assessment: FrameAssessment, levels: dict[str, np.ndarray]
+) -> None:
+    from hwp_bench.base.tables import Column, Table, print_table
+
+    count = len(assessment)
+    rows: list[tuple[str, int, float | None]] = [
+        ("judged clean", int((assessment.clean >= 0.5).sum()), None),
+        ("judged perturbed", int((assessment.usable & (assessment.clean < 0.5)).sum()), None),
+        ("cannot be judged", count - int(assessment.usable.sum()), None),
+    ]
+    for kind, level in levels.items():
+        acting = level[level > 0]
+        mean = float(acting.mean()) if len(acting) else None
+        rows.append((kind.replace("_", " "), len(acting), mean))
+    columns = (Column("estimate"), Column("frames"), Column("mean level", 1))
+    print_table(Table(f"{capture.info.id}, {count} frames", columns, tuple(rows), ranked=False))
+
+
+def _draw_judged(assessment: FrameAssessment, levels: dict[str, np.ndarray], path: Path) -> None:
+    import io
+
+    from matplotlib.figure import Figure
+
+    from hwp_bench.base.files import atomic_write
+
+    figure = Figure(figsize=(9.0, 3.6), layout="constrained")
+    clean, severity = figure.subplots(2, 1, sharex=True)
+    clean.plot(assessment.indices, assessment.clean, color="black")
+    clean.set(ylabel="probability clean", ylim=(-0.05, 1.05))
+    for kind, level in levels.items():
+        severity.step(assessment.indices, level, where="mid", label=kind.replace("_", " "))
+    severity.set(ylabel="estimated severity", xlabel="frame", ylim=(-0.2, 5.2))
+    severity.legend(fontsize=7, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    memory = io.BytesIO()
+    figure.savefig(memory, format="png", dpi=110)
+    atomic_write(path, memory.getvalue())
+
+
+_EXPLAIN_EXAMPLES = """examples:
+  wildghand explain my_avatar my_capture -o explained.png
+  wildghand explain my_avatar my_capture --frames 3 17 40 -o explained.png
+
+Shows what the biases took out of training frames: the frame, the hand without biases (what the
+avatar is), the hand with the frame's biases, and the difference of the two. Without --frames the
+eight frames of largest temporal weight are shown. The capture is the one that was fitted.
+"""
+
+
+def add_explain(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _EXPLAIN_EXAMPLES
+    parser.add_argument("avatar", type=Path, help="avatar folder")
+    parser.add_argument("capture", type=Path, help="capture folder that it was fitted to")
+    parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="PNG file")
+    parser.add_argument(
+        "--frames", type=int, nargs="+", action="extend", metavar="N", help="frames of the capture"
+    )
+    parser.add_argument(
+        "--hand-model", metavar="MODEL", help="anny or mano:PATH (default: the avatar's own)"
+    )
+
+
+def do_explain(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.base.files import check_places
+    from hwp_bench.base.images import write_image
+    from hwp_bench.capture import open_capture
+    from wildghand.avatar.files import load_avatar
+    from wildghand.avatar.render import explain_frames, explanation_sheet
+
+    check_places({"--out": args.out}, {"AVATAR": args.avatar, "CAPTURE": args.capture})
+    capture = open_capture(args.capture)
+    found = explain_frames(load_avatar(args.avatar, hand=args.hand_model), capture, args.frames)
+    names = {
+        item.frame: ", ".join(
+            kind.replace("_", " ")
+            for kind, level in capture.info.severity(item.frame).items()
+            if level
+        )
+        for item in found
+    }
+    write_image(args.out, explanation_sheet(found, names))
+    print(f"{args.out}: {len(found)} frames")
+    return 0
+
+
+_INFO_EXAMPLES = """examples:
+  wildghand info
+  wildghand info --json
+  wildghand info --network paper
+
+Draws a small scene with every rasterizer backend that this machine has and compares it with the
+float64 reference. Exit status 0: every backend that is there is right; 1: one is not.
+With --network it lists the parameters of the prediction network for two hands instead.
+"""
+
+#: Largest difference to the float64 reference, on colours in [0, 1], that counts as right.
+TOLERANCE = 1e-4
+
+
+def add_info(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    parser.epilog = _INFO_EXAMPLES
+    parser.add_argument(
+        "--network", choices=("compact", "paper"), help="list the parameters of the network"
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON")
+
+
+def do_info(args: argparse.Namespace) -> int:
+    """Run the command."""
+    if args.network:
+        _print_network(args.network, args.json)
+        return 0
+    from hwp_bench.base.tables import Column, Table, print_table
+    from hwp_bench.results.schema import environment
+
+    facts = environment()
+    backends = [_check(name) for name in ("numba", "gsplat")]
+    if args.json:
+        json.dump({"environment": facts, "backends": backends}, sys.stdout, indent=1)
+        print()
+    else:
+        rows = [(name, version) for name, version in facts.pop("packages").items()]
+        rows = [*((name, str(value)) for name, value in facts.items()), *rows]
+        print_table(Table("Environment", (Column("what"), Column("version")), tuple(rows)))
+        columns = (Column("backend"), Column("state"), Column("largest error", 8))
+        cells = tuple((b["backend"], b["state"], b["largest_error"]) for b in backends)
+        print_table(Table("Rasterizer", columns, cells))
+    return 1 if any(backend["state"] == "wrong" for backend in backends) else 0
+
+
+def _print_network(size: str, as_json: bool) -> None:
+    """List the parameters of one size of the network."""
+    from hwp_bench.base.tables import Column, Table, print_table
+    from wildghand.network.network import blank_network, parameter_table
+    from wildghand.network.settings import network_settings
+
+    settings = network_settings(size)
+    rows = parameter_table(blank_network(settings))
+    parts: dict[str, int] = {}
+    for row in rows:
+        parts[row.part] = parts.get(row.part, 0) + row.parameters
+    total = sum(parts.values())
+    if as_json:
+        layers = [
+            {**dataclasses.asdict(row), "part": row.part, "parameters": row.parameters}
+            for row in rows
+        ]
+        facts = {"settings": settings.to_json(), "layers": layers, "parts": parts, "total": total}
+        json.dump(facts, sys.stdout, indent=1)
+        print()
+        return
+    columns = (
+        Column("layer"),
+        Column("weights"),
+        Column("each"),
+        Column("times"),
+        Column("parameters"),
+    )
+    cells = [
+        (row.layer, row.weights, f"{row.each:,}", row.times, f"{row.parameters:,}") for row in rows
+    ]
+    print_table(Table(f"Network {size!r}, two hands", columns, tuple(cells), ranked=False))
+    sums = [(part, f"{count:,}") for part, count in [*parts.items(), ("total", total)]]
+    print_table(Table("Parts", (Column("part"), Column("parameters")), tuple(sums), ranked=False))
+
+
+def _check(backend: str) -> dict[str, Any]:
+    """Draw a seeded scene and compare it with the reference."""
+    import torch
+
+    from hwp_bench.base.errors import HwpError
+    from wildghand.splat import rasterize
+
+    generator = torch.Generator().manual_seed(0)
+    means = torch.rand(50, 3, generator=generator, dtype=torch.float64) - 0.5
+    means[:, 2] += 2.0
+    scene: dict[str, Any] = {
+        "means": means,
+        "quats": torch.randn(50, 4, generator=generator, dtype=torch.float64),
+        "scales": 0.02 + 0.05 * torch.rand(50, 3, generator=generator, dtype=torch.float64),
+        "opacities": torch.rand(50, generator=generator, dtype=torch.float64),
+        "colors": torch.rand(50, 3, generator=generator, dtype=torch.float64),
+        "viewmats": torch.eye(4, dtype=torch.float64)[None],
+        "Ks": torch.tensor([[[60.0, 0, 24], [0, 60, 24], [0, 0, 1]]], dtype=torch.float64),
+    }
+    truth = rasterize(**scene, width=48, height=48, backend="reference")[0]
+    device = "cuda" if backend == "gsplat" else "cpu"
+    try:
+        if device == "cuda" and not torch.cuda.is_available():
+            return {"backend": backend, "state": "no CUDA device", "largest_error": None}
+        moved = {name: value.float().to(device) for name, value in scene.items()}
+        image = rasterize(**moved, width=48, height=48, backend=backend)[0]
+    except HwpError as error:
+        return {"backend": backend, "state": f"not there: {error}", "largest_error": None}
+    largest = float((image.cpu().double() - truth).abs().max())
+    state = "right" if largest <= TOLERANCE else "wrong"
+    return {"backend": backend, "state": state, "largest_error": largest}
+
+
+def add_completion(parser: argparse.ArgumentParser) -> None:
+    """Add the arguments of the command."""
+    add_shell_argument(parser, "wildghand")
+
+
+def do_completion(args: argparse.Namespace) -> int:
+    """Run the command."""
+    from hwp_bench.cli.program import completion_script
+    from wildghand.cli.main import command_tree
+
+    print(completion_script("wildghand", command_tree(), args.shell))
+    return 0
+
+
+#: What adds the arguments of a command, and what runs it and returns the status.
+COMMANDS = {
+    "judge": (add_judge, do_judge),
+    "explain": (add_explain, do_explain),
+    "info": (add_info, do_info),
+    "completion": (add_completion, do_completion),
+}
