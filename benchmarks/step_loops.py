@@ -21,7 +21,7 @@ import torch
 
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from hwp_bench.methods.manifest import find_method
-from wildghand.fitting.fit import Fit
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.method import ready_fit
 from wildghand.gaussians.fit_loop import StepThreads
 from wildghand.model.settings import read_settings
@@ -81,7 +81,7 @@ class WildGHandLoop:
         threads: StepThreads | None = None,
     ) -> None:
         chosen = read_settings({"device": "cpu", **settings})
-        self._fit = Fit(training, chosen, 0, ready_fit("cpu"))
+        self._fit = make_fit(training, chosen, 0, ready_fit("cpu"))
         self._watchers = Watchers(0)
         self._threads = threads or StepThreads()
         self._taken = 0
