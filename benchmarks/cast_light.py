@@ -25,7 +25,7 @@ from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.light import CastLight
 from wildghand.light.fit_lights import CONE, SKY
 from wildghand.model.dress import Gaussians
-from wildghand.model.rasterize_hands import rasterize_hands
+from wildghand.model.frames import rasterize_hands
 
 
 def lamps_of(light: CastLight) -> list[tuple[np.ndarray, float]]:

@@ -53,7 +53,7 @@ class Listener(event.Listener):  # type: ignore[misc]
 
 def ready_to_fit() -> None:
     """Make ready what a fit and its rasterizer call."""
-    from wildghand.fitting.ready import ready_fit
+    from wildghand.fitting.method import ready_fit
 
     ready_fit("cpu")
 

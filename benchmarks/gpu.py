@@ -26,8 +26,8 @@ from benchmarks.small_capture import opened_request, small_capture
 from hwp_bench.base.tables import Column, Table, print_table
 from hwp_bench.methods.contract import TrainingCapture
 from hwp_bench.methods.manifest import find_method, read_manifest
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.ready import ready_fit
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.method import ready_fit
 from wildghand.gaussians.fit_loop import batches
 from wildghand.model.settings import read_settings
 from wildghand.splat.threads import denormals_flushed
@@ -85,7 +85,7 @@ class Loop:
     def __init__(self, training: TrainingCapture, settings: Mapping[str, Any]) -> None:
         chosen = read_settings(dict(settings))
         self.device = ready_fit(chosen.device)
-        self._fit = Fit(training, chosen, 0, self.device)
+        self._fit = make_fit(training, chosen, 0, self.device)
         self._order = batches(len(self._fit.frames), chosen.schedule.batch, 0)
 
     def block(self, steps: int = BLOCK) -> float:

@@ -39,8 +39,7 @@ from wildghand.network import (
     surface_points,
 )
 from wildghand.plain.model import make_model
-from wildghand.plain.recipe import learning_rates
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import FitSettings, learning_rates
 from wildghand.splat import rasterize
 
 #: Gaussians of the stated cost.

@@ -30,8 +30,8 @@ from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.sim.produce.truth import add_subject_mesh
-from wildghand.fitting.judging_frames import judging_frames
-from wildghand.fitting.subject_shape import subject_of
+from wildghand.fitting.data import judging_frames
+from wildghand.fitting.start import subject_of
 from wildghand.gaussians.training import TrainingFrames, load_frames
 from wildghand.model.settings import read_settings
 from wildghand.subject import SubjectShape, unknowns

@@ -21,11 +21,11 @@ import torch
 
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from hwp_bench.methods.manifest import find_method
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import Watchers, optimize
-from wildghand.fitting.ready import ready_fit
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.method import ready_fit
 from wildghand.gaussians.fit_loop import StepThreads
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import Watchers, run_fit
 from wildghand.splat.threads import denormals_flushed
 
 #: Least number of steps of a block.
@@ -81,7 +81,7 @@ class WildGHandLoop:
         threads: StepThreads | None = None,
     ) -> None:
         chosen = read_settings({"device": "cpu", **settings})
-        self._fit = Fit(training, chosen, 0, ready_fit("cpu"))
+        self._fit = make_fit(training, chosen, 0, ready_fit("cpu"))
         self._watchers = Watchers(0)
         self._threads = threads or StepThreads()
         self._taken = 0
@@ -106,7 +106,7 @@ class WildGHandLoop:
         budget = Budget(steps=BUDGET)
         denormals = denormals_flushed() if flush else contextlib.nullcontext()
         with denormals, contextlib.suppress(_Enough):
-            optimize(
+            run_fit(
                 self._fit,
                 budget,
                 clock,

@@ -27,7 +27,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "network: geometry": ("wildghand.network.network:PredictionNetwork.geometry",),
     "network: shared": (
         "wildghand.network.network:PredictionNetwork.features",
-        "wildghand.fitting.shared_features:SharedFeatures._share_out",
+        "wildghand.fitting.descent:SharedFeatures._share_out",
     ),
     "network: heads": ("wildghand.network.network:PredictionNetwork.forward",),
     "hand poses": (
@@ -48,7 +48,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     "shading": ("wildghand.plain.model:sh_basis",),
     "rasterizer": (
         "wildghand.model.model:rasterize_hands",
-        "wildghand.model.rasterize_hands:rasterize",
+        "wildghand.model.frames:rasterize",
         "wildghand.plain.model:rasterize",
     ),
     "photometric loss": (
@@ -57,7 +57,7 @@ FUNCTIONS: dict[str, tuple[str, ...]] = {
     ),
     "regularisers": ("wildghand.fitting.objective:Objective.__call__",),
     "targets and weights": (
-        "wildghand.fitting.weighting:Weighting.__call__",
+        "wildghand.fitting.weights:Weighting.__call__",
         "wildghand.gaussians.training:FrameTable.__call__",
     ),
     "optimizer": (

@@ -17,7 +17,7 @@ def compile_all() -> None:
     """
     from hwp_bench.sim.render.frame import render_frame
     from hwp_bench.sim.scene_files import load_scene
-    from wildghand.fitting.ready import ready_fit
+    from wildghand.fitting.method import ready_fit
 
     ready_fit("cpu")
     render_frame(load_scene("capture0"), 0, 10, 32)

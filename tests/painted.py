@@ -15,8 +15,7 @@ from hwp_bench.capture.reader import open_capture
 from hwp_bench.hands import load_template
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Avatar, Camera, HandPose, TrainingCapture
-from wildghand.plain.avatar import PlainAvatar
-from wildghand.plain.model import make_model
+from wildghand.plain.model import PlainAvatar, make_model
 
 #: Frames and edge of the capture.
 FRAMES, SIZE = 40, 64

@@ -20,8 +20,7 @@ from hwp_bench.sim.subject.atlas import painted_atlas
 from hwp_bench.sim.subject.hand import subject_hand
 from hwp_bench.sim.subject.subject import Subject
 from wildghand.network.surface import PlaneSampler
-from wildghand.plain.avatar import PlainAvatar
-from wildghand.plain.model import make_model
+from wildghand.plain.model import PlainAvatar, make_model
 
 #: A dark person with pale palms, whom no prior has seen.
 STRANGER = Subject(seed=910_357, tone=1.0, age=40.0)

@@ -21,15 +21,14 @@ from painted import (
 )
 from scipy.spatial.transform import Rotation
 
-from exposure_fit.method import ExposureMethod
+from exposure_fit.method import ExposureMethod, ExposureRecipe
 from exposure_fit.motion import motion_px, nearest_turn, pose_velocities, velocities
-from exposure_fit.recipe import ExposureRecipe
 from hwp_bench.capture import Capture
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from plain_fit.method import PlainMethod
 from wildghand.gaussians.training import load_frames
-from wildghand.plain.avatar import PlainAvatar
+from wildghand.plain.model import PlainAvatar
 from wildghand.plain.recipe import Batch, Material
 
 

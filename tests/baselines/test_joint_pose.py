@@ -11,8 +11,7 @@ from painted import QUICK, SilentReport, TrainingMaker, masked_psnr
 
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, TrainingCapture
-from joint_pose_fit.method import JointPoseMethod
-from joint_pose_fit.recipe import JointPoseRecipe
+from joint_pose_fit.method import JointPoseMethod, JointPoseRecipe
 from plain_fit.method import PlainMethod
 from wildghand.gaussians.training import load_frames
 from wildghand.plain.recipe import Batch, Material, PlainRecipe

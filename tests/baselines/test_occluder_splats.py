@@ -20,9 +20,8 @@ from painted import (
 )
 
 from hwp_bench.methods.contract import Budget
-from occluder_splats_fit.method import OccluderMethod
+from occluder_splats_fit.method import OccluderMethod, OccluderRecipe
 from occluder_splats_fit.occluders import DISTANCE, FrameOccluders, make_occluders, mask_boxes
-from occluder_splats_fit.recipe import OccluderRecipe
 from plain_fit.method import PlainMethod
 from wildghand.gaussians.training import load_frames
 from wildghand.plain.recipe import Batch, Material

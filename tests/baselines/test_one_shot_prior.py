@@ -10,15 +10,17 @@ from painted import SilentReport, TrainingMaker, masked_psnr
 
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
-from one_shot_prior_fit.chosen_frame import choose_frame, only
+from one_shot_prior_fit.method import (
+    HALVED_AFTER,
+    OneShotRecipe,
+    OneShotSettings,
+    choose_frame,
+    only,
+)
 from one_shot_prior_fit.model import OneShotModel
-from one_shot_prior_fit.recipe import HALVED_AFTER, OneShotRecipe
-from one_shot_prior_fit.settings import OneShotSettings
 from wildghand.gaussians.training import TrainingFrames, load_frames
-from wildghand.plain.hooks import Material
 from wildghand.plain.loop import run_fit
-from wildghand.plain.recipe import PlainRecipe
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import FitSettings, Material, PlainRecipe
 
 CPU = torch.device("cpu")
 SMALL = OneShotSettings(gaussians=500, steps=3, device="cpu")

@@ -14,7 +14,7 @@ from hwp_bench.base.errors import DidNotConverge, MissingDependency, UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, Camera, HandPose, TrainingCapture
 from plain_fit.method import PlainMethod
-from wildghand.plain.avatar import PlainAvatar
+from wildghand.plain.model import PlainAvatar
 
 
 def upright(side: str) -> HandPose:

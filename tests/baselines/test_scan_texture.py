@@ -32,14 +32,12 @@ from hwp_bench.capture.reader import open_capture
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget
 from plain_fit.method import PlainMethod
-from scan_texture_fit.method import ScanMethod
-from scan_texture_fit.recipe import ScanRecipe, total_variation
-from scan_texture_fit.settings import ScanSettings
-from scan_texture_fit.shadow import _two_columns
+from scan_texture_fit.method import ScanMethod, ScanRecipe, total_variation
+from scan_texture_fit.model import ScanSettings, _two_columns
 from scan_texture_fit.unwrap import nearest_anchor, read_pixels, weighted_median
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.training import load_frames
-from wildghand.plain.hooks import Material
+from wildghand.plain.recipe import Material
 
 #: A texture that is fine enough for the small captures of these tests.
 SMALL = {**QUICK, "gaussians": 1500, "texture_size": 64, "steps": 200}

@@ -14,8 +14,7 @@ from hwp_bench.base.errors import BadMethod
 from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.settings import settings_from
 from plain_fit.method import PlainMethod
-from wildghand.plain.method import RecipeMethod
-from wildghand.plain.settings import FitSettings
+from wildghand.plain.recipe import FitSettings, RecipeMethod
 
 BASELINES = Path(__file__).resolve().parents[2] / "baselines"
 

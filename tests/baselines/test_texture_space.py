@@ -21,14 +21,12 @@ from hwp_bench.sim.produce.suites import suite, suite_names
 from hwp_bench.sim.scene_files import load_scene
 from plain_fit.method import PlainMethod
 from texture_space_fit import build
-from texture_space_fit.method import SpaceMethod
+from texture_space_fit.method import SpaceMethod, SpaceRecipe, SpaceSettings
 from texture_space_fit.model import SpaceModel, to_srgb
-from texture_space_fit.recipe import SpaceRecipe
-from texture_space_fit.settings import SpaceSettings
 from texture_space_fit.skins import FILE, shipped_skins, skin_uv
 from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.training import load_frames
-from wildghand.plain.hooks import Material
+from wildghand.plain.recipe import Material
 
 ROOT = Path(__file__).resolve().parents[2]
 #: SHA-256 of the file that `python -m texture_space_fit.build` wrote.

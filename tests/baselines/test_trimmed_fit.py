@@ -15,7 +15,7 @@ from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from plain_fit.method import PlainMethod
 from trimmed_fit.method import TrimmedMethod
-from wildghand.plain.method import RecipeMethod
+from wildghand.plain.recipe import RecipeMethod
 
 SETTINGS = {**QUICK, "steps": 150}
 # The network has to learn first.

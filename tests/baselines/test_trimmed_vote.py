@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from trimmed_fit.vote import (
+from trimmed_fit.inliers import (
     DIRECTIONS,
     FEATURES,
     LOOK,

@@ -12,7 +12,7 @@ from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from plain_fit.method import PlainMethod
 from wild_fit.method import WildMethod
-from wildghand.plain.method import RecipeMethod
+from wildghand.plain.recipe import RecipeMethod
 
 SETTINGS = {**QUICK, "steps": 150}
 

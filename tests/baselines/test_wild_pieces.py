@@ -9,10 +9,18 @@ import torch
 from painted import QUICK, TrainingMaker
 from torch.distributions import Laplace, Normal
 
-from wild_fit.appearance import OCTAVES, appear, places_at_rest, start_appearance
-from wild_fit.method import WildMethod
-from wild_fit.recipe import WildRecipe
-from wild_fit.uncertainty import after_drawing, before_drawing, certain, gauss_loss, laplace_loss
+from wild_fit.frames import (
+    OCTAVES,
+    after_drawing,
+    appear,
+    before_drawing,
+    certain,
+    gauss_loss,
+    laplace_loss,
+    places_at_rest,
+    start_appearance,
+)
+from wild_fit.method import WildMethod, WildRecipe
 from wildghand.gaussians.training import load_frames
 from wildghand.plain.recipe import Batch, Material
 

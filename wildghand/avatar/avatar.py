@@ -252,7 +252,7 @@ class WildGHandAvatar(HandAvatar):
         height: int,
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Draw the hands without what perturbed the training frames; see `HandAvatar.draw`."""
-        refine = self.settings.heads.refinement
+        refine = self.settings.heads
         return self.model.draw(hands, viewmats, Ks, width, height, refine=refine)
 
     @functools.cached_property
@@ -375,7 +375,7 @@ class WildGHandAvatar(HandAvatar):
         Raises:
             UsageError: no hand, or one that was not fitted.
         """
-        refine, posed = self.settings.heads.refinement, self.posed(hands)
+        refine, posed = self.settings.heads, self.posed(hands)
         dark = self.model.cast(posed)
         viewmats = None if viewmat is None else self._tensor(viewmat)[None]
         found = {

@@ -31,7 +31,7 @@ from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.evidence import ColorChanges, Evidence, rename_former
 from wildghand.light import CastLight, KnownLight
-from wildghand.model.assemble import make_model
+from wildghand.model.model import make_model
 from wildghand.model.settings import WildGHandSettings, read_stored, read_version_1
 from wildghand.network.network import MAPS, shapes_of_settings
 from wildghand.poses import ClipPoses

@@ -19,8 +19,8 @@ from hwp_bench.base.images import as_uint8, check_encoder, write_image, write_mo
 from hwp_bench.capture import Capture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.gaussians.training import TrainingClip
+from wildghand.model.frames import largest
 from wildghand.model.model import WildGHandModel
-from wildghand.model.rendered import largest
 from wildghand.splat.threads import denormals_flushed
 
 
@@ -147,7 +147,7 @@ def explain_frames(
     for frame in frames:
         row = fitted.index(frame)
         biased, canonical = (
-            _drawn(model, clip, row, capture, avatar.settings.heads.refinement, biases=on)
+            _drawn(model, clip, row, capture, avatar.settings.heads, biases=on)
             for on in (True, False)
         )
         mask = capture.mask(frame)[..., None] / 255.0

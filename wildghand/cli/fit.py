@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from wildghand.fitting.optimize import Watch
     from wildghand.fitting.parallel import World
+    from wildghand.fitting.session import Watch
     from wildghand.from_video import MadeAvatar
     from wildghand.viewer.server import Address
 
@@ -280,8 +280,8 @@ def do_pretrain(args: argparse.Namespace) -> int:
     from hwp_bench.base.errors import UsageError
     from hwp_bench.base.files import check_places
     from hwp_bench.cli.options import overrides
-    from wildghand.pretrain.session import pretrain
-    from wildghand.prior.files import WEIGHTS
+    from wildghand.pretrain.pretrain import pretrain
+    from wildghand.prior.prior import WEIGHTS
 
     check_places({"--out": args.out}, {"CAPTURE": args.captures}, replaces=args.overwrite)
     if args.steps is not None and args.steps < 1:

@@ -1,52 +1,157 @@
-"""A fit: how it is made from a capture, everything that changes from step to step, and one step."""
+"""A fit as a list of components, and one step of it.
+
+A component is one idea of the method: it may find something before the fit, take part in each
+step, and end the fit. What `Fit` adds to the loop (`wildghand.plain.loop`) are short loops over its
+components. `wildghand.fitting.components` lists them; a switch leaves one out of that list.
+"""
 
 from __future__ import annotations
 
-import dataclasses
-import functools
 import math
-from collections.abc import Mapping
-from typing import Any
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, TypedDict, TypeVar
 
 import numpy as np
 import torch
+from torch import Tensor
 
-from hwp_bench.capture.schema import HandModelId
-from hwp_bench.methods.contract import TrainingCapture
+from hwp_bench.base.arrays import evenly
+from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
-from wildghand.dpd.dpd import draw_kept
-from wildghand.dpd.temporal import TemporalTarget
-from wildghand.evidence import shown_frames, weigh_evidence
-from wildghand.fitting.averaging import StepAverage
-from wildghand.fitting.believed_poses import in_believed_poses
-from wildghand.fitting.borrowed_colors import BorrowedColors
-from wildghand.fitting.cast_shadows import cast_shadows, shadows_in
-from wildghand.fitting.closing import MOST_OF_BUDGET, LightFit, weight_masks
-from wildghand.fitting.evidence_choice import EvidenceChoice, Gaps
-from wildghand.fitting.filled_colors import FilledColors
-from wildghand.fitting.hand_masks import hand_masks
-from wildghand.fitting.judged_drawings import JudgedDrawings
-from wildghand.fitting.judging_frames import judging_frames
-from wildghand.fitting.objective import Objective
-from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, digest_of
-from wildghand.fitting.rates import make_optimizer, set_rates
-from wildghand.fitting.shared_features import SharedFeatures
-from wildghand.fitting.skin_places import skin_places
-from wildghand.fitting.start_colors import start_from_colors
-from wildghand.fitting.state_choice import StateChoice
-from wildghand.fitting.subject_shape import bent_templates, subject_of
-from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
-from wildghand.gaussians.fit_loop import Loss, repeatable
-from wildghand.gaussians.training import TrainingClip, load_frames, upload
-from wildghand.model.assemble import make_model
-from wildghand.model.model import WildGHandModel
-from wildghand.model.rendered import RenderedFrames
+from wildghand.fitting.data import FitData
+from wildghand.fitting.descent import Descent, Features
+from wildghand.fitting.parallel import World, digest_of
+from wildghand.gaussians.fit_loop import Loss, batches
+from wildghand.gaussians.training import upload
+from wildghand.model.frames import RenderedFrames
+from wildghand.model.model import make_model
 from wildghand.model.settings import WildGHandSettings
-from wildghand.network import HandFeatures
-from wildghand.prior.files import choose_prior
+from wildghand.plain.loop import IterativeFit
+
+#: Largest share of a budget that is kept for the end of a fit.
+MOST_OF_BUDGET = 0.5
+#: Most weight masks of an avatar, spread evenly over the clip.
+MAX_MASKS = 100
 
 
-class Fit:
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """The frames of one step, or frames that are looked at."""
+
+    #: (B,) int64, which of the training frames; on the CPU, the same in every process.
+    rows: Tensor
+    #: Those that this process draws.
+    part: slice = field(default_factory=lambda: slice(None))
+    #: Whether a step is taken on them.
+    stepping: bool = False
+
+    @property
+    def mine(self) -> Tensor:
+        """The rows that this process draws."""
+        return self.rows[self.part]
+
+
+@dataclass(frozen=True, eq=False)
+class FrameTarget:
+    """The images that the drawing of B frames is compared with, and how much each pixel counts."""
+
+    #: (B, H, W, 3) sRGB over black outside the mask.
+    image: Tensor
+    #: (B, H, W) estimated coverage of the visible hand.
+    hand: Tensor
+    #: (B, H, W) weight of each pixel within its frame.
+    weights: Tensor
+    #: (B,) means of PAO's weights, which the loss rewards; None without regions.
+    sizes: Tensor | None = None
+
+
+class DrawOptions(TypedDict, total=False):
+    """How training frames are drawn; see `WildGHandModel.draw_frames`."""
+
+    kept: Mapping[str, Tensor]
+    teach: Callable[[Tensor], Tensor | None]
+    move: bool
+    features: Features
+    dark: Mapping[str, Tensor]
+
+
+class Component:
+    """One idea of a fit. A component overrides the hooks in which it does something.
+
+    The hooks of all components are called in the order of their list.
+    """
+
+    def prepare(self, fit: Fit) -> None:
+        """Before the model is made: correct what is given, in `fit.data`."""
+
+    def before(self, fit: Fit) -> None:
+        """Before the first step: find something by the model, or give it something to keep."""
+
+    def begin(self, fit: Fit) -> None:
+        """After that, when everything that steps move is known."""
+
+    def parameters(self) -> dict[str, Iterable[Tensor]]:
+        """What steps move besides the model, by the name of its rate."""
+        return {}
+
+    def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
+        """How the frames of a batch are drawn."""
+        return {}
+
+    def compare(
+        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+    ) -> FrameTarget:
+        """What the drawing of a batch is compared with, and how much each pixel counts."""
+        return target
+
+    def loss(
+        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+    ) -> Iterable[Tensor]:
+        """Weighted terms of the loss of a batch, scalars, which are added up in their order."""
+        return ()
+
+    def loss_of_features(self, fit: Fit, features: Features) -> Tensor | None:
+        """The terms that no frame enters, a scalar; None: none."""
+        return None
+
+    def after_step(self, fit: Fit) -> None:
+        """After a step that was sound."""
+
+    def forget(self) -> None:
+        """The fit went back: what was noted after its steps no longer holds."""
+
+    def checkpoint(self, avatar: Avatar) -> Avatar:
+        """The avatar as it would be if the fit ended here."""
+        return avatar
+
+    def seconds(self, fit: Fit) -> float:
+        """About how long `after` takes, kept back from a budget; nothing of the fit changes."""
+        return 0.0
+
+    def seconds_now(self, fit: Fit) -> float:
+        """More of these, which depend on the steps so far; asked before each step."""
+        return 0.0
+
+    def after(self, fit: Fit) -> None:
+        """After the last step: choose, or find what follows from the model."""
+
+    def record(self, fit: Fit, *, final: bool) -> dict[str, Any]:
+        """Fields of the avatar's `FitRecord`."""
+        return {}
+
+    def state_dict(self) -> dict[str, Any]:
+        """What steps change, for `load_state_dict`; it may wait for the device."""
+        return {}
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """Go on from a saved state."""
+
+
+Kind = TypeVar("Kind", bound=Component)
+
+
+class Fit(IterativeFit[WildGHandAvatar]):
     """One fit of one capture.
 
     Args:
@@ -55,6 +160,7 @@ class Fit:
         seed: of anchors, initial weights, order of the frames, and dropout.
         device: where it runs.
         world: the processes that share its batches.
+        components: its ideas, in order.
 
     Raises:
         BadInput: no training frame can be used, or the prior is damaged or of another kind.
@@ -67,88 +173,59 @@ class Fit:
         settings: WildGHandSettings,
         seed: int,
         device: torch.device,
-        world: World = SINGLE_PROCESS,
+        world: World,
+        components: Sequence[Component],
     ) -> None:
-        templates = {side: training.template(side) for side in training.sides}
-        training, clip_poses = in_believed_poses(training, templates, settings.poses)
-        self.training = training
         self.settings = settings
         self.seed = seed
         self.device = device
         self.world = world
-        self.frames = load_frames(training)
-        self.mean_color = self.frames.mean_color()
-        judges = judging_frames(training, settings)
-        subject = subject_of(training, self.frames, templates, settings, judges)
+        self.components = components
+        self.data = FitData(training, device)
+        for component in components:
+            component.prepare(self)
+        data = self.data
         self.model = make_model(
-            templates, settings, self.mean_color, len(self.frames), seed, device, subject
+            data.templates, settings, data.mean_color, len(data.frames), seed, device, data.subject
         )
         self.model.network.mixed_precision = settings.mixed_precision and device.type == "cuda"
-        if clip_poses is not None:
-            self.model.keep(clip_poses)
-        self.source = {"capture": training.id}
-        self.source |= start_from_prior(self.model, settings, training.hand_model)
-        self.clip = TrainingClip(training, self.frames.indices, self.model.rigs, device)
-        # Frames are compared with the person, not with a template that fits none of them.
-        bent = bent_templates(templates, subject)
-        assessment = assess_frames(training, self.frames, bent, settings, judges)
-        masks = hand_masks(training, self.frames, settings.pao.hand, device)
-        self.frames = dataclasses.replace(self.frames, masks=masks)
-        self.weighting = Weighting(
-            self.frames,
-            len(training.sides),
-            assessment,
-            settings,
-            device,
-            skin_places(training, self.frames, bent) if needs_places(settings) else (),
-        )
-        count, shown = len(self.frames), {}
-        if settings.evidence.enabled:
-            shown = shown_frames(self.model.rigs, self.clip, self.weighting.visible, count)
-            self.model.keep(weigh_evidence(shown, count, settings.evidence))
-        cast_shadows(self.model, self.clip, self.frames, self.weighting, settings.shadows, seed)
-        #: The shadows in the training frames.
-        self.dark = shadows_in(self.model, self.clip)
-        if settings.start_colors:
-            start_from_colors(self.model, self.clip, self.frames, self.weighting, self.dark)
-        #: The colours that one of two hands takes from the other, which come last.
-        self.borrowed = BorrowedColors.of(self.model, self.clip, self.weighting, settings.evidence)
-        judged = JudgedDrawings.of(self.model, training, settings, judges)
-        self.choice = EvidenceChoice(
-            self.model,
-            settings,
-            shown,
-            count,
-            judged,
-            FilledColors(self.model, self.borrowed, shown, count),
-            Gaps(self.model, self.clip, self.weighting.visible, count),
-        )
-        temporal = begin_temporal_weights(self.model, self.weighting, settings)
-        self.objective = Objective(settings, self.model.rigs, temporal, device)
-        self.optimizer = make_optimizer(self.model, self.weighting.pao, settings)
-        self.average = StepAverage.of_optimizer(self.optimizer, settings.schedule.average_share)
-        #: Where the fit may go back to after its last step.
-        self.state_choice = StateChoice.of(self.average, count, settings.schedule, judged)
-        #: Steps behind it.
-        self.steps = 0
-        self.generator = torch.Generator().manual_seed(seed)
-        self._record = FitRecord(
-            frames=self.frames.indices.tolist(),
-            clean=self.weighting.clean.tolist(),
-            frame_weights=self.weighting.frame_weights.tolist(),
-            source=dict(self.source),
-        )
-        self.shared = SharedFeatures(
-            self.model.network, settings.schedule.texture_every, self.objective.of_features
-        )
+        self.clip = data.pose(self.model.rigs)
+        for component in components:
+            component.before(self)
+        others = {name: group for c in components for name, group in c.parameters().items()}
+        self.descent = Descent(self.model, others, settings.schedule, self._loss_of_features)
+        for component in components:
+            component.begin(self)
 
-    def step(self, rows: torch.Tensor, fraction: float) -> Loss:
+    @property
+    def plateau_steps(self) -> int:  # type: ignore[override]
+        """See `IterativeFit`."""
+        return self.settings.schedule.plateau_steps
+
+    @property
+    def shared_steps(self) -> int:  # type: ignore[override]
+        """See `IterativeFit`."""
+        return self.settings.schedule.texture_every
+
+    def part(self, kind: type[Kind]) -> Kind | None:
+        """The component of a kind; None where it is left out."""
+        return next((each for each in self.components if isinstance(each, kind)), None)
+
+    def count_steps(self, budget: Budget) -> int:
+        """See `IterativeFit`."""
+        return self.settings.schedule.steps if budget.steps is None else budget.steps
+
+    def batches(self) -> Iterator[Tensor]:
+        """See `IterativeFit`: (B,) int64 each."""
+        return batches(len(self.data.frames), self.settings.schedule.batch, self.seed)
+
+    def step(self, batch: Tensor, fraction: float) -> Loss:
         """Take one step on a batch, of which each process draws its part.
 
         Off the CPU nobody waits for the device: the step is queued.
 
         Args:
-            rows: (B,) int64, which of the training frames; the same in every process. On the CPU.
+            batch: (B,) int64, which of the training frames; the same in every process, on the CPU.
             fraction: share of the budget that is used up.
 
         Returns:
@@ -158,236 +235,186 @@ class Fit:
             UsageError: the processes cannot share the batch evenly.
             PeerLost: another process has ended.
         """
-        set_rates(self.optimizer, self.settings.schedule, fraction, self.steps)
-        loss = self._loss(rows)
-        mean = self.world.average_(loss.detach() + self.shared.value)
+        self.descent.set_rates(fraction)
+        loss = self.loss(Batch(batch, self.world.shard(len(batch)), stepping=True))
+        mean = self.world.average_(loss.detach() + self.descent.shared.value)
         known: Loss = float(mean) if self.device.type == "cpu" else mean
         if isinstance(known, float) and not math.isfinite(known):
             return known
-        self.optimizer.clear()
-        with repeatable(self.device):
-            waiting = self.shared.backward(loss, mean)
-        average_gradients(
-            (tensor for group in self.optimizer.param_groups for tensor in group["params"]),
-            self.world,
-        )
-        self.optimizer.take_step(waiting)
-        self.steps += 1
+        self.descent.take(loss, mean, self.world)
         return known
 
-    def _loss(self, rows: torch.Tensor) -> torch.Tensor:
+    def loss(self, batch: Batch) -> Tensor:
         """The loss of this process's part of a batch, without the terms that no frame enters."""
-        weighting, part = self.weighting, self.world.shard(len(rows))
-        mine = rows[part]
-        kept = {side: keep[part] for side, keep in self._keep(rows).items()}
-        features = self.shared.features()
-        drawing = self.draw(mine, kept, move=weighting.moves(rows), features=features)
-        target = weighting(rows, drawing, self.world)
-        return self.objective(self.model, drawing, target, mine, weighting.clean[mine])
+        drawing = self.draw(batch)
+        target = self.compare(batch, drawing)
+        terms = (t for c in self.components for t in c.loss(self, batch, drawing, target))
+        total = next(terms)
+        for term in terms:
+            total = total + term
+        return total
 
-    def require_same(self, step: int) -> None:
-        """Check that all processes start from the same state.
-
-        Args:
-            step: steps behind it.
-
-        Raises:
-            HwpError: one does not.
-        """
-        if self.world.size == 1:
-            return
-        weighting = self.weighting
-        numbers = {**self.model.state_dict(), **weighting.pao.state_dict()}
-        numbers |= {"clean": weighting.clean, "dropped": weighting.drop_probability}
-        numbers |= {"frames": torch.from_numpy(self.frames.indices)}
-        self.world.require_same(digest_of(numbers, step))
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything that steps change, for `load_state_dict`."""
-        return {
-            "model": self.model.state_dict(),
-            **self.weighting.state_dict(),
-            "optimizer": self.optimizer.state_dict(),
-            "generator": self.generator.get_state(),
-            "shared": self.shared.state_dict(),
-            "average": self.average.state_dict(),
-            "earlier": self.state_choice.states.state_dict(),
-            "steps": self.steps,
-        }
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Go on from a saved state."""
-        self.model.load_state_dict(state["model"])
-        self.weighting.load_state_dict(state)
-        self.optimizer.load_state_dict(state["optimizer"])
-        self.generator.set_state(state["generator"].cpu())
-        # States of before have none of these: their steps shared nothing, were not averaged, and
-        # kept no earlier state.
-        self.shared.load_state_dict(state.get("shared", {"steps": 0}))
-        self.average.load_state_dict(state.get("average", {"steps": 0, "means": []}))
-        if "earlier" in state:
-            self.state_choice.states.load_state_dict(state["earlier"])
-        self.steps = int(state.get("steps", 0))
-
-    def _keep(self, rows: torch.Tensor) -> dict[str, torch.Tensor]:
-        """(B,) bool by side: which frames of a batch keep their biases in this step."""
-        chances = self.weighting.drop_probability[rows]
-        return {
-            side: upload(draw_kept(chances, self.generator), self.device)
-            for side in self.model.perturbation
-        }
-
-    def draw(
-        self,
-        rows: torch.Tensor,
-        kept: Mapping[str, torch.Tensor] | None = None,
-        *,
-        move: bool | None = None,
-        features: Mapping[str, HandFeatures] | None = None,
-    ) -> RenderedFrames:
-        """Draw training frames with everything that is particular to them.
-
-        Args:
-            rows: (B,) int64, which of the training frames; on the CPU.
-            kept: (B,) bool by side, whether a frame keeps its biases; None: every one does.
-            move: refine the poses of the frames; None: if any of them needs it.
-            features: of the network by side, where they are at hand already.
-        """
+    def draw(self, batch: Batch, **options: Any) -> RenderedFrames:
+        """Draw training frames with everything that is particular to them."""
+        chosen: dict[str, Any] = {"dark": {}}
+        for component in self.components:
+            chosen.update(component.draws(self, batch))
+        if batch.stepping:
+            chosen["features"] = self.descent.shared.features()
         return self.model.draw_frames(
             self.clip,
-            upload(rows, self.device),
-            self.training.width,
-            self.training.height,
-            kept=kept,
-            teach=functools.partial(self.weighting.shares, rows),
-            move=self.weighting.moves(rows) if move is None else move,
-            refine=self.settings.heads.refinement,
-            features=features,
-            dark=self.dark(rows),
+            upload(batch.mine, self.device),
+            self.data.training.width,
+            self.data.training.height,
+            refine=self.settings.heads,
+            **chosen | options,
         )
 
-    @property
-    def light(self) -> LightFit:
-        """The fit of the clip's light, which comes last."""
-        weights = self.weighting.frame_weights
-        return LightFit(self.model, self.clip, weights, self.settings.light, self.seed)
+    def compare(self, batch: Batch, drawing: RenderedFrames) -> FrameTarget:
+        """What a drawing is compared with."""
+        mine, data = batch.mine, self.data
+        target = FrameTarget(
+            data.images(mine), data.masks(mine), torch.ones((), device=self.device)
+        )
+        for component in self.components:
+            target = component.compare(self, batch, drawing, target)
+        return target
+
+    def _loss_of_features(self, features: Features) -> Tensor | None:
+        several = [each.loss_of_features(self, features) for each in self.components]
+        found = [loss for loss in several if loss is not None]
+        return sum(found[1:], found[0]) if found else None
+
+    def finite(self) -> bool:
+        """See `IterativeFit`."""
+        return self.model.finite()
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """See `IterativeFit`."""
+        return self.model.snapshot()
+
+    def restore(self, values: dict[str, Tensor]) -> None:
+        """See `IterativeFit`."""
+        self.model.load_state_dict(values)
+        for component in self.components:
+            component.forget()
+
+    def after_step(self) -> None:
+        """See `IterativeFit`."""
+        for component in self.components:
+            component.after_step(self)
+
+    def checkpoint(self, steps: int) -> Avatar:
+        """See `IterativeFit`."""
+        avatar: Avatar = self.avatar(steps)
+        for component in self.components:
+            avatar = component.checkpoint(avatar)
+        return avatar
 
     def seconds_for_steps(self, seconds: float) -> float:
-        """Return the part of a budget that is for steps: all but what `finish` will take.
+        """The part of a budget that is for steps: all but what `after` will take.
 
         Args:
             seconds: of the whole fit.
         """
-        needed = self.light.seconds() + self.choice.seconds()
+        needed = sum(component.seconds(self) for component in self.components)
         return seconds - min(needed, MOST_OF_BUDGET * seconds)
 
-    def finish(self) -> int | None:
-        """Choose the state that the fit ends with, and find what follows from it.
+    def seconds_now(self) -> float:
+        """See `IterativeFit`."""
+        return sum(component.seconds_now(self) for component in self.components)
 
-        That is the light, colours that hands take from each other, how strongly evidence acts, and
-        colours that places take from the skin around them.
+    def finish(self, steps: int, seconds: float) -> WildGHandAvatar:
+        """See `IterativeFit`. Of several processes, rank 0's has the record of the weights."""
+        for component in self.components:
+            component.after(self)
+        return self.avatar(steps, seconds, final=self.world.is_main)
 
-        Returns:
-            Steps behind the state, if it is an earlier one than the last.
-        """
-        chosen = self.state_choice.choose()
-        for find in (self.light.learn, self.borrowed.learn):
-            found = find()
-            if found is not None:
-                self.model.keep(found)
-        for best in self.choice.best():
-            self.model.keep(best)
-        return chosen
+    def agree(self, fraction: float) -> float:
+        """All processes go by the clock of rank 0, or some would stop a step before the others."""
+        return self.world.broadcast(fraction)
 
-    def avatar(
-        self,
-        steps: int,
-        seconds: float = 0.0,
-        *,
-        chosen: int | None = None,
-        final: bool = False,
-    ) -> WildGHandAvatar:
+    def tell(self, text: str) -> None:
+        """See `IterativeFit`."""
+        if self.world.is_main:
+            super().tell(text)
+
+    def require_same(self, step: int) -> None:
+        """Check that all processes start from the same state."""
+        if self.world.size == 1:
+            return
+        numbers = dict(self.model.state_dict())
+        for component in self.components:
+            for name, group in component.parameters().items():
+                numbers |= {f"{name}.{index}": tensor for index, tensor in enumerate(group)}
+        numbers |= {"clean": self.data.judgement.clean}
+        numbers |= {"frames": torch.from_numpy(self.data.frames.indices)}
+        self.world.require_same(digest_of(numbers, step))
+
+    def avatar(self, steps: int, seconds: float = 0.0, *, final: bool = False) -> WildGHandAvatar:
         """The avatar as it stands; it goes on changing with the fit.
 
         Args:
             steps: optimizer steps behind it.
             seconds: of fitting.
-            chosen: steps behind the state that is kept, if it is an earlier one.
-            final: also record the temporal weights, and tell the weight masks.
+            final: also tell what takes time: the temporal weights and the weight masks.
         """
-        hands = self.training.hands
+        data = self.data
+        fields: dict[str, Any] = {
+            "frames": data.frames.indices.tolist(),
+            "clean": data.judgement.clean.tolist(),
+            "frame_weights": data.judgement.frame_weights.tolist(),
+            "source": {"capture": data.training.id},
+        }
+        for component in self.components:
+            for name, value in component.record(self, final=final).items():
+                fields[name] = fields[name] | value if name == "source" else value
         return WildGHandAvatar(
             self.model,
             self.settings,
-            self.training.hand_model,
-            {side: hands[side].betas for side in self.model.rigs},
-            self.mean_color,
+            data.training.hand_model,
+            {side: data.training.hands[side].betas for side in self.model.rigs},
+            data.mean_color,
             self.seed,
-            dataclasses.replace(
-                self._record,
-                temporal=self._temporal() if final else {},
-                steps=steps,
-                chosen_steps=chosen,
-                seconds=seconds,
-            ),
+            FitRecord(**fields, steps=steps, seconds=seconds),
             self._weight_masks if final else dict,
         )
 
-    def _weight_masks(self) -> dict[int, np.ndarray]:
-        pao = self.settings.pao
-        if not pao.enabled:
-            return {}
-        return weight_masks(
-            self.frames.indices.tolist(),
-            lambda rows: self.weighting(rows, self.draw(rows)).weights,
-            unbounded=pao.variant == "printed",
-        )
-
     @torch.no_grad()
-    def _temporal(self) -> dict[str, list[float]]:
-        rows = torch.arange(len(self.frames), device=self.device)
+    def _weight_masks(self) -> dict[int, np.ndarray]:
+        """Weights of pixels in at most `MAX_MASKS` frames as (H, W) uint8, 255 = full weight."""
+        pao, frames = self.settings.pao, self.data.frames.indices.tolist()
+        masks: dict[int, np.ndarray] = {}
+        if not pao.enabled:
+            return masks
+        # The paper's equations have no bound: 255 is the largest weight of a frame.
+        least = 1e-12 if pao.variant == "printed" else 1.0
+        for row in evenly(len(frames), MAX_MASKS).tolist():
+            batch = Batch(torch.tensor([row]))
+            weights = self.compare(batch, self.draw(batch)).weights[0]
+            share = 255.0 * weights / weights.max().clamp(min=least)
+            masks[frames[row]] = share.byte().cpu().numpy()
+        return masks
+
+    def component_states(self) -> dict[str, dict[str, Any]]:
+        """The states of the components, by the names of their classes."""
+        return {type(each).__name__: each.state_dict() for each in self.components}
+
+    def load_component_states(self, states: Mapping[str, Mapping[str, Any]]) -> None:
+        """Go on from saved states of the components."""
+        for component in self.components:
+            component.load_state_dict(states[type(component).__name__])
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that steps change, for `load_state_dict`."""
         return {
-            side: self.model.biases_of(side).temporal(rows).omega.tolist()
-            for side in self.model.perturbation
+            "model": self.model.state_dict(),
+            "descent": self.descent.state_dict(),
+            "components": self.component_states(),
         }
 
-
-def start_from_prior(
-    model: WildGHandModel, settings: WildGHandSettings, hand_model: HandModelId
-) -> dict[str, str]:
-    """Put the prior's weights in place of the network's, where the settings have one.
-
-    Returns:
-        What an avatar says of it: the digest of the weights as `prior`, or nothing.
-
-    Raises:
-        BadInput: the prior is damaged or of another kind.
-    """
-    prior = choose_prior(settings, hand_model, model.network)
-    if prior is None:
-        return {}
-    prior.initialise(model.network)
-    return {"prior": prior.record.weights}
-
-
-def begin_temporal_weights(
-    model: WildGHandModel, weighting: Weighting, settings: WildGHandSettings
-) -> TemporalTarget | None:
-    """Bring temporal weights to what the pre-pass found; None without it or without DPD.
-
-    Args:
-        model: it is changed.
-        weighting: knows what it found.
-        settings: of the fit.
-    """
-    if not (settings.dpd.enabled and settings.prepass.enabled):
-        return None
-    device = model.log_gains.device
-    temporal = TemporalTarget.judged(
-        weighting.clean.to(device),
-        weighting.frame_weights.to(device),
-        settings.dpd.omega_scale,
-        settings.prepass.weight_floor,
-    )
-    temporal.begin(model.biases)
-    return temporal
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.model.load_state_dict(state["model"])
+        self.descent.load_state_dict(state["descent"])
+        self.load_component_states(state["components"])

@@ -12,7 +12,8 @@ import numpy as np
 import torch
 
 from hwp_bench.base.images import as_uint8
-from wildghand.fitting.fit import Fit
+from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.weights import Pao
 from wildghand.splat.threads import denormals_flushed
 
 
@@ -39,25 +40,19 @@ class Glance:
 @denormals_flushed()
 @torch.no_grad()
 def glance(fit: Fit, row: int, step: int, loss: float) -> Glance:
-    """Look at one of the frames that are fitted.
-
-    Args:
-        fit: in the middle of its steps; nothing of it is changed.
-        row: which of its training frames.
-        step: optimizer steps so far.
-        loss: of the last step.
-    """
-    rows = torch.tensor([row])
+    """Look at one of the frames that are fitted."""
+    batch, pao, training = Batch(torch.tensor([row])), fit.part(Pao), fit.data.training
     # Weighing a frame moves the running medians along.
-    before = fit.weighting.state_dict()
+    before = {} if pao is None else pao.state_dict()
     try:
-        target = fit.weighting(rows, fit.draw(rows))
+        target = fit.compare(batch, fit.draw(batch))
     finally:
-        fit.weighting.load_state_dict(before)
+        if pao is not None:
+            pao.load_state_dict(before)
     without = {side: torch.tensor([False]) for side in fit.model.perturbation}
-    drawn = fit.draw(rows, without).image[0] / fit.model.log_gains[row].exp()
-    frame = int(fit.frames.indices[row])
-    truth = fit.training.frame(frame)
+    drawn = fit.draw(batch, kept=without).image[0] / fit.model.log_gains[row].exp()
+    frame = int(fit.data.frames.indices[row])
+    truth = training.frame(frame)
     image = drawn.clamp(0.0, 1.0).nan_to_num(0.0).float().cpu().numpy()
     weights = target.weights[0].float()
     share = weights / weights.max().clamp(min=1e-12)
@@ -65,7 +60,7 @@ def glance(fit: Fit, row: int, step: int, loss: float) -> Glance:
         step=step,
         loss=loss,
         frame=frame,
-        psnr=_psnr(image, truth, fit.training.mask(frame) > 127),
+        psnr=_psnr(image, truth, training.mask(frame) > 127),
         truth=truth,
         avatar=as_uint8(image),
         weights=(255.0 * share).round().byte().cpu().numpy(),

@@ -1,18 +1,37 @@
-"""WildGHand as an entry of the benchmark."""
+"""WildGHand as an entry of the benchmark, and what is made ready before a fit's clock starts."""
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+import torch
+
+from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.methods.contract import Budget, Report, TrainingCapture
+from hwp_bench.methods.settings import source_path
 from wildghand.avatar.avatar import WildGHandAvatar
-from wildghand.fitting.affordable import affordable
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import optimize
-from wildghand.fitting.ready import ready_fit
-from wildghand.model.settings import read_settings
+from wildghand.dpd.dpd import DynamicPerturbation, Perturbation
+from wildghand.fitting.components import make_fit
+from wildghand.gaussians.attributes import CHANNELS, Activation, RawAttributes
+from wildghand.gaussians.fit_loop import ready_device
+from wildghand.gaussians.perceptual import Vgg19
+from wildghand.gaussians.regularizers import off_surface, sum_bags
+from wildghand.gaussians.rig import AnchorPoses
+from wildghand.gaussians.shading import fill_harmonics
+from wildghand.light import Obstacles
+from wildghand.model.dress import dress
+from wildghand.model.settings import WildGHandSettings, read_settings
+from wildghand.network import NetworkOutput, Refinement
+from wildghand.network.frame_heads import warm_up_heads as warm_up_heads
+from wildghand.pao.sam import check_checkpoint
+from wildghand.plain.loop import run_fit
 from wildghand.splat.threads import denormals_flushed
+
+# Training frames that a budget has room for at least: fewer say too little of a person.
+_LEAST = 16
 
 
 class WildGHandMethod:
@@ -36,7 +55,7 @@ class WildGHandMethod:
     @denormals_flushed()
     def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> WildGHandAvatar:
         """Fit an avatar to the training frames (validation frames only choose
-        how strongly evidence acts; see `wildghand.fitting.evidence_choice`).
+        what training frames cannot tell; see `wildghand.fitting.choice`).
 
         Args:
             training: what the method may see of the capture.
@@ -48,4 +67,74 @@ class WildGHandMethod:
             DidNotConverge: the fit diverged at once.
         """
         training = affordable(training, self.settings, budget)
-        return optimize(Fit(training, self.settings, self.seed, self.device), budget, report)
+        return run_fit(make_fit(training, self.settings, self.seed, self.device), budget, report)
+
+
+def affordable(
+    training: TrainingCapture, settings: WildGHandSettings, budget: Budget
+) -> TrainingCapture:
+    """Leave training frames out where judging all of them would take the budget away from steps.
+
+    Before the first step every frame is loaded, judged, compared with the person's outline and
+    counted as evidence: some 0.06 seconds for a frame of 256 px on one core. A clip of a thousand
+    frames would spend a minute on that.
+
+    Args:
+        training: what may be seen of the capture.
+        settings: of the fit.
+        budget: of the fit; without seconds all frames are taken.
+    """
+    share = settings.schedule.frames_per_second
+    if budget.seconds is None or not share:
+        return training
+    return training.thinned(max(_LEAST, int(share * budget.seconds)))
+
+
+def check_networks(values: Mapping[str, Any]) -> None:
+    """Check the files that settings name: that they are there and hold the right tensors."""
+    settings = read_settings(values)
+    for path in {source_path(settings.pao.regions), source_path(settings.pao.hand)} - {None}:
+        check_checkpoint(str(path))
+    perceptual = source_path(settings.perceptual)
+    if perceptual is not None:
+        Vgg19(perceptual)  # as light as a check: its tensors stay on the disk
+
+
+def ready_fit(name: str) -> torch.device:
+    """Choose the device of a fit, and compile or load for it what the fit needs."""
+    device = ready_device(name)
+    if device.type == "cpu":
+        _warm_up()
+    return device
+
+
+@functools.cache
+def _warm_up() -> None:
+    """Run every kernel of the model, both ways, on one Gaussian."""
+    zeros = torch.zeros
+    anchors = AnchorPoses(zeros(1, 1, 3), zeros(1, 1, 4))
+    with torch.random.fork_rng(devices=[]):
+        module = DynamicPerturbation(1, 1)
+    prediction = NetworkOutput(
+        RawAttributes.split(zeros(1, 1, CHANNELS)),
+        zeros(1, 1, 1),
+        zeros(1, 3),
+        Refinement(zeros(1, 16, 3), zeros(10), zeros(1, 3)),
+        zeros(1, 1),
+    )
+    perturbation = Perturbation(module, module.temporal(torch.tensor([0])))
+    gaussians, size = dress(anchors, prediction, Activation(), perturbation, torch.ones(1))
+    assert size is not None
+    (gaussians.means.sum() + size).backward()
+    off_surface(prediction.raw, Activation(), 1.0)
+    first = zeros(1, dtype=torch.int64)
+    sum_bags(zeros(1, 1), first, zeros(1), first)
+    fill_harmonics(zeros(1, 3), 1, zeros(1, 3), 0)
+    warm_up_heads()
+    # Shadows are cast by rays.
+    corner = np.eye(3)
+    Obstacles([(corner, np.array([[0, 1, 2]]))]).free(corner, corner, corner)
+    # The pre-pass draws the hands.
+    faces = np.zeros((1, 3), np.int64)
+    face, mix = draw_faces(np.zeros((1, 2)), np.zeros(1), faces, (1, 1))
+    mix_corners(np.zeros((1, 1)), faces, face.reshape(-1)[:0], mix.reshape(-1, 2)[:0])

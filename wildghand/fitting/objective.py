@@ -1,130 +1,94 @@
-"""The loss of a fit: the weighted reconstruction and the regularisers."""
+"""The loss of a fit: the weighted reconstruction and the regularisers.
+
+Terms of weight 0 cost nothing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from wildghand.dpd.temporal import TemporalTarget
-from wildghand.fitting.networks import choose_perceptual
-from wildghand.fitting.weighting import FrameTarget
-from wildghand.gaussians.attributes import RawAttributes
+from hwp_bench.base.errors import UsageError
+from hwp_bench.methods.settings import source_path
+from wildghand.fitting.descent import Features
+from wildghand.fitting.fit import Batch, Component, Fit, FrameTarget
+from wildghand.gaussians.perceptual import FilterBankLoss, Vgg19
 from wildghand.gaussians.regularizers import attribute_roughness, off_surface, surface_laplacian
-from wildghand.gaussians.rig import HandRig
-from wildghand.gaussians.training import upload
 from wildghand.model import terms
-from wildghand.model.model import WildGHandModel
-from wildghand.model.rendered import RenderedFrames
+from wildghand.model.frames import RenderedFrames
 from wildghand.model.settings import WildGHandSettings
-from wildghand.network import HandFeatures
-
-#: Where batches are unless a fit says otherwise.
-CPU = torch.device("cpu")
 
 
-class Objective:
-    """The loss of a batch, in two parts; terms of weight 0 cost nothing.
+class Reconstruction(Component):
+    """The drawing is to look like the frame."""
 
-    Args:
-        settings: weights of the terms.
-        rigs: by side.
-        temporal: what holds the temporal weights; None: nothing.
-        device: where the batches are.
+    def before(self, fit: Fit) -> None:
+        """Open the perceptual network, if there is one."""
+        self._perceptual = choose_perceptual(fit.settings, fit.device)
 
-    Raises:
-        UsageError: a perceptual network was chosen for a term of weight 0.
-        HwpError: its weights cannot be used.
-    """
-
-    def __init__(
-        self,
-        settings: WildGHandSettings,
-        rigs: Mapping[str, HandRig],
-        temporal: TemporalTarget | None = None,
-        device: torch.device = CPU,
-    ) -> None:
-        self.settings = settings
-        self.temporal = temporal
-        self.weights = settings.terms
-        smooth = (
-            self.weights.laplacian_offsets,
-            self.weights.laplacian_scales,
-            self.weights.laplacian_colors,
-        )
-        self._laplacians = (
-            {side: surface_laplacian(rig) for side, rig in rigs.items()} if any(smooth) else {}
-        )
-        self._spacing = {side: rig.spacing for side, rig in rigs.items()}
-        self._perceptual = choose_perceptual(settings, device)
-
-    def __call__(
-        self,
-        model: WildGHandModel,
-        drawing: RenderedFrames,
-        target: FrameTarget,
-        rows: Tensor,
-        clean: Tensor,
-    ) -> Tensor:
-        """The terms that the frames enter, a scalar; `of_features` has the others.
-
-        Args:
-            model: what is fitted.
-            drawing: of B frames.
-            target: what they are compared with.
-            rows: (B,) which of the training frames they are, on the CPU.
-            clean: (B,) probability that a frame is clean, on the CPU.
-        """
-        weights, settings = self.weights, self.settings
-        image = drawing.image
-        exact = model.clip_poses is None
-        dssim = weights.dssim_share(exact_poses=exact)
-        total = weights.reconstruction * terms.reconstruction(
+    def loss(
+        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+    ) -> Iterable[Tensor]:
+        """Weighted L1 and D-SSIM, the perceptual distance, and the silhouette."""
+        settings, image = fit.settings.terms, drawing.image
+        weights = settings.fixed
+        dssim = settings.dssim_share(exact_poses=fit.model.clip_poses is None)
+        yield weights.reconstruction * terms.reconstruction(
             image, target.image, target.weights, dssim
         )
         if self._perceptual is not None:
             found = self._perceptual(image, target.image, target.weights)
-            total = total + weights.perceptual * found
+            yield settings.perceptual * found
         if weights.silhouette:
-            total = total + weights.silhouette * terms.silhouette(drawing.coverage, target.hand)
-        if weights.weight_reward and target.sizes is not None:
-            total = total + weights.weight_reward * terms.weight_reward(target.sizes)
+            yield weights.silhouette * terms.silhouette(drawing.coverage, target.hand)
+
+
+class Regularisers(Component):
+    """What the Gaussians of a hand are held to, whatever the frames show."""
+
+    def before(self, fit: Fit) -> None:
+        """Make the Laplacians of the surface."""
+        weights = fit.settings.terms.fixed
+        smooth = (weights.laplacian_offsets, weights.laplacian_scales, weights.laplacian_colors)
+        rigs = fit.model.rigs
+        self._laplacians = (
+            {side: surface_laplacian(rig) for side, rig in rigs.items()} if any(smooth) else {}
+        )
+
+    def loss(
+        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+    ) -> Iterable[Tensor]:
+        """Biases, shadows, opacities, discs on the skin, and roughness of scales and colours."""
+        settings, model = fit.settings.terms, fit.model
+        weights, flatness = settings.fixed, 0.0
+        if model.clip_poses is not None:
+            flatness = terms.SURFACE_INEXACT
         for side, hand in drawing.hands.items():
+            raw = hand.prediction.raw
             if weights.bias and hand.bias_size is not None:
-                total = total + weights.bias * hand.bias_size
+                yield weights.bias * hand.bias_size
             if weights.shadow:
-                total = total + weights.shadow * terms.distance_to_one(hand.prediction.shadow)
+                yield weights.shadow * terms.distance_to_one(hand.prediction.shadow)
             if weights.opacity:
-                total = total + weights.opacity * terms.distance_to_one(hand.opacities)
-            if weights.surface:
+                yield weights.opacity * terms.distance_to_one(hand.opacities)
+            if settings.surface:
                 off = off_surface(
-                    hand.prediction.raw,
+                    raw,
                     model.network.activation,
-                    self._spacing[side],
-                    flatness=weights.flatness(exact_poses=exact),
+                    model.rigs[side].spacing,
+                    flatness=flatness,
                 )
-                total = total + weights.surface * off
-            rough = self._roughness(side, hand.prediction.raw)
-            total = total if rough is None else total + rough
-        if self.temporal is not None and settings.dpd.omega_weight:
-            held = self.temporal.temporal_loss(model.biases, int(rows[0]))
-            total = total + settings.dpd.omega_weight * held
-        if settings.dpd.gains:
-            device, dpd = model.log_gains.device, settings.dpd
-            gains = model.log_gains[upload(rows, device)]
-            total = total + dpd.gain_weight * terms.gain_of_clean(gains, upload(clean, device))
-            total = total + dpd.tint_weight * terms.tint_of_gains(gains)
-        return total
+                yield settings.surface * off
+            rough = weights.laplacian_scales, weights.laplacian_colors
+            if any(rough):  # one product with the Laplacian
+                yield attribute_roughness(self._laplacians[side], raw.concatenate(), *rough)
 
-    def of_features(self, features: Mapping[str, HandFeatures]) -> Tensor | None:
-        """The terms that no frame enters, a scalar; None where there are none.
-
-        Args:
-            features: of the network, by side.
-        """
-        weights, found = self.weights, []
-        if weights.laplacian_offsets and self.settings.heads.template:
+    def loss_of_features(self, fit: Fit, features: Features) -> Tensor | None:
+        """Smooth offsets of the template (head iii), and like texture of both hands."""
+        weights, found = fit.settings.terms.fixed, []
+        if weights.laplacian_offsets and fit.settings.heads:
             for side, hand in features.items():
                 rough = self._laplacians[side].offsets(hand.template_offsets)
                 found.append(weights.laplacian_offsets * rough)
@@ -133,9 +97,16 @@ class Objective:
             found.append(weights.cross_hand * terms.cross_hand(left, right))
         return torch.stack(found).sum() if found else None
 
-    def _roughness(self, side: str, raw: RawAttributes) -> Tensor | None:
-        """Weighted roughness of log scales and colours: one product with the Laplacian."""
-        weights = self.weights.laplacian_scales, self.weights.laplacian_colors
-        if not any(weights):
-            return None
-        return attribute_roughness(self._laplacians[side], raw.concatenate(), *weights)
+
+def choose_perceptual(settings: WildGHandSettings, device: torch.device) -> nn.Module | None:
+    """The perceptual distance of a fit; None where its weight is 0."""
+    path = source_path(settings.perceptual)
+    if not settings.terms.perceptual:
+        if path is not None:
+            raise UsageError(
+                "has no effect, since terms.perceptual is 0",
+                field="perceptual",
+                remedy="Set terms.perceptual too: 0.001 (mode default), 0.1 (mode paper).",
+            )
+        return None
+    return FilterBankLoss() if path is None else Vgg19(path).to(device)

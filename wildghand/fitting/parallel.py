@@ -60,11 +60,8 @@ class World:
         return self.rank == 0
 
     def shard(self, count: int) -> slice:
-        """The places in a batch of `count` that this process works on.
-
-        Raises:
-            UsageError: the batch cannot be split evenly: a mean of means would not be the mean.
-        """
+        """The places in a batch of `count` that this process works on."""
+        # The mean of the means of unequal parts would not be the mean.
         if count % self.size:
             raise UsageError(
                 f"is {count}, which {self.size} processes cannot share evenly",
@@ -83,11 +80,7 @@ class World:
         return tensor.div_(self.size)
 
     def gather(self, tensor: Tensor) -> Tensor:
-        """Join the parts of all processes along the first dimension, in order; no gradient.
-
-        Args:
-            tensor: of the same shape in every process.
-        """
+        """Join the parts of all processes along the first dimension, in order; no gradient."""
         if self.size == 1:
             return tensor
         parts = [torch.empty_like(tensor) for _ in range(self.size)]
@@ -109,14 +102,7 @@ class World:
         self.broadcast(0.0)
 
     def require_same(self, digest: str) -> None:
-        """Check that all processes are about to do the same.
-
-        Args:
-            digest: hexadecimal.
-
-        Raises:
-            HwpError: it differs from that of rank 0 somewhere.
-        """
+        """Check that all processes are about to do the same."""
         own = torch.tensor(list(bytes.fromhex(digest)), dtype=torch.uint8, device=self.device)
         found = self.gather(own[None])
         other = (found != found[0]).any(dim=1).nonzero().flatten().tolist()
@@ -145,10 +131,6 @@ def average_gradients(parameters: Iterable[Tensor], world: World) -> None:
 
     A parameter that no process has a gradient for stays without one; where some have none (no
     frame of theirs reaches it) theirs counts as zero.
-
-    Args:
-        parameters: float32, the same ones in the same order in every process.
-        world: the processes.
     """
     if world.size == 1:
         return
@@ -180,13 +162,6 @@ def run_in_world(choose: Callable[[], torch.device], work: Callable[[World], int
     """Do a piece of work together with the processes that were started with this one.
 
     When one fails, all end; the first to fail says why, the others end silently.
-
-    Args:
-        choose: says on what kind of device it runs.
-        work: takes the world, returns an exit status.
-
-    Returns:
-        An exit status.
     """
     world = None
     try:
@@ -220,14 +195,6 @@ def join(device: torch.device) -> World:
     """Meet the processes that `torchrun` started; without it there is one process.
 
     NCCL connects GPUs, one for each process of a machine; gloo connects CPUs.
-
-    Args:
-        device: kind of device; with CUDA the process's own GPU becomes the current one.
-
-    Raises:
-        MissingDependency: this torch cannot connect processes.
-        UsageError: a machine has more processes than GPUs, or the environment makes no sense.
-        HwpError: the other processes cannot be reached.
     """
     size = _number("WORLD_SIZE", 1)
     if size <= 1:

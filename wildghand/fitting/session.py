@@ -1,19 +1,26 @@
-"""A fit from a capture folder to an avatar, which can be stopped and goes on."""
+"""A fit from a capture folder to an avatar, which can be stopped and goes on.
+
+The state of an unfinished fit lies on disk, so that a stopped one goes on as if it had not been.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import io
 import os
+import pickle
 import shutil
 import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+import torch
 
 from hwp_bench.base.console import notice, progress
 from hwp_bench.base.errors import BadInput, HwpError, UsageError
-from hwp_bench.base.files import disc_errors, sha256_file, sha256_json
+from hwp_bench.base.files import atomic_write, disc_errors, sha256_file, sha256_json
 from hwp_bench.base.folders import exclusive
 from hwp_bench.capture import Capture, open_capture
 from hwp_bench.capture.splits import Split, contiguous_split
@@ -21,20 +28,27 @@ from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import CALL, load_avatar, made_by_call, save_avatar
-from wildghand.fitting.affordable import affordable
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import Watch, Watchers, optimize
+from wildghand.fitting.method import affordable, ready_fit
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
-from wildghand.fitting.ready import ready_fit
-from wildghand.fitting.saved_state import load_state, save_state
 from wildghand.gaussians.fit_loop import Loss
 from wildghand.model.settings import WildGHandSettings, read_settings
+from wildghand.plain.loop import IterativeFit, Watchers, run_fit
 from wildghand.splat.threads import denormals_flushed
 
 #: Seconds between two saved states.
 SAVE_EVERY = 20.0
 #: Name of the saved state in the work folder.
 STATE = "state.pt"
+#: Version of the file.
+SCHEMA = "wildghand-fit/1"
+#: Largest file that is read, bytes.
+MAX_BYTES = 8 << 30
+
+#: Looks at a fit: (fit, steps so far, loss of the last one). It changes nothing of the fit.
+Watch = Callable[[Fit, int, Loss], None]
+Result = TypeVar("Result")
 
 
 class _Clock:
@@ -179,49 +193,139 @@ def _fit_in(
     if world.is_main:
         ready = time.perf_counter() - entered
         notice(f"Kernels made ready in {ready:.1f} s, which the seconds of the fit leave out.")
-    fit = Fit(training, chosen, run.seed, device, world)
-    watchers, start, before = Watchers(chosen.schedule.plateau_steps), 0, 0.0
-    state = work / STATE
+    fit = make_fit(training, chosen, run.seed, device, world)
+
+    def look(step: int, loss: Loss) -> None:
+        if watch is not None:
+            watch(fit, step, loss)
+
+    return run_resumed(
+        fit,
+        run.budget,
+        work / STATE,
+        digest,
+        f"Fitting {capture.info.id}",
+        save=save,
+        is_main=world.is_main,
+        begin=fit.require_same,
+        look=look,
+    )
+
+
+def run_resumed(
+    fit: IterativeFit[Result],
+    budget: Budget,
+    state: Path,
+    digest: str,
+    title: str,
+    *,
+    save: bool = True,
+    is_main: bool = True,
+    begin: Callable[[int], None] = lambda start: None,
+    look: Callable[[int, Loss], None] = lambda step, loss: None,
+) -> Result:
+    """Run a fit from its saved state, if there is one, and save it every 20 seconds."""
+    watchers, start, before = Watchers(fit.plateau_steps), 0, 0.0
     if state.is_file():
         start, before = load_state(state, fit, watchers, digest)
-        if world.is_main:
+        if is_main:
             notice(f"Going on after {start} steps.")
-    fit.require_same(start)
-    steps = chosen.schedule.steps if run.budget.steps is None else run.budget.steps
-    with _shown(capture, steps, world) as show:
+    begin(start)
+    with contextlib.ExitStack() as stack:
+        show: Callable[[int], None] = lambda done: None  # noqa: E731
+        if is_main:
+            show = stack.enter_context(progress(title, fit.count_steps(budget)))
         clock = _Clock(before, show)
         saved = time.perf_counter()
 
-        def after_step(step: int, watched: Watchers) -> None:
+        def after_step(step: int, watched: Watchers, loss: Loss) -> None:
             nonlocal saved
-            if save and world.is_main and time.perf_counter() - saved >= SAVE_EVERY:
+            if save and is_main and time.perf_counter() - saved >= SAVE_EVERY:
                 save_state(state, fit, watched, step=step, seconds=clock.elapsed, digest=digest)
                 saved = time.perf_counter()
+            with clock.standing_still():
+                look(step, loss)
 
-        def look(fit: Fit, step: int, loss: Loss) -> None:
-            if watch is not None:
-                with clock.standing_still():
-                    watch(fit, step, loss)
+        return run_fit(fit, budget, clock, start=start, watchers=watchers, after_step=after_step)
 
-        return optimize(
-            fit,
-            run.budget,
-            clock,
-            start=start,
-            watchers=watchers,
-            after_step=after_step,
-            watch=look,
+
+def save_state(
+    path: str | os.PathLike[str],
+    fit: IterativeFit[Any],
+    watchers: Watchers,
+    *,
+    step: int,
+    seconds: float,
+    digest: str,
+) -> None:
+    """Write everything that changes during a fit.
+
+    Args:
+        path: the file; it is replaced whole.
+        fit, watchers: the fit and what watches it.
+        step: optimizer steps so far.
+        seconds: of fitting so far.
+        digest: of what is fitted and how; another one is refused when read.
+    """
+    state = {
+        "schema": SCHEMA,
+        "digest": digest,
+        "step": step,
+        "seconds": seconds,
+        "fit": fit.state_dict(),
+        "watchers": watchers.state_dict(),
+    }
+    buffer = io.BytesIO()
+    torch.save(state, buffer)
+    atomic_write(path, buffer.getvalue())
+
+
+def load_state(
+    path: str | os.PathLike[str],
+    fit: IterativeFit[Any],
+    watchers: Watchers,
+    digest: str,
+) -> tuple[int, float]:
+    """Bring a fit back to a saved state; nothing in the file is executed.
+
+    Returns:
+        Steps and seconds of fitting behind it.
+    """
+    file = Path(path)
+    if not file.is_file() or file.stat().st_size > MAX_BYTES:
+        raise BadInput(f"is missing or larger than {MAX_BYTES} bytes", where=file)
+    try:
+        state = torch.load(file, map_location=fit.device, weights_only=True)
+        if not isinstance(state, Mapping) or state.get("schema") != SCHEMA:
+            raise BadInput(f"is not a state of schema {SCHEMA}", where=file)
+        _check_digest(state, digest, file)
+        fit.load_state_dict(state["fit"])
+        watchers.load_state_dict(state["watchers"])
+        return int(state["step"]), float(state["seconds"])
+    except BadInput:
+        raise
+    except (
+        RuntimeError,
+        pickle.UnpicklingError,
+        EOFError,
+        AttributeError,
+        KeyError,
+        TypeError,
+        ValueError,
+    ) as error:
+        problem = str(error).splitlines()[0][:200] if str(error) else type(error).__name__
+        raise BadInput(
+            f"is damaged ({problem})", where=file, remedy="Remove it to fit from the start."
+        ) from error
+
+
+def _check_digest(state: Mapping[str, Any], digest: str, file: Path) -> None:
+    if state.get("digest") != digest:
+        raise BadInput(
+            "belongs to another capture, other settings or another seed",
+            where=file,
+            remedy="Give the same arguments to go on with it, or remove it to start again.",
         )
-
-
-@contextlib.contextmanager
-def _shown(capture: Capture, steps: int, world: World) -> Iterator[Callable[[int], None]]:
-    """The progress bar, which only rank 0 shows."""
-    if not world.is_main:
-        yield lambda done: None
-        return
-    with progress(f"Fitting {capture.info.id}", steps) as show:
-        yield show
 
 
 def _split(capture: Capture) -> Split:
@@ -236,11 +340,7 @@ def _split(capture: Capture) -> Split:
 
 
 def every_frame(capture: Capture) -> Split:
-    """Every frame but the last two, which stand for the parts that a split must have.
-
-    Raises:
-        BadInput: there are fewer than three.
-    """
+    """Every frame but the last two, which stand for the parts that a split must have."""
     count = capture.info.frame_count
     if count < 3:
         raise BadInput(

@@ -23,9 +23,9 @@ from hwp_bench.base.errors import BadCapture, UsageError
 from hwp_bench.base.records import merged
 from hwp_bench.capture.schema import check_id
 from hwp_bench.importers.video import FitSettings
-from wildghand.fitting.optimize import Watch
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
-from wildghand.model.former_settings import current_names
+from wildghand.fitting.session import Watch
+from wildghand.model.settings import nested
 
 #: The hands that can be asked for; `auto` is one or both, as the video shows.
 SIDES = ("auto", "right", "left", "both")
@@ -91,7 +91,7 @@ class VideoFit:
 
 def with_quick(settings: Mapping[str, Any], *, quick: bool) -> dict[str, Any]:
     """Return settings of the method; if `quick`, with `QUICK` in place of what they leave out."""
-    return merged(QUICK, current_names(settings)) if quick else dict(settings)
+    return merged(QUICK, nested(settings)) if quick else dict(settings)
 
 
 class Job:

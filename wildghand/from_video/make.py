@@ -17,9 +17,8 @@ from hwp_bench.importers.video.decode import probe
 from hwp_bench.methods.contract import Budget
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import DESCRIPTION, load_avatar
-from wildghand.fitting.optimize import Watch
 from wildghand.fitting.parallel import SINGLE_PROCESS, World
-from wildghand.fitting.session import fit_capture
+from wildghand.fitting.session import Watch, fit_capture
 from wildghand.from_video.job import Job, VideoFit, with_quick
 from wildghand.from_video.run import JobRecord, Stage, run_stages
 from wildghand.from_video.stages import STAGES

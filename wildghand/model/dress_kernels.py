@@ -32,7 +32,7 @@ def _sigmoid(x):
 
 
 @compiled(nogil=True)
-def dress(
+def dress_pieces(
     worker, counters, ends, raw, mixing, shift, field, omega, biased, bound, log_scales, moved,
     shadow, positions, orientations, active, means, quats, scales, opacities, colors, sizes,
 ):  # fmt: skip
@@ -132,16 +132,16 @@ def dress(
 
 
 @compiled(nogil=True)
-def dress_backward(
+def dress_pieces_backward(
     worker, counters, ends, raw, mixing, shift, field, omega, biased, share, bound, shadow,
     orientations, active, scales, opacities, of_means, of_quats, of_scales, of_opacities, of_colors,
     of_size, of_raw, of_moved, of_shadow, of_mixing, of_shift, of_field, of_omega,
 ):  # fmt: skip
-    """Gradients of `dress`; `means` have that of the positions.
+    """Gradients of `dress_pieces`; `means` have that of the positions.
 
     Args:
         share: (B,) float32, how much what all frames share learns from each.
-        of_means, ..., of_colors: gradients of what `dress` filled.
+        of_means, ..., of_colors: gradients of what `dress_pieces` filled.
         of_size: gradient of the sum of |bias|.
         of_raw: (B, N, 14), of_moved: (N, 3), of_shadow: (B, N) float32, filled.
         of_field: as `field`, float32, filled.

@@ -1,29 +1,64 @@
-"""The model that is fitted: network, perturbation biases, frame-wise corrections, and drawing."""
+"""The model that is fitted: network, perturbation biases, frame-wise corrections, and drawing.
+
+A hand in free poses is drawn in two stages. What network and light say comes first and takes
+longest (`predict_hand`). What evidence, changes of colours, shadows and the refined pose make of it
+comes second (`dressed`), so that it can be tried in several ways.
+"""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 
+from hwp_bench.hands import HandTemplate, sample_surface
 from wildghand.dpd.dpd import DynamicPerturbation, Perturbation, Temporal, bone_features
 from wildghand.dpd.temporal import scale_refinement
 from wildghand.evidence import ColorChanges, Evidence
+from wildghand.gaussians.found import Found
 from wildghand.gaussians.quaternions import quat_third_axis
-from wildghand.gaussians.rig import AnchorPoses, HandRig
+from wildghand.gaussians.rig import AnchorPoses, HandRig, rig_of
 from wildghand.gaussians.training import TrainingClip
 from wildghand.light import CastLight, HandShadows, KnownLight, ShadowSettings
 from wildghand.light.hand_shadows import Hand, Hands
 from wildghand.model.dress import Gaussians, dress
-from wildghand.model.free_poses import dimmed, dressed, predict_hand
-from wildghand.model.rasterize_hands import rasterize_hands
-from wildghand.model.rendered import HandState, RenderedFrames, largest
+from wildghand.model.frames import HandState, RenderedFrames, largest, rasterize_hands, relit
+from wildghand.model.settings import WildGHandSettings
 from wildghand.model.wrist import WristWall
-from wildghand.network import HandFeatures, NetworkOutput, PredictionNetwork
+from wildghand.network import (
+    HandFeatures,
+    NetworkOutput,
+    PredictionNetwork,
+    mirrored_anchors,
+    surface_points,
+)
 from wildghand.poses import ClipPoses
 from wildghand.subject import SubjectShape
+
+#: What a model may keep, the attribute that draws by it, and whether it says something of each
+#: Gaussian. Another `Found` needs one line here.
+FOUND: tuple[tuple[type[Found], str, bool], ...] = (
+    (KnownLight, "light", False),
+    (CastLight, "shadows", False),
+    (ClipPoses, "clip_poses", False),
+    (Evidence, "evidence", True),
+    (ColorChanges, "color_changes", True),
+)
+
+
+@dataclass(frozen=True, eq=False)
+class HandPrediction:
+    """One hand in B free poses, after the first stage."""
+
+    #: Pose (B, 16, 3), betas (10,) and translation (B, 3).
+    hand: Hand
+    #: In these poses.
+    anchors: AnchorPoses
+    #: Of the network, and of the light where the network knows no colours.
+    prediction: NetworkOutput
 
 
 class WildGHandModel(nn.Module):
@@ -85,29 +120,29 @@ class WildGHandModel(nn.Module):
         self.pose_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 16, 3))
         self.transl_steps = nn.Parameter(torch.zeros(len(rigs), frame_count, 3))
 
-    def keep(
-        self, found: SubjectShape | ClipPoses | KnownLight | Evidence | ColorChanges | CastLight
-    ) -> None:
-        """Keep what was fitted next to the network, so that it is saved with it.
-
-        Args:
-            found: the person's shape, which the rigs have already, or what the model draws by from
-                now on: see the attributes.
-        """
+    def keep(self, found: Found) -> None:
+        """Keep what was fitted next to the network, so that it is saved with it."""
+        device = self.log_gains.device
         for name, values in found.to_tensors().items():
-            self.register_buffer(name, values.to(self.log_gains.device))
-        if isinstance(found, KnownLight):
-            self.light = found.to(self.log_gains.device)
-        if isinstance(found, Evidence):
-            self.evidence = found.to(self.log_gains.device)
+            self.register_buffer(name, values.to(device))
+        held: Any = found.to(device)
+        if isinstance(held, CastLight):
+            held = HandShadows(self.rigs, held, self._shadow_settings)
+        if isinstance(held, Evidence):
             walls = {side: WristWall.of(rig) for side, rig in self.rigs.items()}
             self._walls = {side: wall for side, wall in walls.items() if wall is not None}
-        if isinstance(found, ClipPoses):
-            self.clip_poses = found
-        if isinstance(found, ColorChanges):
-            self.color_changes = found
-        if isinstance(found, CastLight):
-            self.shadows = HandShadows(self.rigs, found, self._shadow_settings)
+        for kind, attribute, _ in FOUND:
+            if isinstance(found, kind):
+                setattr(self, attribute, held)
+
+    def keep_all(self, tensors: Mapping[str, Tensor], where: str) -> None:
+        """Keep what an avatar holds next to its network."""
+        counts = {side: len(rig) for side, rig in self.rigs.items()}
+        for kind, _, of_gaussians in FOUND:
+            sizes = {"N": counts} if of_gaussians else {}
+            found = kind.from_tensors(tensors, where, **sizes)
+            if found is not None:
+                self.keep(found)
 
     def finite(self) -> bool:
         """Whether every fitted number is finite."""
@@ -265,15 +300,7 @@ class WildGHandModel(nn.Module):
         width: int,
         height: int,
     ) -> tuple[Tensor, Tensor]:
-        """Draw hands and their walls.
-
-        Args:
-            found: by side, as `gaussians` returns them.
-            viewmats, Ks, width, height: see `draw`.
-
-        Returns:
-            See `draw`.
-        """
+        """Draw hands and their walls."""
         parts = [made for made, _ in found.values()] + self.walls(found)
         return rasterize_hands(parts, viewmats, Ks, width, height)
 
@@ -284,11 +311,7 @@ class WildGHandModel(nn.Module):
         return self._walls.get(side)
 
     def walls(self, found: Mapping[str, tuple[Gaussians, Hand]]) -> list[Gaussians]:
-        """Close the wrists of hands; none while there is no evidence.
-
-        Args:
-            found: by side, as `gaussians` returns them.
-        """
+        """Close the wrists of hands; none while there is no evidence."""
         several = ((self.wall(side), *each) for side, each in found.items())
         return [wall.close(made, *hand) for wall, made, hand in several if wall is not None]
 
@@ -318,15 +341,83 @@ class WildGHandModel(nn.Module):
             rows: (B,) positions among the training frames, whose biases and gains are added.
             features: of the network, where they are at hand already.
             dark: (B, N) factors of the hands' shadows; None: of those that it casts on itself.
-
-        Returns:
-            The Gaussians, and the parameters that they are posed by: the given or the refined ones.
         """
         hand = pose, betas, transl
         if dark is None:
             dark = self.cast({side: hand}).get(side)
-        predicted = predict_hand(self, side, hand, viewmats, features)
-        return dressed(self, side, predicted, refine=refine, rows=rows, dark=dark)
+        predicted = self.predict_hand(side, hand, viewmats, features)
+        return self.dressed(side, predicted, refine=refine, rows=rows, dark=dark)
+
+    def predict_hand(
+        self,
+        side: str,
+        hand: Hand,
+        viewmats: Tensor | None,
+        features: HandFeatures | None = None,
+    ) -> HandPrediction:
+        """What network and light say of one hand.
+
+        Args:
+            side: which hand.
+            hand: pose (B, 16, 3), betas (10,) and translation (B, 3).
+            viewmats: (B, 4, 4) of the cameras that look at it; None: the light says nothing.
+            features: of the network, where they are at hand already.
+        """
+        pose = hand[0]
+        anchors = self.rigs[side].pose(*hand)
+        features = self.network.features(side) if features is None else features
+        prediction = self.predict(side, anchors, pose, features)
+        if self.light is not None and viewmats is not None:
+            prediction = relit(
+                prediction,
+                self.light,
+                lambda normals: self.shaded(self.network(side, normals, pose, features), normals),
+                anchors,
+                viewmats,
+            )
+        return HandPrediction(hand, anchors, prediction)
+
+    def dressed(
+        self,
+        side: str,
+        predicted: HandPrediction,
+        *,
+        refine: bool = False,
+        rows: Tensor | None = None,
+        dark: Tensor | None = None,
+    ) -> tuple[Gaussians, Hand]:
+        """The Gaussians of one hand.
+
+        Args:
+            side: which hand.
+            predicted: of it, by `predict_hand`.
+            refine: apply the network's refinement of the parameters (head iv).
+            rows: (B,) positions among the training frames, whose biases and gains are added; None:
+                free of perturbations.
+            dark: (B, N) factors of the hands' shadows; None: ones.
+        """
+        rig, anchors, prediction = self.rigs[side], predicted.anchors, predicted.prediction
+        pose, betas, transl = predicted.hand
+        if self.evidence is not None:
+            bias = self.network.activation.log_scale_bias
+            settled = self.evidence.settle(side, prediction.raw, rig.spacing, bias)
+            prediction = replace(prediction, raw=settled)
+        if self.color_changes is not None:
+            prediction = replace(prediction, raw=self.color_changes.color(side, prediction.raw))
+        prediction = dimmed(prediction, dark)
+        if refine:
+            step = prediction.refinement
+            pose, betas, transl = pose + step.pose, betas + step.betas, transl + step.transl
+            anchors = rig.follow(pose, betas, transl)
+        hand = pose, betas, transl
+        if rows is None:
+            return dress(anchors, prediction, self.network.activation)[0], hand
+        perturbation = None
+        if side in self.perturbation:
+            temporal = self.biases_of(side).temporal(rows)
+            perturbation = self.perturbation_in(side, temporal, anchors, None)
+        made = dress(anchors, prediction, self.network.activation, perturbation)[0]
+        return replace(made, colors=made.colors * self.log_gains[rows].exp()[:, None]), hand
 
     def shaded(self, prediction: NetworkOutput, normals: Tensor) -> NetworkOutput:
         """A prediction in the light that casts shadows, with nothing in its way."""
@@ -363,9 +454,82 @@ class WildGHandModel(nn.Module):
         return replace(made, template_offsets=torch.zeros_like(made.template_offsets))
 
 
+def dimmed(prediction: NetworkOutput, dark: Tensor | None) -> NetworkOutput:
+    """A prediction whose colours are multiplied by (B, N) factors; None: as it is."""
+    if dark is None:
+        return prediction
+    return replace(prediction, shadow=prediction.shadow * dark[..., None])
+
+
 def _in_frames(
     parameters: tuple[Tensor, Tensor, Tensor], rows: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """The parameters of a hand in some frames of a clip."""
     pose, betas, transl = parameters
     return pose[rows], betas, transl[rows]
+
+
+def make_model(
+    templates: Mapping[str, HandTemplate],
+    settings: WildGHandSettings,
+    mean_color: torch.Tensor,
+    frame_count: int,
+    seed: int,
+    device: torch.device,
+    subject: SubjectShape | None = None,
+) -> WildGHandModel:
+    """Make the model that a fit starts from; the same arguments make the same model.
+
+    Args:
+        templates: by side.
+        settings: which parts it has.
+        mean_color: (3,) sRGB in [0, 1] of the visible hand.
+        frame_count: training frames that are fitted.
+        seed: of the places of the Gaussians, and of the initial weights.
+        device: where it lives.
+        subject: how the person's hand differs from the templates; None: not at all.
+    """
+    rigs = make_rigs(templates, settings.gaussians, seed, device, subject)
+    surfaces = {
+        side: surface_points(templates[side], rig.anchors, rig.spacing, mean_color)
+        for side, rig in rigs.items()
+    }
+    network = PredictionNetwork(settings.network.build(), surfaces, seed)
+    with torch.random.fork_rng(devices=[]):
+        torch.manual_seed(seed)
+        dpd = settings.dpd
+        model = WildGHandModel(
+            rigs,
+            network,
+            frame_count,
+            dpd=dpd.enabled,
+            rank=dpd.rank,
+            template=settings.heads,
+            shadows=settings.shadows,
+        )
+    if subject is not None:
+        model.keep(subject)
+    return model.to(device)
+
+
+def make_rigs(
+    templates: Mapping[str, HandTemplate],
+    count: int,
+    seed: int,
+    device: torch.device,
+    subject: SubjectShape | None = None,
+) -> dict[str, HandRig]:
+    """Spread anchors over one hand or two, at the same places of the skin.
+
+    They are spread over the template, whatever the person's hand is: a prior knows these places.
+    """
+    rigs: dict[str, HandRig] = {}
+    anchors = None
+    for side, template in templates.items():
+        # The left template is the right one's mirror image, face by face.
+        anchors = (
+            sample_surface(template, count, seed) if anchors is None else mirrored_anchors(anchors)
+        )
+        bent = template if subject is None else subject.applied(template)
+        rigs[side] = rig_of(bent, anchors, device)
+    return rigs

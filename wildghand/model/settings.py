@@ -18,9 +18,8 @@ from hwp_bench.methods.settings import check_source, choice, number, settings_fr
 from wildghand.dpd.dpd import DpdSettings
 from wildghand.evidence import EvidenceSettings
 from wildghand.light import LightSettings, ShadowSettings
-from wildghand.model.former_settings import current_names
-from wildghand.model.terms import PAPER_TERMS, TermWeights
-from wildghand.network.settings import NetworkSettings, network_settings
+from wildghand.model.terms import TermSettings
+from wildghand.network.settings import SIZES, NetworkSettings, network_settings
 from wildghand.pao.pao import PAPER_PAO, PaoSettings
 from wildghand.poses.errors import PoseSettings
 from wildghand.prepass import PrepassSettings
@@ -31,41 +30,24 @@ WHERE = "wildghand"
 
 
 @dataclass(frozen=True)
-class HeadSettings:
-    """Heads iii and iv of the network, and the corrections of single frames."""
+class NetworkChoice:
+    """Which network; what is not here follows from its size (`wildghand.network.settings`)."""
 
-    #: Component: template offsets (head iii) and refinement of the hand parameters (head iv).
-    enabled: bool = True
-    #: Head iii acts; without it the template stands.
-    template: bool = True
-    #: Head iv acts; without it the given hand parameters stand.
-    refinement: bool = True
+    #: `compact` (convolutions on a small plane) or `paper` (point network and transformer).
+    size: str = choice(*SIZES)
+    #: Texels along each edge of one hand's half of the identity map.
+    identity_resolution: int = number(160, 4, 4096)
+    #: Cells along each edge of the UV plane that the encoder-decoder works on; a multiple of 4.
+    plane_resolution: int = number(40, 4, 512)
+    #: Leave the first 14 channels of the map at 0 and add them to the raw attributes.
+    direct: bool = True
 
+    def __post_init__(self) -> None:
+        self.build()
 
-@dataclass(frozen=True)
-class Rates:
-    """Adam's step for each group of parameters at the start of a fit."""
-
-    #: The latent identity map.
-    identity: float = number(0.015)
-    #: The matrix that adds the map to the attributes.
-    direct: float = number(1e-3)
-    #: The linear part of the shadow head.
-    light: float = number(0.01)
-    #: Head iv.
-    refinement: float = number(1e-3)
-    #: The other layers of the network.
-    network: float = number(0.01)
-    #: DPD.
-    dpd: float = number(1e-3)
-    #: Thresholds of PAO.
-    thresholds: float = number(1e-6)
-    #: Log gain of each frame.
-    gains: float = number(0.01)
-    #: Pose of each frame, rad.
-    pose: float = number(5e-4)
-    #: Translation of each frame, m.
-    transl: float = number(5e-5)
+    def build(self) -> NetworkSettings:
+        """All settings of the network."""
+        return network_settings(**dataclasses.asdict(self))
 
 
 @dataclass(frozen=True)
@@ -78,17 +60,9 @@ class ScheduleSettings:
     batch: int = number(1, 1, 64)
     #: Steps that share one evaluation of the texture branch, which moves at the last of them.
     texture_every: int = number(8, 1, 64)
-    #: Norm that the gradient is clipped to; 0 leaves it as it is.
-    clip_gradient: float = number(1.0)
-    #: `geometric`: rates fall smoothly to `final_rate`; `halving`: by half, `halvings` times.
-    decay: str = choice("geometric", "halving")
-    #: Rates at the end of the budget, as a share of those at its start.
-    final_rate: float = number(0.3, 1e-6, 1.0)
-    #: How often `halving` halves.
-    halvings: int = number(10, 0, 100)
-    #: After t steps, rates are also divided by sqrt(1 + t / root_steps); 0: they are not. A long
-    #: fit ends with lower rates than a short one.
-    root_steps: float = number(200.0, 0.0, 1e7)
+    #: How rates fall: `root` (to 0.3, and with the root of the steps, so that a long fit ends with
+    #: lower rates than a short one), `geometric` (to 0.05) or `halving` (ten times).
+    decay: str = choice("root", "geometric", "halving")
     #: The fit ends with a mean of its steps, nearly all of it from this share of them, the last
     #: ones; 0: with the last step.
     average_share: float = number(0.1, 0.0, 1.0)
@@ -100,8 +74,10 @@ class ScheduleSettings:
     frames_per_second: float = number(4.0, 0.0, 1e6)
     #: Stop when the loss has not fallen by 0.1 % over this many steps; 0 never stops early.
     plateau_steps: int = number(0, 0, 10_000_000)
-    #: Adam's steps.
-    rates: Rates = field(default_factory=Rates)
+    #: Adam's steps for the network at the start: `fast`, or the authors' `published`.
+    rates: str = choice("fast", "published")
+    #: Adam's step for DPD.
+    dpd_rate: float = number(1e-3, 0.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -125,8 +101,8 @@ class WildGHandSettings:
     dpd: DpdSettings = field(default_factory=DpdSettings)
     #: Component: perturbation-aware optimization.
     pao: PaoSettings = field(default_factory=PaoSettings)
-    #: Component: heads iii and iv.
-    heads: HeadSettings = field(default_factory=HeadSettings)
+    #: Component: template offsets (head iii) and refinement of the hand parameters (head iv).
+    heads: bool = True
     #: Addition: given poses are corrected by what the clip's poses have in common.
     poses: PoseSettings = field(default_factory=PoseSettings)
     #: Addition: the template is bent to the person before the fit.
@@ -138,12 +114,16 @@ class WildGHandSettings:
     #: Addition: Gaussians that few frames show are discs on the skin.
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
-    #: covered, and which poses need refining.
-    prepass: PrepassSettings = field(default_factory=PrepassSettings)
+    #: covered, and which poses need refining. It leaves the biases out of every clean
+    #: frame, not out of three in ten: what little they took from these, the avatar lacked
+    #: (docs/wildghand.md).
+    prepass: PrepassSettings = field(
+        default_factory=lambda: PrepassSettings(weight_floor=0.2, omega_dropout=1.0)
+    )
     #: The network.
-    network: NetworkSettings = field(default_factory=NetworkSettings)
+    network: NetworkChoice = field(default_factory=NetworkChoice)
     #: Weights of the terms of the loss.
-    terms: TermWeights = field(default_factory=TermWeights)
+    terms: TermSettings = field(default_factory=TermSettings)
     #: The perceptual distance of the loss, where `terms.perceptual` is above 0: `filter-bank`, or
     #: `vgg19:PATH`, torchvision's weights.
     perceptual: str = "filter-bank"
@@ -161,9 +141,11 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
         "pao": {
             "variant": PAPER_PAO.variant,
             "errors": "batch",
+            "alpha": PAPER_PAO.alpha,
             "beta": PAPER_PAO.beta,
             "error_threshold": PAPER_PAO.error_threshold,
             "share_threshold": PAPER_PAO.share_threshold,
+            "spare_clean": False,
         },
         "start_colors": False,
         "poses": {"enabled": False},
@@ -176,96 +158,43 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
             "batch": 4,
             "texture_every": 1,
             "decay": "halving",
-            "root_steps": 0.0,
             "average_share": 0.0,
             "validated": False,
-            "rates": {"dpd": 1e-4},
+            "dpd_rate": 1e-4,
         },
         "terms": {
-            item.name: getattr(PAPER_TERMS, item.name)
-            for item in dataclasses.fields(TermWeights)
-            if item.name != "outside_weight"
+            "weights": "published",
+            "dssim_weight": 0.0,
+            "leave_hidden": False,
+            "surface": 0.0,
+            "perceptual": 0.1,
         },
     }
 )
 
 #: The modes: settings by name, in place of the defaults. `default`: what measurements keep.
 #: `paper`: the formulas as printed, in the reading that works. `released`: what the authors' code
-#: does, where the temporal factor is a constant 1. docs/dpd_pao.md compares the three.
+#: does, where the temporal factor is a constant 1. docs/dpd_pao.md compares the three. `bare`: the
+#: network alone, what the paper's components are added to (`baselines/network-scratch`).
 MODES: Mapping[str, Mapping[str, Any]] = MappingProxyType(
     {
         "default": {},
         "paper": merged(_PUBLISHED, {"pao": {"temporal": "all"}}),
         "released": merged(_PUBLISHED, {"pao": {"temporal": "none"}}),
-    }
-)
-
-
-#: What the mode `paper` of version 1 overruled.
-_PAPER_OF_VERSION_1: Mapping[str, Any] = MappingProxyType(
-    {
-        "dpd": {"gains": False},
-        "poses": {"enabled": False},
-        "subject": {"enabled": False},
-        "light": {"enabled": False},
-        "shadows": {"enabled": False},
-        "evidence": {"enabled": False},
-        "prepass": {"enabled": False},
-        "terms": {
-            name: value for name, value in _PUBLISHED["terms"].items() if name != "dssim_weight"
+        "bare": {
+            "prior": "",
+            "dpd": {"enabled": False},
+            "pao": {"enabled": False},
+            "start_colors": False,
+            "poses": {"enabled": False},
+            "subject": {"enabled": False},
+            "light": {"enabled": False},
+            "shadows": {"enabled": False},
+            "evidence": {"enabled": False},
+            "prepass": {"enabled": False},
+            "schedule": {"validated": False},
+            "terms": {"surface": 0.0, "leave_hidden": False},
         },
-    }
-)
-
-
-#: What settings that came later were before there were any.
-_BEFORE: Mapping[str, Any] = MappingProxyType(
-    {
-        "start_colors": False,
-        "dpd": {"rank": 0},
-        "pao": {"errors": "median"},
-        "poses": {"enabled": False},
-        "subject": {"enabled": False},
-        "light": {"enabled": False},
-        "shadows": {"enabled": False},
-        "evidence": {
-            "enabled": False,
-            "color_share": 0.0,
-            "fill_share": 0.0,
-        },
-        "schedule": {"root_steps": 0.0, "average_share": 0.0, "validated": False},
-        "terms": {
-            "surface": 0.0,
-            "surface_inexact": 0.0,
-            "leave_hidden": False,
-            "dssim_inexact": 1.0,
-        },
-    }
-)
-
-
-#: Numbers that avatars may store and that are constants.
-_CONSTANTS: Mapping[str, str] = MappingProxyType(
-    {
-        "poses": "image_error space_error expected_turn expected_shift rounds",
-        "subject": (
-            "rounds points reach length_spread thickness_spread spread roughness "
-            "joint_spread transl_spread least_gain nodes"
-        ),
-        "light": "directions ridge border samples",
-        "shadows": "frames places directions least_gain softness darkest",
-        "evidence": "shape_share validated",
-        "prepass": (
-            "patch_size sample_count pixel_budget iterations albedo_prior clean_share "
-            "gain_floor residual_floor texture_floor border_floor misplacement_floor "
-            "hidden_floor validated clear_deviation omega_dropout clean_threshold "
-            "residual_scale tint_scale clean_scale residual_prior least_frames"
-        ),
-        "pao": (
-            "mismatch spare_clean alpha background_threshold background_threshold_both "
-            "share_of binary_outside"
-        ),
-        "dpd": "gain_weight tint_weight omega_dropout omega_weight",
     }
 )
 
@@ -279,67 +208,37 @@ def read_settings(values: Mapping[str, Any]) -> WildGHandSettings:
     Args:
         values: `mode`, a name of `MODES` (without it `default`); and any of the fields of
             `WildGHandSettings`, as tables or as `table.field`. `network.size` chooses the network,
-            its other fields change it. Names that settings had before
-            (`wildghand.model.former_settings`) are read too.
+            its other fields change it.
 
     Raises:
         BadMethod: an unknown name (the message says which one is close), a wrong type, or a value
             outside its range.
     """
-    changes = current_names(values)
+    changes = nested(values)
     mode = _mode_of(changes)
     start = dataclasses.asdict(WildGHandSettings())
     _check_names(changes, start)
     network = changes.get("network")
     if isinstance(network, Mapping) and network.get("size") == "paper":
-        start["network"] = network_settings("paper").to_json()
+        paper = network_settings("paper")
+        start["network"] = {name: getattr(paper, name) for name in start["network"]}
     chosen = merged(merged(start, MODES[mode]), changes)
     return _without_idle_parts(settings_from(WildGHandSettings, chosen, WHERE))
 
 
-def read_stored(values: Mapping[str, Any]) -> WildGHandSettings:
-    """Read the settings that an avatar of today's version stores.
-
-    They are complete, but for settings that came later: what these name was as it is here.
-
-    Raises:
-        BadMethod: as for `read_settings`.
-    """
-    tree = current_names(values)
-    for table, names in _CONSTANTS.items():
-        inner = tree.get(table)
-        if isinstance(inner, dict):
-            tree[table] = {name: inner[name] for name in inner.keys() - set(names.split())}
-    heads = tree.get("heads", {})
-    if isinstance(heads, Mapping) and "template" not in heads:
-        # Without heads iii and iv, the third acted.
-        acting = heads.get("enabled", True) and heads.get("refinement", True)
-        tree["heads"] = {**heads, "enabled": True, "template": True, "refinement": acting}
-    return read_settings(merged(_BEFORE, tree))
-
-
-def read_version_1(values: Mapping[str, Any]) -> WildGHandSettings:
-    """Read the settings that an avatar of version 1 stores.
-
-    They are complete and have their former names. Their mode overruled them: with `paper` the
-    additions were off, whatever they said.
-
-    Raises:
-        BadMethod: as for `read_settings`.
-    """
-    tree = current_names(values)
-    paper = _mode_of(tree) == "paper"
-    if paper:
-        named = tree.get("prior")
-        tree = merged(tree, _PAPER_OF_VERSION_1)
-        tree["prior"] = "" if named in (None, "shipped") else named
-    # In the mode `default`, `weights.variant` had no effect.
-    weights = values.get("weights")
-    printed = weights.get("variant") if isinstance(weights, Mapping) else None
-    binary = values.get("binary_mask") is True or (paper and printed == "binary")
-    variant = "binary" if binary else "printed" if paper else "scaled"
-    weighed = {"variant": variant, "temporal": "regions" if paper else "teaching"}
-    return read_stored(merged(tree, {"pao": weighed}))
+def nested(values: Mapping[str, Any]) -> dict[str, Any]:
+    """Settings as nested tables, from tables, `table.field` as names, or both."""
+    tree: dict[str, Any] = {}
+    for name, value in flattened(values):
+        *tables, last = name.split(".")
+        place = tree
+        for table in tables:
+            inner = place.get(table)
+            if not isinstance(inner, dict):
+                inner = place[table] = {}
+            place = inner
+        place[last] = value
+    return tree
 
 
 def _mode_of(changes: dict[str, Any]) -> str:
@@ -380,7 +279,7 @@ def _check_names(changes: Mapping[str, Any], known: Mapping[str, Any]) -> None:
 
 def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
     """The same settings; what could not act is off."""
-    dpd, pao, heads, prepass = settings.dpd, settings.pao, settings.heads, settings.prepass
+    dpd, pao, prepass = settings.dpd, settings.pao, settings.prepass
     return dataclasses.replace(
         settings,
         dpd=dataclasses.replace(
@@ -393,11 +292,6 @@ def _without_idle_parts(settings: WildGHandSettings) -> WildGHandSettings:
             pao,
             regions=pao.regions if pao.enabled else "superpixels",
             hand=pao.hand if pao.enabled else "estimated",
-        ),
-        heads=HeadSettings(
-            enabled=heads.enabled,
-            template=heads.enabled and heads.template,
-            refinement=heads.enabled and heads.refinement,
         ),
         prepass=dataclasses.replace(prepass, frame_poses=prepass.enabled and prepass.frame_poses),
     )

@@ -2,22 +2,30 @@
 
 from __future__ import annotations
 
-import math
-from dataclasses import dataclass, fields
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from hwp_bench.base.errors import ShapeMismatch, UsageError
-from hwp_bench.methods.settings import number
+from hwp_bench.base.errors import ShapeMismatch
+from hwp_bench.methods.settings import choice, number
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.losses import photometric_loss
+
+#: Share of D-SSIM at most, where the poses of a clip had to be corrected (`wildghand.poses`): what
+#: lies some pixels off its place has its structure elsewhere.
+DSSIM_INEXACT = 0.05
+#: Weight within `off_surface` of what is thicker than a disc, where the poses of a clip had to be
+#: corrected. Exact poses make no needles (docs/person.md).
+SURFACE_INEXACT = 5.0
 
 
 @dataclass(frozen=True)
 class TermWeights:
-    """Weight of each term of the loss, and of what it is made of.
+    """Weights of the terms that are no settings: the paper's, or these by default.
 
     The defaults are the authors' weights divided by their 100 for the reconstruction, but for
     the two terms that cost the clean fit several dB: opacity and silhouette.
@@ -25,16 +33,6 @@ class TermWeights:
 
     #: Weighted reconstruction.
     reconstruction: float = 1.0
-    #: Share of D-SSIM in the reconstruction; the rest is L1.
-    dssim_weight: float = number(0.2, 0.0, 1.0)
-    #: That share at most, where the poses of a clip had to be corrected (`wildghand.poses`): what
-    #: lies some pixels off its place has its structure elsewhere.
-    dssim_inexact: float = number(0.05, 0.0, 1.0)
-    #: Weight in the reconstruction of a pixel outside the visible-hand mask; inside it is 1.
-    outside_weight: float = number(0.03, 0.0, 1.0)
-    #: Leave out of the reconstruction what the mask leaves out though the posed hand covers it:
-    #: there something is in front of the hand (`wildghand.fitting.hidden_skin`).
-    leave_hidden: bool = True
     #: `bias_size`: biases of the perturbation module.
     bias: float = 1e-3
     #: `distance_to_one` of the shadow coefficients.
@@ -51,51 +49,57 @@ class TermWeights:
     silhouette: float = 0.0
     #: `weight_reward`: keeps PAO from weighing everything with 0.
     weight_reward: float = 5e-3
-    #: `off_surface`: what keeps Gaussians from being opaque discs that lie on the skin.
-    surface: float = 5e-4
-    #: Within that term, weight of what is thicker than a disc (`flatness`), where the poses of a
-    #: clip had to be corrected. Exact poses make no needles.
-    surface_inexact: float = 5.0
     #: `cross_hand`: texture features of the two hands, where there are two.
     cross_hand: float = 1e-3
+
+
+#: By the setting `terms.weights`. The paper's: reconstruction, silhouette, the two other
+#: Laplacians and the texture term are the authors', whom the paper does not contradict.
+WEIGHTS: Mapping[str, TermWeights] = MappingProxyType(
+    {
+        "ours": TermWeights(),
+        "published": TermWeights(
+            reconstruction=100.0,
+            bias=0.1,
+            shadow=0.001,
+            opacity=0.1,
+            laplacian_offsets=0.1,
+            laplacian_scales=0.1,
+            laplacian_colors=0.1,
+            silhouette=1.0,
+            weight_reward=0.5,
+            cross_hand=0.1,
+        ),
+    }
+)
+
+
+@dataclass(frozen=True)
+class TermSettings:
+    """The terms of the loss."""
+
+    #: The weights of all terms that are not named here: `ours` or `published`.
+    weights: str = choice("ours", "published")
+    #: Share of D-SSIM in the reconstruction; the rest is L1.
+    dssim_weight: float = number(0.2, 0.0, 1.0)
+    #: Weight in the reconstruction of a pixel outside the visible-hand mask; inside it is 1.
+    outside_weight: float = number(0.03, 0.0, 1.0)
+    #: Leave out of the reconstruction what the mask leaves out though the posed hand covers it:
+    #: there something is in front of the hand (`wildghand.fitting.judging`).
+    leave_hidden: bool = True
+    #: `off_surface`: what keeps Gaussians from being opaque discs that lie on the skin.
+    surface: float = number(5e-4, 0.0, 1e6)
     #: A perceptual distance (`wildghand.gaussians.perceptual`).
-    perceptual: float = 0.0
+    perceptual: float = number(0.0, 0.0, 1e6)
+
+    @property
+    def fixed(self) -> TermWeights:
+        """The weights that are no settings."""
+        return WEIGHTS[self.weights]
 
     def dssim_share(self, *, exact_poses: bool) -> float:
         """Share of D-SSIM in the reconstruction, of clips with exact poses or of others."""
-        return self.dssim_weight if exact_poses else min(self.dssim_weight, self.dssim_inexact)
-
-    def flatness(self, *, exact_poses: bool) -> float:
-        """Weight of thickness within `off_surface`, of clips with exact poses or of others."""
-        return 0.0 if exact_poses else self.surface_inexact
-
-    def __post_init__(self) -> None:
-        for item in fields(self):
-            value = getattr(self, item.name)
-            if not (math.isfinite(value) and value >= 0.0):
-                raise UsageError(
-                    f"is {value}", field=item.name, remedy="Use a finite number, 0 or more."
-                )
-
-
-#: The paper's weights; reconstruction, silhouette, the two other Laplacians, the texture term
-#: and the perceptual weight are the authors', whom the paper does not contradict.
-PAPER_TERMS = TermWeights(
-    dssim_weight=0.0,
-    reconstruction=100.0,
-    leave_hidden=False,
-    bias=0.1,
-    shadow=0.001,
-    opacity=0.1,
-    laplacian_offsets=0.1,
-    laplacian_scales=0.1,
-    laplacian_colors=0.1,
-    silhouette=1.0,
-    weight_reward=0.5,
-    surface=0.0,
-    cross_hand=0.1,
-    perceptual=0.1,
-)
+        return self.dssim_weight if exact_poses else min(self.dssim_weight, DSSIM_INEXACT)
 
 
 def reconstruction(

@@ -313,7 +313,7 @@ def bake_biases(
         rows = torch.tensor([known[frame] for frame in frames[part]], device=given.device)
         pose, transl = given[:, :48].reshape(-1, 16, 3), given[:, 48:]
         betas = torch.as_tensor(avatar.betas[side], dtype=torch.float32, device=given.device)
-        refine = avatar.settings.heads.refinement
+        refine = avatar.settings.heads
         clean, _ = model.gaussians(side, pose, betas, transl, refine=refine)
         biased, _ = model.gaussians(side, pose, betas, transl, refine=refine, rows=rows)
         found[part, :count] = _differences(clean, biased, len(pose))

@@ -1,4 +1,4 @@
-"""The plain model: Gaussians anchored on one or two hands, lit by spherical harmonics."""
+"""The plain model: anchored Gaussians of one or two hands, lit by harmonics; its avatar."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import torch
 
 from hwp_bench.hands import HandTemplate
 from wildghand.gaussians.attributes import AnchoredGaussians, flat_gaussians
+from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig, make_rig
 from wildghand.gaussians.shading import sh_basis, sh_count
+from wildghand.gaussians.training import join_hands
 from wildghand.splat import rasterize
 
 
@@ -157,3 +159,36 @@ def make_model(
         light=torch.zeros(sh_count(degree) - 1, 3, device=device),
         degree=degree,
     )
+
+
+class PlainAvatar(HandAvatar):
+    """A fitted model that can be drawn in any pose; see `hwp_bench.methods.contract.Avatar`.
+
+    Args:
+        model: what to draw. While the fit goes on it may be the live one.
+        steps: optimizer steps behind it.
+    """
+
+    def __init__(self, model: PlainModel, steps: int) -> None:
+        super().__init__(model.rigs, model.light.device, steps)
+        self.model = model
+
+    def draw(
+        self,
+        hands: PosedHands,
+        viewmats: torch.Tensor,
+        Ks: torch.Tensor,
+        width: int,
+        height: int,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """See `HandAvatar.draw`."""
+        model = self.model
+        poses = join_hands([model.rigs[side].pose(*posed) for side, posed in hands.items()])
+        if len(hands) < len(model.rigs):
+            sections = list(model.sections(list(hands)))
+            chosen = {
+                name: torch.cat([value[section] for section in sections])
+                for name, value in model.gaussians.parameters().items()
+            }
+            model = replace(model, gaussians=AnchoredGaussians(**chosen))
+        return model.render(poses, viewmats, Ks, width, height)

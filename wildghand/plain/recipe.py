@@ -1,18 +1,258 @@
-"""The recipe of the plain fit: its hooks are all that a method may change of it."""
+"""The plain fit: its settings, its hooks, which are all that a method may change, and its entry.
+
+A baseline is a subclass of `PlainRecipe` that overrides the hooks in which it differs, or a
+`Recipe` of its own, and a `RecipeMethod` that names it.
+"""
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import TypeVar
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Generic, TypeVar
 
 import torch
 
-from hwp_bench.methods.contract import Avatar
-from wildghand.gaussians.training import TrainingClip
-from wildghand.plain.avatar import PlainAvatar
-from wildghand.plain.hooks import Batch, Drawing, Material, Recipe
-from wildghand.plain.model import PlainModel, make_model
-from wildghand.plain.settings import FitSettings
+from hwp_bench.methods.contract import Avatar, Budget, Report, TrainingCapture
+from hwp_bench.methods.settings import choice, number, settings_from
+from wildghand.gaussians.adam import ClippedAdam
+from wildghand.gaussians.fit_loop import batches, ready_device
+from wildghand.gaussians.losses import photometric_loss
+from wildghand.gaussians.shading import MAX_DEGREE
+from wildghand.gaussians.training import (
+    FrameTable,
+    TrainingClip,
+    TrainingFrames,
+    load_frames,
+    soft_weights,
+)
+from wildghand.plain.loop import IterativeFit, run_fit
+from wildghand.plain.model import PlainAvatar, PlainModel, make_model
+from wildghand.splat.threads import denormals_flushed
+
+# Adam's epsilon: gradients of a mean over all pixels are small.
+_EPSILON = 1e-15
+_BETAS = (0.9, 0.99)
+
+
+@dataclass(frozen=True)
+class LoopSettings:
+    """How long is fitted, to how many frames at a time, and what is compared.
+
+    A method with a model of its own extends this class.
+    """
+
+    #: Gaussians on each hand.
+    gaussians: int = number(12_000, 1, 1_000_000)
+    #: Optimizer steps unless the budget says otherwise.
+    steps: int = number(2_000, 1, 10_000_000)
+    #: Frames in each step.
+    batch: int = number(1, 1, 64)
+    #: Share of D-SSIM in the loss; the rest is L1.
+    dssim_weight: float = number(0.2, 0.0, 1.0)
+    #: Weight of a pixel outside the visible-hand mask; 1 inside.
+    outside_weight: float = number(0.03, 0.0, 1.0)
+    #: The steps' size at the end of the budget, as a share of that at its start; in between it
+    #: falls geometrically.
+    final_rate: float = number(0.05, 1e-6, 1.0)
+    #: `auto` (CUDA where both a GPU and gsplat are there), `cpu` or `cuda`.
+    device: str = choice("auto", "cpu", "cuda")
+
+
+@dataclass(frozen=True)
+class FitSettings(LoopSettings):
+    """How the plain model is fitted; the defaults are those of the preset `default`.
+
+    A method with more settings extends this class.
+    """
+
+    #: Degree of the spherical harmonics of the light, 0 (no shading) to 3.
+    shading_degree: int = number(2, 0, MAX_DEGREE)
+    #: Opacity of every Gaussian at the start.
+    initial_opacity: float = number(0.9, 0.01, 0.99)
+    #: Adam step of the offsets, m.
+    offset_rate: float = 2e-4
+    #: Adam step of the log scales.
+    scale_rate: float = 0.01
+    #: Adam step of the quaternions.
+    quat_rate: float = 0.01
+    #: Adam step of the logit opacities.
+    opacity_rate: float = 0.05
+    #: Adam step of the logit colours.
+    color_rate: float = 0.03
+    #: Adam step of the light.
+    light_rate: float = 0.01
+
+
+Settings = TypeVar("Settings", bound=LoopSettings)
+
+
+@dataclass(frozen=True, eq=False)
+class Material:
+    """The material of a fit."""
+
+    #: What the method may see of the capture.
+    training: TrainingCapture
+    #: The frames to fit.
+    frames: TrainingFrames
+    #: Of everything random.
+    seed: int
+    #: Where the tensors live.
+    device: torch.device
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """The B frames of one step."""
+
+    #: Steps before this one.
+    step: int
+    #: Share of the budget that is used up, in [0, 1).
+    fraction: float
+    #: (B,) int64 on the CPU, positions in `TrainingFrames.indices`.
+    rows: torch.Tensor
+    #: (B, H, W, 3) sRGB in [0, 1], black outside the mask: what drawings are compared with.
+    images: torch.Tensor
+    #: (B, H, W) estimated coverage of the visible hand, in [0, 1].
+    masks: torch.Tensor
+
+
+@dataclass(frozen=True, eq=False)
+class Drawing:
+    """A batch as a method draws it."""
+
+    #: (B, H, W, 3) sRGB over black.
+    image: torch.Tensor
+    #: (B, H, W, 1) coverage in [0, 1].
+    coverage: torch.Tensor
+
+
+class Recipe(IterativeFit[Avatar], Generic[Settings]):
+    """A fit with its hooks. The plain fit is one; a method with a model of its own is another.
+
+    Each step calls `draw`, `weights`, `loss` and, after Adam's step, `move_back`.
+    Hooks keep what they need as attributes; tensors that Adam fits are named by `parameters`.
+
+    Args:
+        material: what is fitted.
+        settings: how.
+    """
+
+    def __init__(self, material: Material, settings: Settings) -> None:
+        self.material = material
+        self.settings = settings
+        self.device = material.device
+        self._steps = 0
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """The tensors that Adam fits, by name, in a fixed order."""
+        raise NotImplementedError
+
+    def rates(self) -> dict[str, float]:
+        """Adam's step at the start of each tensor, by name."""
+        raise NotImplementedError
+
+    def draw(self, batch: Batch) -> Drawing:
+        """Draw the frames of a batch; differentiable. The formation of an image is in here."""
+        raise NotImplementedError
+
+    def avatar(self, steps: int) -> Avatar:
+        """The avatar that draws test frames; while the fit goes on it may share live tensors."""
+        raise NotImplementedError
+
+    def rate(self, name: str, fraction: float) -> float:
+        """Adam's step of a tensor after a share of the budget; it falls geometrically.
+
+        Args:
+            name: of the tensor.
+            fraction: in [0, 1).
+        """
+        return self.rates()[name] * self.settings.final_rate**fraction
+
+    def weights(self, batch: Batch, drawing: Drawing) -> torch.Tensor:
+        """Weights of the pixels in the loss, (B, H, W), not negative.
+
+        The plain fit has 1 where the mask shows the hand and `outside_weight` elsewhere.
+        """
+        return soft_weights(batch.masks, self.settings.outside_weight)
+
+    def loss(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
+        """The scalar that Adam makes small."""
+        return photometric_loss(drawing.image, batch.images, weights, self.settings.dssim_weight)
+
+    def move_back(self, batch: Batch) -> None:
+        """Called after Adam's step; keeps the tensors within their ranges."""
+
+    def count_steps(self, budget: Budget) -> int:
+        """See `IterativeFit`."""
+        return self.settings.steps if budget.steps is None else budget.steps
+
+    def batches(self) -> Iterator[torch.Tensor]:
+        """See `IterativeFit`: (batch,) int64 each."""
+        material = self.material
+        return batches(len(material.frames), self.settings.batch, material.seed)
+
+    def step(self, batch: torch.Tensor, fraction: float) -> float:
+        """See `IterativeFit`."""
+        optimizer = self._optimizer
+        for group, name in zip(optimizer.param_groups, self.parameters(), strict=True):
+            group["lr"] = self.rate(name, fraction)
+        images, masks = self._tables
+        drawn = Batch(self._steps, fraction, batch, images(batch), masks(batch))
+        drawing = self.draw(drawn)
+        loss = self.loss(drawn, drawing, self.weights(drawn, drawing))
+        value = float(loss.detach())
+        if not math.isfinite(value):
+            return value
+        optimizer.clear()
+        loss.backward()
+        optimizer.take_step(loss)
+        self.move_back(drawn)
+        self._steps += 1
+        return value
+
+    @functools.cached_property
+    def _optimizer(self) -> ClippedAdam:
+        return ClippedAdam(
+            [
+                {"params": [tensor.requires_grad_()], "lr": 0.0}
+                for tensor in self.parameters().values()
+            ],
+            betas=_BETAS,
+            epsilon=_EPSILON,
+        )
+
+    @functools.cached_property
+    def _tables(self) -> tuple[FrameTable, FrameTable]:
+        """Images and masks of the frames."""
+        frames = self.material.frames
+        return frames.images_on(self.device), frames.masks_on(self.device)
+
+    def checkpoint(self, steps: int) -> Avatar:
+        """See `IterativeFit`."""
+        return self.avatar(steps)
+
+    def finish(self, steps: int, seconds: float) -> Avatar:
+        """See `IterativeFit`."""
+        for tensor in self.parameters().values():
+            tensor.requires_grad_(False)
+        return self.avatar(steps)
+
+    def finite(self) -> bool:
+        """Whether every fitted number is finite."""
+        return all(bool(value.isfinite().all()) for value in self.parameters().values())
+
+    def snapshot(self) -> dict[str, torch.Tensor]:
+        """Copies of the fitted tensors, which the fit no longer changes."""
+        return {name: value.detach().clone() for name, value in self.parameters().items()}
+
+    @torch.no_grad()
+    def restore(self, values: dict[str, torch.Tensor]) -> None:
+        """Go back to a `snapshot`."""
+        for name, value in self.parameters().items():
+            value.copy_(values[name])
+
 
 # Standard deviations stay within these, m: thinner than paper or wider than a finger explains
 # nothing of a hand.
@@ -70,7 +310,7 @@ class PlainRecipe(Recipe[PlainSettings]):
         return Drawing(image, coverage)
 
     @torch.no_grad()
-    def after_step(self, batch: Batch) -> None:
+    def move_back(self, batch: Batch) -> None:
         """Called after Adam's step; keeps the tensors within their ranges."""
         low, high = _SCALES
         self.model.gaussians.log_scales.clamp_(math.log(low), math.log(high))
@@ -90,3 +330,45 @@ def learning_rates(settings: FitSettings) -> dict[str, float]:
         "logit_colors": settings.color_rate,
         "light": settings.light_rate,
     }
+
+
+class RecipeMethod:
+    """See `hwp_bench.methods.contract.Method`. A method is a subclass that names its parts.
+
+    Args:
+        settings: any of the fields of `settings_type`.
+        seed: of the anchors and of the order of the frames; on one machine's CPU the same seed
+            and number of steps give the same avatar bit for bit.
+
+    Raises:
+        BadMethod: a setting is unknown or out of range.
+        MissingDependency: CUDA was asked for and is not there.
+    """
+
+    #: Name in messages about settings.
+    name: ClassVar[str]
+    #: The settings' dataclass.
+    settings_type: ClassVar[type[LoopSettings]] = FitSettings
+    #: The recipe's class.
+    recipe_type: ClassVar[type[Recipe[Any]]] = PlainRecipe
+
+    def __init__(self, settings: Mapping[str, Any], seed: int = 0) -> None:
+        self.settings = settings_from(self.settings_type, settings, self.name)
+        self.seed = seed
+        self.device = ready_device(self.settings.device)
+
+    @denormals_flushed()
+    def fit(self, training: TrainingCapture, budget: Budget, report: Report) -> Avatar:
+        """Fit an avatar to the training frames (the validation frames are left alone).
+
+        Args:
+            training: what the method may see of the capture.
+            budget: when to stop; without steps the settings' number holds.
+            report: where checkpoints are offered.
+
+        Raises:
+            BadInput: no training frame can be used.
+            DidNotConverge: the fit diverged at once.
+        """
+        material = Material(training, load_frames(training), self.seed, self.device)
+        return run_fit(self.recipe_type(material, self.settings), budget, report)

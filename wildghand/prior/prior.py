@@ -2,17 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+import dataclasses
+import hashlib
+import os
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from hwp_bench.base.errors import BadInput
-from hwp_bench.base.records import Count, Seed
-from wildghand.network import PredictionNetwork
-from wildghand.network.network import MAPS
+from hwp_bench.base.errors import BadInput, HwpError
+from hwp_bench.base.files import atomic_folder, inside, read_json, write_json
+from hwp_bench.base.packages import PACKAGES
+from hwp_bench.base.records import Count, Seed, parse_record
+from hwp_bench.capture.schema import HandModelId
+from hwp_bench.hands import load_template
+from wildghand.model.settings import WildGHandSettings
+from wildghand.network import NetworkSettings, PredictionNetwork, network_settings
+from wildghand.network.network import MAPS, shapes_of, shapes_of_settings
 
 
 @dataclass(frozen=True)
@@ -52,9 +61,6 @@ class Prior:
 
         A hand that the prior has not seen starts from the other hand's map: the two halves of
         the atlas hold the same skin at the same places.
-
-        Args:
-            network: with the settings of the prior's.
         """
         state = dict(self.tensors)
         maps = {side: state.pop(f"{MAPS}{side}") for side in self.record.sides}
@@ -64,14 +70,7 @@ class Prior:
 
 
 def mean_weights(networks: Iterable[PredictionNetwork]) -> dict[str, Tensor]:
-    """Weights that networks of several subjects with shared branches and heads have in common.
-
-    Args:
-        networks: they differ in their identity maps only.
-
-    Returns:
-        The shared weights, and for each hand the mean of the maps there are of it; float32, CPU.
-    """
+    """Weights that networks of several subjects with shared branches and heads have in common."""
     shared: dict[str, Tensor] = {}
     maps: dict[str, list[Tensor]] = {}
     for network in networks:
@@ -87,16 +86,7 @@ def mean_weights(networks: Iterable[PredictionNetwork]) -> dict[str, Tensor]:
 def check_tensors(
     tensors: Mapping[str, Tensor], sides: Iterable[str], shapes: Mapping[str, torch.Size]
 ) -> None:
-    """Refuse tensors that are not the weights of a network.
-
-    Args:
-        tensors: by name.
-        sides: hands that should have an identity map.
-        shapes: of the network's weights, with the maps of both hands.
-
-    Raises:
-        BadInput: one is missing, too many, of another shape, no float, or not finite; it is named.
-    """
+    """Refuse tensors that are not the weights of a network."""
     absent = {f"{MAPS}{side}" for side in ("right", "left") if side not in sides}
     expected = {name: shape for name, shape in shapes.items() if name not in absent}
     for name in sorted(expected.keys() ^ tensors.keys()):
@@ -110,3 +100,248 @@ def check_tensors(
             raise BadInput(f"holds {value.dtype}, not floating point", field=name)
         if not bool(value.isfinite().all()):
             raise BadInput("holds NaN or infinity", field=name)
+
+
+#: Version of the folder.
+SCHEMA = "wildghand-prior/1"
+#: Names of its files.
+DESCRIPTION = "prior.json"
+WEIGHTS = "weights.safetensors"
+#: Largest file of weights that is read, bytes; the `paper` network has about 150 MB of them.
+MAX_BYTES = 512 << 20
+
+#: The value of the setting that stands for the prior of this package, and where that lies.
+SHIPPED = "shipped"
+_SHIPPED_FOLDER = "priors/compact"
+
+_SIDES = ("right", "left")
+
+
+def choose_prior(
+    settings: WildGHandSettings, hand_model: HandModelId, network: PredictionNetwork | None = None
+) -> Prior | None:
+    """Return the prior that a fit starts from, or None for random weights.
+
+    A prior that a person names has to be of the fit's kind. The one that ships is taken where it
+    is: nobody asked for it who chose another network or hand model.
+
+    Args:
+        settings: of the fit.
+        hand_model: of the capture.
+        network: of the fit, where it is made already; saves a second.
+
+    Raises:
+        BadInput: the prior that is named is missing, damaged, or of another kind.
+    """
+    if not settings.prior:
+        return None
+    if settings.prior != SHIPPED:
+        path = find_prior(settings.prior)
+        return load_prior(path, settings.network.build(), hand_model, network)
+    root = find_prior(_SHIPPED_FOLDER)
+    record = _read_record(root)
+    try:
+        _check_fit(record, settings.network.build(), hand_model, str(root))
+    except BadInput:
+        return None
+    return _read_prior(root, record, settings.network.build(), network)
+
+
+def find_prior(text: str) -> Path:
+    """Return the folder that the setting `prior` names.
+
+    A method's preset names it with a path inside the package, which it may not leave; a person
+    names it with an absolute one.
+
+    Raises:
+        BadInput: a relative path leads out of the package, or there is not a prior.
+    """
+    remedy = (
+        "Give the absolute path of a folder that `wildghand pretrain` made, and show it to an "
+        "isolated method with --expose."
+    )
+    try:
+        path = Path(text)
+        if not path.is_absolute():
+            path = inside(PACKAGES / "wildghand", text)
+        found = (path / DESCRIPTION).is_file()
+    except (BadInput, OSError, ValueError) as error:
+        problem = str(error).splitlines()[0][:300]
+        raise BadInput(f"is not a prior ({problem})", field="prior", remedy=remedy) from error
+    if not found:
+        raise BadInput(
+            f"is not a prior: it has no {DESCRIPTION}", where=path, field="prior", remedy=remedy
+        )
+    return path
+
+
+def save_prior(
+    path: str | os.PathLike[str],
+    tensors: Mapping[str, Tensor],
+    *,
+    hand_model: HandModelId,
+    captures: Sequence[Mapping[str, Any]],
+    settings: WildGHandSettings,
+    seed: int,
+    steps: int,
+    overwrite: bool = False,
+) -> Prior:
+    """Write a prior, whole or not at all.
+
+    Args:
+        path: the folder.
+        tensors: as `wildghand.prior.prior.mean_weights` returns them; stored with 16 bits each.
+        hand_model: of the captures.
+        captures: those that it was fitted to.
+        settings: of the fit.
+        seed: of the fit.
+        steps: of the fit.
+        overwrite: replace a prior that is there.
+
+    Returns:
+        The prior as it is read again.
+
+    Raises:
+        UsageError: something is there and may not be replaced.
+        BadInput: a weight is not finite, or too large for 16 bits.
+    """
+    from safetensors.torch import save
+
+    halves = {name: value.detach().half().contiguous() for name, value in tensors.items()}
+    sides = [side for side in _SIDES if f"{MAPS}{side}" in tensors]
+    check_tensors(halves, sides, shapes_of_settings(settings.network.build()))
+    data = save(halves)
+    record = PriorRecord(
+        schema=SCHEMA,
+        hand_model=dataclasses.asdict(hand_model),
+        sides=sides,
+        network=settings.network.build().to_json(),
+        captures=[dict(capture) for capture in captures],
+        settings=dataclasses.asdict(settings),
+        seed=seed,
+        steps=steps,
+        weights=hashlib.sha256(data).hexdigest(),
+    )
+    with atomic_folder(path, overwrite=overwrite, flag="--overwrite") as folder:
+        (folder / WEIGHTS).write_bytes(data)
+        write_json(folder / DESCRIPTION, dataclasses.asdict(record))
+    return Prior(record, {name: value.float() for name, value in halves.items()})
+
+
+def load_prior(
+    path: str | os.PathLike[str],
+    settings: NetworkSettings,
+    hand_model: HandModelId,
+    network: PredictionNetwork | None = None,
+) -> Prior:
+    """Read a prior; nothing in it is executed.
+
+    Args:
+        path: the folder.
+        settings: of the network of the fit that will start from it.
+        hand_model: of the capture.
+        network: that network, where it is made already; saves a second.
+
+    Raises:
+        BadInput: no prior, damaged, or of another network or hand model.
+    """
+    root = Path(path)
+    record = _read_record(root)
+    _check_fit(record, settings, hand_model, str(root / DESCRIPTION))
+    return _read_prior(root, record, settings, network)
+
+
+def _read_record(root: Path) -> PriorRecord:
+    where = str(root / DESCRIPTION)
+    description = read_json(root / DESCRIPTION)
+    record = parse_record(PriorRecord, description, where=where, error=BadInput)
+    try:
+        _check_record(record)
+    except HwpError as error:
+        raise BadInput(str(error), where=where) from error
+    return record
+
+
+def _check_record(record: PriorRecord) -> None:
+    if record.schema != SCHEMA:
+        raise BadInput(f"is {record.schema[:40]!r} where {SCHEMA!r} is read", field="schema")
+    if not record.sides or record.sides != [side for side in _SIDES if side in record.sides]:
+        raise BadInput(f"are {record.sides}"[:200], field="sides")
+    network_settings(**record.network)
+
+
+def _check_fit(
+    record: PriorRecord, network: NetworkSettings, hand_model: HandModelId, where: str
+) -> None:
+    """Refuse a prior that is sound but of another kind than the fit."""
+    needed = network.to_json()
+    for name, value in dataclasses.asdict(network_settings(**record.network)).items():
+        if value != needed[name]:
+            raise BadInput(
+                f"was made with {name} = {value}, and this fit has {needed[name]}",
+                where=where,
+                field="network",
+                remedy="Fit with the network settings of the prior, or without it.",
+            )
+    name = record.hand_model.get("name", "")
+    if name != hand_model.name:
+        raise BadInput(
+            f"was made with the hand model {name[:100]}, not {hand_model.name}",
+            where=where,
+            field="hand_model",
+            remedy="Make one with `wildghand pretrain` on captures of this hand model.",
+        )
+    digest = record.hand_model.get("digest", "")
+    if not _same_edition(digest, hand_model):
+        raise BadInput(
+            f"was made with another edition of the hand model {hand_model.name} "
+            f"({digest[:12]}) than the capture ({hand_model.digest[:12]})",
+            where=where,
+            field="hand_model",
+            remedy="Make one with `wildghand pretrain` on captures of this edition.",
+        )
+
+
+def _same_edition(digest: str, hand_model: HandModelId) -> bool:
+    """Whether a digest and a capture's are of one edition of the hand model.
+
+    Both state the digest of their first hand: that of the left one where there is no right one.
+    """
+    if digest == hand_model.digest:
+        return True
+    try:
+        sides = {load_template(hand_model.source, side).digest for side in _SIDES}
+    except HwpError:
+        # A model that is not here: its captures cannot be fitted anyway.
+        return False
+    return {digest, hand_model.digest} <= sides
+
+
+def _read_prior(
+    root: Path, record: PriorRecord, settings: NetworkSettings, network: PredictionNetwork | None
+) -> Prior:
+    shapes = shapes_of_settings(settings) if network is None else shapes_of(network)
+    return Prior(record, _read_weights(root / WEIGHTS, record, shapes))
+
+
+def _read_weights(
+    file: Path, record: PriorRecord, shapes: Mapping[str, torch.Size]
+) -> dict[str, torch.Tensor]:
+    from safetensors import SafetensorError
+    from safetensors.torch import load
+
+    if not file.is_file() or file.stat().st_size > MAX_BYTES:
+        raise BadInput(f"is missing or larger than {MAX_BYTES} bytes", where=file)
+    try:
+        data = file.read_bytes()
+        if hashlib.sha256(data).hexdigest() != record.weights:
+            raise BadInput(f"is damaged: {DESCRIPTION} states another digest", where=file)
+        tensors = load(data)
+    except (SafetensorError, OSError, ValueError, KeyError) as error:
+        problem = str(error).splitlines()[0][:300] if str(error) else type(error).__name__
+        raise BadInput(f"holds no weights ({problem})", where=file) from error
+    try:
+        check_tensors(tensors, record.sides, shapes)
+    except BadInput as error:
+        raise BadInput(f"does not hold this prior's weights: {error}", where=file) from error
+    return {name: value.float() for name, value in tensors.items()}

@@ -64,7 +64,7 @@ _POINTS = 400
 
 
 class Live:
-    """Looks at a fit now and then; see `wildghand.fitting.optimize.Watch`.
+    """Looks at a fit now and then; see `wildghand.fitting.session.Watch`.
 
     Args:
         show: takes what was seen.
@@ -89,7 +89,7 @@ class Live:
         if began < self._due or not self._wanted():
             return
         try:
-            self._show(glance(fit, self._row(len(fit.frames)), step, float(loss)))
+            self._show(glance(fit, self._row(len(fit.data.frames)), step, float(loss)))
         except OSError as error:  # the network's: a page that is gone must not end a fit
             notice(f"The fit cannot be shown ({error}).")
         now = time.monotonic()

@@ -1,21 +1,175 @@
-"""One-shot-prior: a network that knows other people's hands, frozen, and bent to one person.
-
-In the manner of InterGaussianHand. What it knows comes from the prior that ships with WildGHand.
-"""
+"""The fit of an identity map under a frozen network, in the manner of InterGaussianHand."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
-from one_shot_prior_fit.recipe import OneShotRecipe
-from one_shot_prior_fit.settings import OneShotSettings
-from wildghand.fitting.ready import ready_fit
-from wildghand.plain.method import RecipeMethod
+import cv2
+import numpy as np
+import torch
+
+from hwp_bench.methods.contract import Avatar
+from hwp_bench.methods.settings import choice, number
+from one_shot_prior_fit.model import OneShotAvatar, OneShotModel
+from wildghand.fitting.method import ready_fit
+from wildghand.gaussians.perceptual import FilterBankLoss
+from wildghand.gaussians.training import TrainingClip, TrainingFrames
+from wildghand.model.terms import silhouette
+from wildghand.plain.recipe import Batch, Drawing, LoopSettings, Material, Recipe, RecipeMethod
+
+
+@dataclass(frozen=True)
+class OneShotSettings(LoopSettings):
+    """How the frozen prior is bent to a person; weights of terms are the original's."""
+
+    #: Gaussians on each hand.
+    gaussians: int = number(12_337, 1, 1_000_000)
+    #: Share of D-SSIM in the reconstruction; the rest is L1.
+    dssim_weight: float = number(0.0, 0.0, 1.0)
+    #: Training frames that are fitted: `clip`, all of them; `one`, see `choose_frame`.
+    frames: str = choice("clip", "one")
+    #: Rates fall smoothly to `final_rate` (`geometric`), or by half after 2, 5, 10, 20, 35, 50 and
+    #: 75 % of the budget (`halving`, the original's).
+    decay: str = choice("geometric", "halving")
+    #: Adam step of the identity map; the original's is 0.01.
+    identity_rate: float = number(0.03)
+    #: Adam step of the bias of the texture plane.
+    bias_rate: float = number(0.01)
+    #: Adam step of gain and offset.
+    color_rate: float = number(0.01)
+    #: Weight of the reconstruction.
+    reconstruction: float = number(10.0)
+    #: Weight of a perceptual distance; a bank of filters, because VGG's weights need a file.
+    perceptual: float = number(0.1)
+    #: Weight of the coverage's distance to the mask.
+    mask: float = number(1.0)
+    #: Weight of the mean square of the bias.
+    bias: float = number(0.01)
+
+
+# Frames whose hand is at least this share of the largest one show as much of it.
+_LARGE = 0.9
+
+
+def choose_frame(frames: TrainingFrames) -> int:
+    """The row of the frame that shows much of the hand, and shows it sharply.
+
+    Among the frames whose mask has at least nine tenths of the largest mask's area, it is the one
+    with the largest mean magnitude of the Laplacian within the mask: blur and covered skin
+    lower one or the other. The first of equals is taken.
+
+    Args:
+        frames: the training frames.
+    """
+    areas = (frames.masks > 127).flatten(1).sum(dim=1).numpy()
+    rows = np.flatnonzero(areas >= _LARGE * areas.max())
+    sharp = [_edge_strength(frames, row) for row in rows.tolist()]
+    return int(rows[int(np.argmax(sharp))])
+
+
+def only(frames: TrainingFrames, row: int) -> TrainingFrames:
+    """One row of the training frames."""
+    part = slice(row, row + 1)
+    return replace(
+        frames,
+        indices=frames.indices[part],
+        images=frames.images[part],
+        masks=frames.masks[part],
+    )
+
+
+def _edge_strength(frames: TrainingFrames, row: int) -> float:
+    image = frames.images[row].numpy().astype(np.float32).mean(axis=-1)
+    # The outline against the background says nothing of the skin.
+    mask = (frames.masks[row].numpy() > 127).astype(np.uint8)
+    inside = cv2.erode(mask, np.ones((3, 3), np.uint8)) > 0
+    if not inside.any():
+        return 0.0
+    return float(np.abs(cv2.Laplacian(image, cv2.CV_32F))[inside].mean())
+
+
+#: Shares of the budget after which rates are halved: the original's epochs of its hundred.
+HALVED_AFTER = (0.02, 0.05, 0.10, 0.20, 0.35, 0.50, 0.75)
+
+
+class OneShotRecipe(Recipe[OneShotSettings]):
+    """Fit the identity map, the bias of the texture plane, and one gain and offset.
+
+    Attributes:
+        fitted: the frozen network and what is fitted.
+        clip: hands and cameras of the frames that are fitted.
+    """
+
+    def __init__(self, material: Material, settings: OneShotSettings) -> None:
+        if settings.frames == "one":
+            frames = only(material.frames, choose_frame(material.frames))
+            material = replace(material, frames=frames)
+        super().__init__(material, settings)
+        frames = material.frames
+        self.fitted = OneShotModel(
+            material.training,
+            settings.gaussians,
+            frames.mean_color(),
+            len(frames),
+            material.seed,
+            material.device,
+        )
+        self.clip = TrainingClip(
+            material.training, frames.indices, self.fitted.model.rigs, material.device
+        )
+        self._perceptual = FilterBankLoss()
+
+    def parameters(self) -> dict[str, torch.Tensor]:
+        """See `Recipe`."""
+        return self.fitted.parameters()
+
+    def rates(self) -> dict[str, float]:
+        """See `Recipe`."""
+        settings = self.settings
+        by_kind = {"identity": settings.identity_rate, "bias": settings.bias_rate}
+        return {
+            name: by_kind.get(name.partition(".")[0], settings.color_rate)
+            for name in self.parameters()
+        }
+
+    def rate(self, name: str, fraction: float) -> float:
+        """See `Recipe`."""
+        if self.settings.decay == "geometric":
+            return super().rate(name, fraction)
+        halvings = sum(fraction >= share for share in HALVED_AFTER)
+        return self.rates()[name] * 0.5**halvings
+
+    def draw(self, batch: Batch) -> Drawing:
+        """See `Recipe`."""
+        training = self.material.training
+        drawn = self.fitted.model.draw_frames(
+            self.clip, batch.rows, training.width, training.height, refine=True
+        )
+        return Drawing(self.fitted.colored(drawn.image, drawn.coverage), drawn.coverage)
+
+    def loss(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
+        """See `Recipe`."""
+        settings = self.settings
+        total = settings.reconstruction * super().loss(batch, drawing, weights)
+        if settings.perceptual:
+            distance = self._perceptual(drawing.image, batch.images, weights)
+            total = total + settings.perceptual * distance
+        if settings.mask:
+            # Outside, the mask may be what covers the hand: it counts as little as in colours.
+            coverage = drawing.coverage[..., 0]
+            total = total + settings.mask * silhouette(coverage * weights, batch.masks * weights)
+        squares = [bias.square().mean() for bias in self.fitted.plane_bias.values()]
+        return total + settings.bias * torch.stack(squares).mean()
+
+    def avatar(self, steps: int) -> Avatar:
+        """See `Recipe`."""
+        return OneShotAvatar(self.fitted, steps)
 
 
 class OneShotMethod(RecipeMethod):
-    """See `one_shot_prior_fit.recipe.OneShotRecipe` for all that it does."""
+    """See `one_shot_prior_fit.method.OneShotRecipe` for all that it does."""
 
     name: ClassVar[str] = "baselines/one-shot-prior"
     settings_type = OneShotSettings

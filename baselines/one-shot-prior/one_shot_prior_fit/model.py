@@ -10,14 +10,13 @@ from torch import Tensor, nn
 from hwp_bench.base.errors import BadInput
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
-from wildghand.model.assemble import make_model
-from wildghand.model.model import WildGHandModel
+from wildghand.model.model import WildGHandModel, make_model
 from wildghand.model.settings import read_settings
 from wildghand.network import NetworkSettings
 from wildghand.network.branches import CompactTexture
 from wildghand.network.heads import IdentityMap
 from wildghand.network.surface import Chart
-from wildghand.prior.files import choose_prior
+from wildghand.prior.prior import choose_prior
 
 # What the network of the prior is fitted with in WildGHand, of which nothing acts here.
 _FIT = {"dpd.enabled": False, "pao.enabled": False, "prepass.enabled": False}

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from typing import ClassVar
 
-from wildghand.plain.method import RecipeMethod
+from wildghand.plain.recipe import RecipeMethod
 
 
 class PlainMethod(RecipeMethod):

@@ -47,11 +47,7 @@ class SkinSpace:
 
 
 def shipped_skins(path: Path = FILE) -> SkinSpace:
-    """Read the space.
-
-    Raises:
-        BadInput: the file is missing or damaged.
-    """
+    """Read the space."""
     arrays = read_npz(path, max_bytes=_MOST_BYTES)
     mean, steps, scales = (arrays.get(name) for name in ("mean", "components", "scales"))
     if mean is None or steps is None or scales is None or steps.shape[1:] != mean.shape:
@@ -63,15 +59,7 @@ def shipped_skins(path: Path = FILE) -> SkinSpace:
 
 
 def skin_uv(template: HandTemplate, anchors: SurfaceAnchors) -> Tensor:
-    """Where anchors read the skin: (N, 2); both hands wear that of the right one, mirrored.
-
-    Args:
-        template: of a left or right free hand.
-        anchors: on it.
-
-    Raises:
-        BadInput: the hand is not the free hand, on which the skins are painted.
-    """
+    """Where anchors read the skin: (N, 2); both hands wear that of the right one, mirrored."""
     right = load_template("anny", "right")
     if len(template.faces) != len(right.faces) or not template.name.startswith("anny"):
         raise BadInput(

@@ -60,13 +60,11 @@ def _describe(avatar: Path, change: Change) -> None:
         ),
         (lambda v: v["betas"].update(right=[0.0] * 9 + [-101.0]), "betas.right"),
         (
-            lambda v: v["settings"]["network"].update(
-                identity_resolution=4096, identity_channels=1024
-            ),
+            lambda v: v["settings"]["network"].update(identity_resolution=4096),
             "network.*as its description says",
         ),
         (
-            lambda v: v["settings"]["network"].update(head_width=4096, head_layers=10),
+            lambda v: v["settings"]["network"].update(plane_resolution=512, direct=False),
             "network",
         ),
         (

@@ -14,9 +14,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load_file
 
 from hwp_bench.base.errors import BadInput
-from wildghand.fitting.averaging import StepAverage
-from wildghand.fitting.earlier_states import EarlierStates
-from wildghand.fitting.saved_state import SCHEMA, load_state
+from wildghand.fitting.choice import EarlierStates, StepAverage
+from wildghand.fitting.session import SCHEMA, load_state
 from wildghand.gaussians.perceptual import Vgg19
 
 

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from hwp_bench.base.errors import BadInput
-from wildghand.evidence import ColorChanges, rename_former
+from wildghand.evidence import ColorChanges
 from wildghand.gaussians.attributes import CHANNELS, RawAttributes
 
 COUNTS = {"left": 40, "right": 40}
@@ -26,16 +26,9 @@ def test_colours_alone_change() -> None:
         torch.testing.assert_close(values, expected.expand_as(values))
 
 
-@pytest.mark.parametrize("former", [False, True])
-def test_they_are_read_as_they_were_written(former: bool) -> None:
+def test_they_are_read_as_they_were_written() -> None:
     made = some_changes()
-    tensors = made.to_tensors()
-    if former:
-        tensors = {
-            name.replace("color_changes_", "other_hand_"): value for name, value in tensors.items()
-        }
-        assert ColorChanges.from_tensors(tensors, "an avatar", N=COUNTS) is None
-    read = ColorChanges.from_tensors(rename_former(tensors), "an avatar", N=COUNTS)
+    read = ColorChanges.from_tensors(made.to_tensors(), "an avatar", N=COUNTS)
     assert read is not None
     for side, change in made.changes.items():
         assert torch.equal(read.changes[side], change)

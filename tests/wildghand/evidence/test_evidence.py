@@ -18,7 +18,7 @@ from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.evidence import Evidence, EvidenceSettings, shown_frames, weigh_evidence
 from wildghand.evidence.count import _FAR, _depth_image
-from wildghand.fitting.fit import Fit
+from wildghand.fitting.components import make_fit
 from wildghand.gaussians.attributes import Activation, RawAttributes
 from wildghand.model.settings import read_settings
 
@@ -96,8 +96,8 @@ def test_the_depth_image_has_the_nearest_of_all_hands_around_a_cell() -> None:
 
 def test_frames_show_what_faces_them_and_lies_in_the_mask(make_training: TrainingMaker) -> None:
     """All of a frame counts as visible: about half of a hand faces a camera, and never all."""
-    fit = Fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
-    rows, size = len(fit.frames), fit.frames.masks.shape[1:]
+    fit = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
+    rows, size = len(fit.data.frames), fit.data.frames.masks.shape[1:]
     everything = shown_frames(
         fit.model.rigs, fit.clip, lambda part: torch.ones(len(part), *size), rows
     )
@@ -116,8 +116,8 @@ def test_frames_show_what_faces_them_and_lies_in_the_mask(make_training: Trainin
 
 def test_an_avatar_keeps_its_evidence(make_training: TrainingMaker, tmp_path: Path) -> None:
     training = make_training()
-    fit = Fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
-    bare = Fit(
+    fit = make_fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
+    bare = make_fit(
         training, read_settings({**UNJUDGED, "evidence.enabled": False}), 0, torch.device("cpu")
     )
     frame = int(training.validation[0])

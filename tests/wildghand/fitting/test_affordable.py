@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hwp_bench.methods.contract import Budget, TrainingCapture
-from wildghand.fitting.affordable import affordable
+from wildghand.fitting.method import affordable
 from wildghand.model.settings import read_settings
 
 

@@ -14,15 +14,16 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from odd_fits import part
 from painted import SilentReport
 from tiny_fits import QUICK
 
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
-from wildghand.fitting.averaging import AveragedAvatar, StepAverage
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import optimize
+from wildghand.fitting.choice import AveragedAvatar, Averaging, StepAverage
+from wildghand.fitting.components import make_fit
 from wildghand.gaussians.fit_loop import batches, repeatable
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import run_fit
 
 FIT: dict[str, Any] = {**QUICK, "schedule.steps": 24}
 TrainingMaker = Callable[..., TrainingCapture]
@@ -90,9 +91,9 @@ def test_in_place_gives_every_bit_back() -> None:
 def test_a_fit_ends_with_the_mean_of_its_steps(share: float, make_training: TrainingMaker) -> None:
     settings = read_settings({**FIT, "schedule.average_share": share})
     training = make_training()
-    avatar = optimize(Fit(training, settings, 0, CPU), Budget(), SilentReport())
-    fit, steps = Fit(training, settings, 0, CPU), settings.schedule.steps
-    order = batches(len(fit.frames), 1, 0)
+    avatar = run_fit(make_fit(training, settings, 0, CPU), Budget(), SilentReport())
+    fit, steps = make_fit(training, settings, 0, CPU), settings.schedule.steps
+    order = batches(len(fit.data.frames), 1, 0)
     states = []
     with repeatable(CPU):
         for step in range(steps):
@@ -119,17 +120,17 @@ def test_a_checkpoint_is_drawn_as_a_fit_that_ends_there(make_training: TrainingM
                 assert avatar.device == "cpu"
 
     settings = read_settings(changes)
-    watched = optimize(Fit(training, settings, 0, CPU), Budget(), Drawing())
-    alone = optimize(Fit(training, settings, 0, CPU), Budget(), SilentReport())
+    watched = run_fit(make_fit(training, settings, 0, CPU), Budget(), Drawing())
+    alone = run_fit(make_fit(training, settings, 0, CPU), Budget(), SilentReport())
     for name, value in alone.model.snapshot().items():
         assert torch.equal(watched.model.snapshot()[name], value)
     # The same rates as of a fit of 24 steps, of which ten are taken.
-    fit, order = Fit(training, settings, 0, CPU), batches(len(watched.record.frames), 1, 0)
+    fit, order = make_fit(training, settings, 0, CPU), batches(len(watched.record.frames), 1, 0)
     with repeatable(CPU):
         for step in range(10):
             fit.step(next(order), step / 24)
-            fit.average.take()
-    fit.average.put()
+            part(fit, Averaging).average.take()
+    part(fit, Averaging).average.put()
     ended = fit.avatar(10).render(training.hand_poses(0), training.camera(0))
     np.testing.assert_array_equal(drawn[10], ended)
     assert np.abs(drawn[0] - ended).max() > 0.05

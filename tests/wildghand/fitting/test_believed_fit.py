@@ -22,8 +22,9 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.export.formats import ExportSettings, export
-from wildghand.fitting import believed_poses
+from wildghand.fitting import start
 from wildghand.fitting.method import WildGHandMethod
+from wildghand.model import terms
 from wildghand.page.poses import PageSettings, sample_poses
 from wildghand.poses import ClipPoses
 from wildghand.viewer.posed_view import Motion
@@ -43,7 +44,7 @@ def _bent(hands: dict[str, HandParameters]) -> dict[str, HandParameters]:
 def believing(monkeypatch: pytest.MonkeyPatch) -> None:
     """Fits believe in bent fingers."""
     monkeypatch.setattr(
-        believed_poses, "believed_hands", lambda templates, hands, cameras, settings: _bent(hands)
+        start, "believed_hands", lambda templates, hands, cameras, settings: _bent(hands)
     )
 
 
@@ -53,10 +54,13 @@ def _fitted(training: TrainingCapture, **changes: object) -> WildGHandAvatar:
 
 
 @pytest.mark.usefixtures("believing")
-def test_a_fit_is_that_of_a_capture_with_the_believed_poses(make_training: TrainingMaker) -> None:
+def test_a_fit_is_that_of_a_capture_with_the_believed_poses(
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
     training = make_training("both")
     # Where poses are believed, D-SSIM has another share, and thickness of Gaussians costs.
-    avatar = _fitted(training, **{"terms.surface_inexact": 0.0})
+    monkeypatch.setattr(terms, "SURFACE_INEXACT", 0.0)
+    avatar = _fitted(training)
     bent = training.with_hands(_bent(training.hands))
     told = _fitted(bent, **{"poses.enabled": False, "terms.dssim_weight": 0.05})
     frame = int(training.targets[0])
@@ -69,7 +73,8 @@ def test_a_fit_is_that_of_a_capture_with_the_believed_poses(make_training: Train
     # Other poses are drawn as they are.
     other = bent.hand_poses(frame)
     np.testing.assert_array_equal(avatar.render(other, camera), told.render(other, camera))
-    flatter = _fitted(training, **{"terms.surface_inexact": 100.0})
+    monkeypatch.setattr(terms, "SURFACE_INEXACT", 100.0)
+    flatter = _fitted(training)
     assert np.abs(drawn - flatter.render(training.hand_poses(frame), camera)).max() > 1e-3
 
 

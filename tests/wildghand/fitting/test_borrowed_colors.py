@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from pathlib import Path
@@ -11,16 +10,16 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from odd_fits import a_light
+from odd_fits import a_light, part
 from tiny_fits import UNJUDGED
 
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.evidence import ColorChanges
-from wildghand.fitting.borrowed_colors import clearly_visible
+from wildghand.fitting.colors import OtherHand, clearly_visible, known_normals
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.known_colors import known_normals
 from wildghand.gaussians.attributes import CHANNELS, SIZES
 from wildghand.model.settings import read_settings
 
@@ -32,7 +31,7 @@ TrainingMaker = Callable[..., TrainingCapture]
 
 @pytest.fixture
 def fit(make_training: TrainingMaker) -> Fit:
-    made = Fit(make_training("both"), read_settings(PLAIN), 0, torch.device("cpu"))
+    made = make_fit(make_training("both"), read_settings(PLAIN), 0, torch.device("cpu"))
     with torch.no_grad():  # the hands start alike
         made.model.network.identity.maps["left"][:, COLORS] += 0.5
     made.model.keep(a_light())
@@ -44,7 +43,9 @@ def sharing(fit: Fit, left: float, right: float) -> ColorChanges | None:
     counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
     own = {"left": left, "right": right}
     given = {side: np.full(counts[side], own[side]) for side in counts}
-    return dataclasses.replace(fit.borrowed, own=given, lent=given).learn()
+    other = part(fit, OtherHand)
+    other.own = other.lent = given
+    return other.learn(fit)
 
 
 @torch.no_grad()
@@ -79,22 +80,22 @@ def test_the_mixture_is_by_what_each_knows(fit: Fit, left: float, right: float) 
 
 
 def test_frames_that_show_a_hand_clearly_make_its_colours_its_own(fit: Fit) -> None:
-    assert set(fit.borrowed.own) == {"left", "right"}
-    for own in fit.borrowed.own.values():
+    assert set(part(fit, OtherHand).own) == {"left", "right"}
+    for own in part(fit, OtherHand).own.values():
         assert own.min() == 0.0  # the backs that no frame shows
         assert own.max() > 0.9
-    for side, lent in fit.borrowed.lent.items():
+    for side, lent in part(fit, OtherHand).lent.items():
         # Four times as easily: odds of n / half.
-        own = fit.borrowed.own[side]
+        own = part(fit, OtherHand).own[side]
         np.testing.assert_allclose(lent, 4.0 * own / (1.0 + 3.0 * own), atol=1e-6)
 
 
 def test_unsure_frames_say_nothing_of_colours(fit: Fit) -> None:
-    rows = torch.arange(len(fit.frames))
-    fit.weighting.frame_weights[:] = 0.35
-    assert not clearly_visible(fit.weighting)(rows).any()
-    fit.weighting.frame_weights[:] = 1.0
-    torch.testing.assert_close(clearly_visible(fit.weighting)(rows), fit.weighting.visible(rows))
+    rows = torch.arange(len(fit.data.frames))
+    fit.data.judgement.frame_weights[:] = 0.35
+    assert not clearly_visible(fit.data, rows).any()
+    fit.data.judgement.frame_weights[:] = 1.0
+    torch.testing.assert_close(clearly_visible(fit.data, rows), fit.data.visible(rows))
 
 
 def test_known_normals_lie_in_the_cap() -> None:
@@ -110,17 +111,17 @@ def test_nothing_is_taken_without_a_light_or_another_hand(
 ) -> None:
     fit.model.light = None
     assert sharing(fit, 0.0, 1.0) is None
-    one = Fit(make_training(), read_settings(PLAIN), 0, torch.device("cpu"))
+    one = make_fit(make_training(), read_settings(PLAIN), 0, torch.device("cpu"))
     one.model.keep(a_light())
-    assert one.borrowed.own == {}
-    assert one.borrowed.learn() is None
+    assert part(one, OtherHand).own == {}
+    assert part(one, OtherHand).learn(one) is None
     off = read_settings({**PLAIN, "evidence.color_share": 0.0})
-    assert Fit(make_training("both"), off, 0, torch.device("cpu")).borrowed.own == {}
+    assert make_fit(make_training("both"), off, 0, torch.device("cpu")).part(OtherHand) is None
 
 
 def test_an_avatar_keeps_them(fit: Fit, tmp_path: Path) -> None:
-    frame = int(fit.training.validation[0])
-    where = fit.training.hand_poses(frame), fit.training.camera(frame)
+    frame = int(fit.data.training.validation[0])
+    where = fit.data.training.hand_poses(frame), fit.data.training.camera(frame)
     before = fit.avatar(0).render(*where)
     found = sharing(fit, 0.0, 1.0)
     assert found is not None

@@ -10,7 +10,9 @@ import pytest
 import torch
 
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fitting import closing
+from wildghand.fitting import fit as fitting
+from wildghand.fitting import light as closing
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.model.settings import read_settings
 
@@ -19,7 +21,7 @@ TrainingMaker = Callable[..., TrainingCapture]
 
 def begun(training: TrainingCapture, **changes: Any) -> Fit:
     quick = {"gaussians": 300, "network.identity_resolution": 24, "network.plane_resolution": 12}
-    return Fit(training, read_settings({**quick, **changes}), 0, torch.device("cpu"))
+    return make_fit(training, read_settings({**quick, **changes}), 0, torch.device("cpu"))
 
 
 @pytest.fixture
@@ -40,7 +42,7 @@ def test_the_light_gets_the_seconds_that_it_takes(
     monkeypatch.setattr(closing, "light_samples", slow)
     monkeypatch.setattr(closing, "fit_light", lambda samples, settings: None)
     monkeypatch.setattr(closing.time, "perf_counter", lambda: now)
-    whole = 0.5 + 0.1 * len(fit.frames)
+    whole = 0.5 + 0.1 * len(fit.data.frames)
     assert fit.seconds_for_steps(60.0) == pytest.approx(60.0 - whole)
     # A short budget is not spent on the light alone.
     assert fit.seconds_for_steps(2.0) == 1.0
@@ -64,17 +66,17 @@ def test_without_light_all_seconds_are_for_steps(make_training: TrainingMaker) -
 def test_weight_masks_are_made_when_they_are_asked_for(
     fit: Fit, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(closing, "MAX_MASKS", 3)
+    monkeypatch.setattr(fitting, "MAX_MASKS", 3)
     calls: list[int] = []
     draw = fit.draw
-    monkeypatch.setattr(fit, "draw", lambda rows: calls.append(int(rows[0])) or draw(rows))
+    monkeypatch.setattr(fit, "draw", lambda batch: calls.append(int(batch.rows[0])) or draw(batch))
     avatar = fit.avatar(0, final=True)
     assert not calls
-    frames = fit.frames.indices.tolist()
+    frames = fit.data.frames.indices.tolist()
     assert sorted(avatar.weight_masks) == [frames[row] for row in sorted(calls)]
     assert (calls[0], calls[-1], len(calls)) == (0, len(frames) - 1, 3)
     mask = avatar.weight_masks[frames[0]]
     assert mask.dtype == np.uint8
-    assert mask.shape == fit.frames.images.shape[1:3]
+    assert mask.shape == fit.data.frames.images.shape[1:3]
     assert len(calls) == 3
     assert not fit.avatar(0).weight_masks

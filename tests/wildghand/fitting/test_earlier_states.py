@@ -15,18 +15,18 @@ import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
+from odd_fits import part
 from painted import SilentReport
 from tiny_fits import UNJUDGED
 
 from hwp_bench.capture.splits import Split
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.fitting.averaging import StepAverage
-from wildghand.fitting.earlier_states import EarlierStates
+from wildghand.fitting.choice import Averaging, EarlierStates, StateChoice, StepAverage
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import optimize
-from wildghand.fitting.state_choice import StateChoice
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import run_fit
 
 TrainingMaker = Callable[..., TrainingCapture]
 CPU = torch.device("cpu")
@@ -129,22 +129,22 @@ def fitted(
     **changes: Any,
 ) -> tuple[Fit, Any, dict[int, list[torch.Tensor]]]:
     """A fit in which a state draws the validation frames best, its avatar, and its means."""
-    fit = Fit(training, read_settings({**FIT, **changes}), 0, CPU)
+    fit = make_fit(training, read_settings({**FIT, **changes}), 0, CPU)
     means: dict[int, list[torch.Tensor]] = {}
 
     def error() -> float:
-        now = fit.average.now()
+        now = part(fit, Averaging).average.now()
         for step, mean in means.items():
             if all(torch.equal(a, b) for a, b in zip(now, mean, strict=True)):
                 return abs(math.log(step / wanted))
         pytest.fail("the tensors are no state of the fit")
 
-    def watch(fit: Fit, step: int, loss: object) -> None:
-        means[step] = fit.average.values()
+    def watch(step: int, watchers: object, loss: object) -> None:
+        means[step] = part(fit, Averaging).average.values()
 
     monkeypatch.setattr(StateChoice, "error", lambda choice: error())
     report = SilentReport()
-    return fit, optimize(fit, budget or Budget(), report, watch=watch), means
+    return fit, run_fit(fit, budget or Budget(), report, after_step=watch), means
 
 
 def test_a_fit_ends_with_the_state_that_draws_validation_frames_best(
@@ -154,8 +154,10 @@ def test_a_fit_ends_with_the_state_that_draws_validation_frames_best(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     fit, avatar, means = fitted(training, monkeypatch, 5)
-    assert fit.state_choice.states.candidates == [10, 5]
-    assert all(torch.equal(a, b) for a, b in zip(fit.average.now(), means[5], strict=True))
+    assert part(fit, StateChoice).states.candidates == [10, 5]
+    assert all(
+        torch.equal(a, b) for a, b in zip(part(fit, Averaging).average.now(), means[5], strict=True)
+    )
     assert (avatar.record.steps, avatar.record.chosen_steps) == (20, 5)
     assert "The state of step 5 draws the validation frames best" in capsys.readouterr().err
     again = load_avatar(save_avatar(avatar, tmp_path / "avatar"))
@@ -163,14 +165,14 @@ def test_a_fit_ends_with_the_state_that_draws_validation_frames_best(
 
 
 def test_the_error_is_that_of_the_validation_frames(training: TrainingCapture) -> None:
-    fit = Fit(training, read_settings(FIT), 0, CPU)
-    judges = fit.state_choice.judges
+    fit = make_fit(training, read_settings(FIT), 0, CPU)
+    judges = part(fit, StateChoice).judges
     assert judges is not None
     assert judges.frames.indices.tolist() == training.validation.tolist()
     # Evidence is chosen after the state.
     assert fit.model.evidence is not None
     expected = judges.error(judges.predict_all(), None, None)
-    assert fit.state_choice.error() == expected > 0.0
+    assert part(fit, StateChoice).error() == expected > 0.0
 
 
 @pytest.mark.parametrize("changes", [{"schedule.validated": False}, {"mode": "paper"}])
@@ -180,9 +182,11 @@ def test_without_the_choice_a_fit_ends_with_its_last_state(
     changes = {**changes, "schedule.batch": 1}
     fit, avatar, means = fitted(training, monkeypatch, 5, **changes)
     assert avatar.record.chosen_steps is None
-    assert all(torch.equal(a, b) for a, b in zip(fit.average.now(), means[20], strict=True))
-    assert fit.state_choice.seconds() == 0.0
-    assert fit.state_choice.states.state_dict()["kept"] == {}
+    assert all(
+        torch.equal(a, b)
+        for a, b in zip(part(fit, Averaging).average.now(), means[20], strict=True)
+    )
+    assert fit.part(StateChoice) is None
 
 
 def test_the_seconds_of_the_choice_are_left_out_of_the_steps(
@@ -191,19 +195,19 @@ def test_the_seconds_of_the_choice_are_left_out_of_the_steps(
     """The report's clock runs one second for each step, and one for the start."""
     monkeypatch.setattr(Fit, "seconds_for_steps", lambda fit, seconds: seconds)
     monkeypatch.setattr(
-        StateChoice, "seconds", lambda choice: 3.0 * (len(choice.states.candidates) > 0)
+        StateChoice, "seconds_now", lambda choice, fit: 3.0 * (len(choice.states.candidates) > 0)
     )
     _, avatar, _ = fitted(training, monkeypatch, 20, Budget(seconds=16.0))
     assert avatar.record.steps == 16 - 1 - 3
 
 
 def test_seconds_are_asked_for_once_there_are_states(training: TrainingCapture) -> None:
-    fit = Fit(training, read_settings(FIT), 0, CPU)
-    assert fit.state_choice.seconds() == 0.0
+    fit = make_fit(training, read_settings(FIT), 0, CPU)
+    assert part(fit, StateChoice).seconds_now(fit) == 0.0
     for _ in range(10):
-        fit.average.take()
-        fit.state_choice.states.take()
-    assert fit.state_choice.states.candidates == [5]
+        part(fit, Averaging).average.take()
+        part(fit, StateChoice).states.take()
+    assert part(fit, StateChoice).states.candidates == [5]
     before = {name: value.clone() for name, value in fit.model.state_dict().items()}
-    assert fit.state_choice.seconds() > 0.0
+    assert part(fit, StateChoice).seconds_now(fit) > 0.0
     assert all(torch.equal(value, before[name]) for name, value in fit.model.state_dict().items())

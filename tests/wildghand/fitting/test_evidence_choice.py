@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections.abc import Callable
 from pathlib import Path
@@ -12,7 +13,7 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from odd_fits import a_light, odd_fit
+from odd_fits import a_light, odd_fit, part
 from tiny_fits import UNJUDGED
 
 from hwp_bench.capture.splits import Split
@@ -26,11 +27,13 @@ from wildghand.evidence import (
     strengths,
     weigh_evidence,
 )
-from wildghand.fitting.evidence_choice import EvidenceChoice, Gaps
+from wildghand.fitting.choice import StateChoice
+from wildghand.fitting.colors import FilledColors
+from wildghand.fitting.evidence import FewShown, Gaps
 from wildghand.fitting.fit import Fit
 from wildghand.gaussians.training import load_validation_frames
 from wildghand.model.dress import Gaussians
-from wildghand.model.rasterize_hands import rasterize_hands
+from wildghand.model.frames import rasterize_hands
 from wildghand.subject.fit_subject import LEAST_CHOOSING
 
 QUICK: dict[str, Any] = {**UNJUDGED, "light.enabled": False}
@@ -55,9 +58,11 @@ def training(make_training: TrainingMaker) -> TrainingCapture:
 def spared(fit: Fit, index: int) -> Evidence:
     """The evidence of one of the strengths, without the Gaussians that close gaps."""
     several = strengths(fit.settings.evidence)
-    evidence = [weigh_evidence(fit.choice.shown, len(fit.frames), each) for each in several]
+    evidence = [
+        weigh_evidence(part(fit, FewShown).shown, len(fit.data.frames), each) for each in several
+    ]
     # The third opens the most: it asks for four times the frames.
-    return evidence[index].spare(fit.choice.gaps.closers(evidence[2]))
+    return evidence[index].spare(part(fit, FewShown).gaps.closers(evidence[2]))
 
 
 def drawn_with(fit: Fit, training: TrainingCapture, index: int) -> np.ndarray:
@@ -73,27 +78,27 @@ def drawn_with(fit: Fit, training: TrainingCapture, index: int) -> np.ndarray:
     return np.clip(np.stack(images), 0.0, 1.0)
 
 
-def error_with(
-    choice: EvidenceChoice, evidence: Evidence | None, colors: ColorChanges | None
-) -> float:
+def error_with(choice: FewShown, evidence: Evidence | None, colors: ColorChanges | None) -> float:
     """The error of all validation frames as they are drawn with both."""
-    drawings = choice.drawings
+    drawings = choice.judges
     assert drawings is not None
     return drawings.error(drawings.predict_all(), evidence, colors)
 
 
-def judged_by(choice: EvidenceChoice, images: torch.Tensor) -> EvidenceChoice:
+def judged_by(choice: FewShown, images: torch.Tensor) -> FewShown:
     """The same choice, with (F, H, W, 3) uint8 images as the truth."""
-    drawings = choice.drawings
+    choice, drawings = copy.copy(choice), choice.judges
     assert drawings is not None
     frames = dataclasses.replace(drawings.frames, images=images)
-    return dataclasses.replace(choice, judges=dataclasses.replace(drawings, frames=frames))
+    choice.judges = dataclasses.replace(drawings, frames=frames)
+    return choice
 
 
 def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> None:
     fit = begun(training)
-    assert fit.choice.drawings is not None
-    frames = fit.choice.drawings.frames
+    judges = part(fit, FewShown).judges
+    assert judges is not None
+    frames = judges.frames
     erode = np.ones((3, 3), np.uint8)
     inside = [cv2.erode((mask > 127).astype(np.uint8), erode) for mask in frames.masks.numpy()]
     hand = np.stack(inside)[..., None]
@@ -101,7 +106,7 @@ def test_errors_are_those_of_the_avatars_pictures(training: TrainingCapture) -> 
     for index in range(len(strengths(fit.settings.evidence))):
         off = (drawn_with(fit, training, index) - truth) ** 2 * hand
         expected = off.sum() / hand.sum() / 3.0
-        found = error_with(fit.choice, spared(fit, index), None)
+        found = error_with(part(fit, FewShown), spared(fit, index), None)
         assert found == pytest.approx(expected, rel=1e-4)
 
 
@@ -111,12 +116,12 @@ def test_the_strength_that_draws_the_frames_best_is_chosen(
 ) -> None:
     fit = begun(training)
     images = torch.from_numpy((255.0 * drawn_with(fit, training, index)).round().astype(np.uint8))
-    choice = judged_by(fit.choice, images)
-    (evidence,) = choice.best()
+    choice = judged_by(part(fit, FewShown), images)
+    (evidence,) = choice.best(fit)
     assert isinstance(evidence, Evidence)
     assert evidence.equals(spared(fit, index))
     fit.model.keep(evidence)
-    assert choice.best() == []  # the model has it already
+    assert choice.best(fit) == []  # the model has it already
 
 
 def test_gaussians_stay_as_learnt_where_that_draws_the_frames_much_better(
@@ -132,7 +137,7 @@ def test_gaussians_stay_as_learnt_where_that_draws_the_frames_much_better(
     ]
     fit.model.evidence = before
     images = torch.from_numpy((255.0 * np.clip(np.stack(drawn), 0.0, 1.0)).round().astype(np.uint8))
-    (evidence,) = judged_by(fit.choice, images).best()
+    (evidence,) = judged_by(part(fit, FewShown), images).best(fit)
     assert isinstance(evidence, Evidence)
     assert evidence.equals(learnt)
     assert all(bool((shares == 1.0).all()) for shares in evidence.shapes.values())
@@ -158,23 +163,24 @@ def test_a_wall_in_the_way_is_left_out_and_stays_out_of_a_file(
         def error(self, _: Any, evidence: Evidence, __: Any) -> float:
             return 1.0 if side in evidence.open_wrists else 2.0
 
-    choice = dataclasses.replace(fit.choice, judges=Walls())  # type: ignore[arg-type]
+    choice = part(fit, FewShown)
+    choice.judges = Walls()  # type: ignore[assignment]
     fit.model.keep(spared(fit, 0))
-    (evidence,) = choice.best()
+    (evidence,) = choice.best(fit)
     assert isinstance(evidence, Evidence)
     assert evidence.equals(opened)
 
 
 def test_evidence_has_no_say_in_the_choice_of_a_state(training: TrainingCapture) -> None:
     fit = odd_fit(training, {**QUICK, "schedule.validated": True})
-    expected = fit.state_choice.error()
+    expected = part(fit, StateChoice).error()
     discs = weigh_evidence(
-        {side: torch.zeros_like(count) for side, count in fit.choice.shown.items()},
-        len(fit.frames),
+        {side: torch.zeros_like(count) for side, count in part(fit, FewShown).shown.items()},
+        len(fit.data.frames),
         fit.settings.evidence,
     )
     fit.model.keep(discs)
-    assert fit.state_choice.error() == expected
+    assert part(fit, StateChoice).error() == expected
 
 
 class GapModel:
@@ -233,15 +239,15 @@ def test_all_of_what_is_spared_is_kept() -> None:
 
 def test_the_border_of_an_estimated_mask_judges_nothing(training: TrainingCapture) -> None:
     fit = begun(training)
-    drawings = fit.choice.drawings
+    drawings = part(fit, FewShown).judges
     assert drawings is not None
-    expected = error_with(fit.choice, spared(fit, 0), None)
+    expected = error_with(part(fit, FewShown), spared(fit, 0), None)
     frames, images = drawings.frames, drawings.frames.images.clone()
     kernel = np.ones((3, 3), np.uint8)
     for image, mask in zip(images, frames.masks.numpy(), strict=True):
         hand = (mask > 127).astype(np.uint8)
         image[torch.from_numpy(hand != cv2.erode(hand, kernel))] = 255
-    assert error_with(judged_by(fit.choice, images), spared(fit, 0), None) == expected
+    assert error_with(judged_by(part(fit, FewShown), images), spared(fit, 0), None) == expected
 
 
 def test_strengths_are_around_the_settings_own() -> None:
@@ -257,15 +263,15 @@ def test_the_fill_that_draws_the_frames_best_is_chosen(
     fit = begun(training)
     fit.model.keep(a_light())
     # Hardly anything is shown, so that each share changes what the frames show.
-    shown = {side: 0.05 * count for side, count in fit.choice.shown.items()}
-    filled = dataclasses.replace(fit.choice.filled, shown=shown)
-    choice = dataclasses.replace(fit.choice, filled=filled)
+    shown = {side: 0.05 * count for side, count in part(fit, FewShown).shown.items()}
+    choice, filled = copy.copy(part(fit, FewShown)), FilledColors(fit, shown)
+    choice.filled = filled
     fills = filled.carried_on(fill_shares(fit.settings.evidence))
     fit.model.color_changes = fills[index]
     images = torch.from_numpy((255.0 * drawn_with(fit, training, 0)).round().astype(np.uint8))
     fit.model.color_changes = None
     fit.model.keep(spared(fit, 0))
-    found = judged_by(choice, images).best()
+    found = judged_by(choice, images).best(fit)
     if index == 2:  # as they were learnt
         assert found == []
         return
@@ -286,17 +292,21 @@ def test_looking_changes_nothing_and_finishing_keeps_the_best(
 ) -> None:
     fit = begun(training)
     before = {name: value.clone() for name, value in fit.model.state_dict().items()}
-    assert fit.choice.seconds() > 0.0
-    fit.choice.best()
+    assert part(fit, FewShown).seconds(fit) > 0.0
+    part(fit, FewShown).best(fit)
     assert all(torch.equal(value, before[name]) for name, value in fit.model.state_dict().items())
     # Offsets as they were learnt are made to be the best.
-    kept = weigh_evidence(fit.choice.shown, len(fit.frames), strengths(fit.settings.evidence)[3])
-    monkeypatch.setattr(EvidenceChoice, "best", lambda choice: [kept])
-    fit.finish()
+    kept = weigh_evidence(
+        part(fit, FewShown).shown, len(fit.data.frames), strengths(fit.settings.evidence)[3]
+    )
+    monkeypatch.setattr(FewShown, "best", lambda choice, fit: [kept])
+    fit.finish(0, 0.0)
     frame = int(training.validation[0])
     where = training.hand_poses(frame), training.camera(frame)
     drawn = fit.avatar(0).render(*where)
-    fit.model.evidence = weigh_evidence(fit.choice.shown, len(fit.frames), fit.settings.evidence)
+    fit.model.evidence = weigh_evidence(
+        part(fit, FewShown).shown, len(fit.data.frames), fit.settings.evidence
+    )
     assert np.abs(fit.avatar(0).render(*where) - drawn).max() > 0.01
     fit.model.evidence = kept
     np.testing.assert_allclose(fit.avatar(0).render(*where), drawn, atol=1e-6)
@@ -314,14 +324,15 @@ def test_nothing_is_chosen_where_it_is_off(
         monkeypatch.setattr(EvidenceSettings, "validated", False)
         changes = {}
     fit = begun(training, **changes)
-    assert fit.choice.drawings is None
-    if fit.settings.evidence.enabled:
-        # Gaps are closed all the same.
-        assert fit.choice.seconds() > 0.0
-        fit.model.keep(spared(fit, 0))
-    else:
-        assert fit.choice.seconds() == 0.0
-    assert fit.choice.best() == []
+    choice = fit.part(FewShown)
+    assert (choice is not None) == fit.settings.evidence.enabled
+    if choice is None:
+        return
+    assert choice.judges is None
+    # Gaps are closed all the same.
+    assert choice.seconds(fit) > 0.0
+    fit.model.keep(spared(fit, 0))
+    assert choice.best(fit) == []
 
 
 def test_a_frame_or_two_do_not_judge(training: TrainingCapture) -> None:
@@ -329,7 +340,7 @@ def test_a_frame_or_two_do_not_judge(training: TrainingCapture) -> None:
     few = first - LEAST_CHOOSING + 1
     training.split = Split(training.id, last + 1, (0, few), (few, first), (first, last + 1))
     training._train = training.split.train
-    assert begun(training).choice.drawings is None
+    assert part(begun(training), FewShown).judges is None
 
 
 def test_validation_frames_are_spread_and_never_fitted_ones(training: TrainingCapture) -> None:

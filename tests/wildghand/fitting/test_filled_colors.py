@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,16 +9,22 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from odd_fits import a_light, odd_fit
+from odd_fits import a_light, odd_fit, part
 from tiny_fits import UNJUDGED
 
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.evidence import EvidenceSettings
-from wildghand.fitting.filled_colors import FilledColors, roughness, smooth_fill
+from wildghand.fitting.colors import (
+    FilledColors,
+    OtherHand,
+    known_logits,
+    log_linear,
+    roughness,
+    smooth_fill,
+)
+from wildghand.fitting.evidence import FewShown
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.known_colors import known_logits, log_linear
 from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
 from wildghand.gaussians.rig import HandRig, make_rig
 
@@ -88,10 +93,10 @@ def test_extremes_of_what_is_known(rig: HandRig) -> None:
 
 def test_the_changes_lead_to_the_filled_colours(make_training: TrainingMaker) -> None:
     fit = begun(make_training())
-    (found,) = fit.choice.filled.carried_on([0.02])
+    (found,) = part(fit, FewShown).filled.carried_on([0.02])
     assert found is not None
-    shown = fit.choice.shown["right"].double().numpy()
-    known = shown / (shown + 0.02 * len(fit.frames))
+    shown = part(fit, FewShown).shown["right"].double().numpy()
+    known = shown / (shown + 0.02 * len(fit.data.frames))
     assert known.min() == 0.0  # the back, which no frame shows
     expected = smooth_fill(roughness(fit.model.rigs["right"]), levels(fit, "right"), known)
     assert np.abs(levels(fit, "right") - expected).max() > 0.1
@@ -106,13 +111,14 @@ def test_colours_from_the_other_hand_are_known_and_carried_on(
     counts = {side: len(rig) for side, rig in fit.model.rigs.items()}
     # No frame shows the left hand, and the right one knows all colours.
     own = {"left": np.zeros(counts["left"]), "right": np.ones(counts["right"])}
-    borrowed = dataclasses.replace(fit.borrowed, own=own, lent=own)
-    taken = borrowed.learn()
+    other = part(fit, OtherHand)
+    other.own = other.lent = own
+    taken = other.learn(fit)
     assert taken is not None
     fit.model.keep(taken)
     shown = {side: torch.zeros(count) for side, count in counts.items()}
     shown["right"] += 1e9
-    found = FilledColors(fit.model, borrowed, shown, len(fit.frames)).carried_on([0.02])[0]
+    found = FilledColors(fit, shown).carried_on([0.02])[0]
     assert found is not None
     for side, change in taken.changes.items():
         np.testing.assert_allclose(found.changes[side].numpy(), change.numpy(), atol=1e-4)
@@ -123,28 +129,27 @@ def test_nothing_is_filled_where_it_is_off(
     changes: dict[str, Any], make_training: TrainingMaker
 ) -> None:
     fit = begun(make_training(), **changes)
-    fit.finish()
+    fit.finish(0, 0.0)
     assert fit.model.color_changes is None
 
 
 def test_nothing_is_filled_without_a_light(make_training: TrainingMaker) -> None:
     fit = begun(make_training(), **{"light.enabled": False})
     fit.model.light = None
-    assert fit.choice.filled.carried_on([0.02, 0.0]) == [None, None]
-    assert fit.choice.seconds() >= 0.0
+    assert part(fit, FewShown).filled.carried_on([0.02, 0.0]) == [None, None]
+    assert part(fit, FewShown).seconds(fit) >= 0.0
 
 
 def test_without_judges_the_settings_share_holds_and_an_avatar_keeps_it(
-    make_training: TrainingMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make_training: TrainingMaker, tmp_path: Path
 ) -> None:
-    monkeypatch.setattr(EvidenceSettings, "validated", False)
-    fit = begun(make_training(), **{"light.enabled": False})
-    (expected,) = fit.choice.filled.carried_on([0.02])
+    fit = begun(make_training(), **{"evidence.validated": False, "light.enabled": False})
+    (expected,) = part(fit, FewShown).filled.carried_on([0.02])
     assert expected is not None
-    frame = int(fit.training.validation[0])
-    where = fit.training.hand_poses(frame), fit.training.camera(frame)
+    frame = int(fit.data.training.validation[0])
+    where = fit.data.training.hand_poses(frame), fit.data.training.camera(frame)
     before = fit.avatar(0).render(*where)
-    fit.finish()
+    fit.finish(0, 0.0)
     assert fit.model.color_changes is not None
     assert torch.equal(fit.model.color_changes.changes["right"], expected.changes["right"])
     drawn = fit.avatar(0).render(*where)

@@ -19,12 +19,13 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from plain_fit.method import PlainMethod
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.method import WildGHandMethod
-from wildghand.fitting.optimize import Watchers, optimize
-from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.fitting.session import load_state, save_state
 from wildghand.gaussians.fit_loop import choose_device, ready_device
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import Watchers, run_fit
 
 HAS_GPU = choose_device("auto").type == "cuda"
 pytestmark = pytest.mark.skipif(not HAS_GPU, reason="needs a GPU and gsplat")
@@ -87,7 +88,7 @@ def test_a_stopped_fit_goes_on(make_training: TrainingMaker, tmp_path: Path) -> 
     settings = read_settings(settings_of("default", "cuda"))
 
     def fit() -> Fit:
-        return Fit(training, settings, 0, ready_device("cuda"))
+        return make_fit(training, settings, 0, ready_device("cuda"))
 
     stopped, again = fit(), fit()
 
@@ -95,10 +96,10 @@ def test_a_stopped_fit_goes_on(make_training: TrainingMaker, tmp_path: Path) -> 
         if step == STEPS // 2:
             save_state(file, stopped, watchers, step=step, seconds=1.0, digest="d")
 
-    whole = optimize(stopped, Budget(), SilentReport(), after_step=save)
+    whole = run_fit(stopped, Budget(), SilentReport(), after_step=save)
     watchers = Watchers(0)
     start, _ = load_state(file, again, watchers, "d")
-    finished = optimize(again, Budget(), SilentReport(), start=start, watchers=watchers)
+    finished = run_fit(again, Budget(), SilentReport(), start=start, watchers=watchers)
     assert finished.steps == STEPS
     # Kernels add in any order, so that not even two runs from one state have the same bits.
     assert psnr(finished, training) == pytest.approx(psnr(whole, training), abs=0.5)

@@ -12,10 +12,11 @@ import torch
 from tiny_fits import UNJUDGED
 
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.hidden_skin import MARGIN, hidden_skin
-from wildghand.fitting.skin_places import skin_places
-from wildghand.fitting.weighting import Weighting
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.data import skin_places
+from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.judging import MARGIN, HiddenSkin, hidden_skin
+from wildghand.fitting.weights import MaskWeights
 from wildghand.model.settings import read_settings
 
 CPU = torch.device("cpu")
@@ -41,14 +42,19 @@ def test_without_a_hand_nothing_is_hidden() -> None:
 
 def covered(training: TrainingCapture, **changes: Any) -> tuple[Fit, torch.Tensor]:
     """A fit whose first frame's mask has lost its upper half, and what is hidden in it then."""
-    fit = Fit(training, read_settings({**UNJUDGED, **changes}), 0, CPU)
-    masks = fit.frames.masks.clone()
+    fit = make_fit(training, read_settings({**UNJUDGED, **changes}), 0, CPU)
+    masks = fit.data.frames.masks.clone()
     rows = torch.nonzero((masks[0] > 127).any(dim=1))[:, 0]
     masks[0, : int(rows.float().mean())] = 0
-    fit.frames = dataclasses.replace(fit.frames, masks=masks)
+    fit.data.frames = dataclasses.replace(fit.data.frames, masks=masks)
     templates = {side: training.template(side) for side in training.sides}
-    places = skin_places(training, fit.frames, templates)
-    fit.weighting = Weighting(fit.frames, len(training.sides), None, fit.settings, CPU, places)
+    places = skin_places(training, fit.data.frames, templates)
+    for name in ("images", "masks"):  # what was made of the masks before
+        vars(fit.data).pop(name, None)
+    for kind in (HiddenSkin, MaskWeights):
+        found = fit.part(kind)
+        if found is not None:
+            found.before(fit)
     return fit, torch.from_numpy(hidden_skin(places, masks.numpy()))[0]
 
 
@@ -58,10 +64,12 @@ def test_hidden_pixels_are_compared_with_what_is_drawn(
 ) -> None:
     fit, hidden = covered(make_training(), **{"pao.enabled": pao})
     assert hidden.sum() > 20
-    drawing = fit.draw(torch.tensor([0]))
-    target = fit.weighting(torch.tensor([0]), drawing)
+    drawing = fit.draw(Batch(torch.tensor([0])))
+    target = fit.compare(Batch(torch.tensor([0])), drawing)
     assert torch.equal(target.image[0][hidden], drawing.image.detach()[0][hidden])
-    masked = fit.frames.images[0].float() / 255.0 * (fit.frames.masks[0] / 255.0)[..., None]
+    masked = (
+        fit.data.frames.images[0].float() / 255.0 * (fit.data.frames.masks[0] / 255.0)[..., None]
+    )
     torch.testing.assert_close(target.image[0][~hidden], masked[~hidden])
 
 
@@ -72,11 +80,12 @@ def test_hidden_pixels_ask_for_nothing_where_they_are_left_out(
     """The gradient of the image is 0 in them without SSIM, whose windows reach the others."""
     changes = {"terms.leave_hidden": leave, "terms.dssim_weight": 0.0, "pao.enabled": False}
     fit, hidden = covered(make_training(), **changes)
-    drawing = fit.draw(torch.tensor([0]))
+    drawing = fit.draw(Batch(torch.tensor([0])))
     drawing.image.retain_grad()
-    target = fit.weighting(torch.tensor([0]), drawing)
-    loss = fit.objective(fit.model, drawing, target, torch.tensor([0]), fit.weighting.clean[:1])
-    loss.backward()
+    target = fit.compare(Batch(torch.tensor([0])), drawing)
+    batch = Batch(torch.tensor([0]))
+    terms = [term for each in fit.components for term in each.loss(fit, batch, drawing, target)]
+    torch.stack(terms).sum().backward()
     asked = drawing.image.grad[0].abs().sum(dim=-1)
     assert asked[~hidden].max() > 0.0
     assert bool((asked[hidden] == 0.0).all()) is leave

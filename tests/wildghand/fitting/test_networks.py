@@ -26,9 +26,10 @@ from hwp_bench.methods import find_method, read_manifest
 from hwp_bench.methods.contract import RunSettings, TrainingCapture
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main as wildghand
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.hand_masks import hand_masks, hand_roots
-from wildghand.fitting.networks import check_networks
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.fit import Batch
+from wildghand.fitting.judging import hand_masks, hand_roots
+from wildghand.fitting.method import check_networks
 from wildghand.model.settings import read_settings
 from wildghand.pao.sam import AutomaticSettings
 
@@ -53,10 +54,10 @@ def _fewer_points(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def weights(training: TrainingCapture, **changes: Any) -> torch.Tensor:
-    fit = Fit(training, read_settings({**FIT, **changes}), 0, torch.device("cpu"))
+    fit = make_fit(training, read_settings({**FIT, **changes}), 0, torch.device("cpu"))
     rows = torch.arange(3)
     with torch.no_grad():
-        return fit.weighting(rows, fit.draw(rows)).weights
+        return fit.compare(Batch(rows), fit.draw(Batch(rows))).weights
 
 
 def options(settings: dict[str, Any]) -> list[str]:
@@ -97,13 +98,13 @@ def test_the_binary_mask_is_the_hand_that_was_chosen(
     binary = {"pao.variant": "binary", "prepass.enabled": False}
     found = weights(training, **binary, **{"pao.hand": hand})
     settings = read_settings({**FIT, **binary})
-    fit = Fit(training, settings, 0, torch.device("cpu"))
-    masks = hand_masks(training, fit.frames, hand, torch.device("cpu"))
+    fit = make_fit(training, settings, 0, torch.device("cpu"))
+    masks = hand_masks(training, fit.data.frames, hand, torch.device("cpu"))
     assert torch.equal(found, (masks[:3] > 127).float())
-    assert not torch.equal(masks, fit.frames.masks)
+    assert not torch.equal(masks, fit.data.frames.masks)
     if source == "graph-cut":  # the painted hand is where its parameters say, and alone
-        shared = ((masks > 127) & (fit.frames.masks > 127)).sum()
-        assert shared / ((masks > 127) | (fit.frames.masks > 127)).sum() > 0.8
+        shared = ((masks > 127) & (fit.data.frames.masks > 127)).sum()
+        assert shared / ((masks > 127) | (fit.data.frames.masks > 127)).sum() > 0.8
 
 
 def test_without_pao_no_checkpoint_is_opened(make_training: TrainingMaker) -> None:

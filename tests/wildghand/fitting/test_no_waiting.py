@@ -14,20 +14,24 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from odd_fits import part
 from painted import TrainingMaker
 from torch.overrides import TorchFunctionMode
 from torch.utils import _pytree
 from torch.utils._python_dispatch import TorchDispatchMode
 
 from hwp_bench.methods.contract import TrainingCapture
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.descent import Descent
+from wildghand.fitting.disentangle import Dpd
 from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import Plateau
-from wildghand.fitting.rates import make_optimizer
-from wildghand.fitting.skin_places import skin_places
-from wildghand.fitting.weighting import Weighting, assess_frames, needs_places
+from wildghand.fitting.judging import HiddenSkin
+from wildghand.fitting.light import Shadows
+from wildghand.fitting.objective import Regularisers
+from wildghand.fitting.weights import MaskWeights, Pao
 from wildghand.gaussians.fit_loop import WINDOW, Guard, batches, choose_device, ready_device
-from wildghand.light import ShadowTable
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import Plateau
 
 FAKE = torch.device("meta")
 HAS_GPU = choose_device("auto").type == "cuda"
@@ -44,9 +48,9 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "paper": {"mode": "paper"},
     "released": {"mode": "released"},
     "binary": {"pao.variant": "binary"},
-    "bare": {"dpd.enabled": False, "pao.enabled": False, "heads.enabled": False},
+    "bare": {"dpd.enabled": False, "pao.enabled": False, "heads": False},
     "batch of 4": {"schedule.batch": 4},
-    "perceptual": {"terms.perceptual": 0.1, "terms.silhouette": 0.1, "terms.opacity": 0.1},
+    "perceptual": {"terms.perceptual": 0.1, "terms.weights": "published"},
 }
 
 
@@ -134,24 +138,31 @@ def moved(value: Any) -> Any:
 def fake_fit(training: TrainingCapture, changes: dict[str, Any]) -> Fit:
     """A fit that was made on the CPU and then brought to the fake device."""
     settings = read_settings({**QUICK, "device": "cpu", **changes})
-    fit = Fit(training, settings, 0, torch.device("cpu"))
-    templates = {side: training.template(side) for side in training.sides}
-    assessment = assess_frames(training, fit.frames, templates, settings)
-    fit.device = FAKE
+    fit = make_fit(training, settings, 0, torch.device("cpu"))
+    fit.device = fit.data.device = FAKE
+    for name in ("images", "masks"):
+        vars(fit.data).pop(name, None)
     fit.model = fit.model.to(FAKE)
     fit.model.rigs = moved(fit.model.rigs)
     fit.clip = moved(fit.clip)
     fit.clip._rigs = fit.model.rigs
-    objective = fit.objective
-    objective.temporal, objective._laplacians = moved((objective.temporal, objective._laplacians))
-    places = skin_places(training, fit.frames, templates) if needs_places(settings) else ()
+    held = fit.part(Dpd)
+    if held is not None:
+        held.temporal = moved(held.temporal)
+    smooth = part(fit, Regularisers)
+    smooth._laplacians = moved(smooth._laplacians)
     if fit.model.shadows is not None:
         for name in ("_corners", "_directions", "_strengths"):
             setattr(fit.model.shadows, name, moved(getattr(fit.model.shadows, name)))
-        assert isinstance(fit.dark, ShadowTable)
-        fit.dark._device = FAKE
-    fit.weighting = Weighting(fit.frames, len(training.sides), assessment, settings, FAKE, places)
-    fit.optimizer = make_optimizer(fit.model, fit.weighting.pao, settings)
+        table = part(fit, Shadows)._table
+        assert table is not None
+        table._device = FAKE
+    for kind in (HiddenSkin, Pao, MaskWeights):
+        found = fit.part(kind)
+        if found is not None:
+            found.before(fit)
+    others = {name: group for c in fit.components for name, group in c.parameters().items()}
+    fit.descent = Descent(fit.model, others, settings.schedule, fit._loss_of_features)
     return fit
 
 
@@ -178,7 +189,7 @@ def fake_device(monkeypatch: pytest.MonkeyPatch) -> None:
     optimizers = sys.modules[torch.optim.Optimizer.__module__]
     name = "_get_fused_kernels_supported_devices"
     monkeypatch.setattr(optimizers, name, lambda: ["cpu", "cuda", "meta"])
-    monkeypatch.setattr("wildghand.model.rasterize_hands.rasterize", stand_in)
+    monkeypatch.setattr("wildghand.model.frames.rasterize", stand_in)
 
 
 @pytest.mark.parametrize("name", VARIANTS)
@@ -186,7 +197,7 @@ def test_a_step_reads_nothing_from_the_device(
     name: str, fake_device: None, make_training: TrainingMaker
 ) -> None:
     fit = fake_fit(make_training("both" if name == "two hands" else "right"), VARIANTS[name])
-    order = batches(len(fit.frames), fit.settings.schedule.batch, 0)
+    order = batches(len(fit.data.frames), fit.settings.schedule.batch, 0)
     fit.step(next(order), 0.0)  # tables of targets are made in the first step
     guard, plateau = Guard(), Plateau(10 * WINDOW)
     with Waits() as waits, HandedOver() as handed:
@@ -230,7 +241,7 @@ def test_on_a_gpu_only_the_rasterizer_waits(
     name: str, monkeypatch: pytest.MonkeyPatch, make_training: TrainingMaker
 ) -> None:
     """gsplat itself reads how many tiles its splats cover; for that call the mode is off."""
-    import wildghand.model.rasterize_hands as module
+    import wildghand.model.frames as module
 
     rasterize = module.rasterize
 
@@ -243,8 +254,8 @@ def test_on_a_gpu_only_the_rasterizer_waits(
 
     settings = read_settings({**QUICK, "device": "cuda", **VARIANTS[name]})
     training = make_training("both" if name == "two hands" else "right")
-    fit = Fit(training, settings, 0, ready_device("cuda"))
-    order = batches(len(fit.frames), settings.schedule.batch, 0)
+    fit = make_fit(training, settings, 0, ready_device("cuda"))
+    order = batches(len(fit.data.frames), settings.schedule.batch, 0)
     for _ in range(3):
         fit.step(next(order), 0.0)
     monkeypatch.setattr(module, "rasterize", may_wait)

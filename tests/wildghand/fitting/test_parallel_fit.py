@@ -26,13 +26,13 @@ from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
 from wildghand.fitting import parallel
-from wildghand.fitting.fit import Fit
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.fit import Component
 from wildghand.fitting.method import WildGHandMethod
-from wildghand.fitting.objective import Objective
-from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.parallel import SINGLE_PROCESS, World, average_gradients, join, run_in_world
-from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.fitting.session import load_state, save_state
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import Watchers, run_fit
 
 SHORT: dict[str, Any] = {**TINY, "schedule.steps": 4, "schedule.batch": 2}
 VARIANTS: dict[str, dict[str, Any]] = {
@@ -51,43 +51,43 @@ CPU = torch.device("cpu")
 def fitted(request: Path, changes: dict[str, Any], world: World) -> tuple[State, State]:
     """Return the parameters before the first step and after the last."""
     settings = read_settings({**SHORT, **changes})
-    fit = Fit(open_request(request), settings, 0, CPU, world)
+    fit = make_fit(open_request(request), settings, 0, CPU, world)
     fit.require_same(0)
     start = fit.model.snapshot()
-    return start, optimize(fit, Budget(), SilentReport()).model.snapshot()
+    return start, run_fit(fit, Budget(), SilentReport()).model.snapshot()
 
 
 def resumed(request: Path, world: World, state: Path) -> State:
     """Two steps, a saved state, and the rest from it."""
     settings = read_settings({**SHORT, **VARIANTS["default"]})
-    half, watchers = Fit(open_request(request), settings, 0, CPU, world), Watchers(0)
+    half, watchers = make_fit(open_request(request), settings, 0, CPU, world), Watchers(0)
 
-    def save(step: int, watched: Watchers) -> None:
+    def save(step: int, watched: Watchers, loss: object) -> None:
         if step == 2 and world.is_main:
             save_state(state, half, watched, step=step, seconds=0.0, digest="d")
 
-    optimize(half, Budget(), SilentReport(), watchers=watchers, after_step=save)
+    run_fit(half, Budget(), SilentReport(), watchers=watchers, after_step=save)
     world.wait_for_main()
-    rest, watchers = Fit(open_request(request), settings, 0, CPU, world), Watchers(0)
+    rest, watchers = make_fit(open_request(request), settings, 0, CPU, world), Watchers(0)
     start, _ = load_state(state, rest, watchers, "d")
     rest.require_same(start)
-    return optimize(rest, Budget(), SilentReport(), start=start, watchers=watchers).model.snapshot()
+    return run_fit(rest, Budget(), SilentReport(), start=start, watchers=watchers).model.snapshot()
 
 
-class NanObjective(Objective):
-    """An objective that is always NaN."""
+class NanLoss(Component):
+    """A term that is always NaN."""
 
-    def __call__(self, *given: Any) -> torch.Tensor:
-        return super().__call__(*given) * math.nan
+    def loss(self, *given: Any) -> list[torch.Tensor]:
+        return [torch.tensor(math.nan)]
 
 
 def check_spoiled(request: Path, world: World) -> None:
     """A loss that is NaN in one process only stops the step in all of them."""
     settings = read_settings(SHORT)
-    fit = Fit(open_request(request), settings, 0, CPU, world)
+    fit = make_fit(open_request(request), settings, 0, CPU, world)
     before = fit.model.snapshot()
     if world.rank == 1:
-        fit.objective = NanObjective(settings, fit.model.rigs)
+        fit.components = [*fit.components, NanLoss()]
     assert math.isnan(fit.step(torch.tensor([0, 1]), 0.0))
     assert all(torch.equal(before[name], v) for name, v in fit.model.snapshot().items())
 

@@ -3,54 +3,46 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import pytest
 import torch
+from tiny_fits import UNJUDGED
 
-from wildghand.fitting.rates import rate_factor, set_rates
-from wildghand.gaussians.adam import ClippedAdam
-from wildghand.model.settings import ScheduleSettings
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.descent import rate_factor
+from wildghand.model.settings import ScheduleSettings, read_settings
 
 
 @pytest.mark.parametrize(
     ("fraction", "steps", "factor"),
-    [
-        (0.0, 0, 1.0),
-        (0.5, 0, 0.1),
-        (1.0, 0, 0.01),
-        (0.0, 150, 0.5),
-        (0.5, 150, 0.05),
-    ],
+    [(0.0, 0, 1.0), (0.5, 0, 0.3**0.5), (1.0, 0, 0.3), (0.0, 600, 0.5), (1.0, 600, 0.15)],
 )
 def test_rates_fall_geometrically_and_with_the_root_of_the_steps(
     fraction: float, steps: int, factor: float
 ) -> None:
-    schedule = ScheduleSettings(final_rate=0.01, root_steps=50.0)
-    assert rate_factor(schedule, fraction, steps) == pytest.approx(factor, rel=1e-12)
+    assert rate_factor(ScheduleSettings(), fraction, steps) == pytest.approx(factor, rel=1e-12)
 
 
-def test_without_root_steps_only_the_share_of_the_budget_counts() -> None:
-    schedule = ScheduleSettings(final_rate=0.01, root_steps=0.0)
-    assert rate_factor(schedule, 0.5, 10_000) == pytest.approx(0.1, rel=1e-12)
+def test_without_the_root_only_the_share_of_the_budget_counts() -> None:
+    schedule = ScheduleSettings(decay="geometric")
+    assert rate_factor(schedule, 0.5, 10_000) == pytest.approx(0.05**0.5, rel=1e-12)
 
 
 def test_halving_halves_at_even_shares() -> None:
-    schedule = ScheduleSettings(decay="halving", halvings=10, root_steps=0.0)
+    schedule = ScheduleSettings(decay="halving")
     found = [rate_factor(schedule, share, 7) for share in (0.0, 0.05, 0.1, 0.99)]
     assert found == [1.0, 1.0, 0.5, 0.5**9]
 
 
-def test_every_group_falls_from_its_own_rate() -> None:
-    tensors = [torch.zeros(1, requires_grad=True) for _ in range(2)]
-    groups = [
-        {"params": [tensor], "lr": rate, "start": rate}
-        for tensor, rate in zip(tensors, (0.1, 0.02), strict=True)
-    ]
-    optimizer = ClippedAdam(groups, 1.0)
-    schedule = ScheduleSettings(final_rate=0.25, root_steps=100.0)
+def test_every_group_falls_from_its_own_rate(make_training: Callable[..., TrainingCapture]) -> None:
+    settings = read_settings(UNJUDGED)
+    descent = make_fit(make_training(), settings, 0, torch.device("cpu")).descent
+    descent.steps = 300
     for _ in range(2):  # what was set before does not count
-        set_rates(optimizer, schedule, 0.5, 300)
-    factor = 0.5 / math.sqrt(4.0)
-    assert [group["lr"] for group in optimizer.param_groups] == pytest.approx(
-        [0.1 * factor, 0.02 * factor], rel=1e-12
-    )
+        descent.set_rates(0.5)
+    factor = math.sqrt(0.3) / math.sqrt(1.0 + 300 / 200)
+    found = {group["start"]: group["lr"] for group in descent.optimizer.param_groups}
+    assert len(found) > 4
+    assert list(found.values()) == pytest.approx([rate * factor for rate in found], rel=1e-12)

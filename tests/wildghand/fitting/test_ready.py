@@ -26,9 +26,8 @@ from hwp_bench.methods.request import open_request
 from hwp_bench.run import worker
 from hwp_bench.run.worker import RUN, read_facts
 from wildghand.fitting import session
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.method import WildGHandMethod
-from wildghand.fitting.ready import ready_fit
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.method import WildGHandMethod, ready_fit
 from wildghand.model.settings import read_settings
 
 #: Settings that call other kernels, or the same ones in another way.
@@ -40,7 +39,7 @@ VARIANTS: tuple[dict[str, Any], ...] = (
     {"schedule.batch": 4},
     {"prior": ""},
     {"dpd.enabled": False},
-    {"heads.enabled": False},
+    {"heads": False},
     {"prepass.enabled": False},
 )
 _PROGRAM = """
@@ -79,7 +78,7 @@ def versions() -> dict[str, int]:
 def test_a_step_compiles_nothing(make_training: Callable[..., TrainingCapture]) -> None:
     device = ready_fit("cpu")
     settings = read_settings({"gaussians": 600, "device": "cpu"})
-    fit = Fit(make_training(), settings, 0, device)
+    fit = make_fit(make_training(), settings, 0, device)
     before = versions()
     assert sum(before.values()) > 20
     for _ in range(2 * settings.schedule.texture_every):
@@ -156,7 +155,7 @@ def test_getting_ready_and_a_step_leave_torchs_compiler_out() -> None:
     program = """
 import sys
 import torch
-from wildghand.fitting.ready import ready_fit
+from wildghand.fitting.method import ready_fit
 from wildghand.gaussians.adam import ClippedAdam
 from wildghand.gaussians.fit_loop import repeatable
 with repeatable(ready_fit("cpu")):

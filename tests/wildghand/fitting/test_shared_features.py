@@ -8,7 +8,7 @@ import pytest
 import torch
 from torch import Tensor
 
-from wildghand.fitting.shared_features import SharedFeatures
+from wildghand.fitting.descent import SharedFeatures
 from wildghand.network import HandFeatures, PredictionNetwork, SurfacePoints, network_settings
 
 COUNT, EVERY = 40, 3

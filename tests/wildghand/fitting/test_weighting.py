@@ -8,71 +8,63 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from odd_fits import part
 from tiny_fits import TINY
 
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.judging_frames import judging_frames
-from wildghand.fitting.subject_shape import bent_templates, subject_of
-from wildghand.fitting.weighting import assess_frames
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.disentangle import Dpd
+from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.judging import Prepass
+from wildghand.fitting.weights import Pao
+from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.settings import read_settings
-from wildghand.pao.pao import PaoSettings
-from wildghand.prepass import PrepassSettings
+from wildghand.prepass import PrepassInput, judge_frames
 
 CPU = torch.device("cpu")
+#: What the pre-pass leads PAO to spare is off.
+STRICT: dict[str, Any] = {"pao.mismatch": 0.0, "pao.spare_clean": False}
 ROWS = torch.tensor([0, 3])
 TrainingMaker = Callable[..., TrainingCapture]
-
-
-@pytest.fixture
-def _strict(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What the pre-pass leads PAO to spare is off."""
-    monkeypatch.setattr(PaoSettings, "mismatch", 0.0)
-    monkeypatch.setattr(PaoSettings, "spare_clean", False)
 
 
 def fit_of(training: TrainingCapture, **changes: Any) -> Fit:
     """A fit before its first step; shadows take part in no weight, and their time is saved."""
     settings = read_settings({**TINY, "shadows.enabled": False, **changes})
-    return Fit(training, settings, 0, CPU)
+    return make_fit(training, settings, 0, CPU)
 
 
-@pytest.mark.usefixtures("_strict")
 def test_frames_teach_by_their_temporal_weights(make_training: TrainingMaker) -> None:
-    fit = fit_of(make_training())
+    fit = fit_of(make_training(), **STRICT)
     omega = torch.tensor([0.0, -0.2])
-    shares = fit.weighting.shares(ROWS, omega)
+    shares = part(fit, Pao).shares(ROWS, omega)
     np.testing.assert_allclose(shares, [1.0, 1.0 / (1.0 + 100.0 * 0.2)], rtol=1e-6)
 
 
 def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
-    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+    make_training: TrainingMaker,
 ) -> None:
     # Oracle: the formula on the best tenth of the misplacements, by hand. A bent template would
     # meet the masks of this clip.
     training = make_training()
-    monkeypatch.setattr(PaoSettings, "mismatch", 0.5)
-    fit = fit_of(training, **{"subject.enabled": False})
-    templates = {side: training.template(side) for side in training.sides}
-    assessment = assess_frames(training, fit.frames, templates, fit.settings)
-    assert assessment is not None
+    fit = fit_of(training, **{"pao.mismatch": 0.5, "subject.enabled": False})
+    assessment = part(fit, Prepass).assessment
     found = np.quantile(assessment.misplacement[assessment.usable], 0.1)
     shared = 0.5 * found / fit.settings.prepass.misplacement_floor
     tolerance = shared**2 / (1.0 + shared**2)
     assert 0.0 < tolerance < 1.0
-    shares = fit.weighting.shares(ROWS, torch.tensor([0.0, -0.2]))
+    shares = part(fit, Pao).shares(ROWS, torch.tensor([0.0, -0.2]))
     alone = 1.0 / (1.0 + 100.0 * 0.2)
     np.testing.assert_allclose(shares, [1.0, alone + tolerance * (1.0 - alone)], rtol=1e-6)
     # Regions that are rejected keep that share of the hand's weight.
-    drawing = fit.draw(ROWS)
-    lifted = fit.weighting(ROWS, drawing).weights
-    monkeypatch.setattr(PaoSettings, "mismatch", 0.0)
-    strict = fit_of(training, **{"subject.enabled": False}).weighting(ROWS, drawing).weights
+    drawing = fit.draw(Batch(ROWS))
+    lifted = fit.compare(Batch(ROWS), drawing).weights
+    without = {"pao.mismatch": 0.0, "subject.enabled": False}
+    strict = fit_of(training, **without).compare(Batch(ROWS), drawing).weights
     assert (lifted >= strict - 1e-6).all()
     assert lifted.sum() > strict.sum()
-    monkeypatch.undo()
     # Without the pre-pass nothing is known of it.
-    assert fit_of(training, **{"prepass.enabled": False}).weighting.tolerance == 0.0
+    assert part(fit_of(training, **{"prepass.enabled": False}), Pao).tolerance == 0.0
 
 
 @pytest.mark.parametrize(
@@ -89,89 +81,86 @@ def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
 def test_all_frames_teach_alike_where_a_part_of_it_is_missing(
     changes: dict[str, Any], make_training: TrainingMaker
 ) -> None:
-    assert fit_of(make_training(), **changes).weighting.shares(ROWS, torch.ones(2)) is None
+    fit = fit_of(make_training(), **changes)
+    found = fit.part(Pao)
+    assert found is None or "teach" not in found.draws(fit, Batch(ROWS))
 
 
-@pytest.mark.usefixtures("_strict")
 def test_what_is_explained_teaches(make_training: TrainingMaker) -> None:
-    fit = fit_of(make_training(), **{"dpd.pay_back": 2.0})
-    weighting, omega = fit.weighting, torch.tensor([0.4, 0.4])
+    fit = fit_of(make_training(), **{"dpd.pay_back": 2.0, "pao.mismatch": 0.0})
+    weighting, omega = part(fit, Pao), torch.tensor([0.4, 0.4])
     assert weighting.pay_back is not None
     before = weighting.shares(ROWS, omega)
-    weighting.clean[:] = 1.0
     weighting.pay_back._clean[:] = True
     weighting.pay_back.residuals[:] = 0.01
     assert float(weighting.shares(ROWS, omega)[0]) == pytest.approx(np.exp(-0.25), rel=1e-5)
     assert float(before[0]) < 0.03
     # Drawing a frame is what tells how well it is explained.
     weighting.pay_back.residuals.zero_()
-    weighting(ROWS, fit.draw(ROWS))
+    fit.compare(Batch(ROWS), fit.draw(Batch(ROWS)))
     assert (weighting.pay_back.residuals[ROWS] > 0.0).all()
     assert int((weighting.pay_back.residuals > 0.0).sum()) == 2
 
 
-@pytest.mark.usefixtures("_strict")
 @pytest.mark.parametrize("pao", [True, False])
 def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
     pao: bool, make_training: TrainingMaker
 ) -> None:
     training = make_training()
     fit, bare = (
-        fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on}) for on in (True, False)
+        fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on, **STRICT})
+        for on in (True, False)
     )
-    templates = {side: training.template(side) for side in training.sides}
-    judges = judging_frames(training, fit.settings)
-    subject = subject_of(training, fit.frames, templates, fit.settings, judges)
-    bent = bent_templates(templates, subject)
-    assessment = assess_frames(training, fit.frames, bent, fit.settings, judges)
-    assert assessment is not None
-    drawing = fit.draw(ROWS)
-    weights, whole = fit.weighting(ROWS, drawing).weights, bare.weighting(ROWS, drawing).weights
+    assessment = part(fit, Prepass).assessment
+    drawing = fit.draw(Batch(ROWS))
+    weights, whole = (
+        fit.compare(Batch(ROWS), drawing).weights,
+        bare.compare(Batch(ROWS), drawing).weights,
+    )
     expected = whole * torch.from_numpy(assessment.pixel_weights[ROWS.numpy()]).float() / 255.0
     torch.testing.assert_close(weights.detach(), expected.detach(), rtol=1e-5, atol=1e-6)
 
 
-def test_validation_frames_are_known_to_be_clean(
-    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_validation_frames_are_known_to_be_clean(make_training: TrainingMaker) -> None:
     # Oracle: the pre-pass with the validation frames and without; a clip that tolerates nothing.
     training = make_training()
-    believing = fit_of(training, **{"prepass.tolerance": 1e-3})
-    monkeypatch.setattr(PrepassSettings, "validated", False)
-    alone = fit_of(training, **{"prepass.tolerance": 1e-3})
-    monkeypatch.undo()
-    judges = judging_frames(training, believing.settings)
+    believing, alone = (
+        fit_of(training, **{"prepass.validated": on, "prepass.tolerance": 1e-3})
+        for on in (True, False)
+    )
+    judges = believing.data.judges
     assert judges is not None
     assert set(judges.indices.tolist()) <= set(training.validation.tolist())
-    templates = {side: training.template(side) for side in training.sides}
-    subject = subject_of(training, alone.frames, templates, alone.settings, judges)
-    bent = bent_templates(templates, subject)
-    for fit, known in ((believing, judges), (alone, None)):
-        expected = assess_frames(training, fit.frames, bent, believing.settings, known)
-        assert expected is not None
-        np.testing.assert_array_equal(fit.weighting.clean, np.float32(expected.clean))
-    assert (believing.weighting.clean >= alone.weighting.clean).all()
-    assert not torch.equal(believing.weighting.clean, alone.weighting.clean)
+
+    def given(frames: TrainingFrames) -> PrepassInput:
+        images, masks = np.asarray(frames.images), np.asarray(frames.masks)
+        bent = believing.data.bent
+        return PrepassInput(frames.indices, images, masks, training.hands, training.cameras, bent)
+
+    for fit, known in ((believing, given(judges)), (alone, None)):
+        expected = judge_frames(given(fit.data.frames), believing.settings.prepass, known)
+        np.testing.assert_array_equal(fit.data.judgement.clean, np.float32(expected.clean))
+    assert (believing.data.judgement.clean >= alone.data.judgement.clean).all()
+    assert not torch.equal(believing.data.judgement.clean, alone.data.judgement.clean)
     # They teach nothing: a fit has the rows of its training frames alone.
-    assert believing.frames.indices.tolist() == alone.frames.indices.tolist()
+    assert believing.data.frames.indices.tolist() == alone.data.frames.indices.tolist()
 
 
 def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(
-    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+    make_training: TrainingMaker,
 ) -> None:
     # Oracle: w + c (1 - w) on the weights of regions, from those of the fit that spares nothing.
     training = make_training()
-    monkeypatch.setattr(PaoSettings, "mismatch", 0.0)
-    spares = fit_of(training)
-    monkeypatch.setattr(PaoSettings, "spare_clean", False)
-    strict = fit_of(training)
-    clean = spares.weighting.clean[ROWS]
+    spares, strict = (
+        fit_of(training, **{"pao.mismatch": 0.0, "pao.spare_clean": on}) for on in (True, False)
+    )
+    clean = spares.data.judgement.clean[ROWS]
     assert (clean > 0.0).all()
-    drawing = spares.draw(ROWS)
-    found = spares.weighting(ROWS, drawing)
-    lower = strict.weighting(ROWS, drawing).weights
+    drawing = spares.draw(Batch(ROWS))
+    found = spares.compare(Batch(ROWS), drawing)
+    lower = strict.compare(Batch(ROWS), drawing).weights
     outside = spares.settings.terms.outside_weight * (1.0 - found.hand)
-    pixels = spares.weighting._uncovered(ROWS)
+    pixels = spares.data.uncovered(ROWS)
     regions = lower - outside * pixels
     expected = lower + clean[:, None, None] * (found.hand * pixels - regions)
     torch.testing.assert_close(found.weights, expected, rtol=1e-5, atol=1e-6)
@@ -180,25 +169,27 @@ def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(
 def test_regions_that_are_drawn_badly_count_less(make_training: TrainingMaker) -> None:
     fit = fit_of(make_training(), **{"prepass.enabled": False, "pao.temporal": "none"})
     row = torch.tensor([0])
-    drawing = fit.draw(row)
-    target = fit.weighting(row, drawing)
-    hand = fit.weighting(row, drawing).hand[0] > 0.9
+    drawing = fit.draw(Batch(row))
+    target = fit.compare(Batch(row), drawing)
+    hand = fit.compare(Batch(row), drawing).hand[0] > 0.9
     error = (drawing.image[0].detach() - target.image[0]).abs().mean(dim=-1)
     worst, best = (error >= error[hand].quantile(0.9)), (error <= error[hand].quantile(0.1))
     weights = target.weights[0].detach()
     assert weights[hand & worst].mean() < 0.8 * weights[hand & best].mean()
-    assert fit.weighting.median is not None
+    assert part(fit, Pao).median is not None
 
 
 def test_omega_starts_where_the_prepass_weight_puts_it(make_training: TrainingMaker) -> None:
     fit = fit_of(make_training())
-    rows = torch.arange(len(fit.frames))
+    rows = torch.arange(len(fit.data.frames))
     omega = fit.model.biases[0].temporal(rows).omega.detach()
-    target = fit.objective.temporal.omega
+    temporal = part(fit, Dpd).temporal
+    assert temporal is not None
+    target = temporal.omega
     assert float((omega - target).abs().mean()) < 0.05
     # docs/dpd_pao.md: 1 in a clean frame, 0.02 in a perturbed one.
-    expected = 1.0 / (1.0 + 12.5 * (1.0 / fit.weighting.frame_weights - 1.0))
-    factor = fit.weighting.pao.temporal_factor(target)
+    expected = 1.0 / (1.0 + 12.5 * (1.0 / fit.data.judgement.frame_weights - 1.0))
+    factor = part(fit, Pao).weights.temporal_factor(target)
     torch.testing.assert_close(factor, expected, rtol=1e-4, atol=1e-4)
     assert 0.0196 - 1e-4 <= float(factor.min()) < float(factor.max()) <= 1.0
 
@@ -207,20 +198,26 @@ def test_without_heads_the_template_stands_and_nothing_else_changes(
     make_training: TrainingMaker,
 ) -> None:
     training = make_training()
-    fit, bare = fit_of(training), fit_of(training, **{"heads.enabled": False})
+    fit, bare = fit_of(training), fit_of(training, **{"heads": False})
     for made in (fit, bare):
         with torch.no_grad():
             for value in made.model.network.template_head.parameters():
                 value.fill_(0.05)
     row = torch.tensor([0])
-    moved = fit.draw(row).hands["right"].prediction.template_offsets
-    still = bare.draw(row).hands["right"].prediction.template_offsets
+    moved = fit.draw(Batch(row)).hands["right"].prediction.template_offsets
+    still = bare.draw(Batch(row)).hands["right"].prediction.template_offsets
     assert moved.abs().max() > 0.0
     assert (still == 0.0).all()
-    raw = (made.draw(row).hands["right"].prediction.raw.concatenate() for made in (fit, bare))
+    raw = (
+        made.draw(Batch(row)).hands["right"].prediction.raw.concatenate() for made in (fit, bare)
+    )
     assert torch.equal(*raw)
     loss = bare.objective(
-        bare.model, bare.draw(row), bare.weighting(row, bare.draw(row)), row, torch.ones(1)
+        bare.model,
+        bare.draw(Batch(row)),
+        bare.weighting(row, bare.draw(Batch(row))),
+        row,
+        torch.ones(1),
     )
     loss.backward()
     assert all(

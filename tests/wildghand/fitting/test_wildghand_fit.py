@@ -27,14 +27,14 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.files import load_avatar, save_avatar
 from wildghand.cli.main import main
-from wildghand.fitting import fit_capture
-from wildghand.fitting.fit import Fit
+from wildghand.fitting import descent, fit_capture
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.method import WildGHandMethod
-from wildghand.fitting.optimize import Watchers, optimize
 from wildghand.fitting.parallel import World
-from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.fitting.session import load_state, save_state
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import Watchers, run_fit
 from wildghand.splat import rasterize
 
 FIT: dict[str, Any] = {**QUICK, "schedule.steps": 60}
@@ -79,7 +79,7 @@ def test_a_fit_learns_what_the_frames_show(
     [
         {"dpd.enabled": False},
         {"pao.enabled": False},
-        {"heads.enabled": False},
+        {"heads": False},
         {"pao.variant": "binary"},
         {"dpd.biases": False},
         {"dpd.pay_back": 1.5},
@@ -120,7 +120,7 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
     class Stopped(Exception):
         pass
 
-    def stop(step: int, watchers: Watchers) -> None:
+    def stop(step: int, watchers: Watchers, loss: object) -> None:
         if step == 17:
             save_state(
                 tmp_path / "state", half, watchers, step=step, seconds=1.5, digest="of this fit"
@@ -128,14 +128,14 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
             raise Stopped
 
     report = SilentReport()
-    whole = optimize(Fit(training, settings, 0, device), Budget(), report)
+    whole = run_fit(make_fit(training, settings, 0, device), Budget(), report)
     assert [step for step, _ in report.offers] == list(range(31))
-    half = Fit(training, settings, 0, device)
+    half = make_fit(training, settings, 0, device)
     with pytest.raises(Stopped):
-        optimize(half, Budget(), SilentReport(), after_step=stop)
-    rest, watchers = Fit(training, settings, 0, device), Watchers(0)
+        run_fit(half, Budget(), SilentReport(), after_step=stop)
+    rest, watchers = make_fit(training, settings, 0, device), Watchers(0)
     assert load_state(tmp_path / "state", rest, watchers, "of this fit") == (17, 1.5)
-    resumed = optimize(rest, Budget(), SilentReport(), start=17, watchers=watchers)
+    resumed = run_fit(rest, Budget(), SilentReport(), start=17, watchers=watchers)
     expected, found = whole.model.snapshot(), resumed.model.snapshot()
     assert all(torch.equal(expected[name], found[name]) for name in expected)
     with pytest.raises(BadInput, match="another capture"):
@@ -146,15 +146,16 @@ def test_a_stopped_fit_goes_on_as_if_it_had_not_been(
 
 
 def test_rates_far_too_high_stop_with_a_message_or_keep_the_best(
-    make_training: TrainingMaker, capsys: pytest.CaptureFixture[str]
+    make_training: TrainingMaker,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     training = make_training()
-    high = {
-        f"schedule.rates.{name}": 3.0 for name in ("identity", "direct", "light", "network", "dpd")
-    }
-    high["schedule.clip_gradient"] = 0
+    for name in ("identity", "direct", "light", "network"):
+        monkeypatch.setitem(descent._RATES["fast"], name, 3.0)
+    monkeypatch.setattr(descent, "_CLIP", 0.0)
     try:
-        avatar = fitted(training, steps=150, **high)
+        avatar = fitted(training, steps=150, **{"schedule.dpd_rate": 1.0})
     except DidNotConverge:
         return
     assert avatar.model.finite()
@@ -301,7 +302,7 @@ def test_the_wall_of_a_wrist_moves_with_the_refined_hand(
 ) -> None:
     training = make_training()
     avatar = fitted(training, steps=2, **{"shadows.enabled": False})
-    assert avatar.settings.heads.refinement
+    assert avatar.settings.heads
     own, before = (avatar.pose(training.hand_poses(3), closed=closed) for closed in (False, True))
     predict, shift = WildGHandModel.predict, torch.tensor([0.01, -0.02, 0.03])
 

@@ -19,7 +19,7 @@ from hwp_bench.hands import load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
 from wildghand.gaussians.attributes import Activation, RawAttributes
 from wildghand.gaussians.regularizers import off_surface
-from wildghand.model.assemble import make_model
+from wildghand.model.model import make_model
 from wildghand.model.settings import read_settings
 from wildghand.network import NetworkOutput
 

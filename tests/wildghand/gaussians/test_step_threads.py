@@ -11,11 +11,11 @@ from stopped_clock import stop_clock
 from tiny_fits import TINY
 
 from hwp_bench.methods.contract import Budget
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import optimize
+from wildghand.fitting.components import make_fit
 from wildghand.gaussians import fit_loop as step_threads
 from wildghand.gaussians.fit_loop import BLOCK, HELD, TURNS, StepThreads, candidates, fewest
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import run_fit
 from wildghand.splat import threads
 
 CPU = torch.device("cpu")
@@ -122,8 +122,8 @@ def test_a_fit_has_the_same_bits_whatever_was_chosen(
             return threads.at_most(number)
 
     def fitted(*numbers: int) -> dict[str, torch.Tensor]:
-        fit = Fit(make_training(), settings, 0, CPU)
-        optimize(fit, Budget(steps=3), Silent(), threads=Changing(numbers))
+        fit = make_fit(make_training(), settings, 0, CPU)
+        run_fit(fit, Budget(steps=3), Silent(), threads=Changing(numbers))
         return fit.model.snapshot()
 
     try:

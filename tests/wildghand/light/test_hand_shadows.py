@@ -15,7 +15,8 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import load_template, pose_hand, vertex_normals
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
-from wildghand.fitting.fit import Fit
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.light import Shadows
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig, make_rig
 from wildghand.light import CastLight, HandShadows, Obstacles, ShadowSettings, ShadowTable
@@ -144,7 +145,7 @@ def test_shading_is_the_irradiance_with_nothing_in_the_way(rigs: dict[str, HandR
 
 
 def test_the_table_of_a_clip_holds_the_same(make_training: TrainingMaker) -> None:
-    fit = Fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
+    fit = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     shadows = HandShadows(fit.model.rigs, a_light(), ShadowSettings())
     table = ShadowTable(shadows, fit.clip)
     pose, betas, transl = fit.clip.parameters["right"]
@@ -158,7 +159,7 @@ def test_shadows_darken_what_is_drawn_and_are_kept(
     make_training: TrainingMaker, tmp_path: Path
 ) -> None:
     training = make_training()
-    fit = Fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
+    fit = make_fit(training, read_settings(UNJUDGED), 0, torch.device("cpu"))
     frame = int(training.validation[0])
     hands, camera = training.hand_poses(frame), training.camera(frame)
     fit.model.shadows = None
@@ -181,11 +182,11 @@ def test_shadows_darken_what_is_drawn_and_are_kept(
 
 
 def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMaker) -> None:
-    fit = Fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
+    fit = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     fit.model.keep(a_light())
     rows = torch.tensor([1, 4])
     table = ShadowTable(HandShadows(fit.model.rigs, a_light(), ShadowSettings()), fit.clip)
-    size = fit.training.width, fit.training.height
+    size = fit.data.training.width, fit.data.training.height
     # Without factors at hand the model casts them itself.
     own = fit.model.draw_frames(fit.clip, rows, *size)
     given = fit.model.draw_frames(fit.clip, rows, *size, dark=table(rows))
@@ -195,13 +196,15 @@ def test_training_frames_are_drawn_with_their_shadows(make_training: TrainingMak
 
 
 def test_a_fit_finds_a_light_unless_it_is_switched_off(make_training: TrainingMaker) -> None:
-    found = Fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
+    found = make_fit(make_training(), read_settings(UNJUDGED), 0, torch.device("cpu"))
     assert found.model.shadows is not None
-    assert set(found.dark(torch.tensor([0]))) == {"right"}
+    shadows = found.part(Shadows)
+    assert shadows is not None
+    assert set(shadows.dark(torch.tensor([0]))) == {"right"}
     off = read_settings({**UNJUDGED, "shadows.enabled": False})
-    without = Fit(make_training(), off, 0, torch.device("cpu"))
+    without = make_fit(make_training(), off, 0, torch.device("cpu"))
     assert without.model.shadows is None
-    assert without.dark(torch.tensor([0])) == {}
+    assert without.part(Shadows) is None
     assert not [name for name, _ in without.model.named_buffers() if name.startswith("shadows_")]
 
 

@@ -12,7 +12,7 @@ from torch import Tensor
 from wildghand.gaussians.attributes import RawAttributes
 from wildghand.gaussians.rig import AnchorPoses
 from wildghand.light import KnownLight
-from wildghand.model.relight import camera_centres, carried_on, relit
+from wildghand.model.frames import camera_centres, carried_on, relit
 from wildghand.network import NetworkOutput
 
 COUNT = 40

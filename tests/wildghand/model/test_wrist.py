@@ -16,7 +16,7 @@ from hwp_bench.hands.raster import draw_faces
 from hwp_bench.hands.template import open_loops
 from wildghand.gaussians.rig import HandRig, make_rig
 from wildghand.model.dress import Gaussians
-from wildghand.model.rasterize_hands import rasterize_hands
+from wildghand.model.frames import rasterize_hands
 from wildghand.model.wrist import WristWall
 
 SIZE = 192

@@ -20,7 +20,8 @@ from tiny_fits import TINY
 import wildghand
 from hwp_bench.capture import Capture
 from wildghand.avatar import WildGHandAvatar, load_avatar, save_avatar
-from wildghand.fitting.fit import Fit
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.fit import Batch
 from wildghand.model.settings import read_settings
 from wildghand.page import bake_hand, write_page
 from wildghand.page.bake import bake_biases
@@ -76,13 +77,13 @@ def psnr(found: np.ndarray, truth: np.ndarray, coverage: np.ndarray) -> float:
 def test_gaussians_of_a_frame_are_those_that_the_fit_draws(make_training: Any) -> None:
     training = make_training("right")
     settings = read_settings({**QUICK, "evidence.enabled": False, "light.enabled": False})
-    fit = Fit(training, settings, 0, torch.device("cpu"))
+    fit = make_fit(training, settings, 0, torch.device("cpu"))
     with torch.no_grad():
         fit.model.biases_of("right").psi.bias.fill_(1.0)
         fit.model.log_gains.fill_(-0.3)
         row = torch.tensor([4])
-        drawn = fit.draw(row)
-        frame = int(fit.frames.indices[4])
+        drawn = fit.draw(Batch(row))
+        frame = int(fit.data.frames.indices[4])
         avatar = fit.avatar(0)
         given = avatar.posed({"right": training.hand_poses(frame)["right"]})["right"]
         made, _ = fit.model.gaussians("right", *given, rows=row)

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from painted import FRAMES, cameras, hand_parameters, painted_info
+from painted import FRAMES, SilentReport, cameras, hand_parameters, painted_info
 from safetensors.torch import load_file, save_file
 from tiny_fits import TINY
 
@@ -28,13 +28,14 @@ from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from wildghand.avatar.files import load_avatar
 from wildghand.cli.main import main
-from wildghand.fitting.fit import Fit
-from wildghand.fitting.optimize import Watchers
-from wildghand.fitting.saved_state import load_state, save_state
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.fit import Batch, Fit
+from wildghand.fitting.session import load_state, save_state
 from wildghand.model.settings import read_settings
 from wildghand.network import network_settings
-from wildghand.pretrain.joint import JointFit, take_steps
-from wildghand.prior.files import DESCRIPTION, WEIGHTS, choose_prior, find_prior, load_prior
+from wildghand.plain.loop import Watchers, run_fit
+from wildghand.pretrain.pretrain import JointFit
+from wildghand.prior.prior import DESCRIPTION, WEIGHTS, choose_prior, find_prior, load_prior
 
 QUICK: dict[str, Any] = {**TINY, "gaussians": 400, "schedule.steps": 40}
 NETWORK = network_settings(identity_resolution=24, plane_resolution=12)
@@ -86,13 +87,12 @@ def mean_loss(fit: Fit) -> float:
     """L1 + D-SSIM over all training frames, without steps."""
     with torch.no_grad():
         losses = []
-        for row in range(len(fit.frames)):
+        for row in range(len(fit.data.frames)):
             rows = torch.tensor([row])
-            drawing = fit.draw(rows)
-            target = fit.weighting(rows, drawing)
-            losses.append(
-                fit.objective(fit.model, drawing, target, rows, fit.weighting.clean[rows])
-            )
+            drawing = fit.draw(Batch(rows))
+            target = fit.compare(Batch(rows), drawing)
+            terms = (t for c in fit.components for t in c.loss(fit, Batch(rows), drawing, target))
+            losses.append(torch.stack(list(terms)).sum())
         return float(torch.stack(losses).mean())
 
 
@@ -102,8 +102,8 @@ def test_a_prior_of_two_subjects_helps_a_third(
     training = training_of(subjects["dora"], tmp_path)
     # Without the light of the clip, which tells both most of what a prior of 60 steps knows.
     alone = {**QUICK, "shadows.enabled": False}
-    plain = Fit(training, read_settings(alone), 0, CPU)
-    ahead = Fit(training, read_settings({**alone, "prior": str(prior)}), 0, CPU)
+    plain = make_fit(training, read_settings(alone), 0, CPU)
+    ahead = make_fit(training, read_settings({**alone, "prior": str(prior)}), 0, CPU)
     assert mean_loss(ahead) < 0.8 * mean_loss(plain)
     # And it stays ahead while both are fitted.
     for fit in (plain, ahead):
@@ -133,18 +133,18 @@ def test_maps_are_averaged_and_a_hand_not_seen_takes_the_other_ones(
         0,
         CPU,
     )
-    take_steps(joint, 4, Watchers(0))
+    weights, _ = run_fit(joint, Budget(steps=4), SilentReport())
     first, second = (fit.model.network for fit in joint.fits)
     assert first.texture_branch is second.texture_branch
     maps = [network.identity("right").detach() for network in (first, second)]
     assert not torch.equal(*maps)
     torch.testing.assert_close(
-        joint.weights()["identity.maps.right"], (maps[0] + maps[1]) / 2, rtol=0, atol=1e-7
+        weights["identity.maps.right"], (maps[0] + maps[1]) / 2, rtol=0, atol=1e-7
     )
     both = make_training("both")
     # Frames' colours would change the maps of the two hands apart.
     settings = read_settings({**QUICK, "prior": str(prior), "start_colors": False})
-    network = Fit(both, settings, 0, CPU).model.network
+    network = make_fit(both, settings, 0, CPU).model.network
     assert torch.equal(network.identity("left"), network.identity("right"))
 
 
@@ -154,25 +154,26 @@ def test_the_same_seed_repeats_and_a_stopped_run_goes_on(
     trainings = [training_of(subjects[name], tmp_path) for name in ("anna", "ben")]
     settings = read_settings(QUICK)
     whole, half, rest = (JointFit(trainings, settings, 0, CPU) for _ in range(3))
-    take_steps(whole, 13, Watchers(0))
-    watchers = Watchers(0)
+    budget, watchers = Budget(steps=13), Watchers(0)
+    expected_weights, _ = run_fit(whole, budget, SilentReport())
 
     class Stopped(Exception):
         pass
 
-    def stop(step: int) -> None:
+    def stop(step: int, watchers: Watchers, loss: object) -> None:
         if step == 7:
             save_state(tmp_path / "state", half, watchers, step=7, seconds=1.0, digest="d")
             raise Stopped
 
     with pytest.raises(Stopped):
-        take_steps(half, 13, watchers, after_step=stop)
+        run_fit(half, budget, SilentReport(), watchers=watchers, after_step=stop)
     resumed = Watchers(0)
     assert load_state(tmp_path / "state", rest, resumed, "d") == (7, 1.0)
-    assert take_steps(rest, 13, resumed, start=7) == 13
+    weights, steps = run_fit(rest, budget, SilentReport(), start=7, watchers=resumed)
+    assert steps == 13
     expected, found = whole.snapshot(), rest.snapshot()
     assert all(torch.equal(expected[name], found[name]) for name in expected)
-    assert all(torch.equal(whole.weights()[name], value) for name, value in rest.weights().items())
+    assert all(torch.equal(expected_weights[name], value) for name, value in weights.items())
 
 
 def test_the_commands_use_a_prior(
@@ -296,22 +297,22 @@ def test_the_prior_that_ships_saw_no_subject_and_no_scene_of_a_suite(
 
 def test_a_default_fit_starts_from_the_prior_that_ships(make_training: Callable[..., Any]) -> None:
     training = make_training("right")
-    fit = Fit(training, read_settings({"gaussians": 200}), 0, CPU)
+    fit = make_fit(training, read_settings({"gaussians": 200}), 0, CPU)
     shipped = choose_prior(fit.settings, training.hand_model)
     assert shipped is not None
-    assert fit.source["prior"] == shipped.record.weights
+    assert fit.avatar(0).record.source["prior"] == shipped.record.weights
     # Start colours change channels of the map after the prior is there.
-    untinted = Fit(training, read_settings({"gaussians": 200, "start_colors": False}), 0, CPU)
+    untinted = make_fit(training, read_settings({"gaussians": 200, "start_colors": False}), 0, CPU)
     found = untinted.model.network.identity("right")
     torch.testing.assert_close(found, shipped.tensors[MAP], rtol=0, atol=0)
-    bare = Fit(training, read_settings({"gaussians": 200, "prior": ""}), 0, CPU)
-    assert "prior" not in bare.source
+    bare = make_fit(training, read_settings({"gaussians": 200, "prior": ""}), 0, CPU)
+    assert "prior" not in bare.avatar(0).record.source
 
 
 def test_captures_of_different_hand_models_are_refused(
     subjects: dict[str, Path], make_capture: Callable[..., Capture], tmp_path: Path
 ) -> None:
-    from wildghand.pretrain.session import pretrain
+    from wildghand.pretrain.pretrain import pretrain
 
     other = make_capture("other", frames=20)
     info = other.root / "capture.json"

@@ -7,7 +7,7 @@ import pytest
 from hwp_bench.capture.schema import HandModelId
 from hwp_bench.hands import load_template
 from wildghand.model.settings import read_settings
-from wildghand.prior.files import choose_prior
+from wildghand.prior.prior import choose_prior
 
 
 @pytest.mark.parametrize("side", ["right", "left"])

@@ -15,10 +15,13 @@ from tiny_fits import TINY
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.fitting import fit_capture
+from wildghand.fitting.components import make_fit
 from wildghand.fitting.fit import Fit
 from wildghand.fitting.glance import Glance, glance
-from wildghand.fitting.optimize import optimize
+from wildghand.fitting.session import Watch
+from wildghand.gaussians.fit_loop import Loss
 from wildghand.model.settings import read_settings
+from wildghand.plain.loop import Watchers, run_fit
 from wildghand.viewer.live import Live
 
 QUICK: dict[str, Any] = {**TINY, "gaussians": 400}
@@ -33,12 +36,16 @@ def test_a_watched_fit_gives_the_same_bits(
     settings = read_settings({**QUICK, "schedule.steps": 10, **changes})
     seen: list[Glance] = []
 
-    def fitted(**options: Any) -> dict[str, torch.Tensor]:
-        fit = Fit(training, settings, 0, torch.device("cpu"))
-        return optimize(fit, Budget(), SilentReport(), **options).model.state_dict()
+    def fitted(watch: Watch) -> dict[str, torch.Tensor]:
+        fit = make_fit(training, settings, 0, torch.device("cpu"))
 
-    expected = fitted()
-    found = fitted(watch=Live(seen.append, row=lambda count: len(seen) % count, pause=0.0))
+        def look(step: int, watchers: Watchers, loss: Loss) -> None:
+            watch(fit, step, loss)
+
+        return run_fit(fit, Budget(), SilentReport(), after_step=look).model.state_dict()
+
+    expected = fitted(lambda fit, step, loss: None)
+    found = fitted(Live(seen.append, row=lambda count: len(seen) % count, pause=0.0))
     assert expected.keys() == found.keys()
     assert all(torch.equal(expected[name], found[name]) for name in expected)
     assert [look.step for look in seen] == list(range(1, 11))
@@ -48,9 +55,9 @@ def test_a_watched_fit_gives_the_same_bits(
 def test_a_glance_shows_the_frame_the_avatar_and_the_weights(make_training: TrainingMaker) -> None:
     training = make_training()
     settings = read_settings({**QUICK, "schedule.steps": 60})
-    fit = Fit(training, settings, 0, torch.device("cpu"))
+    fit = make_fit(training, settings, 0, torch.device("cpu"))
     first = glance(fit, 2, 0, 1.0)
-    avatar = optimize(fit, Budget(), SilentReport())
+    avatar = run_fit(fit, Budget(), SilentReport())
     last = glance(fit, 2, 60, 0.5)
     assert last.psnr > first.psnr + 3.0
     frame = last.frame
@@ -87,7 +94,7 @@ def test_the_clock_of_a_fit_stands_still_while_it_is_watched(
 def test_a_look_waits_for_its_time_and_for_somebody_who_looks(
     make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fit = Fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
+    fit = make_fit(make_training(), read_settings(QUICK), 0, torch.device("cpu"))
     now, seen, looked = [100.0], [], [False]
     monkeypatch.setattr("wildghand.viewer.live.time.monotonic", lambda: now[0])
 

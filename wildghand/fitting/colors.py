@@ -1,0 +1,362 @@
+"""Colours of places that frames do not show well: before the fit, and after it.
+
+Before it, the identity map starts from the frames' colours where no skin has these (`StartColors`).
+After it, a hand takes the colours of the other hand (`OtherHand`), and places that few frames have
+shown take those of the skin around them (`FilledColors`). These two compare colours under the light
+that the clip shows, as logarithms of linear light.
+"""
+
+from __future__ import annotations
+
+import functools
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from hwp_bench.base.colors import linear_to_srgb, srgb_to_linear
+from wildghand.evidence import ColorChanges, kept_share, shown_frames
+from wildghand.evidence.count import read_images, seen_anchors
+from wildghand.fitting.data import FitData
+from wildghand.fitting.fit import Component, Fit
+from wildghand.fitting.light import Shadows, best_of_each_part
+from wildghand.gaussians.attributes import CHANNELS, SIZES
+from wildghand.gaussians.quaternions import quat_third_axis
+from wildghand.gaussians.regularizers import nearest_on_surface, rest_anchors
+from wildghand.gaussians.rig import HandRig
+from wildghand.gaussians.training import TrainingClip
+from wildghand.light import KnownLight
+from wildghand.light.lights import ring_around
+from wildghand.model.model import WildGHandModel
+from wildghand.network.surface import Chart, PlaneSampler
+
+#: Frames that are read, spread over the clip: of each part the one that the pre-pass weighs most.
+FRAMES = 16
+#: Distance of the tint from the network's, in logits of sRGB, at which the frames' colour begins to
+#: count, and at which it counts fully.
+FROM, FULL = 0.3, 0.5
+# Corrections of the map one after the other, and the share of the difference that each takes.
+_ROUNDS, _SHARE = 3, 0.8
+# Views that the network's colour is worth.
+_VIEWS = 0.5
+# Weight of a cell of the map below which it keeps what it has.
+_CELL = 0.02
+# sRGB nearer to 0 or 1 says nothing in logits; nor do larger differences.
+_END, _FARTHEST = 0.01, 3.0
+_COLORS = slice(CHANNELS - SIZES["logit_colors"], CHANNELS)
+# Normals at which colours are read: the axis of the cap that the light knows, and so many around it
+# at this share of the cap's angle.
+_RING, _INSIDE = 4, 0.6
+# sRGB nearer to 0 or 1, and linear light below this, say nothing.
+_EDGE, _DARKEST = 0.005, 1e-3
+# Weight of a frame from which its colours begin to count; what perturbs a frame changes them.
+_UNSURE = 0.35
+# A colour that is somebody's is better than none: it takes so much less to be lent.
+_LENT = 0.25
+_OTHER = {"left": "right", "right": "left"}
+# Neighbours of a Gaussian, and what a squared difference from one of them weighs against a squared
+# change of a colour that is fully known.
+_NEIGHBOURS, _SMOOTH = 8, 0.3
+# Weight of the mean colour where nothing around is known either.
+_MEAN = 1e-6
+
+
+class StartColors(Component):
+    """Colours that no skin has are read from the frames before the first step.
+
+    The prior knows skin. From there it takes hundreds of steps to the palm of a green glove that
+    few frames show, and a short fit ends on the way. So where the frames show a tint that is far
+    from what the network says, the identity map starts from theirs. Differences in brightness are
+    left alone: they are light too, which the network has to tell from colour.
+    """
+
+    def before(self, fit: Fit) -> None:
+        """Move the identity map."""
+        start_from_colors(fit)
+
+
+class OtherHand(Component):
+    """Where clean frames have shown a place of one hand alone, the other hand takes its colour.
+
+    Both hands of a person look alike. The network alone does not do this: each hand has a map of
+    its own.
+
+    Attributes:
+        own: (N,) by side in [0, 1), how far each Gaussian's colour is the hand's own; empty:
+            nothing is taken.
+        lent: (N,) by side in [0, 1), how far it is good enough for the other hand.
+    """
+
+    def __init__(self) -> None:
+        self.own: Mapping[str, np.ndarray] = {}
+        self.lent: Mapping[str, np.ndarray] = {}
+
+    def before(self, fit: Fit) -> None:
+        """Count what clean frames show of each of two hands."""
+        if len(fit.model.rigs) < 2:
+            return
+        count = len(fit.data.frames)
+        shown = shown_frames(
+            fit.model.rigs, fit.clip, functools.partial(clearly_visible, fit.data), count
+        )
+        half = fit.settings.evidence.color_share * count
+
+        def shares(half: float) -> dict[str, np.ndarray]:
+            return {side: kept_share(n, half).cpu().double().numpy() for side, n in shown.items()}
+
+        self.own, self.lent = shares(half), shares(_LENT * half)
+
+    def after(self, fit: Fit) -> None:
+        """Give each hand the colours that it takes."""
+        found = self.learn(fit)
+        if found is not None:
+            fit.model.keep(found)
+
+    @torch.no_grad()
+    def learn(self, fit: Fit) -> ColorChanges | None:
+        """The colours that the hands take; None where they take none.
+
+        They are compared at normals that the clip's light knows; without a light nothing is taken.
+        """
+        light = fit.model.light
+        if not self.own or light is None:
+            return None
+        logits = {side: known_logits(fit.model, fit.clip, side, light) for side in self.own}
+        levels = {side: log_linear(values) for side, values in logits.items()}
+        mixed = {}
+        for side, level in levels.items():
+            difference = levels[_OTHER[side]] - level
+            mixed[side] = level + self.taken(side)[:, None] * difference
+        return changes_to(mixed, logits, fit.device)
+
+    def taken(self, side: str) -> np.ndarray:
+        """(N,) in [0, 1), how much of the other hand's colours a hand takes; of two hands."""
+        return (1.0 - self.own[side]) * self.lent[_OTHER[side]]
+
+
+@dataclass(eq=False)
+class FilledColors:
+    """The colours that places take from the skin around them, which few frames have shown or none.
+
+    The network's colours of such places are nobody's: they began as the prior's and went where the
+    weights went that other places moved, which leaves blotches. What is known of the skin is
+    carried on to them as smoothly as can be.
+    """
+
+    #: Of one or two hands.
+    fit: Fit
+    #: (N,) by side, how many training frames show each Gaussian.
+    shown: Mapping[str, Tensor]
+
+    def carried_on(self, shares: Sequence[float]) -> list[ColorChanges | None]:
+        """All changes of colours, those of the model and those of places that are seldom shown."""
+        light, before = self.fit.model.light, self.fit.model.color_changes
+        if light is None or not any(share > 0.0 for share in shares):
+            return [before] * len(shares)
+        logits, levels = {}, {}
+        for side in self.fit.model.rigs:
+            logits[side] = known_logits(self.fit.model, self.fit.clip, side, light)
+            change = 0.0 if before is None else before.changes[side].double().cpu().numpy()
+            levels[side] = log_linear(logits[side] + change)
+        device = self.fit.device
+        return [
+            changes_to(self._filled(levels, share), logits, device) if share > 0.0 else before
+            for share in shares
+        ]
+
+    def rehearse(self) -> None:
+        """Carry nothing on; it takes as long as a share of `carried_on`."""
+        rigs = self.fit.model.rigs
+        self._filled({side: np.zeros((len(rig), 3)) for side, rig in rigs.items()}, 1.0)
+
+    def _filled(self, levels: Mapping[str, np.ndarray], share: float) -> dict[str, np.ndarray]:
+        return {
+            side: smooth_fill(self._roughness[side], values, self._known(side, share))
+            for side, values in levels.items()
+        }
+
+    @functools.cached_property
+    def _roughness(self) -> dict[str, Any]:
+        return {side: roughness(rig) for side, rig in self.fit.model.rigs.items()}
+
+    def _known(self, side: str, share: float) -> np.ndarray:
+        """(N,) in [0, 1), how far a Gaussian's colour is known, from either hand."""
+        frames = self.shown[side].double().cpu()
+        known: np.ndarray = kept_share(frames, share * len(self.fit.data.frames)).numpy()
+        other = self.fit.part(OtherHand)
+        if other is not None and other.own:
+            known = 1.0 - (1.0 - known) * (1.0 - other.taken(side))
+        return known
+
+
+@torch.no_grad()
+def start_from_colors(fit: Fit) -> None:
+    """Move the identity map to the frames' colours where their tint is far from the network's.
+
+    The shadows and the light are taken out of the colours. Nothing is random. A network without a
+    direct path from map to attributes stays as it is.
+    """
+    model, clip, data, cast = fit.model, fit.clip, fit.data, fit.part(Shadows)
+    direct = model.network.attribute_head.direct
+    if direct is None:
+        return
+    rows = best_of_each_part(data.judgement.frame_weights, FRAMES)
+    says = data.visible(rows)
+    images = data.frames.images[rows].to(says.device).float() / 255.0
+    here = rows.to(says.device)
+    hands = {side: clip.hand(side, here) for side in model.rigs}
+    seen = seen_anchors(hands, clip.viewmats[here], clip.Ks[here], says.shape[1:])
+    shadows = {} if cast is None else cast.dark(rows)
+    to_map = torch.linalg.pinv(direct.weight[_COLORS, _COLORS])
+    for side, (pixels, facing) in seen.items():
+        views = read_images(says, pixels) * facing
+        shown = [read_images(images[..., channel].contiguous(), pixels) for channel in range(3)]
+        normals, poses = quat_third_axis(hands[side].orientations), clip.parameters[side][0][here]
+        wanted = _logits(torch.stack(shown, dim=-1) / _lit(model, normals, shadows.get(side)))
+        chart = model.network.charts[side]
+        assert isinstance(chart, Chart)
+        share = None
+        for _ in range(_ROUNDS):
+            made = model.network(side, normals, poses)
+            drawn = _logits(made.raw.logit_colors.sigmoid() * made.shadow)
+            off = _mean((wanted - drawn).clamp(-_FARTHEST, _FARTHEST), views)
+            share = tint_share(off) if share is None else share
+            trust = views.sum(dim=0) / (views.sum(dim=0) + _VIEWS)
+            change = share * off @ to_map.mT
+            step = _spread(
+                chart.identity, torch.cat((change, torch.ones_like(share)), dim=1), trust
+            )
+            model.network.identity.maps[side][:, _COLORS] += _SHARE * step
+
+
+def tint_share(off: Tensor) -> Tensor:
+    """(N, 1) in [0, 1], how far colours that differ by (N, 3) are not skin: by their tint alone."""
+    tint = (off - off.mean(dim=-1, keepdim=True)).norm(dim=-1, keepdim=True)
+    return ((tint - FROM) / (FULL - FROM)).clamp(0.0, 1.0)
+
+
+def _lit(model: WildGHandModel, normals: Tensor, dark: Tensor | None) -> Tensor:
+    """(B, N, 1) factors of light and shadows on colours of (B, N) places."""
+    lit = torch.ones_like(normals[..., 0]) if dark is None else dark
+    shading = None if model.shadows is None else model.shadows.shading(normals)
+    return (lit if shading is None else lit * shading)[..., None]
+
+
+def _logits(colors: Tensor) -> Tensor:
+    return torch.logit(colors.clamp(_END, 1.0 - _END))
+
+
+def _mean(values: Tensor, weights: Tensor) -> Tensor:
+    """(N, C) mean over B frames of (B, N, C), weighted by (B, N); 0 without any weight."""
+    sums = (weights[..., None] * values).sum(dim=0)
+    return sums / weights.sum(dim=0).clamp(min=1e-6)[:, None]
+
+
+def _spread(sampler: PlaneSampler, values: Tensor, weights: Tensor) -> Tensor:
+    """(cells, C) weighted means in the cells of a plane of what Gaussians ask of it.
+
+    Args:
+        sampler: reads the plane at N places.
+        values: (N, C + 1), the last one 1.
+        weights: (N,) in [0, 1].
+    """
+    asked = sampler.transposed(values * weights[:, None])
+    return asked[:, :-1] / (asked[:, -1:] + _CELL)
+
+
+def clearly_visible(data: FitData, rows: Tensor) -> Tensor:
+    """How much pixels say of a hand's colour: as `visible`, but of frames that are sure alone."""
+    weights = data.judgement.frame_weights
+    sure = ((weights - _UNSURE) / (1.0 - _UNSURE)).clamp(0.0, 1.0) / weights.clamp(min=1e-3)
+    says = data.visible(rows)
+    return says * sure[rows].to(says)[:, None, None]
+
+
+@torch.no_grad()
+def known_logits(
+    model: WildGHandModel, clip: TrainingClip, side: str, light: KnownLight
+) -> np.ndarray:
+    """Mean colour of each Gaussian over known normals and poses of the clip.
+    Returns:
+        (N, 3) in logits of sRGB.
+    """
+    poses = clip.parameters[side][0]
+    normals = known_normals(light).to(poses)
+    rows = torch.linspace(0, len(poses) - 1, len(normals)).long().to(poses.device)
+    spread = normals[:, None].expand(-1, len(model.rigs[side]), 3).contiguous()
+    made = model.network(side, spread, poses[rows], model.network.features(side))
+    colors = (made.raw.logit_colors.sigmoid() * made.shadow).clamp(_EDGE, 1.0 - _EDGE)
+    found: np.ndarray = torch.logit(colors).mean(dim=0).double().cpu().numpy()
+    return found
+
+
+def known_normals(light: KnownLight) -> Tensor:
+    """(5, 3) normals of the cap that a light knows: its axis, and four around it."""
+    axis = light.axis.double().cpu().numpy()
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-6)
+    angle = _INSIDE * math.acos(max(-1.0, min(1.0, float(light.cosine))))
+    return torch.from_numpy(np.concatenate([axis[None], ring_around(axis, angle, _RING)])).float()
+
+
+def log_linear(logits: np.ndarray) -> np.ndarray:
+    """Logarithm of linear light of colours in logits of sRGB."""
+    linear = srgb_to_linear(1.0 / (1.0 + np.exp(-logits)))
+    return np.log(np.clip(linear, _DARKEST, 1.0))
+
+
+def changes_to(
+    levels: Mapping[str, np.ndarray], logits: Mapping[str, np.ndarray], device: torch.device
+) -> ColorChanges:
+    """The changes that bring colours to others.
+
+    Args:
+        levels: (N, 3) by side, logarithms of linear light, where they are to be.
+        logits: (N, 3) by side, of sRGB, where they are.
+        device: of the changes.
+    """
+    changes = {}
+    for side, aim in levels.items():
+        srgb = linear_to_srgb(np.exp(aim)).clip(_EDGE, 1.0 - _EDGE)
+        change = np.log(srgb / (1.0 - srgb)) - logits[side]
+        changes[side] = torch.as_tensor(change, dtype=torch.float32, device=device)
+    return ColorChanges(changes)
+
+
+def roughness(rig: HandRig) -> Any:
+    """(N, N) sparse form whose value is the sum of squared differences between neighbours."""
+    from scipy.sparse import coo_array, diags_array
+
+    near = nearest_on_surface(*rest_anchors(rig), _NEIGHBOURS)
+    rows, places = np.nonzero(near >= 0)
+    edges = coo_array((np.ones(len(rows)), (rows, near[rows, places])), shape=(len(rig), len(rig)))
+    edges = 0.5 * (edges + edges.T)
+    return diags_array(edges.sum(axis=1)) - edges
+
+
+def smooth_fill(rough: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Carry values on from where they are known to where they are not.
+
+    The filled values x are smooth and near what is known: they minimise the sum of known (x - v)^2
+    + 0.3 roughness(x). A value keeps its own part as far as it is known, and takes the rest from x.
+
+    Args:
+        rough: see `roughness`.
+        values: (N, C).
+        known: (N,) in [0, 1].
+
+    Returns:
+        (N, C); the values themselves where nothing is known at all.
+    """
+    from scipy.sparse import diags_array
+    from scipy.sparse.linalg import splu
+
+    if known.sum() <= 0.0:
+        return values
+    system = diags_array(known + _MEAN) + _SMOOTH * rough
+    mean = known @ values / known.sum()
+    found = splu(system.tocsc()).solve(known[:, None] * (values - mean)) + mean
+    return np.asarray(known[:, None] * values + (1.0 - known)[:, None] * found)

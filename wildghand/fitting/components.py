@@ -1,0 +1,62 @@
+"""The components of a fit: the list that the settings make. A switch leaves one out of it."""
+
+from __future__ import annotations
+
+import torch
+
+from hwp_bench.methods.contract import TrainingCapture
+from wildghand.fitting.choice import Averaging, StateChoice, ValidationFrames
+from wildghand.fitting.colors import OtherHand, StartColors
+from wildghand.fitting.disentangle import Dpd
+from wildghand.fitting.evidence import FewShown
+from wildghand.fitting.fit import Component, Fit
+from wildghand.fitting.judging import HandMasks, HiddenSkin, Prepass
+from wildghand.fitting.light import Shadows, UnseenLight
+from wildghand.fitting.objective import Reconstruction, Regularisers
+from wildghand.fitting.parallel import SINGLE_PROCESS, World
+from wildghand.fitting.start import Person, Poses, StartFromPrior
+from wildghand.fitting.weights import MaskWeights, Pao
+from wildghand.model.settings import WildGHandSettings
+
+
+def components_of(settings: WildGHandSettings) -> list[Component]:
+    """The components of a fit, in the order in which their hooks are called.
+
+    Hands and frames are corrected and judged first, then colours and light are found, and the loss
+    is put together; what ends a fit comes last.
+    """
+    pao, evidence = settings.pao, settings.evidence
+    chosen = settings.schedule.validated or (evidence.enabled and evidence.validated)
+    by_regions = pao.enabled and pao.variant != "binary"
+    listed: list[tuple[bool, type[Component]]] = [
+        (settings.poses.enabled, Poses),
+        (settings.subject.enabled, Person),
+        (settings.prepass.enabled, Prepass),
+        (pao.hand != "estimated", HandMasks),
+        (bool(settings.prior), StartFromPrior),
+        (chosen, ValidationFrames),
+        (settings.shadows.enabled, Shadows),
+        (settings.start_colors, StartColors),
+        (settings.terms.leave_hidden, HiddenSkin),
+        (True, Reconstruction),
+        (True, Pao if by_regions else MaskWeights),
+        (True, Regularisers),
+        (settings.dpd.enabled, Dpd),
+        (True, Averaging),
+        (settings.schedule.validated, StateChoice),
+        (settings.light.enabled, UnseenLight),
+        (evidence.enabled and evidence.color_share > 0.0, OtherHand),
+        (evidence.enabled, FewShown),
+    ]
+    return [kind() for wanted, kind in listed if wanted]
+
+
+def make_fit(
+    training: TrainingCapture,
+    settings: WildGHandSettings,
+    seed: int,
+    device: torch.device,
+    world: World = SINGLE_PROCESS,
+) -> Fit:
+    """The fit of a capture with the components that its settings ask for; see `Fit`."""
+    return Fit(training, settings, seed, device, world, components_of(settings))

@@ -1,0 +1,220 @@
+"""Gaussians that few frames have shown: discs on the skin, as far as validation frames agree.
+
+Where a person's hand is far from the hand model, offsets from the skin are the person's and not
+errors of depth, and evidence takes away what is right. Where a palm has another colour than the
+back, as that of a glove, the back says nothing of it. Nothing in the training frames tells: they
+are drawn without evidence, and show other places.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+
+import torch
+from torch import Tensor
+
+from hwp_bench.base.arrays import evenly
+from wildghand.evidence import (
+    ColorChanges,
+    Evidence,
+    EvidenceSettings,
+    fill_shares,
+    shown_frames,
+    strengths,
+    weigh_evidence,
+)
+from wildghand.fitting.choice import JudgedDrawings, ValidationFrames
+from wildghand.fitting.colors import FilledColors
+from wildghand.fitting.fit import Component, Fit
+from wildghand.gaussians.training import TrainingClip
+from wildghand.model.model import WildGHandModel
+
+# Most training frames in which gaps are looked for.
+_FRAMES = 12
+# Coverage that discs may take from a pixel without a gap, and the share of what a Gaussian draws
+# that lies in gaps from which on it is spared.
+_GAP, _SPARED = 0.1, 0.01
+# All Gaussians stay as they were learnt, and a wrist has no wall, where that lowers the error of
+# validation frames by these shares. The first is large: discs also close what no frame shows, which
+# validation frames, taken from where the camera stood, do not show either.
+_AS_LEARNT, _IN_THE_WAY = 0.1, 0.01
+
+
+@dataclass(frozen=True, eq=False)
+class Gaps:
+    """Where discs on the skin leave open what training frames show of the hand.
+
+    A hand model that does not reach the mask, as in the web of a thumb, has no skin there.
+    Gaussians that left the skin to close such a place are right, however few frames show them.
+    """
+
+    #: What is drawn; its evidence is put back.
+    model: WildGHandModel
+    #: Hands and cameras of the training frames.
+    clip: TrainingClip
+    #: Takes (1,) rows and gives (1, H, W), how much each pixel says of the hand, in [0, 1].
+    visible: Callable[[Tensor], Tensor]
+    #: Training frames.
+    count: int
+
+    def closers(self, evidence: Evidence) -> dict[str, Tensor]:
+        """Find the Gaussians that close what evidence would open.
+        Returns:
+            (N,) bool by side.
+        """
+        drawn = self._nothing()
+        for row in evenly(self.count, _FRAMES).tolist():
+            self._add(drawn, row, evidence)
+        return {side: sums[:, 0] > _SPARED * sums[:, 1] for side, sums in drawn.items()}
+
+    def seconds(self, evidence: Evidence) -> float:
+        """Return about how long `closers` takes; nothing of the model changes."""
+        begun = time.perf_counter()
+        self._add(self._nothing(), 0, evidence)
+        return min(self.count, _FRAMES) * (time.perf_counter() - begun)
+
+    def _nothing(self) -> dict[str, Tensor]:
+        """(N, 2) by side: what each Gaussian draws in gaps and in all, px."""
+        zeros = self.model.log_gains.new_zeros
+        return {side: zeros(len(rig), 2) for side, rig in self.model.rigs.items()}
+
+    def _add(self, drawn: Mapping[str, Tensor], row: int, evidence: Evidence) -> None:
+        """Add what each Gaussian draws in a frame."""
+        rows = torch.tensor([row])
+        visible = self.visible(rows)
+        colors, image, closed = self._draw(rows, visible.shape, None)
+        with torch.no_grad():
+            left = self._draw(rows, visible.shape, evidence)[-1]
+            opened = (closed - left - _GAP).clamp(min=0.0)[..., 0] * visible
+        # What a Gaussian weighs in a pixel is the slope of the pixel by the Gaussian's colour.
+        pixels = (opened * image[..., 0] + image[..., 1]).sum()
+        slopes = torch.autograd.grad(pixels, list(colors.values()))
+        for side, slope in zip(colors, slopes, strict=True):
+            drawn[side].add_(slope[0, :, :2])
+
+    def _draw(
+        self, rows: Tensor, shape: torch.Size, evidence: Evidence | None
+    ) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+        """Draw a frame free of perturbations: colours by side, image and coverage."""
+        model, here = self.model, rows.to(self.model.log_gains.device)
+        colors, found, before = {}, {}, model.evidence
+        model.evidence = evidence
+        try:
+            for side, (pose, betas, transl) in self.clip.parameters.items():
+                with torch.no_grad():
+                    made, hand = model.gaussians(side, pose[here], betas, transl[here])
+                colors[side] = made.colors.detach().clone().requires_grad_()
+                found[side] = replace(made, colors=colors[side]), hand
+        finally:
+            model.evidence = before
+        size = shape[-1], shape[-2]
+        image, coverage = model.rasterize(
+            found, self.clip.viewmats[here], self.clip.Ks[here], *size
+        )
+        return colors, image, coverage.detach()
+
+
+class FewShown(Component):
+    """Evidence counts before the fit; how strongly it acts, and fill, is chosen after it.
+
+    Attributes:
+        shown: (N,) by side, how many training frames show each Gaussian.
+        gaps: what discs would leave open.
+        filled: the colours of places that few frames have shown.
+        judges: validation frames; None where they are too few, or choose nothing.
+    """
+
+    shown: Mapping[str, Tensor]
+    gaps: Gaps
+    filled: FilledColors
+    judges: JudgedDrawings | None
+
+    def before(self, fit: Fit) -> None:
+        """Count, and let the model keep the evidence of the settings' own strength."""
+        data, model, count = fit.data, fit.model, len(fit.data.frames)
+        self.shown = shown_frames(model.rigs, fit.clip, data.visible, count)
+        model.keep(weigh_evidence(self.shown, count, fit.settings.evidence))
+        self.gaps = Gaps(model, fit.clip, data.visible, count)
+        self.filled = FilledColors(fit, self.shown)
+        frames = fit.part(ValidationFrames) if fit.settings.evidence.validated else None
+        self.judges = None if frames is None else frames.drawings
+
+    def after(self, fit: Fit) -> None:
+        """Let the model keep what draws validation frames best."""
+        for best in self.best(fit):
+            fit.model.keep(best)
+
+    def best(self, fit: Fit) -> list[Evidence | ColorChanges]:
+        """What draws validation frames best; without what is the model's own already.
+
+        Where nothing is judged, that is evidence and fill by the settings' own shares. In each case
+        Gaussians that close gaps are spared.
+        """
+        several, shares = self.candidates(fit), fill_shares(fit.settings.evidence)
+        if self.judges is None:
+            evidence, (colors,) = several[0], self.filled.carried_on(shares[:1])
+        else:
+            evidence, colors = self._judged(fit, self.judges, several)
+        found: list[Evidence | ColorChanges] = []
+        if not evidence.equals(fit.model.evidence):
+            found.append(evidence)
+        if colors is not None and colors is not fit.model.color_changes:
+            found.append(colors)
+        return found
+
+    def candidates(self, fit: Fit) -> list[Evidence]:
+        """The strengths, the settings' own first; Gaussians that close gaps are spared in each."""
+        closers = self.gaps.closers(self._strongest(fit))
+        return [self._weigh(fit, each).spare(closers) for each in strengths(fit.settings.evidence)]
+
+    def _judged(
+        self, fit: Fit, judges: JudgedDrawings, several: Sequence[Evidence]
+    ) -> tuple[Evidence, ColorChanges | None]:
+        """One evidence of several, and with it the changes of colours."""
+        predicted = judges.predict_all()
+        changes = fit.model.color_changes
+        errors = [judges.error(predicted, each, changes) for each in several]
+        least = min(errors)
+        # Of equal ones the first is taken, which is the settings' own.
+        best = several[errors.index(least)]
+        opened = frozenset(fit.model.rigs)
+        for other, share in (
+            (replace(best, open_wrists=opened), _IN_THE_WAY),
+            (best.spare_all(), _AS_LEARNT),
+            (replace(best.spare_all(), open_wrists=opened), _AS_LEARNT),
+        ):
+            error = judges.error(predicted, other, changes)
+            if error < (1.0 - share) * least:
+                best, least = other, error
+        if fit.model.light is not None:
+            fills = self.filled.carried_on(fill_shares(fit.settings.evidence))
+            changes = min(fills, key=lambda each: judges.error(predicted, best, each))
+        return best, changes
+
+    def seconds(self, fit: Fit) -> float:
+        """See `Component`."""
+        total = self.gaps.seconds(self._strongest(fit))
+        settings, lit = fit.settings.evidence, fit.settings.light.enabled
+        fills = fill_shares(settings)
+        if self.judges is not None:
+            took = self.judges.seconds
+            # With a light, which there is at the end alone, the network is asked twice.
+            each = (2.0 if lit else 1.0) * took.predict
+            # Besides the strengths, three more without a wall or discs.
+            each += (len(strengths(settings)) + 3 + len(fills)) * took.draw
+            total += took.features + each * len(self.judges.frames)
+        if lit:  # without a light nothing is filled
+            begun = time.perf_counter()
+            self.filled.rehearse()
+            total += (time.perf_counter() - begun) * sum(share > 0.0 for share in fills)
+        return total
+
+    def _strongest(self, fit: Fit) -> Evidence:
+        """What opens the most."""
+        several = strengths(fit.settings.evidence)
+        return self._weigh(fit, max(several, key=lambda each: each.offset_share))
+
+    def _weigh(self, fit: Fit, settings: EvidenceSettings) -> Evidence:
+        return weigh_evidence(self.shown, len(fit.data.frames), settings)

@@ -1,0 +1,88 @@
+"""What a fit starts from: the poses it believes in, the person's hand, and the prior."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from wildghand.fitting.fit import Component, Fit
+from wildghand.gaussians.training import TrainingFrames
+from wildghand.poses import ClipPoses, believed_hands
+from wildghand.prior.prior import choose_prior
+from wildghand.subject import fit_subject
+from wildghand.subject.outlines import ComparedFrames
+
+
+class Poses(Component):
+    """The given poses of a capture are corrected, those of the frames to predict too."""
+
+    def __init__(self) -> None:
+        #: So that an avatar draws the same hands where it is given the capture's; None where
+        #: nothing was corrected.
+        self.remembered: ClipPoses | None = None
+
+    def prepare(self, fit: Fit) -> None:
+        """Put the capture with corrected hands in place of the given one."""
+        training, templates = fit.data.training, fit.data.templates
+        believed = believed_hands(templates, training.hands, training.cameras, fit.settings.poses)
+        self.remembered = ClipPoses.of(training.hands, believed)
+        if self.remembered is not None:
+            fit.data.training = training.with_hands(believed)
+
+    def before(self, fit: Fit) -> None:
+        """Let the model keep what is believed."""
+        if self.remembered is not None:
+            fit.model.keep(self.remembered)
+
+
+class Person(Component):
+    """The templates are bent to the masks, so that frames are compared with the person.
+
+    Validation frames choose how far.
+    """
+
+    def prepare(self, fit: Fit) -> None:
+        """Find how the person's hand differs from the templates."""
+        data = fit.data
+        training, frames, settings = data.training, data.frames, fit.settings.subject
+        judges = data.judges if settings.validated else None
+
+        def compared(some: TrainingFrames) -> ComparedFrames:
+            masks = np.asarray(some.masks) > 127
+            return ComparedFrames(
+                data.templates, training.hands, training.cameras, some.indices, masks
+            )
+
+        data.subject = fit_subject(
+            data.templates,
+            training.hands,
+            training.cameras,
+            frames.indices,
+            np.asarray(frames.masks),
+            settings,
+            judges=None if judges is None else compared(judges),
+        )
+
+
+class StartFromPrior(Component):
+    """The network starts from a prior over subjects in place of random weights.
+
+    Raises:
+        BadInput: the prior is damaged or of another kind.
+    """
+
+    def __init__(self) -> None:
+        self._source: dict[str, str] = {}
+
+    def before(self, fit: Fit) -> None:
+        """Put the prior's weights in place of the network's."""
+        network = fit.model.network
+        prior = choose_prior(fit.settings, fit.data.training.hand_model, network)
+        if prior is not None:
+            prior.initialise(network)
+            self._source = {"prior": prior.record.weights}
+
+    def record(self, fit: Fit, *, final: bool) -> dict[str, Any]:
+        """The digest of the prior's weights."""
+        return {"source": self._source}

@@ -1,0 +1,192 @@
+"""How much each pixel and each frame counts: by the mask alone, or by PAO."""
+
+from __future__ import annotations
+
+import functools
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hwp_bench.methods.settings import source_path
+from wildghand.dpd.temporal import PayBack
+from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
+from wildghand.fitting.judging import Prepass
+from wildghand.gaussians.training import FrameTable, soft_weights, upload
+from wildghand.model import terms
+from wildghand.model.frames import RenderedFrames
+from wildghand.pao.pao import PerturbationAwareWeights, PlaceErrors, binary_weights, running_median
+from wildghand.pao.regions import ClipRegions, FrameRegions
+from wildghand.pao.sam import open_sam
+from wildghand.pao.segmenters import RegionCache, Segmenter, Superpixels
+
+
+class MaskWeights(Component):
+    """A pixel counts as the mask says: softly, or cut at a half (`pao.variant` `binary`)."""
+
+    def before(self, fit: Fit) -> None:
+        """Make the weights of all frames, once."""
+        settings, masks = fit.settings, fit.data.masks
+
+        def weigh(rows: Tensor) -> Tensor:
+            if settings.pao.enabled:
+                return binary_weights(masks(rows), settings.pao.binary_outside)
+            return soft_weights(masks(rows), settings.terms.outside_weight)
+
+        frames = fit.data.frames
+        size = 4 * frames.masks[0].numel()
+        self._weights = FrameTable(weigh, len(frames), size, fit.device)
+
+    def compare(
+        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+    ) -> FrameTarget:
+        """Weigh by the masks."""
+        return replace(target, weights=self._weights(batch.mine) * target.weights)
+
+
+class Pao(Component):
+    """Regions are weighed by the paper's equations, and frames by the temporal weights of DPD.
+
+    Attributes:
+        weights: the paper's, whose thresholds are learnt.
+        median: running median of the regions' errors; None before the first, and where it does not
+            count.
+        places: ordinary errors by place; None where they do not count.
+        tolerance: in [0, 1), how far a mismatch that all frames share lifts weights towards 1:
+            those of regions, and how much a frame teaches.
+        lifts: (R,) in [0, 1], how far the weights of each frame's regions are lifted: by the
+            tolerance, and by the probability that the frame is clean.
+        pay_back: what the frames' biases explain; None where nothing follows from it.
+    """
+
+    weights: PerturbationAwareWeights
+
+    def before(self, fit: Fit) -> None:
+        """Cut the frames into regions."""
+        data, settings, device = fit.data, fit.settings, fit.device
+        pao, count = settings.pao, len(data.frames)
+        self.weights = PerturbationAwareWeights(pao, len(data.training.sides)).to(device)
+        self.median: float | Tensor | None = None
+        self.tolerance, self.lifts = 0.0, torch.zeros(count)
+        by_place, clean = pao.errors == "place", data.judgement.clean
+        prepass = fit.part(Prepass)
+        if prepass is not None and by_place and pao.variant == "scaled":
+            floor = settings.prepass.misplacement_floor
+            shared = pao.mismatch * prepass.assessment.shared_mismatch(floor)
+            self.tolerance = shared**2 / (1.0 + shared**2)
+            spared = clean if pao.spare_clean else torch.zeros_like(clean)
+            self.lifts = 1.0 - (1.0 - self.tolerance) * (1.0 - spared)
+        # Without DPD there is no omega.
+        self._teaches = pao.temporal == "teaching" and settings.dpd.enabled
+        tolerance = settings.dpd.pay_back if self._teaches else 0.0
+        self.pay_back = PayBack(clean.to(device), tolerance) if tolerance else None
+        regions = RegionCache().clip(
+            data.frames.images.numpy(), choose_segmenter(pao.regions, device)
+        )
+        self._regions = ClipRegions(regions, device)
+        self.places: PlaceErrors | None = None
+        if by_place:
+            labels = [FrameRegions(one) for one in data.places]
+            numbers = 1 + max(int(one.max()) for one in data.places)
+            self.places = PlaceErrors(ClipRegions(labels, device), clean.to(device), numbers)
+
+    def parameters(self) -> dict[str, Iterable[Tensor]]:
+        """The thresholds."""
+        return {"thresholds": list(self.weights.parameters())}
+
+    def draws(self, fit: Fit, batch: Batch) -> DrawOptions:
+        """The canonical hand learns the less from a frame, the more it is perturbed."""
+        return {"teach": functools.partial(self.shares, batch.mine)} if self._teaches else {}
+
+    def shares(self, rows: Tensor, omega: Tensor) -> Tensor:
+        """How much the canonical hand learns from each frame of a batch.
+
+        Args:
+            rows: (B,) int64, which of the R frames; on the CPU.
+            omega: (B,) their temporal weights, without gradient.
+
+        Returns:
+            (B,) in (0, 1].
+        """
+        shares = self.weights.temporal_factor(omega)
+        shares = shares + self.tolerance * (1.0 - shares)
+        if self.pay_back is not None:
+            shares = torch.maximum(shares, self.pay_back.shares(rows))
+        return shares
+
+    def compare(
+        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+    ) -> FrameTarget:
+        """Weigh by the paper's equations.
+
+        They compare the frames of a batch, so that all processes weigh all of it.
+        """
+        data, settings, world = fit.data, fit.settings, fit.world
+        rows, mine, hands = batch.rows, batch.mine, data.masks(batch.rows)
+        error = world.gather(_mean_error(drawing.image, target.image))
+        if self.pay_back is not None:
+            counted = soft_weights(hands, settings.terms.outside_weight)
+            uncovered = data.uncovered(rows)
+            counted = counted if uncovered is None else counted * uncovered
+            self.pay_back.watch(rows, error, counted * hands)
+        omega = world.gather(drawing.omega)
+        if world.size > 1:  # what is gathered has no gradient
+            before, after = omega[: batch.part.start], omega[batch.part.stop :]
+            omega = torch.cat([before, drawing.omega, after])
+        expected = None
+        if self.places is not None and self.median is not None:
+            expected = self.places.expected(rows, self.median)
+        found = self.weights(error, self._regions(rows), hands, omega, self.median, expected)
+        if settings.pao.errors in ("median", "place"):
+            self.median = running_median(self.median, found.mean_errors, found.shares > 0.0)
+        if self.places is not None and self.median is not None:
+            self.places.watch(rows, error, hands > 0.5, self.median)
+        weights, lifts = found.weights[batch.part], self.lifts[mine]
+        if bool((lifts > 0.0).any()):
+            share = upload(lifts, fit.device)[:, None, None].to(weights)
+            weights = torch.lerp(weights, target.hand.to(weights), share)
+        if settings.pao.variant == "scaled":
+            weights = weights + settings.terms.outside_weight * (1.0 - target.hand)
+        weights = weights * target.weights
+        return replace(target, weights=weights, sizes=found.sizes[batch.part])
+
+    def loss(
+        self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
+    ) -> Iterable[Tensor]:
+        """Keep it from weighing everything with 0."""
+        weight = fit.settings.terms.fixed.weight_reward
+        if weight and target.sizes is not None:
+            yield weight * terms.weight_reward(target.sizes)
+
+    def state_dict(self) -> dict[str, Any]:
+        """See `Component`."""
+        return {
+            "thresholds": self.weights.state_dict(),
+            "median": None if self.median is None else float(self.median),
+            "ordinary": None if self.places is None else self.places.ordinary.clone(),
+            "residuals": None if self.pay_back is None else self.pay_back.residuals.clone(),
+        }
+
+    def load_state_dict(self, state: Mapping[str, Any]) -> None:
+        """See `Component`."""
+        self.weights.load_state_dict(state["thresholds"])
+        self.median = None if state["median"] is None else float(state["median"])
+        if self.places is not None:
+            self.places.ordinary.copy_(state["ordinary"])
+        if self.pay_back is not None:
+            self.pay_back.residuals.copy_(state["residuals"])
+
+
+def choose_segmenter(source: str, device: torch.device) -> Segmenter:
+    """What cuts frames into regions, as the setting `pao.regions` says."""
+    path = source_path(source)
+    return Superpixels() if path is None else open_sam(path, str(device))
+
+
+def _mean_error(drawing: Tensor, image: Tensor) -> Tensor:
+    """(B, H, W) mean over channels of |drawing - image|, without gradient."""
+    # A product takes a third of the time of a mean over three numbers.
+    thirds = image.new_full((image.shape[-1],), 1.0 / image.shape[-1])
+    return (drawing.detach() - image).abs() @ thirds

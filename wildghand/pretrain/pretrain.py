@@ -1,0 +1,284 @@
+"""Fitting one network to captures of several subjects, for a prior.
+
+Branches and heads are shared, everything else is the captures' own. A run can be stopped and goes
+on.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import shutil
+from collections.abc import Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from hwp_bench.base.errors import UsageError
+from hwp_bench.base.files import sha256_file, sha256_json
+from hwp_bench.base.folders import exclusive
+from hwp_bench.capture import Capture, open_capture
+from hwp_bench.methods.contract import REQUEST, Avatar, Budget, RunSettings, TrainingCapture
+from hwp_bench.methods.request import open_request, write_request
+from wildghand.fitting.components import make_fit
+from wildghand.fitting.fit import Fit
+from wildghand.fitting.method import ready_fit
+from wildghand.fitting.session import STATE, every_frame, run_resumed
+from wildghand.gaussians.fit_loop import Loss, batches
+from wildghand.model.settings import WildGHandSettings, read_settings
+from wildghand.network import PredictionNetwork
+from wildghand.plain.loop import IterativeFit
+from wildghand.prior.prior import MAPS, Prior, mean_weights, save_prior
+from wildghand.splat.threads import denormals_flushed
+
+# Children of a network that belong to its subject.
+_OWN = ("identity", "charts")
+# Thousands of steps end with low rates, as those of the shipped prior did.
+_RATES = {"schedule.decay": "geometric", "schedule.average_share": 0.0}
+
+
+@denormals_flushed()
+def pretrain(
+    sources: Sequence[Path],
+    out: Path,
+    *,
+    settings: Mapping[str, Any],
+    steps: int | None = None,
+    seed: int = 0,
+    overwrite: bool = False,
+) -> Prior:
+    """Fit one network to captures of several subjects, and write it as a prior.
+
+    The state is saved next to `out` every 20 seconds. The same call goes on with it after a stop;
+    the result is that of a run that was never stopped.
+
+    Args:
+        sources: capture folders, one for each subject; all their frames are used.
+        out: the folder to make.
+        settings: overrides of the defaults of a fit; it starts from random weights unless they
+            name a prior, and its rates fall to a twentieth.
+        steps: optimizer steps over all captures; None: the settings' number for each capture.
+        seed: of everything random.
+        overwrite: replace a prior that is there.
+
+    Raises:
+        UsageError: `out` exists, or fewer than two captures.
+        BadInput: captures of different hand models, one without a usable frame, or a saved state
+            of another run.
+        DidNotConverge: the fit diverged at once.
+        HwpError: another run is writing to `out`, or nobody can.
+    """
+    if out.exists() and not overwrite:
+        raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")
+    # A new prior starts from neither the one that ships nor one person's colours, and knows light
+    # by itself, unless asked to.
+    settings = {
+        "prior": "",
+        "start_colors": False,
+        "shadows.enabled": False,
+        **_RATES,
+        **settings,
+    }
+    chosen = read_settings(settings)
+    captures = [open_capture(source) for source in sources]
+    _check_captures(captures)
+    total = chosen.schedule.steps * len(captures) if steps is None else steps
+    run = RunSettings(dict(settings), seed, Budget(steps=total))
+    work = out.with_name(out.name + ".pretrain")
+    with exclusive(work):
+        weights, done = _fit_in(work, captures, run, chosen)
+        prior = save_prior(
+            out,
+            weights,
+            hand_model=captures[0].info.hand_model,
+            captures=[_described(capture) for capture in captures],
+            settings=chosen,
+            seed=seed,
+            steps=done,
+            overwrite=overwrite,
+        )
+        shutil.rmtree(work, ignore_errors=True)
+    return prior
+
+
+def _fit_in(
+    work: Path, captures: Sequence[Capture], run: RunSettings, chosen: WildGHandSettings
+) -> tuple[dict[str, Tensor], int]:
+    """Fit, from the state that is saved in the work folder if there is one."""
+    requests = [
+        write_request(work / f"request-{index}", capture, every_frame(capture), run)
+        for index, capture in enumerate(captures)
+    ]
+    digest = sha256_json(
+        [
+            [sha256_file(request / REQUEST), capture.info.to_json().get("digests")]
+            for request, capture in zip(requests, captures, strict=True)
+        ]
+    )
+    trainings = [open_request(request) for request in requests]
+    joint = JointFit(trainings, chosen, run.seed, ready_fit(chosen.device))
+    title = f"Pretraining on {len(captures)} captures"
+    return run_resumed(joint, run.budget, work / STATE, digest, title)
+
+
+def _check_captures(captures: Sequence[Capture]) -> None:
+    if len(captures) < 2:
+        raise UsageError(
+            "one capture makes no prior over subjects",
+            field="CAPTURE",
+            remedy="Give captures of several people.",
+        )
+    first = captures[0].info.hand_model
+    for capture in captures:
+        if capture.info.hand_model.name != first.name:
+            raise UsageError(
+                f"has the hand model {capture.info.hand_model.name}, the first one {first.name}",
+                where=capture.root,
+                remedy="Give captures of one hand model.",
+            )
+
+
+def _described(capture: Capture) -> dict[str, Any]:
+    """A prior's description of a capture that it was fitted to."""
+    info = capture.info.to_json()
+    return {
+        "id": capture.info.id,
+        "hands": capture.info.hands,
+        "frames": capture.info.frame_count,
+        "digest": sha256_json(info),
+        "source": info["source"],
+    }
+
+
+class JointFit(IterativeFit[tuple[dict[str, Tensor], int]]):
+    """Fits of several captures that share the weights of branches and heads.
+
+    Each capture keeps its identity map, and what is particular to its frames: perturbation
+    biases, gains and poses. A step is a batch of one capture; every capture comes once before
+    any comes again.
+
+    Args:
+        trainings: what may be seen of each capture.
+        settings: how each is fitted.
+        seed: of everything random.
+        device: where it runs.
+
+    Raises:
+        BadInput: a capture has no training frame that can be used.
+    """
+
+    def __init__(
+        self,
+        trainings: Sequence[TrainingCapture],
+        settings: WildGHandSettings,
+        seed: int,
+        device: torch.device,
+    ) -> None:
+        # Between two steps on a capture others move the texture branch, which they share. Its last
+        # steps are thousands, at low rates: nothing is gained by their mean. All of its frames are
+        # fitted, so that none is there to choose a state.
+        schedule = dataclasses.replace(
+            settings.schedule, texture_every=1, average_share=0.0, validated=False
+        )
+        settings = dataclasses.replace(settings, schedule=schedule)
+        self.settings = settings
+        self.device = device
+        self.fits: list[Fit] = []
+        for training in trainings:
+            fit = make_fit(training, settings, seed, device)
+            if self.fits:
+                _share(self.fits[0].model.network, fit.model.network)
+            self.fits.append(fit)
+        _join_optimizers(self.fits)
+        self.plateau_steps = schedule.plateau_steps
+
+    def count_steps(self, budget: Budget) -> int:
+        """Steps over all captures."""
+        each = self.settings.schedule.steps
+        return each * len(self.fits) if budget.steps is None else budget.steps
+
+    def batches(self) -> Iterator[tuple[int, Tensor]]:
+        """Which capture the next step is taken on, and on which of its frames."""
+        size, seed = self.settings.schedule.batch, self.fits[0].seed
+        rows = [
+            batches(len(fit.data.frames), size, seed + 1 + index)
+            for index, fit in enumerate(self.fits)
+        ]
+        for capture in batches(len(self.fits), 1, seed):
+            yield int(capture[0]), next(rows[int(capture[0])])
+
+    def step(self, batch: tuple[int, Tensor], fraction: float) -> Loss:
+        """See `IterativeFit`."""
+        capture, rows = batch
+        return self.fits[capture].step(rows, fraction)
+
+    def checkpoint(self, steps: int) -> Avatar:
+        """The avatar of the first capture."""
+        return self.fits[0].avatar(steps)
+
+    def finish(self, steps: int, seconds: float) -> tuple[dict[str, Tensor], int]:
+        """The shared weights and the mean identity map of each hand (float32, CPU); the steps."""
+        return mean_weights(fit.model.network for fit in self.fits), steps
+
+    def finite(self) -> bool:
+        """Whether every fitted number is finite."""
+        return all(fit.model.finite() for fit in self.fits)
+
+    def snapshot(self) -> dict[str, Tensor]:
+        """A copy of all models that the fit no longer changes; shared weights are in it once."""
+        return {name: value.detach().clone() for name, value in self._tensors().items()}
+
+    def restore(self, values: dict[str, Tensor]) -> None:
+        """Bring the models back to a snapshot."""
+        current = self._tensors()
+        if values.keys() != current.keys():
+            raise ValueError("tensors of other models")
+        with torch.no_grad():
+            for name, value in values.items():
+                current[name].copy_(value)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything that steps change, for `load_state_dict`."""
+        return {
+            "models": self._tensors(),
+            "components": [fit.component_states() for fit in self.fits],
+            "steps": [fit.descent.steps for fit in self.fits],
+            "optimizer": self.fits[0].descent.optimizer.state_dict(),
+        }
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Go on from a saved state."""
+        self.restore(state["models"])
+        for fit, parts, steps in zip(self.fits, state["components"], state["steps"], strict=True):
+            fit.load_component_states(parts)
+            fit.descent.steps = int(steps)
+        self.fits[0].descent.optimizer.load_state_dict(state["optimizer"])
+
+    def _tensors(self) -> dict[str, Tensor]:
+        """The tensors of all models by capture and name; shared ones under the first capture."""
+        tensors = {}
+        for index, fit in enumerate(self.fits):
+            for name, value in fit.model.state_dict().items():
+                shared = name.startswith("network.") and not name.startswith(f"network.{MAPS}")
+                if index == 0 or not shared:
+                    tensors[f"{index}.{name}"] = value
+        return tensors
+
+
+def _share(source: PredictionNetwork, network: PredictionNetwork) -> None:
+    """Make a network use another one's branches and heads."""
+    for name, child in source.named_children():
+        if name not in _OWN:
+            setattr(network, name, child)
+
+
+def _join_optimizers(fits: Sequence[Fit]) -> None:
+    """Let all fits share Adam over the parameters of all of them, each once."""
+    joint, *others = [fit.descent.optimizer for fit in fits]
+    for other in others:
+        for group, more in zip(joint.param_groups, other.param_groups, strict=True):
+            known = {id(parameter) for parameter in group["params"]}
+            group["params"] += [p for p in more["params"] if id(p) not in known]
+    for fit in fits:
+        fit.descent.optimizer = joint
