@@ -10,6 +10,7 @@ depends on the processor: next to nothing on AMD's, a hundred cycles and more on
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 from collections.abc import Mapping
 from pathlib import Path
@@ -22,20 +23,20 @@ from benchmarks.small_capture import opened_request, small_capture
 from benchmarks.step_loops import WildGHandLoop, mean_of
 from hwp_bench.base.tables import Column, Table, print_table
 from wildghand.dpd.dpd import DpdSettings
-from wildghand.model.terms import TermWeights
+from wildghand.model import terms
 
 #: What the loss is multiplied with, so that gradients of pixels are about 1e-40.
 FADED = 1e-35
-#: Terms of the loss by the setting of their weight, and that weight.
-TERMS = {
-    **{
-        f"terms.{name}": getattr(TermWeights(), name)
-        for name in TermWeights.__dataclass_fields__
-        if name not in ("dssim_weight", "outside_weight", "leave_hidden")
-    },
-}
-#: The same of DPD, where the weights are constants.
+#: Weights of the loss that are settings.
+SETTINGS = {"terms.surface": 5e-4}
+#: Those of DPD that are constants.
 CONSTANTS = {"gain_weight": 0.1, "tint_weight": 1.0, "omega_weight": 1.0}
+#: Those of the other terms.
+FADED_WEIGHTS = {
+    "ours": terms.TermWeights(
+        **{name: FADED * w for name, w in dataclasses.asdict(terms.WEIGHTS["ours"]).items()}
+    )
+}
 
 
 def processor_ms(
@@ -45,7 +46,7 @@ def processor_ms(
     torch.set_num_threads(threads)
     settings = {
         "ordinary": {"gaussians": gaussians},
-        "faded": {"gaussians": gaussians} | {name: FADED * w for name, w in TERMS.items()},
+        "faded": {"gaussians": gaussians} | {name: FADED * w for name, w in SETTINGS.items()},
     }
     spent: dict[tuple[str, bool], list[float]] = {}
     with opened_request(small_capture(capture)) as training:
@@ -53,9 +54,13 @@ def processor_ms(
         for turn in range(rounds + 1):
             for name, loop in loops.items():
                 faded = FADED if name == "faded" else 1.0
-                weights = {constant: faded * weight for constant, weight in CONSTANTS.items()}
+                constants = {constant: faded * weight for constant, weight in CONSTANTS.items()}
+                weights = FADED_WEIGHTS if name == "faded" else terms.WEIGHTS
                 for flush in (True, False):
-                    with mock.patch.multiple(DpdSettings, **weights):
+                    with (
+                        mock.patch.multiple(DpdSettings, **constants),
+                        mock.patch.object(terms, "WEIGHTS", weights),
+                    ):
                         _, processor = mean_of(loop.block(flush=flush))
                     if turn > 0:
                         spent.setdefault((name, flush), []).append(processor)

@@ -29,12 +29,9 @@ from hwp_bench.base.records import Seed, parse_record
 from hwp_bench.capture.schema import SIDES, HandModelId
 from hwp_bench.hands import HandTemplate, load_template
 from wildghand.avatar.avatar import FitRecord, WildGHandAvatar
-from wildghand.evidence import ColorChanges, Evidence, rename_former
-from wildghand.light import CastLight, KnownLight
 from wildghand.model.model import make_model
-from wildghand.model.settings import WildGHandSettings, read_stored, read_version_1
+from wildghand.model.settings import WildGHandSettings, read_settings
 from wildghand.network.network import MAPS, shapes_of_settings
-from wildghand.poses import ClipPoses
 from wildghand.subject import SubjectShape
 
 #: Largest model that is read, bytes.
@@ -126,7 +123,7 @@ def _shapes(
         "transl_steps": (len(sides), frame_count, 3),
     }
     absent = {f"{MAPS}{side}" for side in ("right", "left") if side not in sides}
-    for name, shape in shapes_of_settings(settings.network).items():
+    for name, shape in shapes_of_settings(settings.network.build()).items():
         if name not in absent:
             shapes[f"network.{name}"] = tuple(shape)
     return shapes
@@ -155,9 +152,7 @@ def read_weight_masks(folder: Path, frames: list[int]) -> dict[int, np.ndarray]:
 
 
 #: Version of the folder.
-SCHEMA = "wildghand-avatar/2"
-#: The version before it, which is read too: settings under their former names.
-VERSION_1 = "wildghand-avatar/1"
+SCHEMA = "wildghand-avatar/3"
 #: Names of its files.
 DESCRIPTION = "avatar.json"
 MODEL = "model.safetensors"
@@ -269,12 +264,13 @@ def load_avatar(
     description = read_json(root / DESCRIPTION, max_bytes=MAX_DESCRIPTION_BYTES)
     value = parse_record(_Description, description, where=where, error=BadInput)
     try:
-        if value.schema == VERSION_1:
-            settings = read_version_1(value.settings)
-        elif value.schema == SCHEMA:
-            settings = read_stored(value.settings)
-        else:
-            raise BadInput(f"is {value.schema!r} where {SCHEMA!r} is read", field="schema")
+        if value.schema != SCHEMA:
+            raise BadInput(
+                f"is {value.schema[:40]!r} where {SCHEMA!r} is read",
+                field="schema",
+                remedy="Fit the avatar again.",
+            )
+        settings = read_settings(value.settings)
         _check_description(value)
     except HwpError as error:
         raise BadInput(str(error), where=where) from error
@@ -282,25 +278,14 @@ def load_avatar(
     mean_color, frame_count = torch.tensor(value.mean_color), max(1, len(value.fit.frames))
     device = torch.device(device)
     file = root / MODEL
-    tensors = rename_former(read_tensors(file, settings, value.sides, frame_count, value.tensors))
+    tensors = read_tensors(file, settings, value.sides, frame_count, value.tensors)
     try:
         vertices = len(next(iter(templates.values())).vertices)
         subject = SubjectShape.from_tensors(tensors, str(file), V=vertices)
         model = make_model(
             templates, settings, mean_color, frame_count, value.seed, device, subject
         )
-        light = KnownLight.from_tensors(tensors, str(file))
-        cast = CastLight.from_tensors(tensors, str(file))
-        poses = ClipPoses.from_tensors(tensors, str(file))
-        for found in (light, cast, poses):
-            if found is not None:
-                model.keep(found)
-        counts = {side: len(rig) for side, rig in model.rigs.items()}
-        evidence = Evidence.from_tensors(tensors, str(file), N=counts)
-        colors = ColorChanges.from_tensors(tensors, str(file), N=counts)
-        for kept in (evidence, colors):
-            if kept is not None:
-                model.keep(kept)
+        model.keep_all(tensors, str(file))
         model.load_state_dict(tensors, strict=True)
     except RuntimeError as error:
         problem = str(error).splitlines()[0][:300]

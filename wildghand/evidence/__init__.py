@@ -7,7 +7,6 @@ from wildghand.evidence.evidence import (
     EvidenceSettings,
     fill_shares,
     kept_share,
-    rename_former,
     strengths,
     weigh_evidence,
 )
@@ -18,7 +17,6 @@ __all__ = [
     "EvidenceSettings",
     "fill_shares",
     "kept_share",
-    "rename_former",
     "shown_frames",
     "strengths",
     "weigh_evidence",

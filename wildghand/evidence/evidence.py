@@ -186,8 +186,6 @@ def fill_shares(settings: EvidenceSettings) -> list[float]:
 
 
 _PREFIX = "color_changes_"
-# Of avatars from before places that are seldom seen took the colours around them.
-_FORMER = "other_hand_"
 # Largest change of a colour that is read, in logits.
 _LARGEST = 20.0
 
@@ -208,11 +206,3 @@ class ColorChanges(Found):
             raw: (..., N, k) attributes.
         """
         return replace(raw, logit_colors=raw.logit_colors + self.changes[side])
-
-
-def rename_former(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of an avatar by their names of today."""
-    return {
-        _PREFIX + name.removeprefix(_FORMER) if name.startswith(_FORMER) else name: value
-        for name, value in tensors.items()
-    }

@@ -98,7 +98,7 @@ def learn_light(fit: Fit, frames: int | None = None) -> KnownLight | None:
     samples = light_samples(
         fit.model, fit.clip, weights[:read], settings.samples * read // count, fit.seed
     )
-    return fit_light(samples, settings)
+    return fit_light(samples)
 
 
 def _timed(fit: Fit, frames: int) -> float:

@@ -114,12 +114,8 @@ class WildGHandSettings:
     #: Addition: Gaussians that few frames show are discs on the skin.
     evidence: EvidenceSettings = field(default_factory=EvidenceSettings)
     #: Addition: the judge of the frames. It says where the temporal weights start, which pixels are
-    #: covered, and which poses need refining. It leaves the biases out of every clean
-    #: frame, not out of three in ten: what little they took from these, the avatar lacked
-    #: (docs/wildghand.md).
-    prepass: PrepassSettings = field(
-        default_factory=lambda: PrepassSettings(weight_floor=0.2, omega_dropout=1.0)
-    )
+    #: covered, and which poses need refining.
+    prepass: PrepassSettings = field(default_factory=PrepassSettings)
     #: The network.
     network: NetworkChoice = field(default_factory=NetworkChoice)
     #: Weights of the terms of the loss.
@@ -141,11 +137,9 @@ _PUBLISHED: Mapping[str, Any] = MappingProxyType(
         "pao": {
             "variant": PAPER_PAO.variant,
             "errors": "batch",
-            "alpha": PAPER_PAO.alpha,
             "beta": PAPER_PAO.beta,
             "error_threshold": PAPER_PAO.error_threshold,
             "share_threshold": PAPER_PAO.share_threshold,
-            "spare_clean": False,
         },
         "start_colors": False,
         "poses": {"enabled": False},

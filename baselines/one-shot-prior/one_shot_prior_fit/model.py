@@ -87,7 +87,7 @@ class OneShotModel:
                 remedy="This method fits captures of the free hand model only.",
             )
         prior.initialise(network)
-        biased = BiasedTexture(settings.network, templates).to(device)
+        biased = BiasedTexture(settings.network.build(), templates).to(device)
         biased.load_state_dict(network.texture_branch.state_dict(), strict=False)
         network.texture_branch = biased
         self.model.requires_grad_(False)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from typing import ClassVar
 
 import torch
@@ -201,7 +200,7 @@ class ScanRecipe(Recipe[ScanSettings]):
         return {**super().snapshot(), "textured": self.model.textured.clone()}
 
     @torch.no_grad()
-    def restore(self, values: Mapping[str, Tensor]) -> None:
+    def restore(self, values: dict[str, Tensor]) -> None:
         """See `Recipe`."""
         super().restore(values)
         self.model.textured.copy_(values["textured"])
