@@ -1,7 +1,7 @@
 """Rooms import only what lies below them. Oracle: every import statement of the tree.
 
-`docs/architecture.md` states the layers: its tables of rooms are in order, from the lowest to the
-highest, and this test reads them.
+`docs/architecture.md` states the layers: its lists of rooms are in order, from the lowest to the
+highest, and this test reads them. It also follows the walks of the page from import to import.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ def imports(name: str, path: Path, known: dict[str, Path]) -> Iterator[str]:
 
 
 def layers(package: str) -> list[str]:
-    """The rooms of a package in the order of the page's table, lowest first."""
-    rows = re.findall(rf"^\| `{package}/(\w+)` \|", PAGE.read_text("utf-8"), re.MULTILINE)
+    """The rooms of a package in the order of the page's list, lowest first."""
+    rows = re.findall(rf"^- `{package}/(\w+)`", PAGE.read_text("utf-8"), re.MULTILINE)
     assert len(rows) == len(set(rows))
     return rows
 
@@ -164,3 +164,48 @@ def test_no_public_name_of_a_package_is_also_a_room(package: str) -> None:
     # Importing a room sets it as an attribute of the package, in place of the public name.
     public = set(__import__(package).__all__)
     assert public.isdisjoint(room(name) for name in MODULES if name.split(".")[0] == package)
+
+
+#: Most words of the page, and most modules of its walks.
+WORDS, STEPS = 1300, {"hwp-bench evaluate": 18, "wildghand fit": 25}
+
+
+def walk(command: str) -> list[str]:
+    """The files that the page's walk through a command names, in order."""
+    (section,) = (
+        part
+        for part in re.split(r"^## ", PAGE.read_text("utf-8"), flags=re.MULTILINE)
+        if part.startswith(f"A walk through `{command}")
+    )
+    return re.findall(r"^\d+\. `([\w/.-]+\.py)`", section, re.MULTILINE)
+
+
+def leads_to(name: str) -> set[str]:
+    """Modules that one imports, through a package's `__init__` too, or names in a string."""
+    found = set(every_import()[name])
+    for target in list(found):
+        if MODULES[target].name == "__init__.py":
+            found |= set(every_import()[target])
+    text = MODULES[name].read_text("utf-8")
+    # Commands, workers and entries of methods are loaded by name.
+    return found | {
+        other
+        for other in MODULES
+        if other in text or re.search(rf"[\"{{.]{other.rpartition('.')[2]}[\"}}:]", text)
+    }
+
+
+def test_the_page_is_short() -> None:
+    assert len(PAGE.read_text("utf-8").split()) <= WORDS
+
+
+@pytest.mark.parametrize("command", STEPS)
+def test_a_walk_goes_from_import_to_import(command: str) -> None:
+    files = walk(command)
+    assert 10 <= len(files) <= STEPS[command]
+    names = [".".join(Path(file).with_suffix("").parts) for file in files]
+    assert [file for file in files if not (ROOT / file).is_file()] == []
+    behind = set()
+    for number, name in enumerate(names):
+        assert not number or name in behind, f"nothing before {name} leads to it"
+        behind |= leads_to(name)

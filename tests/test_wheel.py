@@ -103,7 +103,7 @@ def test_the_shipped_baseline_can_be_loaded_from_it(programs: Path, tmp_path: Pa
         "from hwp_bench.run.worker import load_entry\n"
         "for name in ('plain', 'baselines/plain', 'network-scratch', 'wildghand'):\n"
         "    manifest = read_manifest(find_method(name))\n"
-        "    print(load_entry(manifest.root, manifest.entry).__name__)\n"
+        "    print(load_entry(manifest.root, manifest.entry.python).__name__)\n"
     )
     names = run(programs / "python", "-c", code, cwd=tmp_path).split()
     assert names == ["PlainMethod", "PlainMethod", "WildGHandMethod", "WildGHandMethod"]

@@ -1,4 +1,4 @@
-"""What a score costs: accuracy against time, seconds and memory of methods, and their tables."""
+"""The cost of a score: accuracy against time, seconds and memory of methods, and their tables."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a person sees while a program works: standard streams, notices, progress.
+"""Everything that a person sees while a program works: standard streams, notices, progress.
 
 Whatever the encoding or the end of a stream, it does not stop the work. Progress and notices go
 to standard error, so that standard output stays the result: on a terminal as bars, elsewhere (logs,

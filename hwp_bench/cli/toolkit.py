@@ -1,4 +1,4 @@
-"""What the toolkit has, and whether it works here: `list`, `stability`, `completion`."""
+"""Contents of the toolkit, and whether it works here: `list`, `stability`, `completion`."""
 
 from __future__ import annotations
 

@@ -86,8 +86,8 @@ def class_settings(root: Path, reference: str) -> list[str]:
         reference: `module:Class`.
 
     Raises:
-        BadMethod: there is no such module or class, the class is no dataclass, or a source cannot
-            be parsed.
+        BadMethod: there is no such module or class, the class is not a dataclass, or a source
+            cannot be parsed.
     """
     module, _, name = reference.partition(":")
     return _ClassReader(root, reference).names(module, name)
@@ -133,7 +133,7 @@ class _ClassReader:
             field, annotation = item.target.id, _without_quotes(item.annotation)
             if "ClassVar" in ast.unparse(annotation):
                 continue
-            # A class of its own may declare anew what its base declares.
+            # A class of its own may declare again what its base declares.
             names = {key: None for key in names if key.partition(".")[0] != field}
             table = self._class_of(module, annotation)
             if table is not None and _is_dataclass(table[1]):

@@ -1,4 +1,4 @@
-"""What a fit is given, and what it knows of its frames before it has a model."""
+"""The data of a fit, and judgements of its frames before there is a model."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ PLACE = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Judgement:
-    """What is known of R frames before they are fitted; without a pre-pass all are clean."""
+    """Judgements of R frames before they are fitted; without a pre-pass all are clean."""
 
     #: (R,) probability that a frame is clean.
     clean: Tensor

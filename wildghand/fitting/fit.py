@@ -102,7 +102,7 @@ class Component:
     def compare(
         self, fit: Fit, batch: Batch, drawing: RenderedFrames, target: FrameTarget
     ) -> FrameTarget:
-        """What the drawing of a batch is compared with, and how much each pixel counts."""
+        """Change the images that a batch is compared with, and how much each pixel counts."""
         return target
 
     def loss(
@@ -271,7 +271,7 @@ class Fit(IterativeFit[WildGHandAvatar]):
         )
 
     def compare(self, batch: Batch, drawing: RenderedFrames) -> FrameTarget:
-        """What a drawing is compared with."""
+        """The images that a drawing is compared with, and the weights of their pixels."""
         mine, data = batch.mine, self.data
         target = FrameTarget(
             data.images(mine), data.masks(mine), torch.ones((), device=self.device)

@@ -1,4 +1,4 @@
-"""What is known of frames and pixels before the fit: the pre-pass, the hand, hidden skin."""
+"""Judgements of frames and pixels before the fit: the pre-pass, the hand, hidden skin."""
 
 from __future__ import annotations
 

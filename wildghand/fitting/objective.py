@@ -46,7 +46,7 @@ class Reconstruction(Component):
 
 
 class Regularisers(Component):
-    """What the Gaussians of a hand are held to, whatever the frames show."""
+    """Terms that hold the Gaussians of a hand, whatever the frames show."""
 
     def before(self, fit: Fit) -> None:
         """Make the Laplacians of the surface."""

@@ -94,7 +94,7 @@ class _Picture(Stage):
         return {"avatar": avatar_digest(job.folder), f"look of the {self.name}": self.look()}
 
     def look(self) -> str:
-        """What the picture depends on but the avatar."""
+        """Everything that the picture depends on, besides the avatar."""
         raise NotImplementedError
 
     def run(self, job: Job) -> None:

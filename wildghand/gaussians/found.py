@@ -1,4 +1,4 @@
-"""What a fit finds next to its network: records of tensors, which an avatar keeps by name.
+"""Findings of a fit next to its network: records of tensors, which an avatar keeps by name.
 
 A record declares how each of its fields stands in a file:
 

@@ -1,4 +1,4 @@
-"""What a page holds: its poses, controls and still image, and how near it comes to the avatar."""
+"""Contents of a page: its poses, controls and still image, and how near it comes to the avatar."""
 
 from __future__ import annotations
 

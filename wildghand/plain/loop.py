@@ -24,7 +24,7 @@ Result = TypeVar("Result")
 
 
 class IterativeFit(Generic[Result]):
-    """What the loop asks of a fit. What it leaves at its default costs nothing.
+    """A fit as the loop sees it. What it leaves at its default costs nothing.
 
     Attributes:
         device: where its tensors live.
@@ -41,7 +41,7 @@ class IterativeFit(Generic[Result]):
         raise NotImplementedError
 
     def batches(self) -> Iterator[Any]:
-        """What the steps are taken on, without end and in the same order every time."""
+        """The batches of the steps, without end and in the same order every time."""
         raise NotImplementedError
 
     def step(self, batch: Any, fraction: float) -> Loss:

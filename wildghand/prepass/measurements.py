@@ -1,4 +1,4 @@
-"""What is measured of one frame: its borders, what hides, what differs from the model."""
+"""Measurements of one frame: its borders, what hides, what differs from the model."""
 
 from __future__ import annotations
 

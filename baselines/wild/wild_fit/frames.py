@@ -1,4 +1,4 @@
-"""What a frame has of its own: its appearance, and how uncertain its pixels are."""
+"""Properties of single frames: their appearance, and how uncertain its pixels are."""
 
 from __future__ import annotations
 

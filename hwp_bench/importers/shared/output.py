@@ -1,4 +1,4 @@
-"""What an import writes: the capture, a sheet to look at, and the import's own report."""
+"""The output of an import: the capture, a sheet to look at, and the import's own report."""
 
 from __future__ import annotations
 
@@ -192,6 +192,6 @@ def _draw_bones(canvas: np.ndarray, landmarks: np.ndarray) -> None:
 
 
 def _fractions(pixels: np.ndarray) -> list[tuple[int, int]]:
-    """Places as OpenCV draws them, in fractions of a pixel with whole numbers at its centre."""
+    """Places as OpenCV draws them, in fractions of a pixel with integers at its centre."""
     scaled = np.clip((pixels - 0.5) * 2**_SHIFT, -(2**20), 2**20).round().astype(int)
     return [(x, y) for x, y in scaled.tolist()]

@@ -146,7 +146,7 @@ class SurfaceResidual(ABC):
 
     @abstractmethod
     def seen(self, frame: int, drawn: Drawn) -> Any:
-        """What a frame shows of the surface."""
+        """The surface as a frame shows it."""
 
     @abstractmethod
     def collect(self, frames: list[int], seen: Iterable[Any]) -> None:

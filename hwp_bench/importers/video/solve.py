@@ -53,7 +53,7 @@ Update = Callable[[int], None]
 
 @dataclass(frozen=True)
 class FitSettings:
-    """How long the fit of a clip takes; its weights and scales stand beside the residuals."""
+    """How long the fit of a clip takes; its weights and scales stand with the residuals."""
 
     #: Steps of Adam from the rigid start, with the world landmarks dominant.
     start_steps: int = 150

@@ -1,4 +1,4 @@
-"""What a clip shows of the surface of a hand: its mean texture, and its colours in their light.
+"""The surface of a hand as a clip shows it: its mean texture, and its colours in their light.
 
 Both lie on the texels of the hand's texture map. The texture is what is left of the frames without
 the light; the colours come with a light for each frame.

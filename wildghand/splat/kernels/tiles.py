@@ -1,4 +1,4 @@
-"""What a tile of pixels sees of a splat: its row of numbers, its alpha, its channels.
+"""A splat as a tile of pixels sees it: its row of numbers, its alpha, its channels.
 
 A splat is a small blob. A vector of pixels shaped as a block (4 x 4 rather than 16 x 1) misses
 it less often, so fewer lanes are wasted. Each tile has 16 blocks, so that one 16-lane vector
