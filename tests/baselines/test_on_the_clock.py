@@ -27,7 +27,7 @@ for folder in map(Path, sys.argv[2:]):
     settings = {**read_manifest(folder).presets["default"], "device": "cpu"}
     if "gaussians" in settings:
         settings["gaussians"] = 400
-    method = load_entry(folder, read_manifest(folder).entry)(settings, 0)
+    method = load_entry(folder, read_manifest(folder).entry.python)(settings, 0)
     before = set(sys.modules)
     method.fit(training, Budget(steps=1), SilentReport())
     found[folder.name] = sorted({name.split(".")[1] for name in set(sys.modules) - before

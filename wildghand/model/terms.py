@@ -25,7 +25,7 @@ SURFACE_INEXACT = 5.0
 
 @dataclass(frozen=True)
 class TermWeights:
-    """Weights of the terms that are no settings: the paper's, or these by default.
+    """Weights of the terms that are not settings: the paper's, or these by default.
 
     The defaults are the authors' weights divided by their 100 for the reconstruction, but for
     the two terms that cost the clean fit several dB: opacity and silhouette.
@@ -94,7 +94,7 @@ class TermSettings:
 
     @property
     def fixed(self) -> TermWeights:
-        """The weights that are no settings."""
+        """The weights that are not settings."""
         return WEIGHTS[self.weights]
 
     def dssim_share(self, *, exact_poses: bool) -> float:

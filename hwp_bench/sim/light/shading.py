@@ -185,7 +185,7 @@ def _reached(
 ) -> np.ndarray:
     """Whether light reaches the samples: (H,) 0 or 1; 1 for all but `rows` (R,).
 
-    `directions` (R, 3) lead from these samples to the light. One that faces away from it is no
+    `directions` (R, 3) lead from these samples to the light. One that faces away from it has no
     row: its normal darkens it.
     """
     reached = np.ones(len(samples.ray))

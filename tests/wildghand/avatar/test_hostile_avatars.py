@@ -64,7 +64,7 @@ def _describe(avatar: Path, change: Change) -> None:
             "network.*as its description says",
         ),
         (
-            lambda v: v["settings"]["network"].update(plane_resolution=512, direct=False),
+            lambda v: v["settings"]["network"].update(size="paper"),
             "network",
         ),
         (

@@ -19,7 +19,6 @@ import cv2
 import numpy as np
 import pytest
 import torch
-from painted import QUICK
 from synthetic_clip import landmark_import, make_clip, write_landmarks, write_video
 from two_hand_clip import make_two_hands, write_two_hands
 
@@ -43,7 +42,9 @@ COUNT, STEPS = 16, 6
 NAMES = [stage.name for stage in STAGES]
 #: A fit without what no stage here asks about: bending and shadows are a third of a run's time.
 SETTINGS: dict[str, Any] = {
-    **QUICK,
+    "gaussians": 600,
+    "device": "cpu",
+    "schedule.batch": 1,
     "schedule.steps": STEPS,
     "subject.enabled": False,
     "shadows.enabled": False,
