@@ -69,17 +69,7 @@ class CaseOutcome:
 
 
 def find_cases(groups: Sequence[str] = (), providers: Sequence[str] = ()) -> list[Case]:
-    """Return the cases that packages offer.
-
-    Args:
-        groups: only these; all if empty.
-        providers: more sources, each "module:function", in addition to the installed entry points.
-
-    Raises:
-        UsageError: no package offers such a group.
-        MissingDependency: no installed package offers cases.
-        HwpError: a source cannot be loaded.
-    """
+    """Return the cases that packages offer."""
     sources = {point.name: point.value for point in metadata.entry_points(group=ENTRY_POINTS)}
     every = dict.fromkeys([*sources.values(), *providers])
     cases = [case for source in every for case in _load(source)]
@@ -103,13 +93,7 @@ def find_cases(groups: Sequence[str] = (), providers: Sequence[str] = ()) -> lis
 def run_cases(
     cases: Iterable[Case], backends: Sequence[str] = (), clock: Callable[[], float] = time.monotonic
 ) -> Iterator[CaseOutcome]:
-    """Run cases one by one, each on every backend that it has, and yield each outcome.
-
-    Args:
-        cases: in the order to run them.
-        backends: only on these; on all if empty.
-        clock: seconds.
-    """
+    """Run cases one by one, each on every backend that it has, and yield each outcome."""
     for case in cases:
         for backend in case.backends:
             if backends and backend not in backends:

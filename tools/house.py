@@ -92,7 +92,7 @@ def walks() -> dict[str, int]:
     """Modules in each walk of docs/architecture.md, by the command that it follows."""
     sections = re.split(r"^## ", PAGE.read_text("utf-8"), flags=re.MULTILINE)[1:]
     return {
-        section.splitlines()[0]: len(re.findall(r"^\| *\d+ *\|", section, re.MULTILINE))
+        section.splitlines()[0]: len(re.findall(r"^\d+\. `", section, re.MULTILINE))
         for section in sections
         if "walk" in section.splitlines()[0].lower()
     }

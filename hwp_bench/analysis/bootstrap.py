@@ -69,16 +69,6 @@ def bootstrap_mean(
 
     Args:
         samples: one (S, F) float array a capture: the difference for each seed and frame.
-        weights: of the captures, above 0; None counts each the same.
-        resamples: number of resamples.
-        seed: of the resampling.
-
-    Returns:
-        The estimate. With one capture only frames and seeds are drawn.
-
-    Raises:
-        UsageError: no capture, one without frames, a value that is not finite, a weight that is
-            not above 0.
     """
     blocks = [_checked(sample) for sample in samples]
     share = _shares(weights, len(blocks))
@@ -236,11 +226,6 @@ def skewness_of_mean(values: np.ndarray, share: np.ndarray) -> float:
     Args:
         values: (N,) float, the captures' means.
         share: (N,) float, their weights, adding up to 1.
-
-    Returns:
-        Sum of w^3 over (sum of w^2)^1.5, times the captures' own skewness; with equal weights
-        that is the skewness over the square root of N. 0 below `FEWEST` captures, and where
-        nothing varies.
     """
     deviations = values - share @ values
     spread = share @ deviations**2
@@ -274,15 +259,7 @@ def inverse_hall_transform(value: float, skew: float) -> float:
 
 
 def interval_reaches(quantile: float, skew: float) -> tuple[float, float]:
-    """Return how far an interval reaches below and above the mean, in standard errors.
-
-    Args:
-        quantile: of Student's t, above 0.
-        skew: skewness of the mean.
-
-    Returns:
-        The larger of Student's reach and that after Hall's transformation, on each side.
-    """
+    """Return how far an interval reaches below and above the mean, in standard errors."""
     below = max(quantile, inverse_hall_transform(quantile, skew))
     return below, max(quantile, -inverse_hall_transform(-quantile, skew))
 

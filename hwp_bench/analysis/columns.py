@@ -16,14 +16,7 @@ Filled = tuple[Column, Sequence[Cell]]
 def table_of(
     caption: str, columns: Iterable[Filled], notes: Iterable[str] = (), **options: Any
 ) -> Table:
-    """Return the table of some columns, each with as many cells as there are rows.
-
-    Args:
-        caption: its caption.
-        columns: the columns; at least one.
-        notes: lines under it.
-        options: further fields of `Table`.
-    """
+    """Return the table of some columns, each with as many cells as there are rows."""
     heads, cells = zip(*columns, strict=True)
     rows = tuple(zip(*cells, strict=True))
     return Table(caption, heads, rows, tuple(notes), **options)

@@ -131,12 +131,7 @@ def _adjust(found: list[Difference], places: list[int]) -> None:
 def standings(
     runs: Sequence[MethodRuns], metric: str, differences: Sequence[Difference]
 ) -> list[Standing]:
-    """Return the methods, best first, with their tie groups.
-
-    Args:
-        differences: what `compare` found; pairs with an adjusted p below `ALPHA` in the macro
-            scope differ significantly.
-    """
+    """Return the methods, best first, with their tie groups."""
     higher = metric_facts(metric).higher_is_better
     means = {run.label: macro_by_seed(run, metric) for run in runs}
     order = sorted(runs, key=lambda run: float(means[run.label].mean()) * (-1 if higher else 1))
@@ -508,20 +503,7 @@ def compare_results(
     resamples: int = RESAMPLES,
     seed: int = 0,
 ) -> Comparison:
-    """Compare the methods of several results.
-
-    Args:
-        results: of at least two methods on the same captures; results that differ only in the
-            seed count as one method.
-        metrics: names of metrics; one that not every result has is left out.
-        all_metrics: refuse a metric that not every result has.
-        resamples: bootstrap resamples of each interval, 100 to 1,000,000.
-        seed: seed of the resampling.
-
-    Raises:
-        UsageError: the results are of one method only or of different data, no metric is left,
-            or the number of resamples is out of range.
-    """
+    """Compare the methods of several results."""
     if not 100 <= resamples <= 1_000_000:
         raise UsageError(f"{resamples} is not between 100 and 1000000", field="--resamples")
     runs = group_runs(results)

@@ -135,14 +135,7 @@ def method_costs(
     budgets: Sequence[float] = BUDGETS,
     reference: MethodRuns | None = None,
 ) -> list[MethodCost]:
-    """Return the cost of every method.
-
-    Args:
-        runs: the methods.
-        metric: a metric of the curves.
-        budgets: seconds at which scores are read; those that no fit lasted for are left out.
-        reference: the method whose final scores are a target.
-    """
+    """Return the cost of every method."""
     curves = [method_curves(run, metric) for run in runs]
     stretch = window(curves)
     longest = max(
@@ -244,11 +237,7 @@ def cost_tables(
     stretch: tuple[float, float] | None,
     notes: Sequence[str] = (),
 ) -> dict[str, Table]:
-    """Return the tables by name: `cost`, `times`, `front`.
-
-    Args:
-        reference: label of the method whose final score is a target; None without one.
-    """
+    """Return the tables by name: `cost`, `times`, `front`."""
     return {
         "cost": _cost_table(costs, metric, reference, stretch, notes),
         "times": _times_table(costs),
@@ -350,11 +339,7 @@ def machine_notes(results: Sequence[Results]) -> list[str]:
 
 
 def run_seconds(capture: CaptureResult) -> dict[str, float] | None:
-    """Return the seconds of one run by part; None where they were not put on record.
-
-    Returns:
-        Keys are those of `PARTS`. What a method does not say of itself is part of its start.
-    """
+    """Return the seconds of one run by part; None where they were not put on record."""
     if capture.job_seconds is None or not capture.wall_seconds:
         return None
     said = {
@@ -442,13 +427,7 @@ def analyse_cost(
     budgets: Sequence[float] = BUDGETS,
     reference: MethodRuns | None = None,
 ) -> CostAnalysis:
-    """Analyse accuracy against time.
-
-    Args:
-        runs: the methods; at least one.
-        reference: the method whose final score is a target; None takes the plain baseline where
-            it is among `runs`.
-    """
+    """Analyse accuracy against time."""
     if reference is None:
         plain = [run for run in runs if run.first.method.name == PLAIN]
         reference = plain[0] if plain else None

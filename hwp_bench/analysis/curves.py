@@ -130,12 +130,7 @@ class FrontPart:
 
 
 def mean_curve(label: str, curves: Mapping[str, Sequence[Curve]]) -> MeanCurve | None:
-    """Return the mean curve of a method.
-
-    Returns:
-        The mean from the first moment at which every fit has had a checkpoint to the end of the
-        longest fit, and Student's interval over captures; None without curves.
-    """
+    """Return the mean curve of a method."""
     every = [curve for fits in curves.values() for curve in fits]
     if not every:
         return None

@@ -179,13 +179,7 @@ def common_seeds(first: MethodRuns, second: MethodRuns) -> list[int]:
 
 
 def scopes(results: Results) -> dict[str, dict[str, float]]:
-    """Return the sets of captures that are averaged, with the weight of each capture.
-
-    Returns:
-        By scope, in the order of tables: `macro` (weights as in the mean over perturbations; all
-        captures count the same where none has a perturbation), `single`, `interacting`, and each
-        perturbation. Scopes without captures are left out.
-    """
+    """Return the sets of captures that are averaged, with the weight of each capture."""
     captures = results.captures
     carriers = {
         name: [capture.id for capture in captures if name in capture.perturbations]

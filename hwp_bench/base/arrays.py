@@ -28,11 +28,7 @@ MAX_MEMBERS = 10_000
 def read_npz(
     path: str | os.PathLike[str], *, max_bytes: int = MAX_NPZ_BYTES
 ) -> dict[str, np.ndarray]:
-    """Read every array of an `.npz` file.
-
-    Raises:
-        BadInput: missing, damaged, larger than `max_bytes` when unpacked, or holding objects.
-    """
+    """Read every array of an `.npz` file."""
     path = Path(path)
     check_is_file(path)
     try:
@@ -126,11 +122,7 @@ def take(
 
 
 def read_tensors(path: str | os.PathLike[str], max_bytes: int) -> dict[str, Tensor]:
-    """Read tensors by name; nothing else that a file may hold is made or run.
-
-    Args:
-        max_bytes: largest file that is read.
-    """
+    """Read tensors by name; nothing else that a file may hold is made or run."""
     import torch
 
     file = Path(path)

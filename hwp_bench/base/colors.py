@@ -33,9 +33,6 @@ def log_light(srgb: np.ndarray, floor: float) -> np.ndarray:
 
     Args:
         srgb: sRGB in [0, 1], any shape.
-
-    Returns:
-        float64 of the same shape.
     """
     return np.log(srgb_to_linear(srgb) + floor)
 
@@ -55,14 +52,7 @@ COUNT = 9
 
 
 def harmonics(normals: np.ndarray) -> np.ndarray:
-    """The nine polynomials of degree 0 to 2 that span the spherical harmonics.
-
-    Args:
-        normals: (..., 3), unit or zero; at zero only the constant is not 0.
-
-    Returns:
-        (..., 9).
-    """
+    """The nine polynomials of degree 0 to 2 that span the spherical harmonics."""
     x, y, z = np.moveaxis(normals, -1, 0)
     known = (normals**2).sum(axis=-1) > 0.5
     second = np.where(known, 3.0 * z * z - 1.0, 0.0)

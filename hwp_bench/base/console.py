@@ -235,11 +235,7 @@ def clock(seconds: float) -> str:
 
 
 def remaining(durations: Sequence[float], left: int) -> float | None:
-    """Estimate the seconds that are left.
-
-    Args:
-        durations: seconds of the jobs that have ended.
-    """
+    """Estimate the seconds that are left."""
     ran = [spent for spent in durations if spent >= FOUND * max(durations)]
     return left * sum(ran) / len(ran) if ran else None
 
@@ -275,13 +271,7 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
 
 
 def track(items: Iterable[Item], description: str, total: int | None = None) -> Iterator[Item]:
-    """Yield the items and show progress over them.
-
-    Args:
-        items: what is worked through.
-        description: what is being done.
-        total: number of items, needed when `items` has no length.
-    """
+    """Yield the items and show progress over them."""
     count = total if total is not None else len(items)  # type: ignore[arg-type]
     with progress(description, count) as update:
         for done, item in enumerate(items, start=1):
@@ -317,11 +307,7 @@ class JobsView:
             self._bars.stop()
 
     def turn(self, index: int, count: int, text: str) -> Callable[[int, int], None]:
-        """Begin job `index` of `count`, after the one before it has ended.
-
-        Returns:
-            A function that takes (done, total) steps of the job.
-        """
+        """Begin job `index` of `count`, after the one before it has ended."""
         if index == 0 or count != self._count:
             self.begin(count)
         for other in list(self._running):
@@ -476,12 +462,7 @@ class StagesView:
             self._bars.stop()
 
     def stage(self, number: int, count: int, text: str, *, own: float, later: float) -> None:
-        """Begin a stage.
-
-        Args:
-            own: seconds that it is expected to take.
-            later: seconds that those after it are expected to take.
-        """
+        """Begin a stage."""
         self._stage_began = time.perf_counter()
         self._left = (own, later)
         elapsed = clock(self._stage_began - self._began)

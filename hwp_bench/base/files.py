@@ -45,22 +45,7 @@ _SURROGATE = re.compile(r"\\u[dD][89a-fA-F]")
 def atomic_write(
     path: str | os.PathLike[str], data: bytes | str, *, overwrite: bool = True, flag: str = ""
 ) -> Path:
-    """Write a file so that a reader sees the old content or the new one, never a part.
-
-    Args:
-        path: the file; its folder is made.
-        data: bytes, or text that is stored as UTF-8.
-        overwrite: replace what is there; without it a file is refused also where another process
-            made it a moment ago.
-        flag: the option by which a person asks for that, for the message; empty where none is.
-
-    Returns:
-        The path.
-
-    Raises:
-        UsageError: `path` exists and may not be replaced.
-        HwpError: the place cannot be written (no space, no permission).
-    """
+    """Write a file so that a reader sees the old content or the new one, never a part."""
     path = Path(path)
     raw = data.encode() if isinstance(data, str) else data
     temporary: Path | None = None
@@ -151,13 +136,7 @@ def check_places(
     replaces: bool = False,
     makes_captures: bool = False,
 ) -> None:
-    """Refuse outputs that would destroy or mix with each other or an input, before work begins.
-
-    Args:
-        outputs, inputs: files and folders that a command writes and reads, by option.
-        replaces: an output takes the place of what is there, so that it may not hold an input.
-        makes_captures: an output is a capture, and may be where one is.
-    """
+    """Refuse outputs that would destroy or mix with each other or an input, before work begins."""
     made = _resolved(outputs)
     read = _resolved(inputs)
     for number, (option, path) in enumerate(made):
@@ -202,21 +181,7 @@ def _exists(path: Path, flag: str) -> UsageError:
 def atomic_folder(
     path: str | os.PathLike[str], *, overwrite: bool = False, flag: str = ""
 ) -> Iterator[Path]:
-    """Fill a folder under a temporary name; it takes its own name only when the block ends well.
-
-    Args:
-        path: the folder to make.
-        overwrite: replace an existing folder; without it an existing non-empty one is refused,
-            also where another process made it during the block.
-        flag: the option by which a person asks for that, for the message; empty where none is.
-
-    Yields:
-        The temporary folder, a sibling of `path`.
-
-    Raises:
-        UsageError: `path` exists and holds something, or is a file.
-        HwpError: the place cannot be written.
-    """
+    """Fill a folder under a temporary name; it takes its own name only when the block ends well."""
     path = Path(path).absolute()
     if path.is_symlink():
         # What it leads to takes the content; the link stays.

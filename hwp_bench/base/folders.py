@@ -187,11 +187,7 @@ _OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
 
 
 def trim(folder: Path, suffix: str, max_bytes: int) -> None:
-    """Remove the files that were used longest ago until the rest fits.
-
-    Args:
-        max_bytes: of all files together.
-    """
+    """Remove the files that were used longest ago until the rest fits."""
     entries = []
     with contextlib.suppress(OSError):
         for entry in os.scandir(folder):
@@ -210,12 +206,7 @@ def trim(folder: Path, suffix: str, max_bytes: int) -> None:
 
 
 def read_private(path: Path, max_bytes: int) -> bytes | None:
-    """Read a file that only this user can have written.
-
-    Returns:
-        Its content; None if there is no such file, it is a link or a device, it belongs to
-        somebody else, others may write to it or to its folder, or it is larger than `max_bytes`.
-    """
+    """Read a file that only this user can have written."""
     try:
         if not _private(os.lstat(path.parent)):
             return None

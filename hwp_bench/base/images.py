@@ -64,17 +64,8 @@ def is_blank(pixels: np.ndarray) -> bool:
 def read_rgb(path: str | os.PathLike[str], size: tuple[int, int] | None = None) -> np.ndarray:
     """Read a colour image.
 
-    Args:
-        path: a PNG, JPEG or BMP file, whatever its name. Gray becomes RGB; an alpha channel is
-            dropped, not composited.
-        size: expected (height, width) in pixels.
-
     Returns:
         (H, W, 3) uint8, sRGB.
-
-    Raises:
-        BadImage: missing, empty, of another format, animated, damaged, not 8-bit, too large, not
-            of `size`, or to be turned before it is shown (EXIF).
     """
     pixels = _read(Path(path), size)
     if pixels.shape[2] < 3:
@@ -87,9 +78,6 @@ def read_gray(path: str | os.PathLike[str], size: tuple[int, int] | None = None)
 
     Returns:
         (H, W) uint8.
-
-    Raises:
-        BadImage: as `read_rgb`.
     """
     return np.ascontiguousarray(_read(Path(path), size)[:, :, 0])
 
@@ -174,13 +162,7 @@ def write_image(path: str | os.PathLike[str], pixels: np.ndarray) -> Path:
     """Write an 8-bit image, whole or not at all.
 
     Args:
-        path: the file; the ending chooses the format (`.png` for everything the toolkit keeps).
         pixels: (H, W) or (H, W, 1 | 3 | 4) uint8.
-
-    Raises:
-        ShapeMismatch: the array is not such an image.
-        UsageError: the path is not UTF-8.
-        HwpError: the place cannot be written.
     """
     path = Path(path)
     array = pixels[:, :, None] if pixels.ndim == 2 else pixels

@@ -67,9 +67,6 @@ def compiled(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     It lies in the folder `kernels` of `HWP_CACHE`. Functions of other packages, and those that read
     variables of a function around them, are compiled in every process. Bounds are not checked, and
     a division by zero gives what NumPy gives.
-
-    Args:
-        options: further options of `numba.njit`, such as `nogil=True`.
     """
     # Nothing calls a kernel from C.
     settings = {"boundscheck": False, "error_model": "numpy", "no_cfunc_wrapper": True, **options}

@@ -191,9 +191,6 @@ def kd_tree(points: np.ndarray) -> cKDTree:
 
     Args:
         points: (N, D), finite.
-
-    Returns:
-        `scipy.spatial.cKDTree`.
     """
     from scipy.spatial import cKDTree
 

@@ -352,23 +352,7 @@ def parse_record(
     complete: bool = False,
     ignore_unknown: bool = False,
 ) -> Record:
-    """Make a dataclass out of a table, checking every field by its annotation.
-
-    Args:
-        kind: the dataclass; see the module.
-        value: what the file holds.
-        where: the file, for messages.
-        field: path of `value` in the file, such as `captures[0]`; empty for the whole file.
-        error: raised when something is wrong.
-        numbers: range of numbers that have no bounds of their own.
-        complete: refuse a missing field even where the dataclass has a default.
-        ignore_unknown: skip unknown fields instead of refusing them.
-
-    Raises:
-        error: the value is not a table, or a field is missing, unknown (the message says which
-            name is close), of the wrong type, out of range, not finite, or holds a control
-            character; or the dataclass refuses the values together. File and field are named.
-    """
+    """Make a dataclass out of a table, checking every field by its annotation."""
     rules = Rules(*numbers, complete, ignore_unknown)
     twin = strict_twin(cast("type", kind), rules)
 

@@ -76,22 +76,6 @@ def load_pickle(
     """Read one object from a pickle file, whatever the file asks for.
 
     Python 2 pickles are read too, their strings as Latin-1.
-
-    Args:
-        path: the file.
-        stand_ins: names that become `StandIn` objects: "module.name" for one class, "package.*"
-            for every class of a package.
-        max_bytes: larger files are refused.
-        max_steps: pickles of more steps are refused.
-
-    Returns:
-        Builtin containers, numbers, strings, stand-ins and numpy arrays of plain numbers. The
-        arrays are of a subclass; `numpy.asarray` makes them plain.
-
-    Raises:
-        UnsafePickle: the file names anything else; the error's field is that name.
-        BadInput: the file is missing, too large, truncated or damaged, holds what is not read here,
-            or would be far larger in memory: by what it shares, or by its depth.
     """
     path = Path(path)
     check_is_file(path)

@@ -145,20 +145,7 @@ class _SplitRecord:
 
 
 def contiguous_split(capture: str, frame_count: int, *, guard: int = 0) -> Split:
-    """Split a capture as the paper does: train [0, 0.8 n), validation to 0.9 n, test the rest.
-
-    Args:
-        capture: id of the capture.
-        frame_count: its number of frames n, at least 10.
-        guard: frames that are left out at the end of training and of validation, so that
-            neighbours of a test or validation frame are never trained on.
-
-    Returns:
-        The split. The bounds are rounded down, as in the released loader.
-
-    Raises:
-        BadSplit: too few frames.
-    """
+    """Split a capture as the paper does: train [0, 0.8 n), validation to 0.9 n, test the rest."""
     if frame_count < MIN_FRAMES:
         raise BadSplit(
             f"has {frame_count} frames, too few to split 80/10/10",
@@ -177,15 +164,7 @@ def contiguous_split(capture: str, frame_count: int, *, guard: int = 0) -> Split
 
 
 def read_splits(path: str | os.PathLike[str]) -> Mapping[str, Split]:
-    """Read a split file.
-
-    Returns:
-        The splits by capture id.
-
-    Raises:
-        BadInput: missing or damaged.
-        BadSplit: a split is not sound, or its digest does not match.
-    """
+    """Read a split file."""
     value = read_json(path)
     where = os.fspath(path)
     listed = without_schema(value, SCHEMA, where=where, error=BadSplit).get("splits")
@@ -208,16 +187,7 @@ def write_splits(path: str | os.PathLike[str], splits: Iterable[Split]) -> Path:
 def split_for(
     capture_id: str, frame_count: int, splits: Mapping[str, Split] | None = None
 ) -> Split:
-    """Return the split that a capture is evaluated with.
-
-    Args:
-        capture_id: id of the capture.
-        frame_count: its number of frames.
-        splits: splits by capture id; without them the 80/10/10 rule is applied.
-
-    Raises:
-        BadSplit: the capture is not listed, is listed with another length, or is too short.
-    """
+    """Return the split that a capture is evaluated with."""
     if splits is None:
         return contiguous_split(capture_id, frame_count)
     if capture_id not in splits:

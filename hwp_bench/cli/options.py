@@ -87,12 +87,7 @@ def splits_of(args: argparse.Namespace) -> Mapping[str, Split] | None:
 
 
 def captures_of(places: Sequence[str] | None, file: Path) -> list[Path]:
-    """Return the capture folders that a result is verified with.
-
-    Args:
-        places: captures or folders of captures; None takes the result's suite, rendered where
-            it is not in the cache.
-    """
+    """Return the capture folders that a result is verified with."""
     from hwp_bench.evaluation.verify import capture_folders
     from hwp_bench.results import read_results
     from hwp_bench.sim import ensure_suite
@@ -142,18 +137,7 @@ def add_actions(
 
 
 def overrides(texts: Iterable[str]) -> dict[str, Any]:
-    """Read texts of the form `NAME=VALUE`.
-
-    Args:
-        texts: a name, or `name.field` for a field of a table, and a value as TOML writes it; a
-            value that is not TOML is text, so that words need no quotation marks. The last value
-            of a name wins.
-
-    Raises:
-        UsageError: a text is not of this form, its value is too large, too deep or no Unicode, or
-            begins as a list, table or string of TOML and is none; or one name is a value and a
-            table.
-    """
+    """Read texts of the form `NAME=VALUE`."""
     found: dict[str, Any] = {}
     for text in texts:
         name, equals, value = text.partition("=")

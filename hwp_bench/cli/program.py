@@ -50,15 +50,7 @@ _READER_GONE = 128 + 13
 
 
 def run_program(program: str, tree: Command, arguments: Sequence[str] | None = None) -> int:
-    """Run one command of a program.
-
-    Args:
-        arguments: the words after the program's name; None takes the process's.
-
-    Returns:
-        The exit status: 0 done, 1 failed, 2 wrong command line, 130 stopped by the user, 141 when
-        the reader of standard output has gone.
-    """
+    """Run one command of a program."""
     if arguments is None:
         in_utf8_mode(program)
     words = list(sys.argv[1:] if arguments is None else arguments)

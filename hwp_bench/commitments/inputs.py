@@ -42,20 +42,7 @@ def write_inputs(
     name: str = "mine",
     score: str = "",
 ) -> Inputs:
-    """Write what a program may see of captures, and the folder that its predictions go into.
-
-    Args:
-        captures: captures with their splits.
-        out: folder to make. `requests/ID/` is what a method of the benchmark is given: no test
-            frame, no truth. `submission/` is a method directory whose `predictions/ID/` waits for
-            the frames.
-        name: short name of the method, for tables.
-        score: the command that scores the submission, for the page that explains.
-
-    Raises:
-        UsageError: `out` exists, or the name is not one of a method.
-        BadImage: an image of a capture is damaged.
-    """
+    """Write what a program may see of captures, and the folder that its predictions go into."""
     check_place(out, name)
     with atomic_folder(out) as root:
         for capture, split in captures:

@@ -117,21 +117,6 @@ def publish(
     validation frames and masks, and the parameters and cameras of every frame) and a manifest
     with the splits and commitments. The sealed part holds the captures without their `extra/`, with
     their free-view clips; the public part has no picture of these.
-
-    Args:
-        captures: capture folders.
-        out: folder to make, with `public/` and `sealed/`.
-        splits: splits by capture id; None applies the 80/10/10 rule.
-        salt: hex of at least 32 bytes that nobody knows; None draws one.
-        describe: writes more into the public part, before it takes its name; gets its folder and
-            the joint commitment.
-
-    Returns:
-        Where the parts are, and the commitment.
-
-    Raises:
-        UsageError: `out` exists, or no capture is given.
-        BadCapture, BadImage, BadSplit: a capture is damaged or cannot be split.
     """
     if not captures:
         raise UsageError("no capture is given", field="CAPTURES")
@@ -205,20 +190,7 @@ class SealedPart:
 def open_sealed(
     path: str | os.PathLike[str], manifest: str | os.PathLike[str] | None = None
 ) -> SealedPart:
-    """Open a sealed part; every test frame and mask is read and compared.
-
-    Args:
-        path: the folder `sealed`, or the publication that holds it.
-        manifest: the public manifest (or its folder) to compare with; None takes the one next
-            to the sealed part, if there is one.
-
-    Returns:
-        Captures and splits to score submissions with.
-
-    Raises:
-        BadInput: it is not a sealed part, or its content, its key and the public manifest
-            contradict each other; the capture is named.
-    """
+    """Open a sealed part; every test frame and mask is read and compared."""
     root = Path(path)
     root = root / "sealed" if (root / "sealed" / KEY).is_file() else root
     key = root / KEY

@@ -108,22 +108,7 @@ def make_suite(
     engine: Engine | None = None,
     needs: Needs | None = None,
 ) -> SealedSuite:
-    """Make a sealed suite in a folder; started again it goes on where it was stopped.
-
-    Args:
-        out: folder of the suite: `keeper/` with the secret and the captures, readable by its owner
-            alone, and `publication/` with `public/` and `sealed/`.
-        recipe: its scenes.
-        secret: hex; None draws one, or takes the one of a start that was stopped.
-        workers: processes for each render.
-        engine: where captures are rendered; one after another in this process if None.
-        needs: what one render takes of a machine.
-
-    Raises:
-        UsageError: the suite is there already.
-        BadInput: a start that was stopped had another secret.
-        HwpError: a render failed, or nothing can be written; what was rendered stays.
-    """
+    """Make a sealed suite in a folder; started again it goes on where it was stopped."""
     folder = Path(out)
     refuse_existing(folder / PUBLICATION)
     keeper = folder / KEEPER
@@ -185,17 +170,7 @@ class Revealed:
 
 
 def reveal(suite: str | os.PathLike[str], out: str | os.PathLike[str]) -> Revealed:
-    """Write the file that reveals a suite's secret.
-
-    Args:
-        suite: folder of the suite, as `make_suite` made it.
-        out: file to write, for everybody.
-
-    Raises:
-        UsageError: the file exists.
-        BadInput: secret, page and sealed part do not belong together: what is revealed would
-            convict the organiser.
-    """
+    """Write the file that reveals a suite's secret."""
     folder = Path(suite)
     target = Path(out)
     refuse_existing(target)
@@ -263,20 +238,7 @@ def check_revealed(
     only: Collection[str] | None = None,
     workers: int | None = None,
 ) -> Checked:
-    """Check a revealed secret against what was published before.
-
-    Args:
-        public: the part for authors, as it was published.
-        revealed: the file that `reveal` wrote.
-        work: folder of the captures that are made again; those that are there are taken.
-        only: ids of captures to make again; None takes all, an empty one none.
-        workers: processes for each render.
-
-    Raises:
-        BadInput: the secret is not the one that the page is committed to, or the page does not
-            belong to the manifest.
-        UsageError: this toolkit renders other captures than its maker's, or `only` names none.
-    """
+    """Check a revealed secret against what was published before."""
     page, found = read_suite_page(public), read_revealed(revealed)
     expected = secret_commitment(found.secret, asdict(page.recipe))
     if not expected == page.secret_commitment == found.secret_commitment:

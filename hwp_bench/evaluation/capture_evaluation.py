@@ -412,17 +412,7 @@ def evaluate_elsewhere(
     output: Path,
     on_progress: OnProgress,
 ) -> None:
-    """Do an evaluation in another process or on another machine; see `engine.job.Work`.
-
-    Args:
-        same: the fields of the evaluation that are as they were where it was ordered.
-        networks: backbones of LPIPS that are scored.
-        shipped: place of a method that ships with the toolkit; None where the method is sent.
-        key: of the evaluation where it was ordered; it must be the same here.
-        inputs: the capture, and the method where it is sent.
-        output: folder of the result.
-        on_progress: is told (done, total) steps.
-    """
+    """Do an evaluation in another process or on another machine; see `engine.job.Work`."""
     known = load_available() if networks else {}
     missing = [name for name in networks if name not in known]
     if missing:

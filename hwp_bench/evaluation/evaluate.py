@@ -136,18 +136,6 @@ def run_plans(
     A capture's result is on disk before the next begins. Results of the same key are taken as they
     are, and that is said; results of another evaluation are refused, or stay until all new ones
     are whole (`overwrite`).
-
-    Args:
-        out: the results folder.
-        plans: by their folder below `out`; an empty name is `out` itself.
-        order: folder and place of the capture, in the order in which they are to begin.
-        on_start: hook for showing progress, where captures are evaluated in turn.
-        engine: where captures are evaluated; one after another in this process if None.
-        needs: the share of a machine that one capture takes.
-        overwrite: results of another evaluation in `out` may be replaced.
-        rehearse: make the method of each plan once before the first capture, where any is to be
-            run; not to be asked for where it runs on other machines.
-        tables: write the tables of each; without, its record is there as soon as its first result.
     """
     with exclusive(out):
         for evaluation in next(iter(plans.values())).evaluations:

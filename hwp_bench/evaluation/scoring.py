@@ -131,18 +131,7 @@ def read_predictions(
 def read_prediction(
     folder: str | os.PathLike[str], frame: int, size: tuple[int, int]
 ) -> Prediction:
-    """Read one predicted frame.
-
-    Args:
-        folder: where the predictions of a capture lie, `000123.png` for frame 123.
-        frame: index of the frame.
-        size: the capture's (height, width).
-
-    Returns:
-        The pixels, or a named failure: missing, a link, empty, larger than
-        `MAX_PREDICTION_BYTES`, damaged, not 8-bit, of another size. An alpha channel is
-        dropped: the data set owns the mask.
-    """
+    """Read one predicted frame."""
     path = Path(folder) / frame_name(frame)
     # A link could lead to the very frame that is to be predicted.
     if path.is_symlink():

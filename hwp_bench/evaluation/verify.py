@@ -107,14 +107,6 @@ def verify_results(
     Labels are compared with the captures and the suite, each capture with its stored copy, and
     the whole with the key and the digest that it states. The predictions lie in
     `captures/ID/predictions` next to the result file.
-
-    Args:
-        file: the result file.
-        captures: folders of the captures; further ones do no harm.
-        splits: splits by capture id; None applies the 80/10/10 rule.
-
-    Raises:
-        BadInput, BadResult: the result file is missing or damaged.
     """
     file = file / "results.json" if file.is_dir() else file
     results = read_results(file)

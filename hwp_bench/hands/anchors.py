@@ -181,11 +181,7 @@ def _forward(like: torch.Tensor) -> torch.Tensor:
 
 
 def unit_or(vectors: torch.Tensor, fallback: torch.Tensor) -> torch.Tensor:
-    """Scale vectors to length one; a zero vector becomes the fallback, with zero gradient.
-
-    Args:
-        vectors: (..., 3).
-    """
+    """Scale vectors to length one; a zero vector becomes the fallback, with zero gradient."""
     squared = (vectors * vectors).sum(dim=-1, keepdim=True)
     usable = squared > _TINY
     length = torch.where(usable, squared, torch.ones_like(squared)).sqrt()

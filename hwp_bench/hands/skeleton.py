@@ -1,4 +1,4 @@
-"""The skeleton of every hand: joints and their tree, 21 landmarks, directions of the palm, parameters."""
+"""The skeleton of every hand: joints, landmarks, directions of the palm, parameters."""
 
 from __future__ import annotations
 

@@ -132,11 +132,7 @@ def make_template(
     fingertips: np.ndarray,
     where: str | None = None,
 ) -> HandTemplate:
-    """Check the parts of a template, fix their types, and compute its digest.
-
-    Args:
-        (others): the fields of `HandTemplate`.
-    """
+    """Check the parts of a template, fix their types, and compute its digest."""
     vertices = np.asarray(vertices)
     count = vertices.shape[0] if vertices.ndim == 2 else 0
     face_count = np.asarray(faces).shape[0] if np.ndim(faces) else 0

@@ -93,15 +93,7 @@ PAPER_SEQUENCES: Mapping[str, InterHandSequence] = MappingProxyType(
 
 
 def find_sequence(name: str) -> InterHandSequence:
-    """Look up a sequence.
-
-    Args:
-        name: one of `PAPER_SEQUENCES`, or `[split/]CaptureN/SEQUENCE/camID` as the data set's
-            folders are named.
-
-    Raises:
-        UsageError: it is neither; the message lists the paper's.
-    """
+    """Look up a sequence."""
     if name in PAPER_SEQUENCES:
         return PAPER_SEQUENCES[name]
     match = _PATH.fullmatch(name.strip("/"))
@@ -424,22 +416,7 @@ def import_interhand(
     out: str | os.PathLike[str],
     options: InterHandImport | None = None,
 ) -> dict[str, Any]:
-    """Make a capture of one camera of one sequence.
-
-    Args:
-        root: the folder with `images/` and `annotations/`.
-        sequence: which one.
-        out: the capture folder to make.
-        options: choices; the defaults where None.
-
-    Returns:
-        Facts that measure the import: mean distance of the hand's joints from the annotated ones,
-        mm, and of the vertices from their place before all frames got one shape, mm.
-
-    Raises:
-        BadInput: a file or field is missing or damaged, or a hand has no annotation.
-        UsageError: `out` exists.
-    """
+    """Make a capture of one camera of one sequence."""
     options = options or InterHandImport()
     refuse_existing(out, overwrite=options.overwrite)
     records = read_annotations(root, sequence, options.side, mano=options.mano is not None)

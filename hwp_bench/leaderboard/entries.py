@@ -252,11 +252,7 @@ class _CheckFile:
 
 
 def entry_name(results: Results, content: str | None = None) -> str:
-    """Return the name of an entry: method, suite, budget, seed, and part of its digest.
-
-    Args:
-        content: the digest of the entry; None takes that of the results.
-    """
+    """Return the name of an entry: method, suite, budget, seed, and part of its digest."""
     parts = [results.method.name, results.suite]
     if results.budget.get("seconds"):
         parts.append(f"{results.budget['seconds']:g}s")

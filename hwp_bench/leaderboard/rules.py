@@ -227,11 +227,7 @@ def check_revisions(entries: Sequence[Entry]) -> None:
 
 
 def check_unchanged(folder: Path, base: Path) -> int:
-    """Check that every entry and check of an earlier state is still there, byte by byte.
-
-    Returns:
-        How many files are new.
-    """
+    """Check that every entry and check of an earlier state is still there, byte by byte."""
     if not base.is_dir():
         raise UsageError("does not exist", where=base, field="--against")
     before, after = (

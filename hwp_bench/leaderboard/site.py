@@ -87,13 +87,6 @@ def write_gallery(
     """Draw every method on a few test frames of every capture, on the scored pixels.
 
     Nobody chooses the frames: they are evenly spread over the test clip.
-
-    Args:
-        folder: of the site; pictures go into `pictures` within.
-        captures: by digest; others have no truth to show and are left out.
-
-    Returns:
-        `Scene`s as JSON values, in the order of the suites, the captures and frames.
     """
     by_capture: dict[tuple[str, str], list[tuple[Entry, ResultsSource, CaptureResult]]] = {}
     ranked = sorted(sources, key=lambda pair: -pair[0].results.scores["psnr"])
@@ -205,11 +198,7 @@ def method_pages(rows: Sequence[BoardRow]) -> list[MethodPage]:
 def write_method_pages(
     folder: Path, pages: Sequence[MethodPage], scenes: Sequence[Mapping[str, Any]] = ()
 ) -> None:
-    """Write the pages into a site.
-
-    Args:
-        folder: of the site; its reports are there already.
-    """
+    """Write the pages into a site."""
     (folder / "methods").mkdir()
     shipped = {manifest.name: manifest for manifest in shipped_methods()}
     for page in pages:
@@ -327,17 +316,7 @@ def build_site(
     *,
     avatar_pages: bool = False,
 ) -> Path:
-    """Write the site into a folder that it replaces; returns its first page.
-
-    Args:
-        folder: where to.
-        entries: the measured rows.
-        results_folders: results with their folders; entries of the same results get images.
-        avatar_pages: also copy the pages of avatars that lie in these folders, and lead to them.
-
-    Raises:
-        UsageError: entries do not fit together; the folder holds something else than a site.
-    """
+    """Write the site into a folder that it replaces; returns its first page."""
     check_entries(entries)
     if folder.is_dir() and any(folder.iterdir()) and not (folder / "board.js").is_file():
         raise UsageError("holds something else than a leaderboard", where=folder, field="-o")
@@ -426,11 +405,7 @@ def _addresses(pages: Sequence[MethodPage]) -> dict[str, str]:
 
 
 def board_page(rows: Sequence[BoardRow], *, pictures: bool, pages: Mapping[str, str]) -> str:
-    """Return the page of the board.
-
-    Args:
-        pages: addresses of the methods' pages by the row's name; rows without one lead to a report.
-    """
+    """Return the page of the board."""
     suites = list(dict.fromkeys(row.suite for row in rows))
     ranks: dict[str, tuple[int, str]] = {}
     leads, verdicts = [], {}

@@ -62,11 +62,7 @@ def check_bound(entry: Entry) -> None:
 
 
 def check_dates(entry: Entry, now: datetime | None = None) -> None:
-    """Refuse an entry or a check of it that is dated after now, or a check before its entry.
-
-    Args:
-        now: the time, UTC; None asks the clock.
-    """
+    """Refuse an entry or a check of it that is dated after now, or a check before its entry."""
     latest = (now or datetime.now(UTC)) + _SKEW
     started = datetime.fromisoformat(entry.results.started)
     if started.tzinfo is None:

@@ -75,22 +75,7 @@ def submit(
     submission: Submission,
     avatars: Path | None = None,
 ) -> Submitted:
-    """Write a folder with everything that a pull request needs.
-
-    Args:
-        folder: a new or empty folder outside of installed packages.
-        sources: results of whole suites.
-        existing: entries of the leaderboard, which they must go together with.
-        submission: who stands for them, links, and for one result: what it revises.
-        avatars: folder with one file or folder for each capture, named by its id; they are not
-            copied, their digests are noted.
-
-    Raises:
-        UsageError: the folder is not empty or belongs to an installed package, a result is of
-            other protocols or data, or there are several results of one revision.
-        BadResult: a result is incomplete, or the predictions next to it are not those that it
-            was scored from.
-    """
+    """Write a folder with everything that a pull request needs."""
     refuse_installed(folder)
     if submission.revises is not None and len(sources) != 1:
         raise UsageError("a revision is of one result", field="--revises")
@@ -234,22 +219,6 @@ def confirm(
     The result is verified first (`hwp-bench verify`). Where it is the entry's own, the check is
     of the kind `rescored`, and reproduces where nothing differs. Where it is another run of the
     same method, settings, seed, budget and data, the kind is `re-run`.
-
-    Args:
-        entries: the leaderboard's entries.
-        file: the result file, with its predictions next to it.
-        captures: folders of its captures.
-        by: who checks.
-        name: name of the entry; None takes the only one that fits.
-        tolerance: largest difference in dB of a second run, 0 to 100.
-        overrules: digests, or at least their first eight digits, of checks of the entry that do
-            not count from now on.
-        reason: why they do not.
-
-    Raises:
-        UsageError: no entry fits, several do, the tolerance is out of range, or there is no such
-            check to overrule.
-        BadResult: a second run is itself not as it says, so that it cannot speak for the entry.
     """
     if not 0 <= tolerance <= 100:
         raise UsageError(f"{tolerance} is not between 0 and 100 dB", field="--tolerance")

@@ -67,15 +67,7 @@ class SuiteData:
 
 
 def read_suite_data(path: str | os.PathLike[str] | None = None) -> SuiteData:
-    """Read the digests of the suites' captures.
-
-    Args:
-        path: the file; None takes the one that ships.
-
-    Raises:
-        BadInput: missing or no JSON.
-        BadResult: a field is missing, unknown or of the wrong type; it is named.
-    """
+    """Read the digests of the suites' captures."""
     file = Path(path) if path is not None else data_folder("leaderboard") / NAME
     value = without_schema(read_json(file), SCHEMA, where=file, error=BadResult)
     return parse_record(SuiteData, value, where=file)

@@ -37,13 +37,6 @@ def method_digest(root: Path) -> str:
     `LEFT_OUT`, and captures and outputs of runs (`is_foreign`). A link counts by its name and the
     place that it leads to: a file inside the folder counts itself, and what lies outside of it is
     refused by `refuse_links_out`.
-
-    Args:
-        root: the method's folder.
-
-    Raises:
-        BadInput: a file or folder cannot be read, or there are more than `MAX_FILES` files or
-            `MAX_BYTES` bytes.
     """
     return digest_of(method_files(root))
 

@@ -70,10 +70,6 @@ def write_request(path: Path, capture: Capture, split: Split, run: RunSettings) 
     """Write the part of a capture that a method may see into a folder of its own.
 
     Images are copied, not linked: a link would lead to the capture, and so to its test frames.
-
-    Raises:
-        BadImage: a training or validation image is missing or damaged.
-        UsageError: the capture does not know what `run.frames` asks for.
     """
     info = capture.info
     material = choose_training_inputs(capture, split, run.frames)

@@ -32,33 +32,12 @@ def settings_from(cls: type[Settings], values: Mapping[str, Any], where: str) ->
 
     A field that is itself a dataclass reads a table of its own; `name.field` reaches into it,
     and so does `--set name.field=value`.
-
-    Args:
-        cls: a dataclass whose fields are bool, int, float, str, Literal, or such dataclasses,
-            each with a default; numbers may be bounded by `number`, words by `choice`. An
-            unbounded number must not be negative.
-        values: any of its fields; later entries win over earlier ones.
-        where: name of the place in messages, such as the method's folder.
-
-    Raises:
-        BadMethod: an unknown name (the message says which one is close), a wrong type, or a
-            value outside its range.
     """
     return parse_record(cls, unfold(values), where=where, error=BadMethod, numbers=(0.0, math.inf))
 
 
 def check_source(value: str, field: str, words: Sequence[str], kinds: Sequence[str]) -> None:
-    """Refuse a setting that is neither one of some words nor `KIND:PATH`.
-
-    Args:
-        value: of the setting.
-        field: its name, for the message.
-        words: those that stand for themselves.
-        kinds: of files that a person brings; `files` in `method.toml` lists them too.
-
-    Raises:
-        UsageError: it is something else.
-    """
+    """Refuse a setting that is neither one of some words nor `KIND:PATH`."""
     kind, colon, place = value.partition(":")
     if value in words or (colon and place and kind in kinds):
         return
@@ -80,14 +59,6 @@ def class_settings(root: Path, reference: str) -> list[str]:
     a field whose type is itself a dataclass is a table of settings (`rates.dpd`). Classes are
     followed through `from module import Name` and `import module`, also by another name. A type
     that is found nowhere is one setting, which stands for everything below it.
-
-    Args:
-        root: the method's folder.
-        reference: `module:Class`.
-
-    Raises:
-        BadMethod: there is no such module or class, the class is not a dataclass, or a source
-            cannot be parsed.
     """
     module, _, name = reference.partition(":")
     return _ClassReader(root, reference).names(module, name)

@@ -138,14 +138,10 @@ class Lpips:
 
         Args:
             x: (B, 3, H, W) float in [-1, 1], on the device of the weights.
-            y: like `x`.
 
         Returns:
             (B,): over the compared layers, the sum of the spatial means of the weighted squared
             differences of unit feature vectors.
-
-        Raises:
-            ShapeMismatch: shapes differ, or are too small for the backbone.
         """
         if x.shape != y.shape or x.ndim != 4 or x.shape[1] != 3:
             raise ShapeMismatch(f"LPIPS wants two (B, 3, H, W), not {x.shape} and {y.shape}")
@@ -246,12 +242,7 @@ def find_weights(net: str, files: LpipsFiles | None = None) -> tuple[Path, Path]
 
 
 def load_lpips(net: str, files: LpipsFiles | None = None, device: str = "cpu") -> Lpips:
-    """LPIPS with the weights found on this machine.
-
-    Raises:
-        MissingDependency: a file is not there.
-        BadInput: a file is not the published one, or damaged.
-    """
+    """LPIPS with the weights found on this machine."""
     backbone, linear = find_weights(net, files)
     prefixes = [Path(name).stem.rsplit("-", 1)[1] for name in BACKBONE_FILES[net]]
     return Lpips(

@@ -39,10 +39,6 @@ def check_truth(target: np.ndarray, mask: np.ndarray) -> None:
     Args:
         target: (H, W, 3) uint8.
         mask: (H, W) uint8 or bool.
-
-    Raises:
-        BadImage: a type is wrong.
-        ShapeMismatch: a shape is wrong.
     """
     if target.dtype != np.uint8:
         raise BadImage(f"the target is {target.dtype}, not uint8", field="target")
@@ -57,12 +53,7 @@ def check_truth(target: np.ndarray, mask: np.ndarray) -> None:
 
 
 def check_prediction(prediction: np.ndarray, target: np.ndarray) -> None:
-    """Refuse a prediction that is not an image like `target`.
-
-    Raises:
-        BadPrediction: the type is not uint8.
-        ShapeMismatch: the shape differs from the target's; nothing is ever resized.
-    """
+    """Refuse a prediction that is not an image like `target`."""
     if prediction.dtype != np.uint8:
         raise BadPrediction(
             f"the prediction is {prediction.dtype}, not uint8",
@@ -86,9 +77,6 @@ def check_same_shape(
         prediction: (H, W, 3).
         target: (H, W, 3).
         mask: (H, W), or None.
-
-    Raises:
-        ShapeMismatch: they differ, or are not of that form.
     """
     if prediction.shape != target.shape or target.ndim != 3:
         raise ShapeMismatch(
@@ -176,11 +164,7 @@ def scored_pixels(mask: np.ndarray, *, erosion: int, coverage: bool = False) -> 
 
 
 def bounding_box(region: np.ndarray) -> Box:
-    """The smallest box around the True pixels of `region` (H, W) bool.
-
-    Raises:
-        EmptyMask: there are none.
-    """
+    """The smallest box around the True pixels of `region` (H, W) bool."""
     rows = np.flatnonzero(region.any(axis=1))
     columns = np.flatnonzero(region.any(axis=0))
     if rows.size == 0:
@@ -197,10 +181,6 @@ def crop(image: np.ndarray, box: Box) -> np.ndarray:
 
     Args:
         image: (H, W) or (H, W, C), any type.
-        box: rows and columns to take.
-
-    Returns:
-        a new array of shape `box.shape` + trailing axes, same type.
     """
     height, width = image.shape[:2]
     out = np.zeros(box.shape + image.shape[2:], image.dtype)

@@ -78,22 +78,6 @@ def score_frame(
             that it has on disk: clipped, rounded half to even.
         target: (H, W, 3) like `prediction`.
         mask: (H, W) uint8 (above 127 is hand) or bool, the data set's own visible-hand mask.
-        protocols: which protocols to score in.
-        coverage: True where `mask` holds the share of each pixel that the hand covers
-            (255 = all); see `region.scored_pixels`.
-        networks: LPIPS by backbone name ("alex", "vgg"); metrics of an absent one are absent.
-
-    Returns:
-        metric name -> score, the names of `table.metric_names(protocols, networks)`.
-
-    Raises:
-        BadImage: target or mask have the wrong type, or the target has values that an image
-            cannot have.
-        BadPrediction: the same of the prediction.
-        ShapeMismatch: the three do not describe the same image, or it is smaller than the
-            window of SSIM.
-        EmptyMask: no pixel to score; this depends on mask and protocol only, never on the
-            prediction, so it is the same for every method.
     """
     target = _eight_bits(target, "target", BadImage)
     check_truth(target, mask)
@@ -248,22 +232,7 @@ def score_frames(
     networks: Mapping[str, Network] | None = None,
     workers: int | None = None,
 ) -> Iterator[FrameScore]:
-    """Score frames in parallel and yield the results in the order of the frames.
-
-    Args:
-        frames: the frames, or functions that read one each (they run on the workers, so
-            reading files is parallel too).
-        protocols: which protocols to score in.
-        networks: LPIPS by backbone name; see `score_frame`.
-        workers: number of threads; None takes one per core.
-
-    Yields:
-        one `FrameScore` per frame; the scores do not depend on `workers`.
-
-    Raises:
-        HwpError: the data set's own side of a frame is at fault (target or mask), or a reading
-            function raised; a fault of the prediction is a `FrameScore.failure` instead.
-    """
+    """Score frames in parallel and yield the results in the order of the frames."""
     chosen = tuple(protocols)
     available = dict(networks or {})
 
@@ -384,16 +353,6 @@ def aggregate(captures: Iterable[CaptureScores]) -> Aggregate:
 
     Sums are exact before they are rounded once (`math.fsum`), so the order of captures and frames
     never changes a digit.
-
-    Args:
-        captures: the scored captures; each lists every frame that was scored.
-
-    Returns:
-        the summaries of all captures, of the single hands, and of the interacting hands.
-
-    Raises:
-        BadResult: no capture; a capture twice or without frames; a score that is NaN or
-            infinite; frames that do not all have the same metrics.
     """
     listed = list(captures)
     _check(listed)

@@ -163,11 +163,6 @@ def draw_pareto(
     """Draw mean validation score over the seconds of fitting, the front behind the curves.
 
     Where there are many methods, only those of the front have their bands.
-
-    Args:
-        curves: the methods' mean curves, at least one.
-        order: number of each method by label, for its colour; None numbers them here and adds
-            a legend.
     """
     facts = metric_facts(metric)
     places = order or {curve.label: index for index, curve in enumerate(curves)}
@@ -259,9 +254,6 @@ def draw_bars(groups: Mapping[str, Sequence[Bar]], metric: str) -> Figure:
     """Draw one group of bars a perturbation, each with its 95 % interval.
 
     Bars begin at zero; an interval that leaves the figure is cut there, and has no end mark.
-
-    Args:
-        groups: by heading; at least one bar in all.
     """
     digits = metric_facts(metric).digits
     values = [bar.estimate.value for bars in groups.values() for bar in bars]
@@ -401,12 +393,7 @@ class StripMethod:
 
 
 def strip_plot(methods: Sequence[StripMethod], info: CaptureInfo | None, metric: str) -> Markup:
-    """Draw the strip of one capture.
-
-    Args:
-        methods: at least one; all with the same test frames.
-        info: the capture; None leaves severities out.
-    """
+    """Draw the strip of one capture."""
     frames = [frame.frame for frame in methods[0].result.frames]
     weights = [(method, side) for method in methods for side in method.weights]
     severities = dict(info.perturbations) if info else {}

@@ -129,20 +129,7 @@ def write_report(
     title: str | None = None,
     avatar_pages: bool = False,
 ) -> Path:
-    """Write the report of some results; returns the page.
-
-    Args:
-        folder: where `index.html` goes.
-        sources: the evaluations.
-        captures: capture folders, for severities.
-        base: method that shares of the gap are counted from.
-        title: heading; None takes the methods' titles.
-        avatar_pages: also copy the pages of avatars that lie in results folders, and lead to them.
-
-    Raises:
-        UsageError: the results cannot stand on one page.
-        BadResult: what lies in the place of an avatar's page is none.
-    """
+    """Write the report of some results; returns the page."""
     pages = copy_avatar_pages(folder, sources) if avatar_pages else {}
     report = gather_report(sources, captures, base=base, avatar_pages=pages)
     titles = dict.fromkeys(source.results.method.title for source in sources)
@@ -183,14 +170,7 @@ AvatarPages = dict[tuple[int, str], str]
 
 
 def copy_avatar_pages(folder: Path, sources: Sequence[ResultsSource]) -> AvatarPages:
-    """Copy pages of avatars next to a report.
-
-    Args:
-        folder: of the report; pages go into `avatars/`, under numbers.
-
-    Returns:
-        Addresses within `folder`; results without pages have none.
-    """
+    """Copy pages of avatars next to a report."""
     found: AvatarPages = {}
     for index, source in enumerate(sources):
         for number, capture in enumerate(source.results.captures):
@@ -365,14 +345,7 @@ def gather_report(
     image_bytes: int | None = None,
     avatar_pages: AvatarPages | None = None,
 ) -> ReportPage:
-    """Gather a report.
-
-    Args:
-        sources: the evaluations; those on clean frames only enter the robustness table.
-        base: name of the method that shares of the gap are counted from; None takes the plain
-            baseline where it is among them.
-        image_bytes: budget of the images; None takes the default.
-    """
+    """Gather a report."""
     if not sources:
         raise UsageError("results are needed", field="RESULTS")
     results = [source.results for source in sources]
@@ -577,17 +550,7 @@ def write_reports(
     title: str | None = None,
     avatar_pages: bool = False,
 ) -> list[Path]:
-    """Write the report of some results, or one report for each of the data that they are on.
-
-    Args:
-        folder: where `index.html` goes; with results on several data it leads to `A/index.html`,
-            `B/index.html`, and so on.
-        base: method that shares of the gap are counted from; data without it have no shares.
-        title: heading; None takes the methods' titles.
-
-    Returns:
-        The pages, the first one to open first.
-    """
+    """Write the report of some results, or one report for each of the data that they are on."""
     groups = data_groups(sources, oracles=True)
     if len(groups) < 2:
         only = write_report(

@@ -108,10 +108,6 @@ def layout_table(
 
     Scores are of protocol paper-wildghand, means over captures and then over seeds. Without
     LPIPS weights the oriented distance is added, in a column under its own name.
-
-    Args:
-        runs: the methods or variants; may be empty where `published` is set.
-        marks: the components of each variant; None shows labels only.
     """
     shown = {
         scope: heading

@@ -54,14 +54,6 @@ def measure_novelty(capture: Capture, split: Split, frames: Sequence[int]) -> It
 
     Hands are where the truth has them, or the estimates where the capture knows no truth. A
     training frame shows a place where its given mask has a pixel of it.
-
-    Args:
-        capture: the capture.
-        split: says which frames train.
-        frames: indices of the frames to compare.
-
-    Raises:
-        BadInput: the hand template that is installed is not the capture's.
     """
     surfaces = HandSurfaces({side: capture.template(side) for side in capture.info.sides}, PATCH)
     hands = capture.true_hands or capture.hands
@@ -142,13 +134,6 @@ def outline_scores(
         prediction: (H, W, 3) uint8 sRGB over black.
         target: (H, W, 3) uint8.
         mask: (H, W) uint8 or bool, the data set's own visible-hand mask.
-        coverage: True where `mask` holds the share of each pixel that the hand covers.
-
-    Returns:
-        The scores; None where no pixel is scored.
-
-    Raises:
-        BadImage, BadPrediction, ShapeMismatch: as `score_frame`.
     """
     check_truth(target, mask)
     check_prediction(prediction, target)
@@ -179,9 +164,6 @@ def spread_outwards(prediction: np.ndarray, lit: np.ndarray) -> np.ndarray:
     Args:
         prediction: (H, W, 3) uint8.
         lit: (H, W) bool, where something is drawn.
-
-    Returns:
-        Like the prediction; the prediction itself where nothing is drawn but a rim.
     """
     from scipy.ndimage import distance_transform_edt
 

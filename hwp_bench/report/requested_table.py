@@ -77,12 +77,7 @@ _ONCE = ("rank", "cost", "seeds", "robustness", "free-view")
 
 
 def make_table(request: TableRequest) -> Table:
-    """Make the table.
-
-    Raises:
-        BadInput, BadResult: a result is missing or damaged.
-        UsageError: the results do not hold what the table needs.
-    """
+    """Make the table."""
     number = request.paper
     if number is None and request.published:
         if request.by not in PAPER_OF:

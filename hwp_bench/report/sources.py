@@ -61,16 +61,7 @@ class TemporalWeights:
 def read_sources(
     paths: Iterable[str | os.PathLike[str]], *, repeats: bool = True
 ) -> list[ResultsSource]:
-    """Read every evaluation that some paths stand for, in order.
-
-    Args:
-        paths: results folders and files, ablations; what holds no results is left out and said.
-        repeats: keep a second run of the same method, settings, seed, budget and data; without,
-            it is left out and said, for what shows each of them once.
-
-    Raises:
-        BadInput, BadResult: one is missing or damaged, or was changed by hand.
-    """
+    """Read every evaluation that some paths stand for, in order."""
     sources = [ResultsSource(read_unchanged(file), file.parent) for file in results_among(paths)]
     if repeats:
         return sources
@@ -152,15 +143,7 @@ def mean_temporal_weight(source: ResultsSource, capture: str) -> float | None:
 def find_captures(
     results: Iterable[Results], folders: Sequence[str | os.PathLike[str]] = ()
 ) -> dict[str, CaptureInfo]:
-    """Find what the evaluated captures say of themselves; nothing is rendered for it.
-
-    Args:
-        folders: capture folders to look at; simulated captures in the toolkit's cache are
-            found without.
-
-    Returns:
-        By digest; captures that are nowhere to be found are left out.
-    """
+    """Find what the evaluated captures say of themselves; nothing is rendered for it."""
     return {digest: info for digest, (info, _) in _located(results, folders).items()}
 
 
@@ -202,11 +185,7 @@ def _literal(text: str) -> str:
 def mean_severity(
     info: CaptureInfo, test: Iterable[int], *, perturbed_only: bool = False
 ) -> dict[str, float]:
-    """Return the mean severity of each declared perturbation over the frames to learn from.
-
-    Returns:
-        By perturbation, 0 to 5; those of unknown severity are left out.
-    """
+    """Return the mean severity of each declared perturbation over the frames to learn from."""
     hidden = set(test)
     found = {}
     for name, values in info.perturbations.items():
@@ -279,15 +258,7 @@ def _text(results: Results) -> str:
 
 
 def stacked(groups: Sequence[DataGroup], tables: Sequence[Table]) -> Table:
-    """Put the tables of several groups under one another; rows are ranked within their group.
-
-    Args:
-        tables: the table of each, of one kind; their columns may differ.
-
-    Returns:
-        The only table, or one with a column that says which data a row is of. A column that a
-        group lacks is empty in its rows.
-    """
+    """Put the tables of several groups under one another; rows are ranked within their group."""
     if len(tables) == 1:
         return tables[0]
     columns = _joined([table.columns for table in tables])

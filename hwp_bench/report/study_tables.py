@@ -128,12 +128,7 @@ LEVELS = ((1.0, "Low"), (2.0, "Medium"), (5.1, "High"))
 
 
 def robustness_table(sources: Sequence[ResultsSource], base: str | None = None) -> Table:
-    """Return what perturbed frames cost each method, and how much of that it wins back.
-
-    Args:
-        sources: for every method an evaluation on the perturbed frames and one on the clean
-            ones (`--frames clean`), the clean-data oracle; seeds are averaged.
-    """
+    """Return what perturbed frames cost each method, and how much of that it wins back."""
     runs = group_runs([source.results for source in sources])
     perturbed = [run for run in runs if run.first.frames == "perturbed"]
     pairs = [(run, clean) for run in perturbed if (clean := _oracle(run, runs)) is not None]

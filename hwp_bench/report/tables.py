@@ -61,11 +61,7 @@ def all_tables(results: Sequence[Results]) -> dict[str, Table]:
 def overall_table(
     results: Sequence[Results], groups: Mapping[str, Sequence[Scores]], metrics: Sequence[str]
 ) -> Table:
-    """Return one row a method: means, and what they cost.
-
-    Args:
-        metrics: which metrics; those that an evaluation lacks are left out.
-    """
+    """Return one row a method: means, and what they cost."""
     table = mean_table(results, groups, metrics)
     costs: list[Filled] = [
         (Column("Fit [s]", 1, group="Cost"), [_fit_seconds(result) for result in results]),
@@ -258,9 +254,6 @@ def over_seeds(table: Table, results: Sequence[Results]) -> Table:
 
     Measurements become means. Counts to the right of the method's name are added up, and texts
     there are joined.
-
-    Returns:
-        The table; as it is where no method has several seeds, or one has a seed twice.
     """
     try:
         runs = group_runs(results)
@@ -335,9 +328,6 @@ def free_view_table(results: Sequence[Results]) -> Table:
 
     Seeds of a method are averaged. Failed frames are counted where there are any. `all` is the
     mean over the captures that every method has scores of, each of which counts the same.
-
-    Args:
-        results: evaluations; those without any scores of a clip are left out.
     """
     scored = [r for r in results if any(item.free_view for item in r.captures)]
     if not scored:

@@ -114,17 +114,7 @@ def models_folder() -> Path:
 
 
 def load_models(model: Path | None = None, *, opener: Opener | None = None) -> HandModels:
-    """Read the networks, downloading them when they are in none of the places.
-
-    Args:
-        model: a folder with the two networks, a `hand_landmarker.task` or a wheel of MediaPipe
-            0.10.21; None takes the cache.
-        opener: opens an address; None uses the network.
-
-    Raises:
-        BadInput: the file is not such a thing, or its content is not the expected one.
-        HwpError: they are not in the cache and cannot be downloaded.
-    """
+    """Read the networks, downloading them when they are in none of the places."""
     if model is None:
         folder = models_folder()
         if not all((folder / name).is_file() for name in (PALM, HAND)):

@@ -34,26 +34,7 @@ def render_clip(
     video: Path | None = None,
     overwrite: bool = False,
 ) -> dict[str, Any]:
-    """Draw frames into a folder, whole or not at all.
-
-    Args:
-        avatar: what is drawn.
-        capture: whose hand parameters and cameras are used.
-        frames: which of its frames.
-        out: the folder.
-        background: grey level behind the hand, 0 to 255.
-        video: MP4 file (H.264) to write, too.
-        overwrite: replace what exists.
-
-    Returns:
-        Number of frames, and frames drawn in a second.
-
-    Raises:
-        UsageError: the capture shows no hand that the avatar has, or belongs to another hand
-            model; or the video lies in the folder, or the folder in the capture.
-        MissingDependency: a video is asked for, and PyAV is not installed.
-        HwpError: the video cannot be written.
-    """
+    """Draw frames into a folder, whole or not at all."""
     check_places({"out": out, "video": video}, {"poses": capture.root}, replaces=overwrite)
     sides = shown_sides(avatar, capture)
     if video is not None:

@@ -38,11 +38,7 @@ def address_of(args: argparse.Namespace) -> Address:
 
 @contextlib.contextmanager
 def watching(args: argparse.Namespace, *, shown: bool) -> Iterator[Watch | None]:
-    """Serve the page of a fit while the block runs, if it is `shown`.
-
-    Yields:
-        What the fit is given as `watch`.
-    """
+    """Serve the page of a fit while the block runs, if it is `shown`."""
     if not shown:
         yield None
         return

@@ -79,9 +79,6 @@ def bone_features(rig: HandRig) -> Tensor:
 
     With 4, the square root of 16, their mean square is at most that of the harmonics, 1.
 
-    Args:
-        rig: N anchors.
-
     Returns:
         (N, 16) float32, rows sum to 4.
     """
@@ -190,9 +187,6 @@ class DynamicPerturbation(nn.Module):
 
         Args:
             frames: (B,) int, 0 to L - 1; frame 0 is the paper's l = 1.
-
-        Raises:
-            UsageError: a frame that is not in the clip.
         """
         # Off the CPU the check would wait for the device.
         known = frames.device.type != "cpu" or not frames.numel()
@@ -221,10 +215,6 @@ class DynamicPerturbation(nn.Module):
 
         Returns:
             (B, N, k) each.
-
-        Raises:
-            BadInput: an attribute is not of the module's floating-point type.
-            ShapeMismatch: the three do not describe the same frames.
         """
         own = cast(nn.Linear, self.varphi["offsets"]).weight.dtype
         for name, g in raw.items():
@@ -317,14 +307,9 @@ def drop(omega: Tensor, probability: Tensor | float, generator: torch.Generator)
         omega: (B,).
         probability: in [0, 1], one for all or (B,): frames that are known to be perturbed may
             keep their weights, with 0.
-        generator: draws B numbers for each call, whatever the probabilities are.
 
     Returns:
         (B,); a dropped frame passes no gradient.
-
-    Raises:
-        UsageError: a probability outside [0, 1].
-        ShapeMismatch: there are not as many probabilities as frames.
     """
     chance = torch.as_tensor(probability, dtype=torch.float32).detach().cpu()
     if not bool(((chance >= 0.0) & (chance <= 1.0)).all()):
@@ -342,7 +327,6 @@ def draw_kept(probability: Tensor, generator: torch.Generator) -> Tensor:
 
     Args:
         probability: (B,) in [0, 1] that a frame does not, on the CPU.
-        generator: draws B numbers.
 
     Returns:
         (B,) bool, where the generator is.

@@ -55,9 +55,6 @@ class TemporalTarget:
         Args:
             clean: (R,) probability that nothing perturbs a frame.
             frame_weights: (R,) the pre-pass's, from the floor to 1.
-            scale: omega of a frame with the least weight. 0: omega of clean frames should be 0,
-                and the others are free.
-            floor: the least weight, above 0.
         """
         if scale <= 0.0:
             return cls(torch.zeros_like(clean), clean)
@@ -90,13 +87,7 @@ class TemporalTarget:
             module.zero_grad(set_to_none=True)
 
     def temporal_loss(self, modules: Sequence[DynamicPerturbation], first: int) -> Tensor:
-        """Mean over frames of the held square of the distance to the target; a sum over hands.
-
-        Args:
-            modules: of the hands, at least one.
-            first: a frame of this step's batch. In long clips it and every k-th frame before and
-                after it is looked at, so that a step costs no more than in short ones.
-        """
+        """Mean over frames of the held square of the distance to the target; a sum over hands."""
         stride = math.ceil(len(self.omega) / _LOOKED_AT)
         part = slice(first % stride, None, stride)
         return torch.stack([self._distance(module, part) for module in modules]).sum()
@@ -231,7 +222,6 @@ def scale_gradients(prediction: NetworkOutput, shares: Tensor) -> NetworkOutput:
     the frame's loss instead would silence both.
 
     Args:
-        prediction: of B frames.
         shares: (B,) in [0, 1], without gradient.
     """
     return dataclasses.replace(
@@ -249,7 +239,6 @@ def scale_refinement(refinement: Refinement, shares: Tensor) -> Refinement:
     """The same corrections of the hand parameters, which learn from each of B frames by its share.
 
     Args:
-        refinement: of B frames.
         shares: (B,) in [0, 1], without gradient.
     """
     return Refinement(

@@ -32,11 +32,8 @@ def shown_frames(
     """Count the training frames that show each anchor, each frame by how much it counts there.
 
     Args:
-        rigs: by side.
-        clip: hands and cameras of the R frames.
         visible: takes rows, (B,) int64 on the CPU, and returns how much each pixel of these frames
             says of the hand, (B, H, W) in [0, 1].
-        count: R.
 
     Returns:
         (N,) by side, from 0 to R.
@@ -59,7 +56,6 @@ def seen_anchors(
     """Project anchors into B frames, and tell which of them neither hand hides.
 
     Args:
-        hands: posed anchors by side.
         viewmats: (B, 4, 4) world to camera.
         Ks: (B, 3, 3) px.
         size: height and width of the frames, px.

@@ -73,13 +73,7 @@ class Evidence(Found):
         """Bring Gaussians nearer to discs on the skin, by what is missing of the evidence.
 
         Args:
-            side: which hand.
-            raw: (..., N, k) attributes.
             spacing: mean distance between neighbouring anchors, m.
-            log_scale_bias: see `Activation`.
-
-        Returns:
-            The same shapes; colours are as they were.
         """
         kept, shape = self.offsets[side][:, None], self.shapes[side][:, None]
         disc = raw.log_scales.new_tensor([_WIDE, _WIDE, _THIN]).mul(spacing).log() - log_scale_bias
@@ -145,8 +139,6 @@ def weigh_evidence(shown: Mapping[str, Tensor], count: int, settings: EvidenceSe
 
     Args:
         shown: (N,) frames by side.
-        count: of all training frames, at least 1.
-        settings: which share outweighs the prior.
     """
 
     def shares(half: float) -> dict[str, Tensor]:
@@ -160,7 +152,6 @@ def kept_share(frames: Tensor, half: float) -> Tensor:
 
     Args:
         frames: (N,) n of each Gaussian.
-        half: how many frames the prior weighs.
     """
     if half <= 0.0:
         return torch.ones_like(frames)
@@ -199,10 +190,5 @@ class ColorChanges(Found):
     changes: Annotated[Mapping[str, Tensor], Kept(("N", 3), -_LARGEST, _LARGEST, name="")]
 
     def color(self, side: str, raw: RawAttributes) -> RawAttributes:
-        """Gaussians in their changed colours.
-
-        Args:
-            side: which hand.
-            raw: (..., N, k) attributes.
-        """
+        """Gaussians in their changed colours."""
         return replace(raw, logit_colors=raw.logit_colors + self.changes[side])

@@ -99,25 +99,7 @@ def export(
     frame: int | None = None,
     overwrite: bool = False,
 ) -> dict[str, int]:
-    """Write an avatar for other programs.
-
-    Args:
-        avatar: what is written.
-        path: the file; its extension decides the format.
-        settings: what is exported; the defaults if None.
-        capture: Gaussians are posed by a frame of it, a mesh gets its motion; without one the
-            Gaussians are at rest, and the mesh's fingers close and open.
-        frame: which frame of the capture, for Gaussians; the first if None.
-        overwrite: replace what exists.
-
-    Returns:
-        Counts of what is in the file, by name.
-
-    Raises:
-        UsageError: `check_target` refuses it; the capture shows none of the avatar's hands, or
-            belongs to another hand model; `path` was made by somebody else meanwhile.
-        BadInput: the avatar gives numbers that are not finite.
-    """
+    """Write an avatar for other programs."""
     settings = settings or ExportSettings()
     check_target(path, settings, overwrite=overwrite)
     if settings.mesh:

@@ -260,7 +260,6 @@ def _spread(sampler: PlaneSampler, values: Tensor, weights: Tensor) -> Tensor:
     """(cells, C) weighted means in the cells of a plane of what Gaussians ask of it.
 
     Args:
-        sampler: reads the plane at N places.
         values: (N, C + 1), the last one 1.
         weights: (N,) in [0, 1].
     """
@@ -281,6 +280,7 @@ def known_logits(
     model: WildGHandModel, clip: TrainingClip, side: str, light: KnownLight
 ) -> np.ndarray:
     """Mean colour of each Gaussian over known normals and poses of the clip.
+
     Returns:
         (N, 3) in logits of sRGB.
     """
@@ -316,7 +316,6 @@ def changes_to(
     Args:
         levels: (N, 3) by side, logarithms of linear light, where they are to be.
         logits: (N, 3) by side, of sRGB, where they are.
-        device: of the changes.
     """
     changes = {}
     for side, aim in levels.items():
@@ -344,7 +343,6 @@ def smooth_fill(rough: Any, values: np.ndarray, known: np.ndarray) -> np.ndarray
     + 0.3 roughness(x). A value keeps its own part as far as it is known, and takes the rest from x.
 
     Args:
-        rough: see `roughness`.
         values: (N, C).
         known: (N,) in [0, 1].
 

@@ -146,6 +146,7 @@ def skin_places(
     training: TrainingCapture, frames: TrainingFrames, templates: Mapping[str, HandTemplate]
 ) -> list[np.ndarray]:
     """Number the places of a hand, and say which of them each pixel shows.
+
     Returns:
         R times (H, W) uint16: 0 where the posed hands are not, else the place, numbered without
         gaps over all frames.

@@ -61,6 +61,7 @@ class Gaps:
 
     def closers(self, evidence: Evidence) -> dict[str, Tensor]:
         """Find the Gaussians that close what evidence would open.
+
         Returns:
             (N,) bool by side.
         """

@@ -141,6 +141,7 @@ def hand_masks(
     training: TrainingCapture, frames: TrainingFrames, source: str, device: torch.device
 ) -> torch.Tensor:
     """Return y_h of R frames, that of each frame found once.
+
     Returns:
         (R, H, W) uint8, 255 = hand. A frame in which no hand is found keeps its estimated mask:
         nothing in it could be learnt otherwise.
@@ -162,7 +163,6 @@ def hand_roots(training: TrainingCapture, frames: np.ndarray) -> np.ndarray:
     """Where the wrists of all hands are seen.
 
     Args:
-        training: hand parameters and cameras.
         frames: (R,) which frames.
 
     Returns:

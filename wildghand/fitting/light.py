@@ -114,11 +114,7 @@ def light_samples(
     """Read the colours that a model gives to visible places in the training frames.
 
     Args:
-        model: fitted; biases and gains of the frames are left out.
-        clip: the hands and cameras of the R frames.
         frame_weights: (R,) how much each frame counts.
-        count: samples at most, about.
-        seed: of their choice.
     """
     generator = torch.Generator().manual_seed(seed)
     rows = torch.arange(len(frame_weights))
@@ -221,7 +217,6 @@ def best_of_each_part(weights: Tensor, count: int) -> Tensor:
 
     Args:
         weights: (R,) of the frames, in their order.
-        count: of parts at most, of equal length.
 
     Returns:
         (count,) int64, ascending, on the CPU; fewer if there are fewer frames.

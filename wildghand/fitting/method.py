@@ -78,11 +78,6 @@ def affordable(
     Before the first step every frame is loaded, judged, compared with the person's outline and
     counted as evidence: some 0.06 seconds for a frame of 256 px on one core. A clip of a thousand
     frames would spend a minute on that.
-
-    Args:
-        training: what may be seen of the capture.
-        settings: of the fit.
-        budget: of the fit; without seconds all frames are taken.
     """
     share = settings.schedule.frames_per_second
     if budget.seconds is None or not share:

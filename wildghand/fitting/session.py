@@ -110,24 +110,7 @@ def fit_capture(
     is that of a fit that was never stopped.
 
     Args:
-        source: the capture folder.
         out: the avatar folder; None: nothing is written (`save_avatar` can do it later).
-        settings: what `wildghand.model.settings.read_settings` takes.
-        budget: when to stop; without steps the settings' number holds.
-        seed: of everything random.
-        all_frames: fit the validation and test frames too: for an avatar, not for a score.
-        overwrite: replace an avatar that is there.
-        world: the processes that fit together; only rank 0 writes.
-        watch: looks at the fit after each step, while its clock stands still.
-
-    Raises:
-        BadMethod: a setting is unknown or out of range.
-        UsageError: `out` exists and is not of the same call, the processes cannot share a batch
-            evenly, or there are several and no `out`.
-        BadInput: no training frame can be used, or the saved state is of another fit.
-        DidNotConverge: the fit diverged at once.
-        HwpError: another fit is writing to `out`, or `out` cannot be written to (steps up to the
-            last saved state are not lost), or another process has ended.
     """
     chosen = read_settings(settings or {})
     world.shard(chosen.schedule.batch)
@@ -258,15 +241,7 @@ def save_state(
     seconds: float,
     digest: str,
 ) -> None:
-    """Write everything that changes during a fit.
-
-    Args:
-        path: the file; it is replaced whole.
-        fit, watchers: the fit and what watches it.
-        step: optimizer steps so far.
-        seconds: of fitting so far.
-        digest: of what is fitted and how; another one is refused when read.
-    """
+    """Write everything that changes during a fit."""
     state = {
         "schema": SCHEMA,
         "digest": digest,
@@ -286,11 +261,7 @@ def load_state(
     watchers: Watchers,
     digest: str,
 ) -> tuple[int, float]:
-    """Bring a fit back to a saved state; nothing in the file is executed.
-
-    Returns:
-        Steps and seconds of fitting behind it.
-    """
+    """Bring a fit back to a saved state; nothing in the file is executed."""
     file = Path(path)
     if not file.is_file() or file.stat().st_size > MAX_BYTES:
         raise BadInput(f"is missing or larger than {MAX_BYTES} bytes", where=file)

@@ -109,18 +109,7 @@ def write_record(path: Path, record: JobRecord) -> None:
 
 
 def run_stages(job: Job, stages: Sequence[Stage]) -> tuple[JobRecord, list[str]]:
-    """Run the stages that are not done; every process of the job's world calls this.
-
-    Args:
-        job: the job; its work folder exists.
-        stages: in order.
-
-    Returns:
-        The record, and the names of the stages that were done before; of the first process.
-
-    Raises:
-        HwpError: whatever a stage raises; the same call goes on with that stage.
-    """
+    """Run the stages that are not done; every process of the job's world calls this."""
     if not job.world.is_main:
         for stage in stages:
             if job.world.broadcast(0.0):

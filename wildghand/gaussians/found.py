@@ -91,21 +91,7 @@ class Found:
     def from_tensors(
         cls, tensors: Mapping[str, Tensor], where: str, **sizes: int | Mapping[str, int]
     ) -> Self | None:
-        """Read what `to_tensors` made.
-
-        Args:
-            tensors: of an avatar.
-            where: the file, for messages.
-            sizes: lengths that letters of the shapes stand for, such as `N={"right": 800}`. A
-                letter without one is free. Where one is given by side, these sides must be there;
-                else each side may be absent.
-
-        Returns:
-            The record; None where the avatar keeps none.
-
-        Raises:
-            BadInput: a tensor is missing, of another shape, or holds another number, or none.
-        """
+        """Read what `to_tensors` made."""
         given = next((size for size in sizes.values() if isinstance(size, Mapping)), None)
         parts = [
             (item, side)
@@ -182,19 +168,7 @@ def read_tensor(
     where: str,
     longest: Mapping[str, int] | None = None,
 ) -> Tensor:
-    """One of the tensors of an avatar.
-
-    Args:
-        tensors: of the avatar.
-        name: which of them.
-        shape: that it must have; a letter stands for any length from 1.
-        bounds: least and largest number in it.
-        where: the file, for messages.
-        longest: largest lengths that letters stand for.
-
-    Raises:
-        BadInput: it is missing, of another shape, or holds another number, or none.
-    """
+    """One of the tensors of an avatar."""
     tensor, (low, high) = tensors.get(name), bounds
     if tensor is None:
         raise BadInput("is missing", where=where, field=name, remedy=_REMEDY)

@@ -294,7 +294,6 @@ def off_surface_kernel(worker, counters, ends, raw, lengths, log_scales, free, t
     """Cost of the Gaussians of all frames, and its gradient.
 
     Args:
-        worker, counters, ends: see `wildghand.splat.threads.run`; a job is `PIECE` Gaussians.
         raw: (B N, 14) float32.
         lengths: (2,) float32 m: largest displacement, and spacing of the anchors.
         log_scales: (3,) float32: bias, least and greatest of the log scales.
@@ -303,7 +302,6 @@ def off_surface_kernel(worker, counters, ends, raw, lengths, log_scales, free, t
             weight of the thickness.
         tiny: float32 below which squares of lengths have no slope.
         made: (B N, 14) float32, filled: gradient of the sum of all costs.
-        costs: (pieces,) float64, filled: their sum over a piece.
     """
     count = len(raw)
     reach, aside, narrow, wide = free[0], free[1], free[2], free[3]
@@ -452,14 +450,7 @@ def off_surface(
 
     Args:
         raw: (B, N, k) attributes.
-        activation: of them.
         spacing: mean distance between neighbouring anchors, m.
-        flatness: weight of what is thicker than a disc, wherever it lies. Where a finger is drawn
-            at wrong places, Gaussians otherwise become needles off its skin, which look like fur.
-
-    Returns:
-        scalar: the sum of squares beyond what costs nothing, of lengths in spacings, of the log of
-        a width, and of opacity.
     """
     if kernels_take(*(tensor for _, tensor in raw.items())):
         free = (_REACH, _SHIFT, math.log(_NARROW), _WIDE, _OPAQUE, _HOLE, _THICK, flatness)

@@ -104,8 +104,6 @@ def chain_backward(pose, rest, rotations, turns, of_turns, of_shifts, of_rotatio
     """Gradients of `chain`, from those of turns and shifts.
 
     Args:
-        pose, rest, rotations, turns: as given to and filled by `chain`.
-        of_turns, of_shifts: float64, gradients; overwritten on the way.
         of_rotations: (16, 3, 3) float64, gradients that reach the rotations directly.
 
     Returns:
@@ -168,7 +166,6 @@ def skin(rest, joint_of, weight_of, turns, shifts, vertices):
     Args:
         rest: (V, 3) float32, shaped rest vertices, m.
         joint_of, weight_of: (V, K), joints of each vertex and their weights.
-        turns, shifts: from `chain`.
         vertices: (V, 3) float32, filled, m.
     """
     matrices = np.empty((16, 3, 4), np.float32)
@@ -196,7 +193,6 @@ def skin_backward(of_points, corners, mix, rest, joint_of, weight_of, turns, of_
     Args:
         of_points: (N, 3) float32.
         corners: (N, 3) int, vertices of each anchor's face; `mix`: (N, 3) barycentric.
-        rest, joint_of, weight_of, turns: as for `skin`.
         of_rest: (V, 3) float32, filled: gradient of the rest vertices.
 
     Returns:
@@ -282,7 +278,6 @@ def place_anchors(
     """Positions and frames of anchors, see `hwp_bench.hands.anchors.anchor_frames`.
 
     Args:
-        worker, counters, ends: see `wildghand.splat.threads.run`; a job is `PIECE` anchors.
         vertices, normals: (V, 3) float32; transl: (3,) m, added to the positions.
         corners: (N, 3) int; `first_edge`: (N, 2) int, its vertices; `mix`: (N, 3) float32.
         positions: (N, 3) float32, filled, m.

@@ -140,9 +140,6 @@ class HandShadows:
     def of(self, hands: Hands) -> dict[str, Tensor]:
         """Factors on the sRGB colours of the Gaussians of hands that stand together.
 
-        Args:
-            hands: by side, in B frames.
-
         Returns:
             (B, N) in (0, 1] by side.
         """

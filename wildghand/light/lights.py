@@ -57,8 +57,6 @@ def ring_around(direction: np.ndarray, angle: float, count: int = 6) -> np.ndarr
 
     Args:
         direction: (3,) of length 1.
-        angle: rad.
-        count: how many.
     """
     help_axis = np.eye(3)[int(np.argmin(np.abs(direction)))]
     across = np.cross(direction, help_axis)
@@ -96,7 +94,6 @@ class CastLight(Found):
         Args:
             normals: (M, 3) of length 1.
             free: (M, K) in [0, 1], how much of each direction's light arrives.
-            darkest: share of the linear light that is left at least.
 
         Returns:
             (M,) up to 1.

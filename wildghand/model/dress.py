@@ -35,11 +35,7 @@ def dress_cpu(
     perturbation: Perturbation | None,
     shares: Tensor | None,
 ) -> tuple[tuple[Tensor, ...], Tensor | None]:
-    """See `wildghand.model.dress.dress`.
-
-    Returns:
-        Means, quats, scales, opacities and colours; and the mean size of the biases, or None.
-    """
+    """See `wildghand.model.dress.dress`."""
     raw = prediction.raw.concatenate()
     frames = len(raw)
     ones = torch.ones(frames)
@@ -192,14 +188,8 @@ def dress(
     p' = p_g + v': the predicted offset from the vertex that heads iii and iv moved.
 
     Args:
-        anchors: N anchors in B frames; orientations have no gradient.
-        prediction: of the network in B frames.
-        activation: of the raw attributes.
         perturbation: of the frames; None: they have no biases.
         shares: (B,) how much `prediction` learns from each frame; None: all.
-
-    Returns:
-        The Gaussians, and `wildghand.model.terms.bias_size` of their biases (None without).
     """
     if kernels_take(anchors.positions, prediction.raw.offsets, prediction.shadow):
         made, size = dress_cpu(anchors, prediction, activation, perturbation, shares)

@@ -39,7 +39,6 @@ def dress_pieces(
     """Make the Gaussians of B frames.
 
     Args:
-        worker, counters, ends: see `wildghand.splat.threads.run`; a job is `PIECE` Gaussians.
         raw: (B, N, 14) float32.
         mixing: (14, 14) float32, of which the blocks of the attributes are read; shift: (B, 14).
             The bias of frame b is omega[b] (mixing g + shift[b] + field[b]).
@@ -54,7 +53,6 @@ def dress_pieces(
             (3), unit quaternion (4), 1 / its length before, colours (3), and in bits of one
             number which scales are within their limits.
         means, quats, scales, opacities, colors: (B, N, k) float32, filled.
-        sizes: (pieces,) float64, filled: sum of |bias| over a piece.
     """
     frames, count, local = raw.shape[0], raw.shape[1], field.shape[1] > 0
     given, bias = np.empty(14, np.float32), np.empty(14, np.float32)
@@ -141,8 +139,6 @@ def dress_pieces_backward(
 
     Args:
         share: (B,) float32, how much what all frames share learns from each.
-        of_means, ..., of_colors: gradients of what `dress_pieces` filled.
-        of_size: gradient of the sum of |bias|.
         of_raw: (B, N, 14), of_moved: (N, 3), of_shadow: (B, N) float32, filled.
         of_field: as `field`, float32, filled.
         of_mixing: (pieces, 14, 14), of_shift: (pieces, B, 14), of_omega: (pieces, B) float32

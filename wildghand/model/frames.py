@@ -69,7 +69,6 @@ def rasterize_hands(
     """Draw the Gaussians of hands together in B frames.
 
     Args:
-        parts: of each hand.
         viewmats: (B, 4, 4).
         Ks: (B, 3, 3) px.
         width, height: px.
@@ -113,10 +112,7 @@ def relit(
     """A prediction with colours at unknown normals carried on from known ones.
 
     Args:
-        prediction: of one hand in B frames.
-        light: of the clip.
         network: from (B, N, 3) normals to what the network predicts for them in these frames.
-        anchors: of the hand in the frames.
         viewmats: (B, 4, 4) of the cameras. Skin that does not face them stays as it is.
     """
     normals = quat_third_axis(anchors.orientations)
@@ -139,8 +135,6 @@ def carried_on(
     """A prediction whose colours are, by a share, those at known normals under another light.
 
     Args:
-        prediction: in B frames, at the Gaussians' own normals.
-        known: at the nearest known normals.
         ratio: (B, N) factor from these to the own ones.
         share: (B, N) in [0, 1].
     """

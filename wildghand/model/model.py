@@ -180,15 +180,11 @@ class WildGHandModel(nn.Module):
         """Draw training frames with everything that is particular to them.
 
         Args:
-            clip: hands and cameras.
             rows: (B,) int64 positions among the training frames.
             width, height: px.
             kept: (B,) bool by side: False leaves a frame's biases out; None: never.
             teach: from (B,) temporal weights, before dropout and without gradient, to how much the
                 canonical hand learns from each frame, (B,) in [0, 1], or None: all. None: all.
-            move: add `pose_steps` and `transl_steps` to the given parameters.
-            refine: apply the network's refinement of the parameters (head iv).
-            features: of the network by side, where they are at hand already.
             dark: (B, N) factors of the hands' shadows by side, where they are at hand already.
         """
         if dark is None:
@@ -358,10 +354,8 @@ class WildGHandModel(nn.Module):
         """What network and light say of one hand.
 
         Args:
-            side: which hand.
             hand: pose (B, 16, 3), betas (10,) and translation (B, 3).
             viewmats: (B, 4, 4) of the cameras that look at it; None: the light says nothing.
-            features: of the network, where they are at hand already.
         """
         pose = hand[0]
         anchors = self.rigs[side].pose(*hand)
@@ -389,9 +383,6 @@ class WildGHandModel(nn.Module):
         """The Gaussians of one hand.
 
         Args:
-            side: which hand.
-            predicted: of it, by `predict_hand`.
-            refine: apply the network's refinement of the parameters (head iv).
             rows: (B,) positions among the training frames, whose biases and gains are added; None:
                 free of perturbations.
             dark: (B, N) factors of the hands' shadows; None: ones.
@@ -442,10 +433,7 @@ class WildGHandModel(nn.Module):
         """Predict the attributes of one hand in B frames.
 
         Args:
-            side: which hand.
-            anchors: in the frames.
             pose: (B, 16, 3) axis-angle, rad.
-            features: of the network, where they are at hand already.
         """
         normals = quat_third_axis(anchors.orientations)
         made = self.shaded(self.network(side, normals, pose, features), normals)
@@ -481,12 +469,7 @@ def make_model(
     """Make the model that a fit starts from; the same arguments make the same model.
 
     Args:
-        templates: by side.
-        settings: which parts it has.
         mean_color: (3,) sRGB in [0, 1] of the visible hand.
-        frame_count: training frames that are fitted.
-        seed: of the places of the Gaussians, and of the initial weights.
-        device: where it lives.
         subject: how the person's hand differs from the templates; None: not at all.
     """
     rigs = make_rigs(templates, settings.gaussians, seed, device, subject)

@@ -198,15 +198,6 @@ def read_settings(values: Mapping[str, Any]) -> WildGHandSettings:
 
     A setting that is given wins over the mode's. Parts of a component that is off are off in what
     is returned.
-
-    Args:
-        values: `mode`, a name of `MODES` (without it `default`); and any of the fields of
-            `WildGHandSettings`, as tables or as `table.field`. `network.size` chooses the network,
-            its other fields change it.
-
-    Raises:
-        BadMethod: an unknown name (the message says which one is close), a wrong type, or a value
-            outside its range.
     """
     changes = nested(values)
     mode = _mode_of(changes)

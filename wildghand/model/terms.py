@@ -112,12 +112,6 @@ def reconstruction(
         target: (B, H, W, 3) float of the same type.
         weights: (B, H, W) W, not negative.
         dssim_weight: share of 1 - SSIM in [0, 1]; the paper has 0.
-
-    Returns:
-        scalar, differentiable in `prediction` and `weights`.
-
-    Raises:
-        ShapeMismatch: the three do not describe the same images.
     """
     if prediction.shape == target.shape and weights.shape == target.shape[:-1]:
         finite = target.isfinite()
@@ -160,9 +154,6 @@ def silhouette(coverage: Tensor, hand: Tensor) -> Tensor:
     Args:
         coverage: (B, H, W) or (B, H, W, 1) alpha of the rendering.
         hand: (B, H, W), bool or in [0, 1].
-
-    Raises:
-        ShapeMismatch: the two do not describe the same images.
     """
     if coverage.ndim == hand.ndim + 1:
         coverage = coverage.squeeze(-1)
@@ -200,11 +191,7 @@ def weight_reward(sizes: Tensor) -> Tensor:
 
 
 def cross_hand(left: Tensor, right: Tensor) -> Tensor:
-    """Mean of |T_left - T_right|: texture features of the two hands, (N, F) each.
-
-    Raises:
-        ShapeMismatch: the hands have different numbers of Gaussians or features.
-    """
+    """Mean of |T_left - T_right|: texture features of the two hands, (N, F) each."""
     if left.shape != right.shape:
         raise ShapeMismatch(
             f"have the shapes {tuple(left.shape)} and {tuple(right.shape)}",

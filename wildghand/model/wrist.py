@@ -50,11 +50,7 @@ class WristWall:
 
     @classmethod
     def of(cls, rig: HandRig) -> WristWall | None:
-        """The wall of a hand; None where its mesh is closed or the open end too narrow or wide.
-
-        Args:
-            rig: of the hand, with its anchors.
-        """
+        """The wall of a hand; None where its mesh is closed or the open end too narrow or wide."""
         vertices, faces = rig.template.vertices, rig.template.faces
         border = torch.from_numpy(boundary_loop(faces.cpu().numpy())).to(vertices.device)
         if not len(border):
@@ -73,13 +69,9 @@ class WristWall:
         """The wall of a posed hand.
 
         Args:
-            hand: its Gaussians in B frames.
             pose: (B, 16, 3) axis-angle, rad.
             betas: (10,) or (B, 10).
             transl: (B, 3) m.
-
-        Returns:
-            M Gaussians in B frames.
         """
         vertices = pose_hand(self.template, pose, betas, transl).vertices
         border = vertices[:, self.border]

@@ -282,7 +282,6 @@ def frame_heads(
     """Heads (i) and (ii) on the geometry features of N Gaussians in B frames.
 
     Args:
-        branch, attributes, shadow: whose parameters are used; the heads have one hidden layer.
         coordinates: (N, 20) of the chart, without gradient.
         normals: (B, N, 3) float32 of length 1, world, without gradient.
         pose: (B, 16, 3) axis-angle, rad.

@@ -248,13 +248,7 @@ class PredictionNetwork(nn.Module):
 
 
 def parameter_groups(network: PredictionNetwork) -> dict[str, list[nn.Parameter]]:
-    """Sort every parameter into one of five groups.
-
-    Returns:
-        `identity`: the identity map; `direct`: the matrix that adds it to the attributes (empty
-        without `direct`); `light`: the linear part of head (ii); `refinement`: head (iv);
-        `network`: all others. Groups and their members are in a fixed order.
-    """
+    """Sort every parameter into one of five groups."""
     groups: dict[str, list[nn.Parameter]] = {
         "identity": [],
         "direct": [],

@@ -343,15 +343,10 @@ def heads_forward(
     """Raw attributes and shadow coefficients of B frames.
 
     Args:
-        worker, counters, ends: see `wildghand.splat.threads.run`; a job is `PIECE` Gaussians.
-        frames, count: B and N.
         places: (N, C); harmonics: (B, N, L); shift: (B, point) of the first layer; hidden:
             (N, head); latent: (N, I); initial: (N, 14), all float32.
-        packed, widths, layout: weights, see `Layout`.
-        start: logit of the shadow coefficient at the start.
         seen: (B, N rounded up to 8, seen), filled: layers before their SiLU.
         raw: (B, N, 14); shadow: (B, N), filled.
-        sums: (pieces, B, room for features) zeros, to which each piece adds its features.
     """
     w = widths
     padded = (count + ROWS - 1) // ROWS * ROWS
@@ -409,8 +404,6 @@ def heads_backward(
         of_raw: (B, N, 14); of_shadow: (B, N).
         of_mean: (B, point), gradient of each Gaussian's second layer by the mean of all.
         of_hidden: (N, head); of_latent: (N, I), filled.
-        of_shift: (pieces, B, point) zeros, to which each piece adds its part.
-        of_packed: (pieces, parts of `layout` up to `second_back`) zeros, likewise.
     """
     w, size = widths, layout.second_back
     padded = (count + ROWS - 1) // ROWS * ROWS

@@ -118,15 +118,7 @@ _PAPER: Mapping[str, Any] = MappingProxyType(
 
 
 def network_settings(size: str = "compact", **changes: Any) -> NetworkSettings:
-    """Return the settings of a size, some of them changed.
-
-    Args:
-        size: `compact` or `paper`.
-        changes: any other fields of `NetworkSettings`.
-
-    Raises:
-        BadMethod: no such size or field, a wrong type, or a value out of its range.
-    """
+    """Return the settings of a size, some of them changed."""
     base = dict(_PAPER) if size == "paper" else {"size": size}
     return settings_from(NetworkSettings, {**base, **changes}, "network")
 

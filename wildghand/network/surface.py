@@ -233,9 +233,6 @@ def mirrored_anchors(anchors: SurfaceAnchors) -> SurfaceAnchors:
     `mirror_template` keeps the order of the faces and turns each round (last corner first), so
     the barycentric coordinates turn round with them. Anchors that are sampled on the mirrored
     template instead share the faces but lie elsewhere in them.
-
-    Args:
-        anchors: of a template or of its mirror image.
     """
     mix = anchors.barycentric
     turned = mix.flip(-1) if isinstance(mix, Tensor) else mix[:, ::-1].copy()

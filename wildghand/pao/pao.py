@@ -29,18 +29,7 @@ LEAST = 0.002
 def running_median(
     previous: float | Tensor | None, errors: Tensor, counted: Tensor
 ) -> float | Tensor:
-    """Follow the median of errors over the steps of a fit.
-
-    Args:
-        previous: what this gave at the step before; None at the first.
-        errors: (...) not negative.
-        counted: as `errors`, bool: those that count; the others, and those that are not finite,
-            do not.
-
-    Returns:
-        The new median, at least `LEAST`; `previous` where nothing counts. A number on the CPU,
-        elsewhere a scalar on the device, float64, which nobody waits for.
-    """
+    """Follow the median of errors over the steps of a fit."""
     counted = counted & errors.isfinite()
     if errors.device.type != "cpu":
         return _on_device(previous, errors, counted)
@@ -97,7 +86,6 @@ class PlaceErrors:
 
         Args:
             rows: (B,) int64 on the CPU, which of the frames.
-            median: of the regions' errors.
 
         Returns:
             (B, H, W), positive.
@@ -382,7 +370,6 @@ def binary_weights(hand: Tensor, outside: float = 0.0) -> Tensor:
 
     Args:
         hand: (B, H, W) y_h: bool, or coverage in [0, 1], hand where above a half.
-        outside: weight of the other pixels.
 
     Returns:
         (B, H, W) float32, 1 on the hand.

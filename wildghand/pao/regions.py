@@ -47,9 +47,6 @@ def partition(labels: np.ndarray) -> FrameRegions:
 
     Args:
         labels: (H, W) integers, any values; they are renumbered from 0 without gaps.
-
-    Raises:
-        UsageError: not an (H, W) array of integers, or more than 65,536 different ones.
     """
     if labels.ndim != 2 or labels.dtype.kind not in "iu":
         raise UsageError(f"are {labels.dtype} of shape {labels.shape}", field="labels")
@@ -63,9 +60,6 @@ def overlapping(masks: np.ndarray) -> FrameRegions:
 
     Args:
         masks: (U, H, W) bool; U may be 0.
-
-    Raises:
-        UsageError: another shape or type, or more than 65,536 different overlaps.
     """
     if masks.ndim != 3 or masks.dtype != np.bool_:
         raise UsageError(f"are {masks.dtype} of shape {masks.shape}", field="masks")
@@ -149,15 +143,7 @@ class Regions:
 
 
 def stack_regions(frames: Sequence[FrameRegions], device: torch.device | str = "cpu") -> Regions:
-    """Put the regions of B frames together.
-
-    Args:
-        frames: all of one image size, at least one.
-        device: where the tensors live.
-
-    Raises:
-        ShapeMismatch: no frame, or frames of different sizes.
-    """
+    """Put the regions of B frames together."""
     sizes = {frame.labels.shape for frame in frames}
     if len(sizes) != 1:
         raise ShapeMismatch(f"have the sizes {sorted(sizes)}", field="frames")

@@ -78,37 +78,18 @@ _MEAN, _STD = (123.675, 116.28, 103.53), (58.395, 57.12, 57.375)
 
 
 def check_checkpoint(path: str | os.PathLike[str]) -> None:
-    """Check that a checkpoint holds a Segment Anything network.
-
-    Raises:
-        BadInput: it is missing, unreadable, or a tensor is missing or of another shape.
-        MissingDependency: `transformers` is not installed.
-    """
+    """Check that a checkpoint holds a Segment Anything network."""
     _load(Path(path))
 
 
 def load_network(path: str | os.PathLike[str], device: str = "cpu") -> SamModel:
-    """Load a network; nothing in its files is executed.
-
-    Args:
-        path: a folder in the layout of `transformers` (config.json and weights), or a checkpoint
-            file of the package `segment-anything`.
-        device: torch device.
-
-    Raises:
-        BadInput: it is missing, unreadable, or a tensor is missing or of another shape.
-        MissingDependency: `transformers` is not installed.
-    """
+    """Load a network; nothing in its files is executed."""
     model: SamModel = _load(Path(path)).to(device).eval().requires_grad_(False)
     return model
 
 
 def checkpoint_digest(path: str | os.PathLike[str]) -> str:
-    """SHA-256 (hex) of what a checkpoint's network depends on.
-
-    Raises:
-        BadInput: it is missing.
-    """
+    """SHA-256 (hex) of what a checkpoint's network depends on."""
     weights = _weights_file(Path(path))
     config = sha256_of(weights.with_name(_CONFIG)) if Path(path).is_dir() else ""
     return sha256_json(["sam-2", config, sha256_of(weights)])
@@ -182,11 +163,7 @@ def _decoder_of(config: Path) -> dict[str, Any]:
 
 
 def _sizes(tensors: Mapping[str, Tensor], decoder: dict[str, Any]) -> dict[str, Any]:
-    """The network's configuration, as the shapes of its tensors tell it.
-
-    Raises:
-        KeyError, ValueError: a tensor is missing, or its shape makes no sense.
-    """
+    """The network's configuration, as the shapes of its tensors tell it."""
     vision, mask = "vision_encoder.layers", "mask_decoder"
 
     def shape(name: str) -> tuple[int, ...]:
@@ -368,7 +345,6 @@ def suppress_overlaps(boxes: Tensor, quality: Tensor, overlap: float) -> Tensor:
     Args:
         boxes: (M, 4) x0 y0 x1 y1.
         quality: (M,).
-        overlap: largest IoU of two boxes that are both kept.
     """
     area = (boxes[:, 2:] - boxes[:, :2]).prod(dim=1)
     waiting = quality.argsort(descending=True, stable=True)
@@ -462,17 +438,7 @@ def mask_of(regions: FrameRegions) -> np.ndarray:
 
 
 def open_sam(checkpoint: str | os.PathLike[str], device: str = "cpu") -> SegmentAnything:
-    """Open a Segment Anything checkpoint on the user's disk; nothing is downloaded.
-
-    Args:
-        checkpoint: a folder in the layout of `transformers` (config.json and weights), or a
-            .pth file of the package `segment-anything`, which is not needed.
-        device: torch device.
-
-    Raises:
-        BadInput: it is missing; when the first image is cut, also: it cannot be read, or is of
-            another network.
-    """
+    """Open a Segment Anything checkpoint on the user's disk; nothing is downloaded."""
     # A graphics card rounds differently, and a mask may turn on it.
     identity = sha256_json([checkpoint_digest(checkpoint), torch.device(device).type])
     network = functools.cache(lambda: load_network(checkpoint, device))

@@ -112,7 +112,6 @@ class RegionCache:
 
         Args:
             image: (H, W, 3) uint8 sRGB.
-            segmenter: makes them.
         """
         path = self.folder / f"{sha256_json([pixel_digest(image), segmenter.identity])}.npz"
         kept = _load(path, image.shape[:2])

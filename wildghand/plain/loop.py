@@ -140,20 +140,7 @@ def run_fit(
     """Take steps until the budget is spent, the loss stands still, or the fit diverges.
 
     Args:
-        fit: what is fitted.
-        budget: when to stop; without steps the settings' number holds.
-        report: where checkpoints are offered.
-        start: steps that `fit` has behind it.
-        watchers: those of the fit so far, where it goes on.
-        after_step: called with steps, watchers and loss after each; saves, for instance, and
-            changes nothing of the fit.
         threads: chooses how many threads steps run on; None: by what they gain.
-
-    Returns:
-        What the fit makes of its last state, or of the best one if it diverged later.
-
-    Raises:
-        DidNotConverge: the fit diverged without ever having been better than its start.
     """
     steps, batches = fit.count_steps(budget), fit.batches()
     for _ in range(start):

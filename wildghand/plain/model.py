@@ -79,7 +79,6 @@ class PlainModel:
 
         Args:
             colors: (N, 3) or (B, N, 3) sRGB without light.
-            poses: the anchors of all Gaussians in B frames.
 
         Returns:
             (B, N, 3) sRGB.
@@ -105,7 +104,6 @@ class PlainModel:
 
         Args:
             channels: (B, N, D), any number D; colours are three of them.
-            poses: the anchors of all Gaussians in B frames.
             viewmats: (B, 4, 4) world to camera.
             Ks: (B, 3, 3) px.
             width, height: px.
@@ -141,13 +139,8 @@ def make_model(
     """Cover the hands with flat Gaussians of one colour under even light.
 
     Args:
-        templates: by side.
         mean_color: (3,) sRGB in [0, 1].
-        gaussians: number on each hand.
         opacity: of each Gaussian, in (0, 1).
-        degree: of the light's spherical harmonics.
-        seed: of the anchors.
-        device: where the tensors live.
     """
     rigs = {
         side: make_rig(template, gaussians, seed, device) for side, template in templates.items()

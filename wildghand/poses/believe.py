@@ -101,17 +101,6 @@ def believed_hands(
 
     A hand moves in few ways, and an estimator errs in all. How the clip's poses spread and how much
     they err is found from the given poses of all frames; no picture is read.
-
-    Args:
-        templates: by side.
-        hands: given parameters of every frame, by side.
-        cameras: of every frame.
-        settings: how.
-
-    Returns:
-        The parameters by side: fingers as expected from both, the wrist and the place moved along,
-        so that the hand stays on its landmarks. A hand whose errors cannot be told, or are small,
-        is the given one.
     """
     return {
         side: _believed(templates[side], hand, cameras.viewmats, settings)
@@ -161,7 +150,6 @@ def _in_vectors(hand: HandParameters, together: np.ndarray) -> tuple[np.ndarray,
     """Rotation vectors of the fingers (F, 45), and covariances of their errors (F, 45, 45).
 
     Args:
-        hand: F frames.
         together: (F, 51, 51) covariances about the joints' own axes.
     """
     vectors = _shortest(hand)

@@ -53,11 +53,7 @@ def in_front(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray)
 
 
 def extent_in(template: HandTemplate, hand: HandParameters, viewmats: np.ndarray) -> float:
-    """How large a hand is in the image, by which landmarks err; see `pose_covariances`.
-
-    Returns:
-        Median over frames of the larger side of its box, in slopes of the camera.
-    """
+    """How large a hand is in the image, by which landmarks err; see `pose_covariances`."""
     return hand_extent(_seen(template, hand, viewmats).landmarks)
 
 
@@ -74,10 +70,7 @@ def pose_covariances(
     say little of it, and the joints of a finger make up for each other.
 
     Args:
-        template: of the hand.
-        hand: given parameters of F frames, in front of the cameras.
         viewmats: (F, 4, 4) world to camera.
-        extent: of the hand in the clip, by `extent_in`: all its frames have one.
 
     Returns:
         (F, 51, 51): 16 joints about their own axes, rad, then the place in camera axes, m.

@@ -109,9 +109,6 @@ class FrameAssessment:
 
         A hand that is not the model, or a tracker that is always a little wrong, leaves it. It is
         no perturbation of any frame.
-
-        Args:
-            floor: misplacement that counts as 1 (`PrepassSettings.misplacement_floor`).
         """
         found = self.misplacement[self.usable]
         return float(np.quantile(found, 0.1)) / floor if len(found) and floor > 0.0 else 0.0
@@ -166,9 +163,6 @@ def estimated_severity(assessment: FrameAssessment) -> dict[str, np.ndarray]:
 
     Each cue also reacts to other perturbations: blur moves outlines, and an object hides texture.
     `assessment.clean` is reliable; how it is split among the perturbations is a guess.
-
-    Args:
-        assessment: of R frames.
 
     Returns:
         (R,) int, 0-5, for each perturbation of the taxonomy; 0 wherever the frame is judged

@@ -82,10 +82,6 @@ def classify_frames(
 
     Args:
         indices: (R,) ascending frame numbers.
-        size: height and width of the frames.
-        measured: by row; rows that are missing cannot be used. Not empty.
-        settings: least tolerance and weight.
-        tolerance: evidence at which a frame is as likely clean as not (`clip_tolerance`).
     """
     count = len(indices)
     rows = np.array(sorted(measured))
@@ -138,7 +134,6 @@ def clip_tolerance(found: np.ndarray, least: float) -> float:
 
     Args:
         found: (K,) evidence of frames of which it is known that nothing perturbs them.
-        least: tolerance; fewer frames than `LEAST_FRAMES` do not raise it.
     """
     if len(found) < LEAST_FRAMES:
         return least
@@ -206,7 +201,6 @@ def evidence(deviations: Sequence[np.ndarray], indices: np.ndarray, tolerance: f
     Args:
         deviations: arrays (R,), not negative.
         indices: (R,) ascending frame numbers.
-        tolerance: evidence at which a frame is as likely clean as not, positive.
 
     Returns:
         (R,) not negative.
@@ -235,15 +229,6 @@ def judge_frames(
     Beyond `PIXEL_BUDGET` pixels the frames are judged at a lower resolution; weights and lengths
     are brought back to the full one. Fewer usable frames than `LEAST_FRAMES` cannot be compared:
     all of them are judged clean.
-
-    Args:
-        given: the frames.
-        settings: how.
-        known_clean: other frames of the clip, of which it is known that nothing perturbs them.
-            They say how much evidence a clean frame has here (`classify.clip_tolerance`).
-
-    Raises:
-        BadInput: no frame can be used: no hand is valid and lies in the image and in the mask.
     """
     settings = settings or PrepassSettings()
     excess_pixels = given.masks.size / PIXEL_BUDGET

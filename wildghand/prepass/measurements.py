@@ -70,12 +70,7 @@ def capture_input(
     """Read frames of a capture; its truth is not read.
 
     Args:
-        capture: the capture.
         indices: (R,) ascending, which frames.
-        frames: the same numbers as an iterable that shows progress.
-
-    Raises:
-        BadImage: an image is missing or damaged.
     """
     numbers = indices.tolist() if frames is None else frames
     images, masks = zip(*((capture.frame(k), capture.mask(k)) for k in numbers), strict=True)
@@ -300,12 +295,8 @@ def measure_frame(
     """Compare a frame with the intensity model.
 
     Args:
-        model: fitted to all frames.
-        footprint: what the silhouette's pixels show; at least one of them is inner.
         image: (H, W, 3) uint8 sRGB.
         mask: (H, W) uint8, 255 = visible hand.
-        shown: the cells that the masks of all frames show.
-        misplacement: of this frame.
         border: width of its border, px.
         motion: since the frame before, px.
     """
@@ -357,7 +348,6 @@ def inner_pixels(footprint: Footprint, masked: np.ndarray, values: np.ndarray) -
     """The pixels that should show skin in a known place and can be read.
 
     Args:
-        footprint: with P pixels.
         masked: (H, W) bool, visible hand.
         values: (P, 3) uint8 sRGB.
 

@@ -43,7 +43,6 @@ def weigh_pixels(
 
     Args:
         masks: (R, H, W) uint8, 255 = visible hand.
-        measured: by row; rows that are missing cannot be used. Not empty.
         clean: (R,) probability that nothing perturbs a frame.
         known: (C,) bool, the cells of the surface that clean frames from different parts of the
             clip show.
@@ -109,9 +108,6 @@ def normal_residuals(
         residuals: for each frame (P,) residuals.
         cells: for each frame (P,) cells.
         trusts: for each frame how much it counts, in [0, 1].
-        cell_count: number of cells.
-        level: median residual of the clean frames, positive.
-        prior: pixels that the level is worth.
 
     Returns:
         (C,) float32, at least the level.
@@ -141,9 +137,6 @@ def geometric_normals(
         distances: for each frame (P,) distances, of tint or residuals.
         cells: for each frame (P,) cells.
         trusts: for each frame how much it counts, in [0, 1].
-        cell_count: number of cells.
-        level: median distance of the clean frames, positive.
-        prior: pixels that the level is worth.
 
     Returns:
         (C,) float32, at least the level.

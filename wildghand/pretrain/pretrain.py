@@ -54,20 +54,7 @@ def pretrain(
     the result is that of a run that was never stopped.
 
     Args:
-        sources: capture folders, one for each subject; all their frames are used.
-        out: the folder to make.
-        settings: overrides of the defaults of a fit; it starts from random weights unless they
-            name a prior, and its rates fall to a twentieth.
         steps: optimizer steps over all captures; None: the settings' number for each capture.
-        seed: of everything random.
-        overwrite: replace a prior that is there.
-
-    Raises:
-        UsageError: `out` exists, or fewer than two captures.
-        BadInput: captures of different hand models, one without a usable frame, or a saved state
-            of another run.
-        DidNotConverge: the fit diverged at once.
-        HwpError: another run is writing to `out`, or nobody can.
     """
     if out.exists() and not overwrite:
         raise UsageError("exists", where=out, remedy="Choose another name, or give --overwrite.")

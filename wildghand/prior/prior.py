@@ -124,14 +124,6 @@ def choose_prior(
 
     A prior that a person names has to be of the fit's kind. The one that ships is taken where it
     is: nobody asked for it who chose another network or hand model.
-
-    Args:
-        settings: of the fit.
-        hand_model: of the capture.
-        network: of the fit, where it is made already; saves a second.
-
-    Raises:
-        BadInput: the prior that is named is missing, damaged, or of another kind.
     """
     if not settings.prior:
         return None
@@ -152,9 +144,6 @@ def find_prior(text: str) -> Path:
 
     A method's preset names it with a path inside the package, which it may not leave; a person
     names it with an absolute one.
-
-    Raises:
-        BadInput: a relative path leads out of the package, or there is not a prior.
     """
     remedy = (
         "Give the absolute path of a folder that `wildghand pretrain` made, and show it to an "
@@ -186,25 +175,7 @@ def save_prior(
     steps: int,
     overwrite: bool = False,
 ) -> Prior:
-    """Write a prior, whole or not at all.
-
-    Args:
-        path: the folder.
-        tensors: as `wildghand.prior.prior.mean_weights` returns them; stored with 16 bits each.
-        hand_model: of the captures.
-        captures: those that it was fitted to.
-        settings: of the fit.
-        seed: of the fit.
-        steps: of the fit.
-        overwrite: replace a prior that is there.
-
-    Returns:
-        The prior as it is read again.
-
-    Raises:
-        UsageError: something is there and may not be replaced.
-        BadInput: a weight is not finite, or too large for 16 bits.
-    """
+    """Write a prior, whole or not at all."""
     from safetensors.torch import save
 
     halves = {name: value.detach().half().contiguous() for name, value in tensors.items()}
@@ -234,17 +205,7 @@ def load_prior(
     hand_model: HandModelId,
     network: PredictionNetwork | None = None,
 ) -> Prior:
-    """Read a prior; nothing in it is executed.
-
-    Args:
-        path: the folder.
-        settings: of the network of the fit that will start from it.
-        hand_model: of the capture.
-        network: that network, where it is made already; saves a second.
-
-    Raises:
-        BadInput: no prior, damaged, or of another network or hand model.
-    """
+    """Read a prior; nothing in it is executed."""
     root = Path(path)
     record = _read_record(root)
     _check_fit(record, settings, hand_model, str(root / DESCRIPTION))

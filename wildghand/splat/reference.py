@@ -200,7 +200,6 @@ def blend(
         (H, W, X); alpha (H, W, 1); blended pairs (); and, (H, W), how near a pixel comes to one of
         the limits in `conventions`, as the least |log ratio|: below 1e-5, float32 may decide
         otherwise.
-
     The order is that of float32 depth, ties by index, as every backend sorts.
     """
     order = torch.argsort(depths.detach().to(torch.float32), stable=True)

@@ -104,9 +104,7 @@ def run(kernel: Callable[..., Any], ends: np.ndarray, *args: Any) -> None:
     """Calls `kernel(worker, counters, ends, *args)` on as many threads as there are shares.
 
     Args:
-        kernel: takes jobs by `kernels.jobs.next_job` until none is left.
         ends: int64 (threads + 1,), the shares; the calling thread has the first.
-        args: the same for all.
     """
     threads = len(ends) - 1
     counters = np.zeros(threads * SPACING, np.int64)

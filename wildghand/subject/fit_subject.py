@@ -55,17 +55,10 @@ def fit_subject(
     """Fit a person's hand to masks; deterministic.
 
     Args:
-        templates: by side.
-        hands: parameters of every frame, by side.
-        cameras: of every frame.
         frames: (R,) numbers of the frames with masks, ascending.
         masks: (R, H, W) uint8, 255 = visible hand.
-        settings: how.
         judges: further frames, which choose how far the hand bends; None: those of the R frames
             that are not compared do.
-
-    Returns:
-        The shape; zeros where too little can be compared.
     """
 
     def compared(rows: np.ndarray) -> ComparedFrames:
@@ -152,10 +145,6 @@ class _Bending:
 
         Args:
             reach: gap at which a point counts a quarter, px.
-            stiffness: as in `STIFFNESS`.
-
-        Returns:
-            Whether enough can be compared.
         """
         rows, gaps = [], []
         frames, unknowns = self.frames, self.unknowns

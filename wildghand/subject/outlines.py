@@ -67,11 +67,6 @@ def compare_outlines(
         pixels: (V, 2) px, the mesh in the image.
         depth: (V,) m.
         faces: (F, 3).
-        outline: of the mask.
-
-    Returns:
-        The points where both outlines run alike. Distances of both are read in the same way, so
-        that the rounding to pixels is the same.
     """
     face, mix = draw_faces(pixels, depth, faces, outline.distance.shape)
     area = face >= 0

@@ -53,10 +53,6 @@ def place_control_points(template: HandTemplate, count: int) -> ControlPoints:
     """Spread control points over a hand, each as far as possible from those before it.
 
     Distances run along the edges of the mesh, so that neighbouring fingers move apart.
-
-    Args:
-        template: the hand.
-        count: K; every vertex is one where the template has fewer.
     """
     vertices, edges = template.vertices, unique_edges(template.faces)[0]
     lengths = np.linalg.norm(vertices[edges[:, 0]] - vertices[edges[:, 1]], axis=1)
@@ -96,11 +92,7 @@ class Proportions:
 
 
 def hand_proportions(template: HandTemplate) -> Proportions:
-    """The proportions of a template.
-
-    Args:
-        template: the hand, of either side.
-    """
+    """The proportions of a template."""
     moves: list[tuple[np.ndarray, np.ndarray, bool]] = []
     below = moved_joints()
     for finger, name in enumerate(FINGERS):
@@ -271,13 +263,6 @@ def outline_rows(
     seen: OutlinePoints,
 ) -> np.ndarray:
     """Rows of the linear problem of one frame.
-
-    Args:
-        unknowns: N of them.
-        frames: that are compared.
-        posed: the hands in them.
-        frame: row of the frame, from 0.
-        seen: M points of the outline in it.
 
     Returns:
         (M, N) float32, px along the outward direction of each point for a unit of each unknown.

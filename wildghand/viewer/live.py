@@ -187,11 +187,6 @@ def serve_fit(address: Address | None = None, pause: float = LEAST_PAUSE) -> Ite
 
     Args:
         address: where it is served; None: on this machine only.
-        pause: see `Live`.
-
-    Raises:
-        MissingDependency: viser is not installed.
-        UsageError: the address cannot be used.
     """
     with serving(address or Address(), "fit") as server:
         page = LivePage(server)

@@ -206,14 +206,7 @@ def serve_view(
     """Serve a view while the block runs.
 
     Args:
-        avatar: what is shown.
-        motion: what is played.
         address: where it is served; None: on this machine only.
-        settings: how it looks.
-
-    Raises:
-        MissingDependency: viser is not installed.
-        UsageError: the address cannot be used.
     """
     require_viser()
     settings = settings or ViewSettings()

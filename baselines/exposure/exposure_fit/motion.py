@@ -13,10 +13,6 @@ def nearest_turn(pose: np.ndarray, to: np.ndarray) -> np.ndarray:
 
     A rotation by t about an axis is one by t - 2 pi too; near half a turn a tracker may jump
     between the two.
-
-    Args:
-        pose: (..., 3) rad, of at most one turn.
-        to: (..., 3) rad.
     """
     angle = np.linalg.norm(pose, axis=-1, keepdims=True)
     axis = pose / np.where(angle > 0.0, angle, 1.0)
@@ -53,7 +49,6 @@ def pose_velocities(pose: np.ndarray, valid: np.ndarray, indices: np.ndarray) ->
 
     Args:
         pose: (F, J, 3) rad.
-        valid, indices: as in `velocities`.
 
     Returns:
         (R, J, 3) rad per frame.

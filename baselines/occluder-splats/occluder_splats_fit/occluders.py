@@ -82,7 +82,6 @@ def mask_boxes(masks: torch.Tensor, margin: float = 0.1) -> torch.Tensor:
 
     Args:
         masks: (R, H, W) uint8; above 127 is the hand, of which each has a pixel.
-        margin: on each side, as a share of the box's longer edge.
 
     Returns:
         (R, 4) int64 px: left, top, right, bottom; the last two are exclusive.
@@ -113,9 +112,7 @@ def make_occluders(
     Args:
         images: (R, H, W, 3) uint8 sRGB.
         boxes: (R, 4) from `mask_boxes`.
-        count: M.
         opacity: of each, in (0, 1).
-        device: where the tensors live.
     """
     square = torch.as_tensor((0.5 + np.arange(count)[:, None] * _R2_STEP) % 1.0)
     sizes = (boxes[:, 2:] - boxes[:, :2])[:, None].double()

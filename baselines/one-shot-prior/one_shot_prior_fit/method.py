@@ -59,9 +59,6 @@ def choose_frame(frames: TrainingFrames) -> int:
     Among the frames whose mask has at least nine tenths of the largest mask's area, it is the one
     with the largest mean magnitude of the Laplacian within the mask: blur and covered skin
     lower one or the other. The first of equals is taken.
-
-    Args:
-        frames: the training frames.
     """
     areas = (frames.masks > 127).flatten(1).sum(dim=1).numpy()
     rows = np.flatnonzero(areas >= _LARGE * areas.max())

@@ -210,7 +210,6 @@ def total_variation(planes: Tensor, where: Tensor | None = None) -> Tensor:
     """Mean absolute difference of neighbours in planes (B, H, W).
 
     Args:
-        planes: any number of planes.
         where: (H, W) weights of the pairs by their first member; None weighs all alike.
     """
     across = (planes[:, :, 1:] - planes[:, :, :-1]).abs()

@@ -191,7 +191,6 @@ class ScanHand(nn.Module):
         """See `ShadowNet.forward`.
 
         Args:
-            posed: the anchors in B frames.
             viewmats: (B, 4, 4) world to camera.
             pose: (B, 16, 3) axis-angle, rad.
         """

@@ -55,12 +55,10 @@ def unwrap(
     """Divide frames by their shadows, and take the median at each anchor.
 
     Args:
-        sides: the hands.
         posed: takes rows, (B,) int64, and returns the anchors of each hand and their shadows,
             (B, N).
         cameras: takes rows, and returns viewmats (B, 4, 4) and Ks (B, 3, 3).
         pictures: takes rows, and returns images (B, H, W, 3) sRGB and masks (B, H, W) in [0, 1].
-        count: R.
 
     Returns:
         By side: (N, 3) sRGB in full light, and (N,) the weight of the frames that show it, 0 where

@@ -139,7 +139,6 @@ class ShadowedModel(PlainModel):
 
         Args:
             colors: (N, 3) or (B, N, 3) albedo, sRGB.
-            poses: the anchors of all Gaussians in B frames.
 
         Returns:
             (B, N, 3) sRGB.

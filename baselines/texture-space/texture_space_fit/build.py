@@ -62,7 +62,6 @@ def principal_components(samples: np.ndarray, count: int) -> tuple[np.ndarray, n
 
     Args:
         samples: (P, D).
-        count: components, below P.
 
     Returns:
         (D,) mean; (count, D) components, each as long as the samples' standard deviation along

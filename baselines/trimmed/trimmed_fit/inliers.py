@@ -42,9 +42,6 @@ class ErrorHistogram:
 
         Args:
             share: in [0, 1].
-
-        Returns:
-            in (0, 1]; 1 while nothing has been added, so that every pixel is an inlier.
         """
         total = self.counts.cumsum(0)
         if float(total[-1]) == 0.0:

@@ -115,20 +115,6 @@ def download_release(
     On first use the checksum of every file is pinned for its commit in the user's cache; a later
     download of the same commit must bring the same bytes. An interrupted download goes on where
     it stopped and stays at its commit. An existing file that differs is never replaced.
-
-    Args:
-        out: folder to make, or one that an earlier call began.
-        hub: the server.
-        captures: beginnings of folder names, such as `capture0_`; empty takes everything.
-        revision: branch, tag or commit; None takes the newest, or the one that was begun.
-        pins: file of pinned checksums; None takes the toolkit's cache.
-        update: called with (done, total) files.
-
-    Raises:
-        UsageError: `out` contains something that no earlier call put there, or another commit.
-        BadInput: a file differs from the pinned or the stated checksum, or its name leads out of
-            the folder.
-        HwpError: the hub cannot be reached.
     """
     folder = Path(out)
     record = _record(folder)

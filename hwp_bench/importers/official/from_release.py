@@ -108,22 +108,7 @@ class OfficialImport:
 def import_official(
     folder: OfficialFolder, out: str | os.PathLike[str], options: OfficialImport | None = None
 ) -> dict[str, Any]:
-    """Make a capture of one folder of the release.
-
-    Args:
-        folder: from `find_folders`.
-        out: the capture folder to make.
-        options: choices; the defaults where None.
-
-    Returns:
-        Facts that measure the import, as the capture's `extra/import.json` holds them;
-        `warnings` lists everything unexpected.
-
-    Raises:
-        UnsafePickle: a pickle asks for something that is not plain data.
-        BadInput: a record, an image or a mask is unusable, or contradicts an assumption.
-        UsageError: `out` exists, or an option makes no sense.
-    """
+    """Make a capture of one folder of the release."""
     options = options or OfficialImport()
     check_id(folder.id, os.fspath(folder.path))
     refuse_existing(out, overwrite=options.overwrite)

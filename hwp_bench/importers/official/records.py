@@ -40,16 +40,7 @@ class OfficialFolder:
 def find_folders(
     path: str | os.PathLike[str], identifier: str | None = None
 ) -> list[OfficialFolder]:
-    """Find the captures of a folder: itself, or its subfolders down to the third level.
-
-    Args:
-        path: a folder with `output.pkl`, or one that contains such folders, as a download does.
-        identifier: id of the capture where the folder has no name of the release.
-
-    Raises:
-        BadInput: the folder is missing, it contains no pickle, a name is not of the release, or
-            two folders are of one capture.
-    """
+    """Find the captures of a folder: itself, or its subfolders down to the third level."""
     root = Path(path)
     if not root.is_dir():
         raise BadInput("is not a folder", where=root)

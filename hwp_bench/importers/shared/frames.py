@@ -66,8 +66,6 @@ def follow_hands(hands: Sequence[Landmarks], fps: float, size: int) -> CropWindo
     window does not jump to the other hand and back.
 
     Args:
-        hands: landmarks of the selected frames; each hand is detected in at least one.
-        fps: frames per second, for the smoothing.
         size: px of the resampled crop.
     """
     from scipy.ndimage import gaussian_filter1d
@@ -132,16 +130,7 @@ def cells(places: np.ndarray, shape: tuple[int, ...]) -> tuple[np.ndarray, np.nd
 
 
 def each_frame(work: Callable[[Frame], Result], frames: Iterable[Frame]) -> Iterator[Result]:
-    """Call a function for each frame in several threads.
-
-    Args:
-        work: gets one of the frames; called from several threads.
-        frames: numbers of frames, or whatever else `work` takes; read as they are needed.
-
-    Yields:
-        The results in the order of `frames`, so that they do not depend on the number of threads;
-        only a few are held at a time.
-    """
+    """Call a function for each frame in several threads."""
     threads = min(MOST_THREADS, os.cpu_count() or 1)
     running: list[Future[Result]] = []
     with ThreadPoolExecutor(threads) as pool:

@@ -366,18 +366,6 @@ def read_landmarks(
     Args:
         path: npz with `image` (F, 21, 2 or 3), `world` (F, 21, 3) and `score` (F,). A frame in
             which the tracker saw nothing has score 0; its landmarks may be NaN.
-        min_score: frames below this score count as not detected.
-        side: `right` or `left`: the hand that is read where the file has several (version 2) and
-            one is of this side; else that which is seen most. Hands that the tracker exchanged
-            are put right (`associate`).
-
-    Returns:
-        The landmarks; values of frames that are not detected are zero.
-
-    Raises:
-        BadInput: the file is missing, not an npz, too large, holds objects or the wrong shapes, has
-            no detected frame, is not in metres, or has NaN where the score is that of a visible
-            hand.
     """
     path = Path(path)
     arrays = _load(path, side)

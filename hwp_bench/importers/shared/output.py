@@ -52,14 +52,8 @@ def write_capture(
     """Write a capture, whole or not at all.
 
     Args:
-        out: the capture folder to make.
-        info: the capture's description.
-        hands: parameters by side.
-        cameras: one camera a frame.
         frames: for each frame its image (H, W, 3) uint8 sRGB and its mask (H, W) uint8.
         sheet: draws the overlay sheet, (H, W, 3) uint8; called once all frames are written.
-        facts: the numbers that measure the import, stored as JSON.
-        overwrite: replace an existing folder.
     """
     with (
         CaptureWriter(out, info, hands, cameras, overwrite=overwrite) as writer,
@@ -136,11 +130,9 @@ def overlay_sheet(
     """Draw frames with the outline of their masks, with the posed meshes next to them.
 
     Args:
-        hands: at least one.
         images: (S, S, 3) uint8 by frame.
         masks: (S, S) uint8 by frame.
         tracked: (N, 2) px by frame, points that are drawn as dots, NaN where unknown.
-        captions: by frame; its number where None.
 
     Returns:
         (H, W, 3) uint8.

@@ -332,16 +332,12 @@ def convert(
 
     Args:
         luma, blue, red: (H, W) uint16, Y', Cb and Cr.
-        black: sample of black.
-        luma_span, chroma_span: samples from black to white, and from one end of a colour
-            difference to the other.
         weights: (3,) of red, green and blue in Y'.
         light: linear light for signals that are evenly spaced in [0, 1].
         luminance: (3,) weights of linear light in luminance.
         display: scales light, for square roots of luminance that are evenly spaced in [0, top];
             one entry where nothing does.
         factors: scales light, for largest components that are evenly spaced in [0, top].
-        top: light above it becomes white.
         matrix: (3, 3) to the primaries of sRGB.
         codes: sRGB of 8 bits for square roots of light that are evenly spaced in [0, 1].
         out: (H, W, 3) uint8, written.

@@ -454,12 +454,7 @@ def _rate(stream: Any) -> float:
 
 
 def _expected(container: Any, stream: Any, kind: str) -> tuple[int | None, float | None, bool]:
-    """Read what a file says of its end.
-
-    Returns:
-        Number of the video's packets, None where they are not listed; its seconds, None where they
-        are not stated; whether these are of the video alone, not of all that the file holds.
-    """
+    """Read what a file says of its end."""
     if kind == "MP4 or MOV" and stream.frames > 0:
         # What an edit list leaves out is not among them.
         return len(stream.index_entries), None, True

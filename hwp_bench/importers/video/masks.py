@@ -211,13 +211,7 @@ def segment_clip(
 
     Args:
         image: gives the (S, S, 3) uint8 RGB image of a frame; called from several threads.
-        prompt: gives the prompt of a frame; called from several threads.
-        count: number of frames.
         hand_size: px of these images.
-        settings: how far to trust the prompts.
-
-    Yields:
-        The prompt and the masks of each frame, in order.
     """
     chosen = np.unique(np.linspace(0, count - 1, min(count, _COLOUR_FRAMES)).astype(int))
 
@@ -473,7 +467,6 @@ def beyond_wrist(
     Args:
         vertices: (V, 3) camera axes, m.
         pixels: (V, 2) px.
-        ring: vertices of the open end.
         size: edge of the image, px.
     """
     if len(ring) < 3:
@@ -517,15 +510,9 @@ def cut_masks(
     """Cut the masks of a clip, prompted by a fit.
 
     Args:
-        images: of the clip.
-        projected: the fit.
         detected: (F,) bool, frames whose pose comes from a detection.
         hand_size: px of the working images.
-        settings: how far to trust the fit.
         own: (F, S, S) uint8 masks of the user's own at the working resolution, taken as they are.
-        reduction: work at this fraction of the working resolution: 2 is four times faster
-            and enough for the outline.
-        update: called with the number of frames done.
     """
     working, size = images.working, images.frames.shape[1]
     edge = working.shape[1] // reduction

@@ -245,7 +245,6 @@ def rigid_start(
     a detection are interpolated.
 
     Args:
-        landmarks: of the clip.
         rest: (21, 3) m, the template's landmarks at rest.
         focal: px.
         centre: (2,) principal point, px.
@@ -370,7 +369,6 @@ class SurfaceMotion:
         """Differentiate vertices' pixels of the whole frame.
 
         Args:
-            frame: which frame.
             vertices: (P,) which vertices.
 
         Returns:

@@ -204,10 +204,7 @@ def linearize(
     ahead of it: the difference grows by the picture's slope times u.
 
     Args:
-        motion: how vertices move in the whole frame.
-        frame: which frame.
         faces: (T, 3) of the hand.
-        found: the differences.
         ratio: px of the images to one px of the whole frame.
 
     Returns:

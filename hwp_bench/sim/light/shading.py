@@ -81,7 +81,6 @@ def radiance(
         maps: albedo (H, 3), wrap (H, 3), roughness, specular and glow (H,), all float32.
         arrives: shares of the key light and of the sky that reach each point, (H,) float64.
         lights: (4, 3) direction of the key light, its irradiance, radiance from above and below.
-        exposure: factor on everything.
     """
     normals, views = vectors
     albedo, wrap, roughness, specular, glow = maps

@@ -68,10 +68,6 @@ def meet(u_pixel, e_pixel, offsets, to, b, opacity, state, place):
     """One splat over the pixels of block `b`, whose transmittance lies at `place`.
 
     Takes from the transmittance what the splat leaves, which both passes must decide alike.
-
-    Returns:
-        u and e (see `tiles`), log2 of alpha before it is clamped, transmittance before, alpha, the
-        weight of the splat's colour, and in which pixels it is blended.
     """
     u = u_pixel + offsets[to + b]
     e = e_pixel + offsets[to + BLOCKS + b]
@@ -146,20 +142,14 @@ def blend(
     """Draws every image.
 
     Args:
-        worker, counters, ends: see `next_job`; a job is a tile.
-        start, entries: the lists of all tiles of all images, see `lists`.
         geom: flat float32 (I, N, 16).
         colors: flat float32 (S, N, D).
-        color_repeat: image i reads entry i // color_repeat of the S.
-        width, height, gaussians: pixels and N.
         backgrounds: float32 (I, D).
         images: out, flat float32 (I, H, W, D).
         alphas: out, flat float32 (I, H, W).
         remaining: out, flat float32 (I, H, W); transmittance.
         stops: out, int64 (tiles,); end of the part of each list that was looked at.
         pairs: out, int64 (tiles,); blended (splat, pixel) pairs, if `counting`.
-        channels: D, or a tuple of D zeros (see `tiles.count`).
-        counting: whether to count pairs.
     """
     size = count(channels)
     stride = (1 + size) * LANES
@@ -275,14 +265,9 @@ def blend_backward(
     """Gradients of every (splat, tile) pair that was looked at.
 
     Args:
-        worker, counters, ends: see `next_job`; a job is a tile.
-        start, entries, geom, colors, color_repeat, width, height, gaussians: as for `blend`.
-        images, remaining, stops: as `blend` left them.
         first_slot: int64 (tiles,); slot of the first entry of each tile.
-        v_images, v_alphas: flat, upstream gradients of images and alphas; the latter may be empty.
         slots: out, flat float32, `slot_size` for each pair; see `tiles.finish_sums`.
         slot_of: out, int32 (E,); slot of each entry in order of Gaussians, or -1.
-        channels: as for `blend`.
     """
     size = count(channels)
     stride = (2 + size) * LANES
@@ -334,7 +319,6 @@ def background_backward(worker, counters, ends, v_images, remaining, v_lines):
     """Gradient of the background, one sum for each line of pixels.
 
     Args:
-        worker, counters, ends: see `next_job`; a job is a line.
         v_images: float32 (I, H, W, D).
         remaining: float32 (I, H, W).
         v_lines: out, float64 (I, H, D).
@@ -388,13 +372,10 @@ def reduce_slots(
     """Gradients of the projected Gaussians, summed over images where images share them.
 
     Args:
-        worker, counters, ends: see `next_job`; a job is a piece of Gaussians.
-        geom, depths: of `Projected`.
         opacities: float32 (S, N), as blended.
         first_entry: int32 (I * N + 1,); see `bins`.
         slot_of: int32 (E,); slot of each entry, -1 if nothing of it was blended.
         slots: float32, a row for each; see `channels.finish_sums`.
-        gradients: out, `BlendGradients`.
     """
     images, gaussians = depths.shape
     v_means2d, v_shapes, v_opacities, v_colors = gradients

@@ -52,7 +52,6 @@ def next_job(worker, counters, ends):
     """A job that nobody has taken yet, or -1.
 
     Args:
-        worker: number of the calling thread.
         counters: int64 (threads * SPACING,), zeros to begin with; shared.
         ends: int64 (threads + 1,); thread w's own jobs are those from ends[w] to ends[w + 1].
     """

@@ -33,7 +33,6 @@ def sort_by_depth(worker, counters, ends, depths, rows, order, spare, visible, c
     """Sorts every image; equal depths keep the order of their indices.
 
     Args:
-        worker, counters, ends: see `next_job`; a job is an image.
         depths: float32 (I, N); 0 where culled.
         rows: int32 (I, N); tile rows of each Gaussian.
         order: out, int32 (I, N); indices of the visible ones, front to back.
@@ -145,13 +144,8 @@ def count_tiles(
     """Finds the tiles of every visible Gaussian and counts, chunk by chunk.
 
     Args:
-        worker, counters, ends: see `next_job`; a job is a chunk of an image.
         geom: flat float32 (I, N, 16).
-        order, visible, chunk_rows: as `sort_by_depth` leaves them.
         image_spans: int64 (I + 1,); where each image's spans start.
-        tiles_x: tiles side by side.
-        width: of the image, in pixels.
-        spans: out, uint32; first tile << 16 | last tile, empty if first > last.
         heads: out, uint32 (I, N); first tile row << 16 | tile rows, in the sorted order.
         counts: out, int32 (I, K, tiles of an image).
         entry_count: in zeros, out, int32 (I, N); tiles that each Gaussian touches.
@@ -205,9 +199,6 @@ def place_tiles(counts, entry_count, start, first_entry):
         entry_count: int32 (I, N).
         start: out, int64 (I * tiles + 1,); where each tile's list starts.
         first_entry: out, int32 (I * N + 1,); entries of the Gaussians before.
-
-    Returns:
-        The number of entries, or -1 if there are more than int32 can count.
     """
     images, chunks, tiles = counts.shape
     place = 0
@@ -239,9 +230,6 @@ def fill_tiles(
     """Writes the lists.
 
     Args:
-        worker, counters, ends: see `next_job`; a job is a chunk of an image.
-        order, visible, heads, chunk_rows, image_spans, spans: as for `count_tiles`.
-        places, first_entry: as `place_tiles` leaves them; places are used up.
         entries: out, uint64 (E,); tile by tile, front to back: the Gaussian in the low half, in
             the high half the number of the entry in order of Gaussians.
     """

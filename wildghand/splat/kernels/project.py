@@ -342,11 +342,7 @@ def project_backward(
     """Gradients of the Gaussians and the cameras.
 
     Args:
-        worker, counters, ends: see `next_job`; a job is a piece of Gaussians.
-        ellipsoids, cameras, view: as for `project`.
         depths: float32 (I, N); 0 where culled.
-        upstream: `PlaneGradients`.
-        gradients: out, `Ellipsoids`.
         v_cameras: out, float64 (I, pieces, 12); rotation row by row, then translation, one sum
             for each piece of Gaussians. (I, 0, 12) if it is not needed.
     """
@@ -397,12 +393,7 @@ def project_backward(
 
 @inline
 def group_backward(seen, mean, quat, size, camera, view, upstream, at):
-    """Gradients of 8 Gaussians from those at the flat index `at`; zeros where not seen.
-
-    Returns:
-        `OnPlane`, and the gradients of the mean in camera axes, of the quaternion, of the size,
-        and (also where not seen) of the two rows of J R.
-    """
+    """Gradients of 8 Gaussians from those at the flat index `at`; zeros where not seen."""
     x = to_camera(camera, 0, mean[0], mean[1], mean[2])
     y = to_camera(camera, 1, mean[0], mean[1], mean[2])
     z = select(seen, to_camera(camera, 2, mean[0], mean[1], mean[2]), 1.0)

@@ -162,14 +162,8 @@ def enter_tile(geom, row, tile_x, tile_y, offsets, to):
     first all u, then all e.
 
     Args:
-        geom, row: the splat.
         tile_x, tile_y: centre of the tile's first pixel, px.
         offsets: float32.
-        to: where to write.
-
-    Returns:
-        The blocks that the splat may reach, as bits; du/dy, by which u changes from one row of
-        pixels to the next.
     """
     along = geom[row + ALONG]
     across = geom[row + ACROSS]
