@@ -13,6 +13,7 @@ from torch import Tensor
 from hwp_bench.methods.settings import source_path
 from wildghand.dpd.temporal import PayBack
 from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
+from wildghand.fitting.parallel import SINGLE_PROCESS
 from wildghand.fitting.judging import Prepass
 from wildghand.gaussians.training import FrameTable, soft_weights, upload
 from wildghand.model import terms
@@ -123,7 +124,9 @@ class Pao(Component):
 
         They compare the frames of a batch, so that all processes weigh all of it.
         """
-        data, settings, world = fit.data, fit.settings, fit.world
+        data, settings = fit.data, fit.settings
+        # Frames are looked at by one process alone.
+        world = fit.world if batch.stepping else SINGLE_PROCESS
         rows, mine, hands = batch.rows, batch.mine, data.masks(batch.rows)
         error = world.gather(_mean_error(drawing.image, target.image))
         if self.pay_back is not None:

@@ -202,6 +202,7 @@ def torchrun(arguments: list[str]) -> subprocess.CompletedProcess[str]:
         text=True,
         env={**shell, **said},
         check=False,
+        timeout=600,
     )
 
 
