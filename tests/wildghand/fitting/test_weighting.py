@@ -226,14 +226,7 @@ def test_without_heads_the_template_stands_and_nothing_else_changes(
         made.draw(Batch(row)).hands["right"].prediction.raw.concatenate() for made in (fit, bare)
     )
     assert torch.equal(*raw)
-    loss = bare.objective(
-        bare.model,
-        bare.draw(Batch(row)),
-        bare.weighting(row, bare.draw(Batch(row))),
-        row,
-        torch.ones(1),
-    )
-    loss.backward()
+    bare.loss(Batch(row)).backward()
     assert all(
         value.grad is None or not value.grad.any()
         for value in bare.model.network.template_head.parameters()
