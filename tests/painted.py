@@ -20,7 +20,7 @@ from wildghand.plain.model import PlainAvatar, make_model
 #: Frames and edge of the capture.
 FRAMES, SIZE = 40, 64
 #: Settings of a fit that takes about a second.
-QUICK = {"gaussians": 600, "schedule.steps": 100, "schedule.batch": 1, "device": "cpu"}
+QUICK = {"gaussians": 600, "steps": 100, "batch": 1, "device": "cpu"}
 
 #: Makes what a method is given: (hands, **settings).
 TrainingMaker = Callable[..., TrainingCapture]
