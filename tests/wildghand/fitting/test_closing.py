@@ -40,7 +40,7 @@ def test_the_light_gets_the_seconds_that_it_takes(
         return count
 
     monkeypatch.setattr(closing, "light_samples", slow)
-    monkeypatch.setattr(closing, "fit_light", lambda samples, settings: None)
+    monkeypatch.setattr(closing, "fit_light", lambda samples: None)
     monkeypatch.setattr(closing.time, "perf_counter", lambda: now)
     whole = 0.5 + 0.1 * len(fit.data.frames)
     assert fit.seconds_for_steps(60.0) == pytest.approx(60.0 - whole)

@@ -15,6 +15,7 @@ from tiny_fits import UNJUDGED
 from hwp_bench.hands import load_template
 from hwp_bench.methods.contract import TrainingCapture
 from wildghand.avatar.files import load_avatar, save_avatar
+from wildghand.evidence import EvidenceSettings
 from wildghand.fitting.colors import (
     FilledColors,
     OtherHand,
@@ -141,9 +142,10 @@ def test_nothing_is_filled_without_a_light(make_training: TrainingMaker) -> None
 
 
 def test_without_judges_the_settings_share_holds_and_an_avatar_keeps_it(
-    make_training: TrainingMaker, tmp_path: Path
+    make_training: TrainingMaker, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    fit = begun(make_training(), **{"evidence.validated": False, "light.enabled": False})
+    monkeypatch.setattr(EvidenceSettings, "validated", False)
+    fit = begun(make_training(), **{"light.enabled": False})
     (expected,) = part(fit, FewShown).filled.carried_on([0.02])
     assert expected is not None
     frame = int(fit.data.training.validation[0])

@@ -19,13 +19,19 @@ from wildghand.fitting.judging import Prepass
 from wildghand.fitting.weights import Pao
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.model.settings import read_settings
-from wildghand.prepass import PrepassInput, judge_frames
+from wildghand.pao.pao import PaoSettings
+from wildghand.prepass import PrepassInput, PrepassSettings, judge_frames
 
 CPU = torch.device("cpu")
-#: What the pre-pass leads PAO to spare is off.
-STRICT: dict[str, Any] = {"pao.mismatch": 0.0, "pao.spare_clean": False}
 ROWS = torch.tensor([0, 3])
 TrainingMaker = Callable[..., TrainingCapture]
+
+
+@pytest.fixture
+def _strict(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What the pre-pass leads PAO to spare is off."""
+    monkeypatch.setattr(PaoSettings, "mismatch", 0.0)
+    monkeypatch.setattr(PaoSettings, "spare_clean", False)
 
 
 def fit_of(training: TrainingCapture, **changes: Any) -> Fit:
@@ -34,20 +40,22 @@ def fit_of(training: TrainingCapture, **changes: Any) -> Fit:
     return make_fit(training, settings, 0, CPU)
 
 
+@pytest.mark.usefixtures("_strict")
 def test_frames_teach_by_their_temporal_weights(make_training: TrainingMaker) -> None:
-    fit = fit_of(make_training(), **STRICT)
+    fit = fit_of(make_training())
     omega = torch.tensor([0.0, -0.2])
     shares = part(fit, Pao).shares(ROWS, omega)
     np.testing.assert_allclose(shares, [1.0, 1.0 / (1.0 + 100.0 * 0.2)], rtol=1e-6)
 
 
 def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
-    make_training: TrainingMaker,
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Oracle: the formula on the best tenth of the misplacements, by hand. A bent template would
     # meet the masks of this clip.
     training = make_training()
-    fit = fit_of(training, **{"pao.mismatch": 0.5, "subject.enabled": False})
+    monkeypatch.setattr(PaoSettings, "mismatch", 0.5)
+    fit = fit_of(training, **{"subject.enabled": False})
     assessment = part(fit, Prepass).assessment
     found = np.quantile(assessment.misplacement[assessment.usable], 0.1)
     shared = 0.5 * found / fit.settings.prepass.misplacement_floor
@@ -59,10 +67,12 @@ def test_a_mismatch_that_all_frames_share_lifts_what_they_teach(
     # Regions that are rejected keep that share of the hand's weight.
     drawing = fit.draw(Batch(ROWS))
     lifted = fit.compare(Batch(ROWS), drawing).weights
-    without = {"pao.mismatch": 0.0, "subject.enabled": False}
-    strict = fit_of(training, **without).compare(Batch(ROWS), drawing).weights
+    monkeypatch.setattr(PaoSettings, "mismatch", 0.0)
+    without = fit_of(training, **{"subject.enabled": False})
+    strict = without.compare(Batch(ROWS), drawing).weights
     assert (lifted >= strict - 1e-6).all()
     assert lifted.sum() > strict.sum()
+    monkeypatch.undo()
     # Without the pre-pass nothing is known of it.
     assert part(fit_of(training, **{"prepass.enabled": False}), Pao).tolerance == 0.0
 
@@ -86,8 +96,9 @@ def test_all_frames_teach_alike_where_a_part_of_it_is_missing(
     assert found is None or "teach" not in found.draws(fit, Batch(ROWS))
 
 
+@pytest.mark.usefixtures("_strict")
 def test_what_is_explained_teaches(make_training: TrainingMaker) -> None:
-    fit = fit_of(make_training(), **{"dpd.pay_back": 2.0, "pao.mismatch": 0.0})
+    fit = fit_of(make_training(), **{"dpd.pay_back": 2.0})
     weighting, omega = part(fit, Pao), torch.tensor([0.4, 0.4])
     assert weighting.pay_back is not None
     before = weighting.shares(ROWS, omega)
@@ -102,14 +113,14 @@ def test_what_is_explained_teaches(make_training: TrainingMaker) -> None:
     assert int((weighting.pay_back.residuals > 0.0).sum()) == 2
 
 
+@pytest.mark.usefixtures("_strict")
 @pytest.mark.parametrize("pao", [True, False])
 def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
     pao: bool, make_training: TrainingMaker
 ) -> None:
     training = make_training()
     fit, bare = (
-        fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on, **STRICT})
-        for on in (True, False)
+        fit_of(training, **{"pao.enabled": pao, "prepass.enabled": on}) for on in (True, False)
     )
     assessment = part(fit, Prepass).assessment
     drawing = fit.draw(Batch(ROWS))
@@ -121,13 +132,15 @@ def test_the_prepass_lowers_covered_pixels_with_pao_and_without(
     torch.testing.assert_close(weights.detach(), expected.detach(), rtol=1e-5, atol=1e-6)
 
 
-def test_validation_frames_are_known_to_be_clean(make_training: TrainingMaker) -> None:
+def test_validation_frames_are_known_to_be_clean(
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
+) -> None:
     # Oracle: the pre-pass with the validation frames and without; a clip that tolerates nothing.
     training = make_training()
-    believing, alone = (
-        fit_of(training, **{"prepass.validated": on, "prepass.tolerance": 1e-3})
-        for on in (True, False)
-    )
+    believing = fit_of(training, **{"prepass.tolerance": 1e-3})
+    monkeypatch.setattr(PrepassSettings, "validated", False)
+    alone = fit_of(training, **{"prepass.tolerance": 1e-3})
+    monkeypatch.undo()
     judges = believing.data.judges
     assert judges is not None
     assert set(judges.indices.tolist()) <= set(training.validation.tolist())
@@ -147,13 +160,14 @@ def test_validation_frames_are_known_to_be_clean(make_training: TrainingMaker) -
 
 
 def test_regions_of_clean_frames_are_lifted_by_how_clean_they_are(
-    make_training: TrainingMaker,
+    make_training: TrainingMaker, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # Oracle: w + c (1 - w) on the weights of regions, from those of the fit that spares nothing.
     training = make_training()
-    spares, strict = (
-        fit_of(training, **{"pao.mismatch": 0.0, "pao.spare_clean": on}) for on in (True, False)
-    )
+    monkeypatch.setattr(PaoSettings, "mismatch", 0.0)
+    spares = fit_of(training)
+    monkeypatch.setattr(PaoSettings, "spare_clean", False)
+    strict = fit_of(training)
     clean = spares.data.judgement.clean[ROWS]
     assert (clean > 0.0).all()
     drawing = spares.draw(Batch(ROWS))
@@ -212,14 +226,7 @@ def test_without_heads_the_template_stands_and_nothing_else_changes(
         made.draw(Batch(row)).hands["right"].prediction.raw.concatenate() for made in (fit, bare)
     )
     assert torch.equal(*raw)
-    loss = bare.objective(
-        bare.model,
-        bare.draw(Batch(row)),
-        bare.weighting(row, bare.draw(Batch(row))),
-        row,
-        torch.ones(1),
-    )
-    loss.backward()
+    bare.loss(Batch(row)).backward()
     assert all(
         value.grad is None or not value.grad.any()
         for value in bare.model.network.template_head.parameters()

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from painted import QUICK, SilentReport
+from painted import SilentReport
 
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from wildghand.avatar.avatar import WildGHandAvatar
@@ -25,7 +25,7 @@ _MADE: dict[str, WildGHandAvatar] = {}
 def made(hands: str, make_training: Callable[..., TrainingCapture]) -> WildGHandAvatar:
     """An avatar that is hardly fitted: it has the shape of the template, painted in red."""
     if hands not in _MADE:
-        method = WildGHandMethod({**QUICK, "schedule.steps": 1}, 0)
+        method = WildGHandMethod({"gaussians": 600, "device": "cpu", "schedule.steps": 1}, 0)
         _MADE[hands] = method.fit(make_training(hands), Budget(), SilentReport())
     return _MADE[hands]
 

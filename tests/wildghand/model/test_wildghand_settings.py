@@ -74,9 +74,9 @@ def test_the_published_modes_have_no_addition(mode: str, temporal: str) -> None:
     assert made.terms.outside_weight == WildGHandSettings().terms.outside_weight
     assert (made.terms.dssim_weight, made.terms.surface) == (0.0, 0.0)
     assert (made.pao.variant, made.pao.temporal, made.pao.errors) == ("printed", temporal, "batch")
-    thresholds = (made.pao.error_threshold, made.pao.share_threshold)
-    assert (*thresholds, made.pao.background_threshold) == (1.0, 0.3, 3.0)
-    assert made.pao.background_threshold_both == 10.0
+    assert (made.pao.error_threshold, made.pao.share_threshold) == (1.0, 0.3)
+    starts = [PerturbationAwareWeights(made.pao, hands).T_b.item() for hands in (1, 2)]
+    assert (*starts, made.pao.alpha) == (3.0, 10.0, 100.0)
     schedule = made.schedule
     assert (schedule.batch, schedule.decay, schedule.dpd_rate) == (4, "halving", 1e-4)
     assert not made.prepass.enabled
@@ -92,7 +92,7 @@ def test_the_published_modes_have_no_addition(mode: str, temporal: str) -> None:
     assert differing <= {name for name, _ in flattened(MODES[mode])} | {"prepass.frame_poses"}
 
 
-@pytest.mark.parametrize("changes", [{}, {"pao.beta": 5.0}, {"pao": {"alpha": 2.0}}])
+@pytest.mark.parametrize("changes", [{}, {"pao.beta": 5.0}, {"pao": {"beta": 2.0}}])
 def test_two_hands_keep_their_background_threshold(changes: dict[str, Any]) -> None:
     for mode in MODES:
         pao = read_settings({"mode": mode, **changes}).pao
@@ -113,7 +113,8 @@ def test_a_setting_that_is_given_wins_over_the_modes() -> None:
 def test_a_table_in_part_leaves_the_rest_of_it() -> None:
     made = read_settings({"prepass": {"weight_floor": 0.5}, "prepass.tolerance": 2})
     assert (made.prepass.weight_floor, made.prepass.tolerance) == (0.5, 2.0)
-    assert made.prepass.omega_dropout == 1.0
+    assert made.prepass.enabled
+    assert made.prepass.frame_poses
 
 
 def test_the_prepass_is_a_component_of_its_own() -> None:
@@ -148,9 +149,9 @@ def test_the_size_chooses_the_network() -> None:
         ({"schedule": 3}, "schedule: must be a table"),
         ({"dpd": 1}, "dpd: must be a table"),
         ({"prior.name": "x"}, r"prior\.name: is not a setting"),
-        ({"dpd.omega_dropout": 1.5}, r"dpd\.omega_dropout: is 1\.5"),
+        ({"prepass.weight_floor": 1.5}, r"prepass\.weight_floor: is 1\.5"),
         ({"pao.variant": "masks"}, r"pao\.variant: is 'masks'"),
-        ({"pao.alpha": -1}, r"pao\.alpha: is -1"),
+        ({"pao.beta": -1}, r"pao\.beta: is -1"),
         ({"schedule.dpd_rate": "fast"}, r"schedule\.dpd_rate: is 'fast'"),
         ({"schedule.rates": "slow"}, r"schedule\.rates: is 'slow'"),
         ({"terms.surface": -1}, r"terms\.surface: is -1"),

@@ -88,7 +88,7 @@ def test_a_fit_flushes_and_gives_the_switch_back(make_training: Callable[..., An
         def progress(self, done: int, total: int) -> None:
             pass
 
-    method = WildGHandMethod(training.run.settings, 0)
+    method = WildGHandMethod({"gaussians": 600, "device": "cpu"}, 0)
     avatar = method.fit(training, Budget(steps=2), Asked())
     assert found == [True] * 6
     assert not flushes()
