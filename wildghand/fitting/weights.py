@@ -13,8 +13,8 @@ from torch import Tensor
 from hwp_bench.methods.settings import source_path
 from wildghand.dpd.temporal import PayBack
 from wildghand.fitting.fit import Batch, Component, DrawOptions, Fit, FrameTarget
-from wildghand.fitting.parallel import SINGLE_PROCESS
 from wildghand.fitting.judging import Prepass
+from wildghand.fitting.parallel import SINGLE_PROCESS
 from wildghand.gaussians.training import FrameTable, soft_weights, upload
 from wildghand.model import terms
 from wildghand.model.frames import RenderedFrames
