@@ -25,7 +25,7 @@ def recipe_methods() -> dict[str, type[RecipeMethod]]:
     for folder in sorted(BASELINES.iterdir()):
         if not (folder / "method.toml").is_file():
             continue
-        module, _, name = str(read_manifest(folder).entry).partition(":")
+        module, _, name = str(read_manifest(folder).entry.python).partition(":")
         entry = getattr(importlib.import_module(module), name)
         if inspect.isclass(entry) and issubclass(entry, RecipeMethod):
             found[folder.name] = entry
