@@ -18,6 +18,7 @@ from unittest import mock
 
 import cv2
 import numpy as np
+import torch
 
 from hwp_bench.base.drawing import labelled, sheet
 from hwp_bench.base.images import write_image
@@ -30,9 +31,8 @@ from hwp_bench.hands.raster import draw_faces, mix_corners
 from hwp_bench.methods.contract import Budget, RunSettings, TrainingCapture
 from hwp_bench.methods.request import open_request, write_request
 from hwp_bench.sim.produce.truth import add_subject_mesh
-from wildghand.fitting.data import judging_frames
-from wildghand.fitting.start import subject_of
-from wildghand.gaussians.training import TrainingFrames, load_frames
+from wildghand.fitting.data import FitData
+from wildghand.fitting.start import find_person
 from wildghand.model.settings import read_settings
 from wildghand.subject import SubjectShape, unknowns
 from wildghand.subject.shape import side_flip
@@ -54,8 +54,6 @@ class Person:
 
     name: str
     training: TrainingCapture
-    #: The frames that are fitted.
-    frames: TrainingFrames
     #: The rest hand of the model, of either side.
     template: HandTemplate
     #: What the model's right hand lacks of the person's.
@@ -63,12 +61,12 @@ class Person:
 
     def shape(self, spreads: Mapping[str, float], validation: bool) -> tuple[SubjectShape, float]:
         """The shape that a fit finds, and its seconds."""
-        training, found = self.training, read_settings({})
-        templates = {side: training.template(side) for side in training.sides}
-        judges = judging_frames(training, found) if validation else None
+        data, settings = FitData(self.training, torch.device("cpu")), read_settings({}).subject
+        judges = data.judges if validation else None
+        _ = data.frames  # read before the clock starts
         began = time.perf_counter()
         with mock.patch.multiple(unknowns, **spreads):
-            shape = subject_of(training, self.frames, templates, found, judges)
+            shape = find_person(data, settings, judges)
         assert shape is not None
         return shape, time.perf_counter() - began
 
@@ -103,7 +101,7 @@ def open_person(folder: Path, work: Path) -> Person:
     mean = np.mean(joints, axis=0)
     truth = SubjectShape(np.mean(surfaces, axis=0) - mean[0], mean - mean[0])
     template = training.template(training.sides[0])
-    return Person(capture.info.id, training, load_frames(training), template, truth)
+    return Person(capture.info.id, training, template, truth)
 
 
 def drawn(person: Person, shape: SubjectShape) -> np.ndarray:

@@ -6,11 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from wildghand.fitting.data import FitData
 from wildghand.fitting.fit import Component, Fit
 from wildghand.gaussians.training import TrainingFrames
 from wildghand.poses import ClipPoses, believed_hands
 from wildghand.prior.prior import choose_prior
-from wildghand.subject import fit_subject
+from wildghand.subject import SubjectSettings, SubjectShape, fit_subject
 from wildghand.subject.outlines import ComparedFrames
 
 
@@ -44,25 +45,29 @@ class Person(Component):
 
     def prepare(self, fit: Fit) -> None:
         """Find how the person's hand differs from the templates."""
-        data = fit.data
-        training, frames, settings = data.training, data.frames, fit.settings.subject
-        judges = data.judges if settings.validated else None
+        data, settings = fit.data, fit.settings.subject
+        data.subject = find_person(data, settings, data.judges if settings.validated else None)
 
-        def compared(some: TrainingFrames) -> ComparedFrames:
-            masks = np.asarray(some.masks) > 127
-            return ComparedFrames(
-                data.templates, training.hands, training.cameras, some.indices, masks
-            )
 
-        data.subject = fit_subject(
-            data.templates,
-            training.hands,
-            training.cameras,
-            frames.indices,
-            np.asarray(frames.masks),
-            settings,
-            judges=None if judges is None else compared(judges),
-        )
+def find_person(
+    data: FitData, settings: SubjectSettings, judges: TrainingFrames | None
+) -> SubjectShape | None:
+    """How a person's hand differs from the templates, chosen by `judges` where there are any."""
+    training, frames = data.training, data.frames
+
+    def compared(some: TrainingFrames) -> ComparedFrames:
+        masks = np.asarray(some.masks) > 127
+        return ComparedFrames(data.templates, training.hands, training.cameras, some.indices, masks)
+
+    return fit_subject(
+        data.templates,
+        training.hands,
+        training.cameras,
+        frames.indices,
+        np.asarray(frames.masks),
+        settings,
+        judges=None if judges is None else compared(judges),
+    )
 
 
 class StartFromPrior(Component):
