@@ -19,7 +19,7 @@ def person() -> Person:
     truth = SubjectShape(
         np.tile(OFFSET, (len(TEMPLATE.vertices), 1)), np.tile(OFFSET, (len(TEMPLATE.joints), 1))
     )
-    return Person("someone", cast(Any, None), cast(Any, None), TEMPLATE, truth)
+    return Person("someone", cast(Any, None), TEMPLATE, truth)
 
 
 def test_distances_are_lengths() -> None:
