@@ -64,7 +64,7 @@ def test_no_command_and_unknown_commands_are_usage_errors(capsys) -> None:
         (["evaluate", "plain", "--capture", "x", "--budget", "-3"], 2, "--budget: -3.0"),
         (["evaluate", "plain", "--capture", "x", "--set", "a b=1"], 2, "is not NAME=VALUE"),
         (["evaluate", "plain", "--capture", "x", "--set", "a.=1"], 2, "is not NAME=VALUE"),
-        (["evaluate", "wildghand", "--capture", "x", "--set", "rates.pose=1"], 1, "not a capture"),
+        (["evaluate", "wildghand", "--capture", "x", "--set", "heads=false"], 1, "not a capture"),
         (["evaluate", "plain", "--capture", "x", "--set", "stps=1"], 1, "Did you mean 'steps'"),
         (["ablate", "plain", "--capture", "x", "--set", "stps=1"], 1, "Did you mean 'steps'"),
         (["table", "nowhere"], 1, "does not exist"),
