@@ -40,7 +40,7 @@ class Difference:
     second: str
     #: Name of the metric.
     metric: str
-    #: A scope of `statistics.pairing.scopes`.
+    #: A scope of `analysis.pairing.scopes`.
     scope: str
     #: First less second, in the metric's unit.
     estimate: Estimate

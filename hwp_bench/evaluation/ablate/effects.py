@@ -50,7 +50,7 @@ class ScoreEffect:
     kind: str
     #: Name of the metric.
     metric: str
-    #: A scope of `statistics.pairing.scopes`.
+    #: A scope of `analysis.pairing.scopes`.
     scope: str
     #: Score with the component less score without it; for interactions, what both together
     #: add to the sum of what each adds without the other.
