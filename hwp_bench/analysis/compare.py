@@ -77,7 +77,7 @@ def compare(
 ) -> list[Difference]:
     """Return the difference of every pair of methods in every scope.
 
-    The runs must have passed `statistics.pairing.refuse_unlike`.
+    The runs must have passed `analysis.pairing.refuse_unlike`.
 
     Args:
         runs: at least two methods.
