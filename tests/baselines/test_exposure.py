@@ -135,8 +135,8 @@ def test_an_exposure_is_the_mean_of_its_moments(make_training: TrainingMaker) ->
     )
     assert recipe.moving.all()
     row = torch.tensor([4])
-    recipe.ends["transl_right"][4] = torch.tensor([[-0.02, 0.0, 0.0], [0.04, 0.01, 0.0]])
-    recipe.ends["pose_right"][4] = 0.0
+    recipe.ends["transl.right"][4] = torch.tensor([[-0.02, 0.0, 0.0], [0.04, 0.01, 0.0]])
+    recipe.ends["pose.right"][4] = 0.0
     frames = recipe.material.frames
     device = method.device
     batch = Batch(0, 0.0, row, frames.images_on(device)(row), frames.masks_on(device)(row))

@@ -49,7 +49,7 @@ def test_corrections_get_gradients_of_their_frames_alone(make_training: Training
     batch = batch_of(material)
     drawing = recipe.draw(batch)
     recipe.loss(batch, drawing, recipe.weights(batch, drawing)).backward()
-    for value in (*recipe.poses.values(), *recipe.places.values()):
+    for value in (*recipe.corrections.poses.values(), *recipe.corrections.places.values()):
         assert value.grad is not None
         assert value.grad[:2].abs().sum() > 0.0
         assert not value.grad[2:].any()
@@ -63,8 +63,8 @@ def test_the_corrections_are_held_by_their_mean_square(make_training: TrainingMa
     drawing = recipe.draw(batch)
     weights = recipe.weights(batch, drawing)
     before = recipe.loss(batch, drawing, weights)
-    recipe.poses["right"].fill_(0.1)
-    recipe.places["right"].fill_(0.02)
+    recipe.corrections.poses["right"].fill_(0.1)
+    recipe.corrections.places["right"].fill_(0.02)
     added = recipe.loss(batch, drawing, weights) - before
     torch.testing.assert_close(added, torch.tensor(0.5 * (0.01 + 0.04) / 2), atol=1e-6, rtol=1e-4)
 

@@ -201,7 +201,7 @@ def test_the_texture_waits_for_the_second_stage(tmp_path: Path) -> None:
     capture = headlamp_capture(tmp_path / "any", hand_parameters("right", 4))
     recipe = made_recipe(capture, tmp_path / "a")
     share = recipe.settings.shape_share
-    texture, betas = "hands.right.texture", "hands.right.betas"
+    texture, betas = "texture.right", "betas.right"
     assert recipe.rate(texture, 0.5 * share) == 0.0 < recipe.rate(texture, share)
     assert recipe.rate(betas, share) < 0.2 * recipe.rate(betas, 0.99 * share)
     assert set(recipe.rates()) == set(recipe.parameters())

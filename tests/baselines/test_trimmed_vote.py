@@ -58,7 +58,7 @@ def test_the_loss_is_that_of_the_formula() -> None:
     network = make_network(3, torch.device("cpu"))
     chance = torch.tensor([0.9, 0.8, 0.3, 0.6])
     surely, maybe = torch.tensor([1.0, 0.0, 1.0, 0.0]), torch.tensor([1.0, 1.0, 1.0, 0.0])
-    steep = network["vote_in"].abs().max() * network["vote_out"].abs().max()
+    steep = network["vote.in"].abs().max() * network["vote.out"].abs().max()
     expected = (0.1 + 0.0 + 0.7 + 0.6) / 4 + 0.5 * float(steep)
     assert float(vote_loss(chance, surely, maybe, network, 0.5)) == pytest.approx(expected)
 

@@ -77,14 +77,16 @@ def test_the_network_is_that_of_its_layers() -> None:
     tensors, _ = start()
     exact = {name: value.double() for name, value in tensors.items()}
     colors = torch.rand(7, 3, generator=torch.Generator().manual_seed(2))
-    frame = tensors["frame_features"][[2, 0]] * 50.0
+    frame = tensors["frame"][[2, 0]] * 50.0
     look = appear(tensors, colors, frame, 0.5)
     for row in range(2):
-        known = torch.cat((colors.double(), exact["gaussian_features"]), dim=-1)
+        known = torch.cat((colors.double(), exact["gaussian"]), dim=-1)
         hidden = torch.cat((known, frame[row].double().expand(7, -1)), dim=-1)
         for layer in ("1", "2"):
-            hidden = torch.relu(hidden @ exact[f"layer_{layer}"].T + exact[f"bias_{layer}"])
-        out = hidden @ exact["layer_3"].T + exact["bias_3"]
+            hidden = torch.relu(
+                hidden @ exact[f"network.layer_{layer}"].T + exact[f"network.bias_{layer}"]
+            )
+        out = hidden @ exact["network.layer_3"].T + exact["network.bias_3"]
         toned = (colors * (1.0 + 0.5 * out[:, :3]) + 0.5 * out[:, 3:6]).clamp(0.0, 1.0)
         expected = (
             toned,
@@ -100,12 +102,12 @@ def test_the_network_is_that_of_its_layers() -> None:
 def test_without_a_tone_the_colours_stay() -> None:
     tensors, _ = start()
     colors = torch.rand(7, 3)
-    assert torch.equal(appear(tensors, colors, tensors["frame_features"], 0.0).colors[1], colors)
+    assert torch.equal(appear(tensors, colors, tensors["frame"], 0.0).colors[1], colors)
 
 
 def test_gaussians_start_as_octaves_of_their_places() -> None:
     tensors, places = start()
-    features = tensors["gaussian_features"]
+    features = tensors["gaussian"]
     assert features.shape == (7, 6 * OCTAVES)
     half = 3 * OCTAVES
     torch.testing.assert_close(features[:, 0], torch.sin(2.0 * math.pi * places[:, 0]))
@@ -136,7 +138,7 @@ def first_batch(recipe: WildRecipe, fraction: float) -> Batch:
 def test_test_frames_look_like_the_least_uncertain(make_training: TrainingMaker) -> None:
     recipe = wild_recipe(make_training, test_share=0.1)
     recipe.frame_uncertainty = torch.arange(len(recipe.frame_uncertainty), 0.0, -1.0)
-    expected = recipe.tensors["frame_features"][-3:].mean(dim=0, keepdim=True)
+    expected = recipe.tensors["frame"][-3:].mean(dim=0, keepdim=True)
     torch.testing.assert_close(recipe.test_frame(), expected)
 
 
@@ -144,8 +146,8 @@ def test_the_uncertainty_is_drawn_as_one_more_channel(make_training: TrainingMak
     """An opaque hand whose Gaussians all have the same uncertainty has it at every pixel."""
     recipe = wild_recipe(make_training)
     recipe.model.gaussians.logit_opacities.fill_(8.0)
-    recipe.tensors["layer_3"].zero_()
-    recipe.tensors["bias_3"][6] = 2.0
+    recipe.tensors["network.layer_3"].zero_()
+    recipe.tensors["network.bias_3"][6] = 2.0
     batch = first_batch(recipe, 0.5)
     with torch.no_grad():
         drawing = recipe.draw(batch)
@@ -167,7 +169,7 @@ def test_the_uncertainty_is_drawn_as_one_more_channel(make_training: TrainingMak
 
 def test_before_its_share_of_the_fit_nothing_is_left_out(make_training: TrainingMaker) -> None:
     recipe = wild_recipe(make_training, mask_from=0.3)
-    recipe.tensors["bias_3"][6] = 2.0
+    recipe.tensors["network.bias_3"][6] = 2.0
     with torch.no_grad():
         for fraction, kept in ((0.2, True), (0.4, False)):
             batch = first_batch(recipe, fraction)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
 import torch
 
@@ -33,12 +32,8 @@ class ExposureSettings(FitSettings):
 class ExposureRecipe(PlainRecipe[ExposureSettings]):
     """Two ends of a linear motion in each frame, which are fitted with the hand.
 
-    Args:
-        material: what is fitted.
-        settings: how.
-
     Attributes:
-        ends: by name: `pose_SIDE` (R, 2, 16, 3) rad and `transl_SIDE` (R, 2, 3) m, what is added
+        ends: by name: `pose.SIDE` (R, 2, 16, 3) rad and `transl.SIDE` (R, 2, 3) m, what is added
             to the given parameters when the shutter opens and when it closes.
         moving: (R,) bool on the CPU, whether a frame is taken for an exposure.
     """
@@ -55,7 +50,7 @@ class ExposureRecipe(PlainRecipe[ExposureSettings]):
             for name, speed in (("pose", turning), ("transl", going)):
                 speeds = torch.as_tensor(speed, dtype=torch.float32)[:, None]
                 shape = (1, 2, *[1] * (speeds.dim() - 2))
-                self.ends[f"{name}_{side}"] = (signs.view(shape) * speeds).to(material.device)
+                self.ends[f"{name}.{side}"] = (signs.view(shape) * speeds).to(material.device)
         self.moving = self._motion() > settings.least_motion
 
     @torch.no_grad()
@@ -70,17 +65,15 @@ class ExposureRecipe(PlainRecipe[ExposureSettings]):
         return torch.cat(made)
 
     def _at(self, rows: torch.Tensor, moments: torch.Tensor) -> AnchorPoses:
-        """The anchors of frames at moments in [0, 1] of their exposures; differentiable.
+        """The anchors of frames (B,) at moments (B,) of their exposures; differentiable.
 
-        Args:
-            rows: (B,) int64.
-            moments: (B,) 0 when the shutter opens, 1 when it closes.
+        The shutter opens at moment 0 and closes at 1.
         """
         hands = []
         moments = moments.to(self.clip.viewmats)
         for side, rig in self.model.rigs.items():
             pose, betas, transl = self.clip.parameters[side]
-            turn, move = self.ends[f"pose_{side}"][rows], self.ends[f"transl_{side}"][rows]
+            turn, move = self.ends[f"pose.{side}"][rows], self.ends[f"transl.{side}"][rows]
             turned = torch.lerp(turn[:, 0], turn[:, 1], moments[:, None, None])
             moved = torch.lerp(move[:, 0], move[:, 1], moments[:, None])
             hands.append(rig.follow(pose[rows] + turned, betas, transl[rows] + moved))
@@ -89,12 +82,6 @@ class ExposureRecipe(PlainRecipe[ExposureSettings]):
     def parameters(self) -> dict[str, torch.Tensor]:
         """The plain fit's, and the ends of the exposures."""
         return {**super().parameters(), **self.ends}
-
-    def rates(self) -> dict[str, float]:
-        """Adam's step at the start of each tensor, by name."""
-        settings = self.settings
-        rates = {"pose": settings.pose_rate, "transl": settings.transl_rate}
-        return {**super().rates(), **{name: rates[name.split("_")[0]] for name in self.ends}}
 
     def draw(self, batch: Batch) -> Drawing:
         """The mean over an exposure for frames that move, one sharp image for the others."""
@@ -125,6 +112,6 @@ class ExposureRecipe(PlainRecipe[ExposureSettings]):
 class ExposureMethod(RecipeMethod):
     """The plain fit to frames that are means over a motion; see `ExposureRecipe`."""
 
-    name: ClassVar[str] = "baselines/exposure"
-    settings_type: ClassVar[type[FitSettings]] = ExposureSettings
-    recipe_type: ClassVar[type[PlainRecipe[Any]]] = ExposureRecipe
+    name = "baselines/exposure"
+    settings_type = ExposureSettings
+    recipe_type = ExposureRecipe

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import Any, ClassVar
 
 import torch
 
@@ -53,16 +52,7 @@ class OccludedDrawing(Drawing):
 
 
 class OccluderRecipe(PlainRecipe[OccluderSettings]):
-    """image = C_occluders + (1 - alpha_occluders) C_hand.
-
-    Args:
-        material: what is fitted.
-        settings: how.
-
-    Attributes:
-        occluders: of each training frame.
-        boxes: (R, 4) where they start; see `mask_boxes`.
-    """
+    """image = C_occluders + (1 - alpha_occluders) C_hand."""
 
     def __init__(self, material: Material, settings: OccluderSettings) -> None:
         super().__init__(material, settings)
@@ -79,18 +69,6 @@ class OccluderRecipe(PlainRecipe[OccluderSettings]):
     def parameters(self) -> dict[str, torch.Tensor]:
         """The plain fit's, and the occluders'."""
         return {**super().parameters(), **self.occluders.parameters()}
-
-    def rates(self) -> dict[str, float]:
-        """Adam's step at the start of each tensor, by name."""
-        settings = self.settings
-        return {
-            **super().rates(),
-            "occluder_places": settings.occluder_place_rate,
-            "occluder_log_sigmas": settings.occluder_shape_rate,
-            "occluder_angles": settings.occluder_shape_rate,
-            "occluder_logit_opacities": settings.occluder_opacity_rate,
-            "occluder_logit_colors": settings.occluder_color_rate,
-        }
 
     def draw(self, batch: Batch) -> OccludedDrawing:
         """The occluders of the frames before the hand."""
@@ -136,6 +114,6 @@ class OccluderRecipe(PlainRecipe[OccluderSettings]):
 class OccluderMethod(RecipeMethod):
     """The plain fit behind occluders of each frame's own; see `OccluderRecipe`."""
 
-    name: ClassVar[str] = "baselines/occluder-splats"
-    settings_type: ClassVar[type[FitSettings]] = OccluderSettings
-    recipe_type: ClassVar[type[PlainRecipe[Any]]] = OccluderRecipe
+    name = "baselines/occluder-splats"
+    settings_type = OccluderSettings
+    recipe_type = OccluderRecipe

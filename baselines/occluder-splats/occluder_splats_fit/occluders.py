@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -38,21 +38,18 @@ class FrameOccluders:
 
     def parameters(self) -> dict[str, torch.Tensor]:
         """The tensors by name, in a fixed order."""
-        return {f"occluder_{item.name}": getattr(self, item.name) for item in fields(self)}
+        return {
+            "occluder_place": self.places,
+            "occluder_shape.sigmas": self.log_sigmas,
+            "occluder_shape.angles": self.angles,
+            "occluder_opacity": self.logit_opacities,
+            "occluder_color": self.logit_colors,
+        }
 
     def render(
         self, rows: torch.Tensor, Ks: torch.Tensor, width: int, height: int
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Draw the occluders of B frames over black; differentiable.
-
-        Args:
-            rows: (B,) int64, the frames.
-            Ks: (B, 3, 3) px, their cameras.
-            width, height: px.
-
-        Returns:
-            (B, H, W, 3) sRGB colour, premultiplied, and (B, H, W, 1) coverage in [0, 1].
-        """
+        """Draw the occluders of frames (B,) over black: premultiplied colour, and coverage."""
         rows = rows.to(self.places.device)
         focal = Ks[:, None, (0, 1), (0, 1)]
         center = Ks[:, None, :2, 2]
@@ -93,15 +90,9 @@ def mask_boxes(masks: torch.Tensor, margin: float = 0.1) -> torch.Tensor:
         left, right = int(across[0]), int(across[-1]) + 1
         top, bottom = int(down[0]), int(down[-1]) + 1
         grow = math.ceil(margin * max(right - left, bottom - top))
-        boxes.append(
-            (
-                max(0, left - grow),
-                max(0, top - grow),
-                min(width, right + grow),
-                min(height, bottom + grow),
-            )
-        )
-    return torch.tensor(boxes)
+        boxes.append((left - grow, top - grow, right + grow, bottom + grow))
+    limits = torch.tensor((width, height, width, height))
+    return torch.tensor(boxes).clamp(min=0).minimum(limits)
 
 
 def make_occluders(

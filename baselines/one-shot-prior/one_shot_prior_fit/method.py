@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar
+from typing import Any
 
 import cv2
 import numpy as np
@@ -12,11 +12,11 @@ import torch
 
 from hwp_bench.methods.contract import Avatar
 from hwp_bench.methods.settings import choice, number
-from one_shot_prior_fit.model import OneShotAvatar, OneShotModel
+from one_shot_prior_fit.model import OneShotModel
 from wildghand.fitting.method import ready_fit
+from wildghand.gaussians.hand_avatar import DrawnAvatar
 from wildghand.gaussians.perceptual import FilterBankLoss
 from wildghand.gaussians.training import TrainingClip, TrainingFrames
-from wildghand.model.terms import silhouette
 from wildghand.plain.recipe import Batch, Drawing, LoopSettings, Material, Recipe, RecipeMethod
 
 
@@ -69,12 +69,7 @@ def choose_frame(frames: TrainingFrames) -> int:
 def only(frames: TrainingFrames, row: int) -> TrainingFrames:
     """One row of the training frames."""
     part = slice(row, row + 1)
-    return replace(
-        frames,
-        indices=frames.indices[part],
-        images=frames.images[part],
-        masks=frames.masks[part],
-    )
+    return TrainingFrames(frames.indices[part], frames.images[part], frames.masks[part])
 
 
 def _edge_strength(frames: TrainingFrames, row: int) -> float:
@@ -92,44 +87,24 @@ HALVED_AFTER = (0.02, 0.05, 0.10, 0.20, 0.35, 0.50, 0.75)
 
 
 class OneShotRecipe(Recipe[OneShotSettings]):
-    """Fit the identity map, the bias of the texture plane, and one gain and offset.
-
-    Attributes:
-        fitted: the frozen network and what is fitted.
-        clip: hands and cameras of the frames that are fitted.
-    """
+    """Fit the identity map, the bias of the texture plane, and one gain and offset."""
 
     def __init__(self, material: Material, settings: OneShotSettings) -> None:
         if settings.frames == "one":
             frames = only(material.frames, choose_frame(material.frames))
             material = replace(material, frames=frames)
         super().__init__(material, settings)
-        frames = material.frames
+        training, frames, device = material.training, material.frames, material.device
+        color = frames.mean_color()
         self.fitted = OneShotModel(
-            material.training,
-            settings.gaussians,
-            frames.mean_color(),
-            len(frames),
-            material.seed,
-            material.device,
+            training, settings.gaussians, color, len(frames), material.seed, device
         )
-        self.clip = TrainingClip(
-            material.training, frames.indices, self.fitted.model.rigs, material.device
-        )
+        self.clip = TrainingClip(training, frames.indices, self.fitted.model.rigs, device)
         self._perceptual = FilterBankLoss()
 
     def parameters(self) -> dict[str, torch.Tensor]:
         """See `Recipe`."""
         return self.fitted.parameters()
-
-    def rates(self) -> dict[str, float]:
-        """See `Recipe`."""
-        settings = self.settings
-        by_kind = {"identity": settings.identity_rate, "bias": settings.bias_rate}
-        return {
-            name: by_kind.get(name.partition(".")[0], settings.color_rate)
-            for name in self.parameters()
-        }
 
     def rate(self, name: str, fraction: float) -> float:
         """See `Recipe`."""
@@ -154,21 +129,19 @@ class OneShotRecipe(Recipe[OneShotSettings]):
             distance = self._perceptual(drawing.image, batch.images, weights)
             total = total + settings.perceptual * distance
         if settings.mask:
-            # Outside, the mask may be what covers the hand: it counts as little as in colours.
-            coverage = drawing.coverage[..., 0]
-            total = total + settings.mask * silhouette(coverage * weights, batch.masks * weights)
+            total = total + settings.mask * self.outline(batch, drawing, weights)
         squares = [bias.square().mean() for bias in self.fitted.plane_bias.values()]
         return total + settings.bias * torch.stack(squares).mean()
 
     def avatar(self, steps: int) -> Avatar:
         """See `Recipe`."""
-        return OneShotAvatar(self.fitted, steps)
+        return DrawnAvatar(self.fitted.draw, self.fitted.model.rigs, self.device, steps)
 
 
 class OneShotMethod(RecipeMethod):
     """See `one_shot_prior_fit.method.OneShotRecipe` for all that it does."""
 
-    name: ClassVar[str] = "baselines/one-shot-prior"
+    name = "baselines/one-shot-prior"
     settings_type = OneShotSettings
     recipe_type = OneShotRecipe
 

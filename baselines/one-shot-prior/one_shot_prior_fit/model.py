@@ -9,8 +9,8 @@ from torch import Tensor, nn
 
 from hwp_bench.base.errors import BadInput
 from hwp_bench.methods.contract import TrainingCapture
-from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
-from wildghand.model.model import WildGHandModel, make_model
+from wildghand.gaussians.hand_avatar import PosedHands
+from wildghand.model.model import make_model
 from wildghand.model.settings import read_settings
 from wildghand.network import NetworkSettings
 from wildghand.network.branches import CompactTexture
@@ -26,10 +26,6 @@ class BiasedTexture(CompactTexture):
     """The texture branch with a learned bias on each hand's plane of features.
 
     Planes are read linearly, so that the bias is read apart and added.
-
-    Args:
-        settings: of the network.
-        sides: the hands.
     """
 
     def __init__(self, settings: NetworkSettings, sides: Iterable[str]) -> None:
@@ -61,9 +57,6 @@ class OneShotModel:
         model: the network's hands; only what `parameters` names may change.
         gain: (3,) on the colours of all Gaussians.
         offset: (3,) added to them.
-
-    Raises:
-        BadInput: there is no prior for the capture's hand model.
     """
 
     def __init__(
@@ -101,38 +94,20 @@ class OneShotModel:
         return {
             **{f"identity.{side}": values for side, values in maps.items()},
             **{f"bias.{side}": values for side, values in self.plane_bias.items()},
-            "gain": self.gain,
-            "offset": self.offset,
+            "color.gain": self.gain,
+            "color.offset": self.offset,
         }
 
     def colored(self, image: Tensor, coverage: Tensor) -> Tensor:
-        """Gain and offset on every Gaussian's colour: (B, H, W, 3) sRGB over black.
+        """Gain and offset on every Gaussian's colour, (B, H, W, 3) sRGB over black.
 
         Blending is linear in the colours, so that the image may be changed in their place.
-
-        Args:
-            image: (B, H, W, 3) over black.
-            coverage: (B, H, W, 1).
         """
         return image * self.gain + coverage * self.offset
-
-
-class OneShotAvatar(HandAvatar):
-    """The fitted model.
-
-    Args:
-        fitted: what to draw; while the fit goes on it may be the live one.
-        steps: optimizer steps behind it.
-    """
-
-    def __init__(self, fitted: OneShotModel, steps: int) -> None:
-        super().__init__(fitted.model.rigs, fitted.gain.device, steps)
-        self.fitted = fitted
 
     def draw(
         self, hands: PosedHands, viewmats: Tensor, Ks: Tensor, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
         """See `HandAvatar.draw`."""
-        model: WildGHandModel = self.fitted.model
-        image, coverage = model.draw(hands, viewmats, Ks, width, height, refine=True)
-        return self.fitted.colored(image, coverage), coverage
+        image, coverage = self.model.draw(hands, viewmats, Ks, width, height, refine=True)
+        return self.colored(image, coverage), coverage

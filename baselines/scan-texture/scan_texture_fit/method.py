@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
+from typing import Any
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool2d
 
 from hwp_bench.hands.anchors import anchor_uv
 from hwp_bench.methods.contract import Avatar
-from scan_texture_fit.model import ScanAvatar, ScanDrawing, ScanModel, ScanSettings
-from scan_texture_fit.unwrap import nearest_anchor, unwrap
+from scan_texture_fit.model import ScanDrawing, ScanModel, ScanSettings
+from scan_texture_fit.unwrap import nearest_anchor, read_pixels, weighted_median
+from wildghand.evidence.count import seen_anchors
+from wildghand.gaussians.hand_avatar import DrawnAvatar
 from wildghand.gaussians.regularizers import surface_laplacian
-from wildghand.gaussians.rig import AnchorPoses, make_rig
+from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.training import TrainingClip
-from wildghand.model.terms import silhouette
+from wildghand.plain.pose_corrections import PoseCorrections
 from wildghand.plain.recipe import Batch, Drawing, Material, Recipe, RecipeMethod
 
 # Displacements stay within these, m.
@@ -23,6 +26,8 @@ _FARTHEST = 0.008
 _BRIGHTEST = 2.0
 # A texel is unseen where the weights of the frames that show it sum up to less than this.
 _LEAST_WEIGHT = 0.3
+# Most frames that are unwrapped; of longer clips as many, evenly spread.
+_MOST_FRAMES = 256
 
 
 class ScanRecipe(Recipe[ScanSettings]):
@@ -31,10 +36,6 @@ class ScanRecipe(Recipe[ScanSettings]):
     Between the stages the frames are unwrapped into the texture.
 
     Attributes:
-        model: what is fitted of the person.
-        clip: hands and cameras of the training frames.
-        poses: by side, (R, 16, 3) rad, added to the axis-angle vectors of each training frame.
-        places: by side, (R, 3) m, added to the translations.
         shown: by side, (N,) weight of the frames that show each anchor; set by the unwrapping.
         unseen: by side, (size, size) 1 where no frame shows a texel; set by the unwrapping.
     """
@@ -57,87 +58,39 @@ class ScanRecipe(Recipe[ScanSettings]):
         color = material.frames.mean_color().to(device)
         self.model = ScanModel(rigs, self._uv, color, settings).to(device)
         self.clip = TrainingClip(training, material.frames.indices, rigs, device)
-        given = self.clip.parameters
-        self.poses = {side: torch.zeros_like(pose) for side, (pose, _, _) in given.items()}
-        self.places = {side: torch.zeros_like(place) for side, (_, _, place) in given.items()}
+        self.corrections = PoseCorrections(self.clip)
         self._laplacians = {side: surface_laplacian(rig) for side, rig in rigs.items()}
         size = settings.texture_size
         self.shown: dict[str, Tensor] = {}
         self.unseen = {side: torch.zeros(size, size, device=device) for side in rigs}
-        self._images = material.frames.images_on(device)
-        self._masks = material.frames.masks_on(device)
-        self._drawn: ScanDrawing | None = None
 
     def parameters(self) -> dict[str, Tensor]:
         """See `Recipe`."""
-        return {
-            **dict(self.model.named_parameters()),
-            **{f"pose.{side}": value for side, value in self.poses.items()},
-            **{f"transl.{side}": value for side, value in self.places.items()},
-        }
-
-    def rates(self) -> dict[str, float]:
-        """See `Recipe`."""
-        return {name: self._kind(name) for name in self.parameters()}
-
-    def _kind(self, name: str) -> float:
-        settings = self.settings
-        kinds = {
-            "betas": settings.betas_rate,
-            "displacement": settings.displacement_rate,
-            "texture": settings.texture_rate,
-            "color": settings.color_rate,
-            "pose": settings.pose_rate,
-            "transl": settings.transl_rate,
-        }
-        parts = name.split(".")
-        if "shadow" in parts:
-            return settings.shadow_rate
-        return kinds[parts[0] if parts[0] in kinds else parts[-1]]
+        return {**self.model.fitted(), **self.corrections.parameters()}
 
     def rate(self, name: str, fraction: float) -> float:
         """See `Recipe`. The texture waits for stage 2, in which the rest moves slowly."""
         late = fraction >= self.settings.shape_share
-        if name.endswith(".texture"):
+        if name.startswith("texture."):
             return super().rate(name, fraction) if late else 0.0
         return super().rate(name, fraction) * (self.settings.late_rate if late else 1.0)
 
-    def corrected(self, rows: Tensor) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-        """Pose, betas and translation of each hand in training frames."""
-        rows = rows.to(self.material.device)
-        return {
-            side: (
-                pose[rows] + self.poses[side][rows],
-                betas,
-                transl[rows] + self.places[side][rows],
-            )
-            for side, (pose, betas, transl) in self.clip.parameters.items()
-        }
-
-    def draw(self, batch: Batch) -> Drawing:
+    def draw(self, batch: Batch) -> ScanDrawing:
         """See `Recipe`."""
         if batch.fraction >= self.settings.shape_share and not bool(self.model.textured):
             self.unwrap()
         training, clip = self.material.training, self.clip
-        rows = batch.rows.to(self.material.device)
-        self._drawn = self.model.draw(
-            self.corrected(rows),
-            clip.viewmats[rows],
-            clip.Ks[rows],
-            training.width,
-            training.height,
-        )
-        return Drawing(self._drawn.image, self._drawn.coverage)
+        rows = batch.rows.to(self.device)
+        hands, viewmats, Ks = self.corrections.hands(rows), clip.viewmats[rows], clip.Ks[rows]
+        return self.model.draw(hands, viewmats, Ks, training.width, training.height)
 
     def loss(self, batch: Batch, drawing: Drawing, weights: Tensor) -> Tensor:
         """See `Recipe`: the photometric loss, the silhouette, and what keeps each part smooth."""
-        settings, drawn = self.settings, self._drawn
-        assert drawn is not None
+        assert isinstance(drawing, ScanDrawing)
+        settings = self.settings
         loss = super().loss(batch, drawing, weights)
-        covered = drawing.coverage[..., 0]
-        # Outside, the mask may be what covers the hand: it counts as little as in colours.
-        loss = loss + settings.mask_weight * silhouette(covered * weights, batch.masks * weights)
-        for plane in drawn.shadows:
+        loss = loss + settings.mask_weight * self.outline(batch, drawing, weights)
+        for plane in drawing.shadows:
             loss = loss - settings.shadow_one * plane.clamp(min=1e-4).log().mean()
             loss = loss + settings.shadow_smoothness * total_variation(plane[:, 0])
         for side, laplacian in self._laplacians.items():
@@ -160,40 +113,48 @@ class ScanRecipe(Recipe[ScanSettings]):
 
     @torch.no_grad()
     def unwrap(self) -> None:
-        """Fill the texture from the frames; places that none shows get the skin's colour."""
-        clip = self.clip
+        """Fill the texture with medians of frames divided by their shadows.
 
-        def posed(rows: Tensor) -> dict[str, tuple[AnchorPoses, Tensor]]:
-            found = {}
-            for side, (pose, betas, transl) in self.corrected(rows).items():
-                anchors = self.model.follow(side, pose, betas, transl)
-                viewmats = clip.viewmats[rows.to(self.material.device)]
-                found[side] = anchors, self.model.hand(side).shadows(anchors, viewmats, pose)[0]
-            return found
-
-        def cameras(rows: Tensor) -> tuple[Tensor, Tensor]:
-            here = rows.to(self.material.device)
-            return clip.viewmats[here], clip.Ks[here]
-
-        def pictures(rows: Tensor) -> tuple[Tensor, Tensor]:
-            return self._images(rows), self._masks(rows)
-
+        Places that no frame shows get the skin's colour.
+        """
+        model, clip, (images, masks) = self.model, self.clip, self._tables
+        count = len(self.material.frames)
+        values: dict[str, list[Tensor]] = {side: [] for side in model.rigs}
+        weights: dict[str, list[Tensor]] = {side: [] for side in model.rigs}
+        chosen = torch.linspace(0, count - 1, min(count, _MOST_FRAMES)).round().long()
+        for rows in chosen.split(16):
+            here = rows.to(self.device)
+            viewmats, image, mask = clip.viewmats[here], images(rows), masks(rows)
+            hands = self.corrections.hands(here)
+            anchors = {side: model.follow(side, *given) for side, given in hands.items()}
+            # A border's pixel is partly background, and it is where a wrong pose shows first.
+            inner = -max_pool2d(-mask[:, None], 3, 1, 1)[:, 0]
+            places = seen_anchors(anchors, viewmats, clip.Ks[here], mask.shape[1:])
+            for side, (pixels, facing) in places.items():
+                shadows, _ = model.hand(side).shadows(anchors[side], viewmats, hands[side][0])
+                inside = read_pixels(inner[..., None], pixels)[..., 0]
+                weights[side].append(facing.square() * (inside > 0.99))
+                values[side].append(read_pixels(image, pixels) / shadows[..., None].clamp(min=0.05))
         size = self.settings.texture_size
-        sides = list(self.model.rigs)
-        for side, (colors, weight) in unwrap(
-            sides, posed, cameras, pictures, len(self.material.frames)
-        ).items():
-            self.shown[side] = weight
-            seen = weight > _LEAST_WEIGHT
+        for side in model.rigs:
+            weight = torch.cat(weights[side])
+            colors = weighted_median(torch.cat(values[side]), weight)
+            self.shown[side] = weight.sum(dim=0)
+            seen = self.shown[side] > _LEAST_WEIGHT
             index = nearest_anchor(self._uv[side], size).to(colors.device)
-            filled = torch.where(seen[:, None], colors, self.model.color)
-            self.model.hand(side).texture.copy_(filled[index].clamp(0.0, _BRIGHTEST))
+            filled = torch.where(seen[:, None], colors, model.color)
+            model.hand(side).texture.copy_(filled[index].clamp(0.0, _BRIGHTEST))
             self.unseen[side] = (~seen[index]).float().reshape(size, size)
-        self.model.textured.fill_(1.0)
+        model.textured.fill_(1.0)
 
     def avatar(self, steps: int) -> Avatar:
         """See `Recipe`."""
-        return ScanAvatar(self.model, steps)
+
+        def draw(*given: Any) -> tuple[Tensor, Tensor]:
+            drawn = self.model.draw(*given)
+            return drawn.image, drawn.coverage
+
+        return DrawnAvatar(draw, self.model.rigs, self.device, steps)
 
     def snapshot(self) -> dict[str, Tensor]:
         """See `Recipe`."""
@@ -222,6 +183,6 @@ def total_variation(planes: Tensor, where: Tensor | None = None) -> Tensor:
 class ScanMethod(RecipeMethod):
     """See `scan_texture_fit.method.ScanRecipe` for all that it does."""
 
-    name: ClassVar[str] = "baselines/scan-texture"
+    name = "baselines/scan-texture"
     settings_type = ScanSettings
     recipe_type = ScanRecipe

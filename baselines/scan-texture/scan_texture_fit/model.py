@@ -4,17 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import leaky_relu, normalize
 
 from hwp_bench.methods.settings import number
-from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
+from wildghand.gaussians.hand_avatar import PosedHands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.network.surface import CellPooling, FixedGather, PlaneSampler
-from wildghand.plain.recipe import LoopSettings
+from wildghand.plain.recipe import Drawing, LoopSettings
 from wildghand.splat import rasterize
 
 _WIDTH = 16
@@ -140,13 +141,9 @@ _THICKNESS, _OPACITY = 0.1, 0.98
 
 
 @dataclass(frozen=True, eq=False)
-class ScanDrawing:
+class ScanDrawing(Drawing):
     """B frames as the model draws them."""
 
-    #: (B, H, W, 3) sRGB over black.
-    image: Tensor
-    #: (B, H, W, 1) coverage in [0, 1].
-    coverage: Tensor
     #: (B, 1, cells, cells) the shadows of each hand.
     shadows: tuple[Tensor, ...]
 
@@ -155,10 +152,8 @@ class ScanHand(nn.Module):
     """One hand: what is fitted of it, and how an anchor is displaced and coloured.
 
     Args:
-        rig: the hand.
         uv: (N, 2) texture coordinates of the anchors.
         color: (3,) sRGB of the skin at the start.
-        settings: sizes.
     """
 
     def __init__(self, rig: HandRig, uv: Tensor, color: Tensor, settings: ScanSettings) -> None:
@@ -188,12 +183,7 @@ class ScanHand(nn.Module):
         return self._texels(self.texture)
 
     def shadows(self, posed: AnchorPoses, viewmats: Tensor, pose: Tensor) -> tuple[Tensor, Tensor]:
-        """See `ShadowNet.forward`.
-
-        Args:
-            viewmats: (B, 4, 4) world to camera.
-            pose: (B, 16, 3) axis-angle, rad.
-        """
+        """See `ShadowNet.forward`."""
         normals = quat_third_axis(posed.orientations)
         centres = -(viewmats[:, :3, :3].mT @ viewmats[:, :3, 3:])[..., 0]
         view = normalize(centres[:, None] - posed.positions.detach(), dim=-1)
@@ -204,14 +194,7 @@ class ScanHand(nn.Module):
 
 
 class ScanModel(nn.Module):
-    """One or two scanned hands.
-
-    Args:
-        rigs: by side.
-        uv: (N, 2) texture coordinates of the anchors, by side.
-        color: (3,) sRGB of the skin at the start.
-        settings: sizes.
-    """
+    """One or two scanned hands; see `ScanHand`."""
 
     textured: Tensor
 
@@ -235,8 +218,13 @@ class ScanModel(nn.Module):
 
     def hand(self, side: str) -> ScanHand:
         """One hand."""
-        found = self.hands[side]
-        assert isinstance(found, ScanHand)
+        return cast("ScanHand", self.hands[side])
+
+    def fitted(self) -> dict[str, Tensor]:
+        """The tensors that are fitted: the colour, then those of each hand, as `betas.right`."""
+        found: dict[str, Tensor] = {"color": self.color}
+        for side, hand in self.hands.items():
+            found |= {f"{name}.{side}": value for name, value in hand.named_parameters()}
         return found
 
     def follow(self, side: str, pose: Tensor, betas: Tensor, transl: Tensor) -> AnchorPoses:
@@ -244,21 +232,9 @@ class ScanModel(nn.Module):
         return self.rigs[side].follow(pose, betas + self.hand(side).betas, transl)
 
     def draw(
-        self,
-        hands: Mapping[str, tuple[Tensor, Tensor, Tensor]],
-        viewmats: Tensor,
-        Ks: Tensor,
-        width: int,
-        height: int,
+        self, hands: PosedHands, viewmats: Tensor, Ks: Tensor, width: int, height: int
     ) -> ScanDrawing:
-        """Draw B frames over black; differentiable.
-
-        Args:
-            hands: pose (B, 16, 3), betas (10,) and translation (B, 3) by side.
-            viewmats: (B, 4, 4) world to camera.
-            Ks: (B, 3, 3) px.
-            width, height: px.
-        """
+        """Draw B frames over black; differentiable. See `HandAvatar.draw`."""
         means, quats, scales, colors, planes = [], [], [], [], []
         for side, (pose, betas, transl) in hands.items():
             hand = self.hand(side)
@@ -285,23 +261,3 @@ class ScanModel(nn.Module):
             height,
         )
         return ScanDrawing(image, coverage, tuple(planes))
-
-
-class ScanAvatar(HandAvatar):
-    """The fitted model.
-
-    Args:
-        model: what to draw; while the fit goes on it may be the live one.
-        steps: optimizer steps behind it.
-    """
-
-    def __init__(self, model: ScanModel, steps: int) -> None:
-        super().__init__(model.rigs, model.color.device, steps)
-        self.model = model
-
-    def draw(
-        self, hands: PosedHands, viewmats: Tensor, Ks: Tensor, width: int, height: int
-    ) -> tuple[Tensor, Tensor]:
-        """See `HandAvatar.draw`."""
-        drawn = self.model.draw(hands, viewmats, Ks, width, height)
-        return drawn.image, drawn.coverage

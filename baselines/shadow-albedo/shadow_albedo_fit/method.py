@@ -5,14 +5,12 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, ClassVar
 
 import torch
 
 from hwp_bench.methods.settings import number
 from shadow_albedo_fit.model import RADIUS, ShadowedModel
 from wildghand.gaussians.regularizers import SurfaceLaplacian, surface_laplacian
-from wildghand.gaussians.rig import AnchorPoses
 from wildghand.gaussians.shading import MAX_DEGREE
 from wildghand.plain.model import PlainModel
 from wildghand.plain.recipe import Batch, Drawing, FitSettings, Material, PlainRecipe, RecipeMethod
@@ -47,12 +45,7 @@ _BRIGHTEST = 0.95
 
 
 class ShadowRecipe(PlainRecipe[ShadowSettings]):
-    """The plain fit of a `ShadowedModel`.
-
-    Args:
-        material: what is fitted.
-        settings: how.
-    """
+    """The plain fit of a `ShadowedModel`."""
 
     model: ShadowedModel
 
@@ -64,13 +57,10 @@ class ShadowRecipe(PlainRecipe[ShadowSettings]):
         away = turn @ torch.tensor(_START, device=material.device)
         with torch.no_grad():
             self.model.lamp.copy_(anchors.positions.mean(dim=(0, 1)) + RADIUS * away / away.norm())
-            self._brighten(anchors)
-
-    def _brighten(self, anchors: AnchorPoses) -> None:
-        """The mean colour of the frames is that of the lit hand; its albedo is brighter."""
-        colors = self.model.gaussians.logit_colors
-        albedo = (colors.sigmoid() / self.model.shading(anchors).mean()).clamp(max=_BRIGHTEST)
-        colors.copy_(torch.logit(albedo, eps=1e-6))
+            # The mean colour of the frames is that of the lit hand; its albedo is brighter.
+            colors = self.model.gaussians.logit_colors
+            albedo = (colors.sigmoid() / self.model.shading(anchors).mean()).clamp(max=_BRIGHTEST)
+            colors.copy_(torch.logit(albedo, eps=1e-6))
 
     def start(self) -> PlainModel:
         """The plain model, and a lamp at the origin."""
@@ -88,15 +78,6 @@ class ShadowRecipe(PlainRecipe[ShadowSettings]):
     def laplacians(self) -> list[SurfaceLaplacian]:
         """Of each hand."""
         return [surface_laplacian(rig) for rig in self.model.rigs.values()]
-
-    def rates(self) -> dict[str, float]:
-        """Adam's step at the start of each tensor, by name."""
-        settings = self.settings
-        return {
-            **super().rates(),
-            "lamp": settings.lamp_rate,
-            "logit_ambient": settings.ambient_rate,
-        }
 
     def loss(self, batch: Batch, drawing: Drawing, weights: torch.Tensor) -> torch.Tensor:
         """The photometric loss, and the roughness of albedo and offsets."""
@@ -118,6 +99,6 @@ class ShadowRecipe(PlainRecipe[ShadowSettings]):
 class ShadowMethod(RecipeMethod):
     """The plain fit under one lamp that casts shadows; see `ShadowRecipe`."""
 
-    name: ClassVar[str] = "baselines/shadow-albedo"
-    settings_type: ClassVar[type[FitSettings]] = ShadowSettings
-    recipe_type: ClassVar[type[PlainRecipe[Any]]] = ShadowRecipe
+    name = "baselines/shadow-albedo"
+    settings_type = ShadowSettings
+    recipe_type = ShadowRecipe

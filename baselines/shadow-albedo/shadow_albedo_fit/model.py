@@ -125,14 +125,14 @@ class ShadowedModel(PlainModel):
 
     def parameters(self) -> dict[str, torch.Tensor]:
         """The fitted tensors by name, in a fixed order."""
-        return {**super().parameters(), "lamp": self.lamp, "logit_ambient": self.logit_ambient}
+        return {**super().parameters(), "lamp": self.lamp, "ambient": self.logit_ambient}
 
     def with_parameters(self, values: Mapping[str, torch.Tensor]) -> ShadowedModel:
         """The same rigs with other values, named as in `parameters`."""
-        rest = {k: value for k, value in values.items() if k not in ("lamp", "logit_ambient")}
+        rest = {name: value for name, value in values.items() if name not in ("lamp", "ambient")}
         made = super().with_parameters(rest)
         assert isinstance(made, ShadowedModel)
-        return replace(made, lamp=values["lamp"], logit_ambient=values["logit_ambient"])
+        return replace(made, lamp=values["lamp"], logit_ambient=values["ambient"])
 
     def lit(self, colors: torch.Tensor, poses: AnchorPoses) -> torch.Tensor:
         """Multiply the light on; differentiable in the colours and the light.

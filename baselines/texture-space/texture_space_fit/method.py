@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import torch
 from torch import Tensor
@@ -11,11 +10,11 @@ from torch import Tensor
 from hwp_bench.base.colors import srgb_to_linear
 from hwp_bench.methods.contract import Avatar
 from hwp_bench.methods.settings import number
-from texture_space_fit.model import SpaceAvatar, SpaceModel
+from texture_space_fit.model import SpaceModel
 from texture_space_fit.skins import shipped_skins, skin_uv
+from wildghand.gaussians.hand_avatar import DrawnAvatar
 from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.training import TrainingClip
-from wildghand.model.terms import silhouette
 from wildghand.plain.recipe import Batch, Drawing, LoopSettings, Material, Recipe, RecipeMethod
 
 
@@ -41,12 +40,7 @@ class SpaceSettings(LoopSettings):
 
 
 class SpaceRecipe(Recipe[SpaceSettings]):
-    """Fit the weights of the space, a light and the shape.
-
-    Attributes:
-        model: what is fitted.
-        clip: hands and cameras of the training frames.
-    """
+    """Fit the weights of the space, a light and the shape."""
 
     def __init__(self, material: Material, settings: SpaceSettings) -> None:
         super().__init__(material, settings)
@@ -58,9 +52,8 @@ class SpaceRecipe(Recipe[SpaceSettings]):
         }
         uv = {side: skin_uv(templates[side], rig.anchors) for side, rig in rigs.items()}
         color = srgb_to_linear(material.frames.mean_color().numpy())
-        self.model = SpaceModel(
-            rigs, uv, shipped_skins(), torch.as_tensor(color, dtype=torch.float32, device=device)
-        )
+        color = torch.as_tensor(color, dtype=torch.float32, device=device)
+        self.model = SpaceModel(rigs, uv, shipped_skins(), color)
         self.clip = TrainingClip(training, material.frames.indices, rigs, device)
 
     def parameters(self) -> dict[str, Tensor]:
@@ -70,21 +63,10 @@ class SpaceRecipe(Recipe[SpaceSettings]):
             found = {name: value for name, value in found.items() if "residual" not in name}
         return found
 
-    def rates(self) -> dict[str, float]:
-        """See `Recipe`."""
-        settings = self.settings
-        kinds = {
-            "latent": settings.latent_rate,
-            "light": settings.light_rate,
-            "betas": settings.betas_rate,
-            "residual": settings.residual_rate,
-        }
-        return {name: kinds[name.partition(".")[0]] for name in self.parameters()}
-
     def draw(self, batch: Batch) -> Drawing:
         """See `Recipe`."""
         training, clip = self.material.training, self.clip
-        rows = batch.rows.to(self.material.device)
+        rows = batch.rows.to(self.device)
         hands = {
             side: (pose[rows], betas, transl[rows])
             for side, (pose, betas, transl) in clip.parameters.items()
@@ -98,9 +80,7 @@ class SpaceRecipe(Recipe[SpaceSettings]):
         """See `Recipe`: the photometric loss, the silhouette, and what keeps the skin likely."""
         settings, model = self.settings, self.model
         loss = super().loss(batch, drawing, weights)
-        covered = drawing.coverage[..., 0]
-        # Outside, the mask may be what covers the hand: it counts as little as in colours.
-        loss = loss + settings.mask_weight * silhouette(covered * weights, batch.masks * weights)
+        loss = loss + settings.mask_weight * self.outline(batch, drawing, weights)
         loss = loss + settings.latent_weight * model.latent.square().mean()
         if settings.residual_rate:
             squares = [value.square().mean() for value in model.residual.values()]
@@ -109,12 +89,12 @@ class SpaceRecipe(Recipe[SpaceSettings]):
 
     def avatar(self, steps: int) -> Avatar:
         """See `Recipe`."""
-        return SpaceAvatar(self.model, steps)
+        return DrawnAvatar(self.model.draw, self.model.hands, self.device, steps)
 
 
 class SpaceMethod(RecipeMethod):
     """See `texture_space_fit.method.SpaceRecipe` for all that it does."""
 
-    name: ClassVar[str] = "baselines/texture-space"
+    name = "baselines/texture-space"
     settings_type = SpaceSettings
     recipe_type = SpaceRecipe

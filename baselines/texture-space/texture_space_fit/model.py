@@ -10,7 +10,7 @@ from torch import Tensor
 
 from texture_space_fit.skins import SkinSpace
 from wildghand.gaussians.attributes import AnchoredGaussians, flat_gaussians
-from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
+from wildghand.gaussians.hand_avatar import PosedHands
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import HandRig
 from wildghand.gaussians.shading import sh_basis, sh_count
@@ -102,17 +102,7 @@ class SpaceModel:
     def draw(
         self, hands: PosedHands, viewmats: Tensor, Ks: Tensor, width: int, height: int
     ) -> tuple[Tensor, Tensor]:
-        """Draw B frames over black; differentiable.
-
-        Args:
-            hands: pose (B, 16, 3), betas (10,) and translation (B, 3) by side.
-            viewmats: (B, 4, 4) world to camera.
-            Ks: (B, 3, 3) px.
-            width, height: px.
-
-        Returns:
-            (B, H, W, 3) sRGB over black, and (B, H, W, 1) coverage.
-        """
+        """Draw B frames over black; differentiable. See `HandAvatar.draw`."""
         posed = {
             side: self.hands[side].rig.follow(pose, betas + self.betas[side], transl)
             for side, (pose, betas, transl) in hands.items()
@@ -141,22 +131,3 @@ def to_srgb(linear: Tensor) -> Tensor:
     """The sRGB curve, differentiable: linear 0 and more to sRGB 0 and more."""
     bent = 1.055 * linear.clamp(min=0.0031308) ** (1.0 / 2.4) - 0.055
     return torch.where(linear <= 0.0031308, 12.92 * linear, bent)
-
-
-class SpaceAvatar(HandAvatar):
-    """The fitted model.
-
-    Args:
-        model: what to draw; while the fit goes on it may be the live one.
-        steps: optimizer steps behind it.
-    """
-
-    def __init__(self, model: SpaceModel, steps: int) -> None:
-        super().__init__(model.hands, model.light.device, steps)
-        self.model = model
-
-    def draw(
-        self, hands: PosedHands, viewmats: Tensor, Ks: Tensor, width: int, height: int
-    ) -> tuple[Tensor, Tensor]:
-        """See `HandAvatar.draw`."""
-        return self.model.draw(hands, viewmats, Ks, width, height)

@@ -189,17 +189,17 @@ def make_network(seed: int, device: torch.device) -> dict[str, torch.Tensor]:
         return (values / math.sqrt(shape[-1])).to(device)
 
     return {
-        "vote_in": uniform(HIDDEN, FEATURES),
-        "vote_in_bias": torch.zeros(HIDDEN, device=device),
-        "vote_out": uniform(1, HIDDEN),
-        "vote_out_bias": torch.zeros(1, device=device),
+        "vote.in": uniform(HIDDEN, FEATURES),
+        "vote.in_bias": torch.zeros(HIDDEN, device=device),
+        "vote.out": uniform(1, HIDDEN),
+        "vote.out_bias": torch.zeros(1, device=device),
     }
 
 
 def chances(features: torch.Tensor, network: dict[str, torch.Tensor]) -> torch.Tensor:
     """The chance of each pixel to be an inlier: (...) of features (..., FEATURES)."""
-    hidden = features @ network["vote_in"].T + network["vote_in_bias"]
-    return (hidden.relu() @ network["vote_out"].T + network["vote_out_bias"]).sigmoid()[..., 0]
+    hidden = features @ network["vote.in"].T + network["vote.in_bias"]
+    return (hidden.relu() @ network["vote.out"].T + network["vote.out_bias"]).sigmoid()[..., 0]
 
 
 def vote_loss(
@@ -221,5 +221,5 @@ def vote_loss(
     Source: Sabour et al., "SpotLessSplats", and its code.
     """
     wrong = (chance - maybe_in).relu() + (surely_in - chance).relu()
-    steepness = network["vote_in"].abs().amax() * network["vote_out"].abs().amax()
+    steepness = network["vote.in"].abs().amax() * network["vote.out"].abs().amax()
     return wrong.mean() + smoothness * steepness

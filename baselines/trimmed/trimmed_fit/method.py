@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -128,6 +127,6 @@ class TrimmedRecipe(PlainRecipe[TrimmedSettings]):
 class TrimmedMethod(RecipeMethod):
     """The plain fit without pixels that fit badly."""
 
-    name: ClassVar[str] = "baselines/trimmed"
-    settings_type: ClassVar[type[TrimmedSettings]] = TrimmedSettings
-    recipe_type: ClassVar[type[TrimmedRecipe]] = TrimmedRecipe
+    name = "baselines/trimmed"
+    settings_type = TrimmedSettings
+    recipe_type = TrimmedRecipe

@@ -45,14 +45,9 @@ def start_appearance(
     Args:
         places: (N, 3) where the Gaussians are on the hand at rest, in the hand's own size: most
             coordinates lie in [0, 1].
-        frames: number of training frames.
-        frame_features: numbers of a frame.
-        hidden: units of each hidden layer.
-        seed: of the weights.
 
     Returns:
-        by name: `frame_features` (R, E), `gaussian_features` (N, 24), and the weights of three
-        layers for `appear`.
+        by name: `frame` (R, E), `gaussian` (N, 24), and the weights of three layers for `appear`.
 
     Source: the code of WildGaussians.
     """
@@ -66,14 +61,14 @@ def start_appearance(
     phases = (places[..., None] * octaves).flatten(1)
     inputs = 3 + GAUSSIAN_FEATURES + frame_features
     return {
-        "frame_features": 0.01 * torch.randn(frames, frame_features, generator=random).to(device),
-        "gaussian_features": torch.cat((phases.sin(), phases.cos()), dim=-1),
-        "layer_1": layer(hidden, inputs),
-        "bias_1": torch.zeros(hidden, device=device),
-        "layer_2": layer(hidden, hidden),
-        "bias_2": torch.zeros(hidden, device=device),
-        "layer_3": layer(sum(_OUTPUTS), hidden),
-        "bias_3": torch.zeros(sum(_OUTPUTS), device=device),
+        "frame": 0.01 * torch.randn(frames, frame_features, generator=random).to(device),
+        "gaussian": torch.cat((phases.sin(), phases.cos()), dim=-1),
+        "network.layer_1": layer(hidden, inputs),
+        "network.bias_1": torch.zeros(hidden, device=device),
+        "network.layer_2": layer(hidden, hidden),
+        "network.bias_2": torch.zeros(hidden, device=device),
+        "network.layer_3": layer(sum(_OUTPUTS), hidden),
+        "network.bias_3": torch.zeros(sum(_OUTPUTS), device=device),
     }
 
 
@@ -94,14 +89,16 @@ def appear(
     Source: Kulhanek et al., "WildGaussians", where the gain starts at 0; here it
     starts at 1, so that the first step is the plain fit's.
     """
-    known = torch.cat((colors, tensors["gaussian_features"]), dim=-1)
+    known = torch.cat((colors, tensors["gaussian"]), dim=-1)
     split = known.shape[-1]
-    first = tensors["layer_1"]
+    first = tensors["network.layer_1"]
     # The share of the frame is the same for all Gaussians.
     hidden = (known @ first[:, :split].T)[None] + (frame @ first[:, split:].T)[:, None]
-    hidden = (hidden + tensors["bias_1"]).relu()
-    hidden = (hidden @ tensors["layer_2"].T + tensors["bias_2"]).relu()
-    made = (hidden @ tensors["layer_3"].T + tensors["bias_3"]).split(_OUTPUTS, dim=-1)
+    hidden = (hidden + tensors["network.bias_1"]).relu()
+    hidden = (hidden @ tensors["network.layer_2"].T + tensors["network.bias_2"]).relu()
+    made = (hidden @ tensors["network.layer_3"].T + tensors["network.bias_3"]).split(
+        _OUTPUTS, dim=-1
+    )
     gain, offset = 1.0 + tone_scale * made[0], tone_scale * made[1]
     return Appearance(
         colors=(colors * gain + offset).clamp(0.0, 1.0),

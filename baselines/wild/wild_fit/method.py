@@ -5,7 +5,6 @@ from __future__ import annotations
 import functools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import ClassVar
 
 import numpy as np
 import torch
@@ -69,8 +68,6 @@ class WildAvatar:
     Args:
         bake: makes the plain model that is drawn; called when the first image is asked for, since
             a fit offers an avatar after each step and few of them are drawn.
-        steps: optimizer steps behind it.
-        device: where it is drawn.
     """
 
     def __init__(self, bake: Callable[[], PlainModel], steps: int, device: str) -> None:
@@ -123,13 +120,8 @@ class WildRecipe(PlainRecipe[WildSettings]):
             template, anchors = rig.template, rig.anchors
             corners = template.vertices[template.faces[anchors.face_index]]
             places.append(places_at_rest(corners, torch.as_tensor(anchors.barycentric)))
-        self.tensors = start_appearance(
-            torch.cat(places),
-            len(material.frames),
-            settings.frame_features,
-            settings.hidden,
-            material.seed,
-        )
+        frames, sizes = len(material.frames), (settings.frame_features, settings.hidden)
+        self.tensors = start_appearance(torch.cat(places), frames, *sizes, material.seed)
         self.brightness = _brightness(material.frames)
         self.frame_uncertainty = torch.full((len(material.frames),), torch.inf)
         self._drawn = torch.zeros(len(material.frames))
@@ -138,21 +130,13 @@ class WildRecipe(PlainRecipe[WildSettings]):
         """The plain fit's, and those of the appearance."""
         return {**super().parameters(), **self.tensors}
 
-    def rates(self) -> dict[str, float]:
-        """Adam's step at the start of each tensor, by name."""
-        settings = self.settings
-        rates = dict.fromkeys(self.tensors, settings.network_rate)
-        rates["frame_features"] = settings.frame_rate
-        rates["gaussian_features"] = settings.gaussian_rate
-        return {**super().rates(), **rates}
-
     def draw(self, batch: Batch) -> WildDrawing:
         """Draw the frames in their own and in the shared colours, with the uncertainty."""
         training, clip, model = self.material.training, self.clip, self.model
         rows = batch.rows.to(self.material.device)
         poses = clip.poses(batch.rows)
         shared = model.gaussians.logit_colors.sigmoid()
-        look = self.appear(shared, self.tensors["frame_features"][rows])
+        look = self.appear(shared, self.tensors["frame"][rows])
         own = look.colors
         if self.settings.uncertainty == "nerf-w":
             own = (1.0 - look.share) * own + look.share * look.transient
@@ -230,7 +214,7 @@ class WildRecipe(PlainRecipe[WildSettings]):
         """(1, E) the mean numbers of the least uncertain frames, which stand for test frames."""
         order = torch.argsort(self.frame_uncertainty, stable=True)
         kept = order[: max(1, round(self.settings.test_share * len(order)))]
-        return self.tensors["frame_features"][kept.to(self.material.device)].mean(0, keepdim=True)
+        return self.tensors["frame"][kept.to(self.material.device)].mean(0, keepdim=True)
 
     def avatar(self, steps: int) -> WildAvatar:
         """The avatar in the look of the least uncertain frames, without transient colours."""
@@ -248,17 +232,15 @@ class WildRecipe(PlainRecipe[WildSettings]):
 
 def _brightness(frames: TrainingFrames) -> torch.Tensor:
     """(R,) mean sRGB of the hand in each frame, as a share of the mean of all frames."""
-    found = []
-    for image, mask in zip(frames.images, frames.masks, strict=True):
-        # One of 255 more, so that a black frame has a brightness.
-        found.append(image[mask > 127].float().mean() + 1.0)
-    brightness = torch.stack(found)
+    # One of 255 more, so that a black frame has a brightness.
+    pairs = zip(frames.images, frames.masks, strict=True)
+    brightness = torch.stack([image[mask > 127].float().mean() + 1.0 for image, mask in pairs])
     return brightness / brightness.mean()
 
 
 class WildMethod(RecipeMethod):
     """The plain fit with an appearance and an uncertainty of each training frame."""
 
-    name: ClassVar[str] = "baselines/wild"
-    settings_type: ClassVar[type[WildSettings]] = WildSettings
-    recipe_type: ClassVar[type[WildRecipe]] = WildRecipe
+    name = "baselines/wild"
+    settings_type = WildSettings
+    recipe_type = WildRecipe
