@@ -24,21 +24,13 @@ LEAST, MOST = 128, 768
 
 
 class Pace:
-    """Follows how long pictures take, and says how large the next one may be.
-
-    Args:
-        edge: of the first picture, px.
-    """
+    """Follows how long pictures take, and says how large the next one may be, px."""
 
     def __init__(self, edge: int = 256) -> None:
         self.edge = edge
 
     def took(self, edge: int, pixels: float, other: float) -> None:
-        """Take note of a picture.
-
-        Args:
-            edge: its larger side, px.
-        """
+        """Take note of a picture: its larger side in px, and its seconds."""
         # At least a third of the time goes to the pixels: smaller pictures would not help.
         left = max(TARGET - other, TARGET / 3)
         wanted = edge * math.sqrt(left / max(pixels, 1e-4))

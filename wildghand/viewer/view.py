@@ -24,14 +24,7 @@ _FOLDERS = {"wrist": (0,), **{finger: finger_joints(finger) for finger in FINGER
 
 
 class Panel:
-    """Everything that a person can change in the page of an avatar.
-
-    Args:
-        gui: of the page.
-        view: what is changed.
-        put_camera: moves the camera of the page.
-        background: sRGB, 0 to 255, at the start.
-    """
+    """Everything that a person can change in the page of an avatar."""
 
     def __init__(
         self,
@@ -203,11 +196,7 @@ def serve_view(
     address: Address | None = None,
     settings: ViewSettings | None = None,
 ) -> Iterator[ServedView]:
-    """Serve a view while the block runs.
-
-    Args:
-        address: where it is served; None: on this machine only.
-    """
+    """Serve a view while the block runs; without an address on this machine only."""
     require_viser()
     settings = settings or ViewSettings()
     view = PosedView(avatar, motion, settings.background)
