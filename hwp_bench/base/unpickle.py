@@ -272,16 +272,6 @@ def _leaf(item: Any) -> int:
     return len(item) if isinstance(item, str | bytes | bytearray) else 1
 
 
-class _Function:
-    """A function that a pickle may call but not change: it takes no state."""
-
-    def __init__(self, function: Callable[..., Any]) -> None:
-        self._function = function
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self._function(*arguments)
-
-
 class _Dtype:
     """An element type as a pickle describes it, checked before numpy sees it."""
 
@@ -322,7 +312,7 @@ class _Array(np.ndarray):
         super().__setstate__(whole)  # type: ignore[arg-type]
 
 
-def _bytes_of(raw: Any) -> bytes:
+def _bytes_of(raw: Any = b"") -> bytes:
     # Nothing but bytes: an integer would make that many zeros.
     if not isinstance(raw, (bytes, bytearray)):
         raise TypeError(f"{type(raw).__name__} where bytes are expected")
@@ -342,12 +332,16 @@ def _plain_dtype(holder: Any) -> np.dtype[Any]:
     return holder.dtype
 
 
-def _refuse_call(*arguments: Any) -> Any:
+def _ndarray(*arguments: Any) -> Any:
+    raise TypeError("this class is only named in pickles, never called")
+
+
+def _object(*arguments: Any) -> Any:
     raise TypeError("this class is only named in pickles, never called")
 
 
 def _reconstruct(subtype: Any, shape: Any, typecode: Any) -> np.ndarray:
-    if subtype is not _NDARRAY:
+    if subtype is not _ndarray:
         raise TypeError("an array of a foreign class")
     return np.ndarray.__new__(_Array, (0,), np.int8)
 
@@ -369,40 +363,33 @@ def _encode(text: Any, codec: Any = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-def _bytes(raw: Any = b"") -> bytes:
-    return _bytes_of(raw)
-
-
 def _bytearray(raw: Any = b"", codec: Any = "latin1") -> bytearray:
     return bytearray(_encode(raw, codec) if isinstance(raw, str) else _bytes_of(raw))
 
 
 def _object_reconstructor(made: Any, base: Any, state: Any) -> Any:
-    if not (isinstance(made, type) and issubclass(made, StandIn) and base is _OBJECT):
+    if not (isinstance(made, type) and issubclass(made, StandIn) and base is _object):
         raise TypeError("an object of a class that is not admitted")
     return made()
 
 
-_NDARRAY = _Function(_refuse_call)
-_OBJECT = _Function(_refuse_call)
-
-
 def _admitted() -> dict[str, Any]:
+    """What a pickle may name, and what it gets: functions that take no state."""
     names: dict[str, Any] = {
-        "numpy.ndarray": _NDARRAY,
+        "numpy.ndarray": _ndarray,
         "numpy.dtype": _Dtype,
-        "_codecs.encode": _Function(_encode),
+        "_codecs.encode": _encode,
     }
     for core in ("numpy.core", "numpy._core"):  # the name changed in numpy 2
-        names[f"{core}.multiarray._reconstruct"] = _Function(_reconstruct)
-        names[f"{core}.multiarray.scalar"] = _Function(_scalar)
-        names[f"{core}.numeric._frombuffer"] = _Function(_from_buffer)
+        names[f"{core}.multiarray._reconstruct"] = _reconstruct
+        names[f"{core}.multiarray.scalar"] = _scalar
+        names[f"{core}.numeric._frombuffer"] = _from_buffer
     for builtins in ("builtins", "__builtin__"):  # Python 3 and 2
-        names[f"{builtins}.bytes"] = _Function(_bytes)
-        names[f"{builtins}.bytearray"] = _Function(_bytearray)
-        names[f"{builtins}.object"] = _OBJECT
+        names[f"{builtins}.bytes"] = _bytes_of
+        names[f"{builtins}.bytearray"] = _bytearray
+        names[f"{builtins}.object"] = _object
     for copyreg in ("copyreg", "copy_reg"):
-        names[f"{copyreg}._reconstructor"] = _Function(_object_reconstructor)
+        names[f"{copyreg}._reconstructor"] = _object_reconstructor
     return names
 
 

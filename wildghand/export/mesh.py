@@ -89,16 +89,11 @@ _FLIP = np.array([1.0, -1.0, -1.0])
 
 @dataclass(frozen=True, eq=False)
 class SkinnedHand:
-    """One hand as glTF takes it."""
+    """One hand as glTF takes it: the mesh at rest, texture coordinates, where it lies, its skin."""
 
-    #: The mesh at rest, with the person's shape.
     template: TemplateTensors
-    #: Its texture coordinates.
     layout: HandTemplate
-    #: (10,) shape parameters.
-    betas: np.ndarray
-    #: (3,) m, where it lies at rest.
-    transl: np.ndarray
+    rest: HandPose
     texture: SkinTexture
 
 
@@ -121,8 +116,10 @@ def skinned_glb_bytes(hands: Mapping[str, SkinnedHand], motion: Motion, generato
     centre = np.concatenate(list(motion.transls.values())).mean(axis=0)
     for side, hand in hands.items():
         require_skinning(hand.template)
-        joints = _joints(hand)
-        first = _add_nodes(made, side, joints, hand.transl)
+        template = hand.template
+        moved = template.joint_basis.numpy().astype(np.float64) @ np.asarray(hand.rest.betas)
+        joints = template.joints.numpy().astype(np.float64) + moved
+        first = _add_nodes(made, side, joints, np.asarray(hand.rest.transl))
         _add_mesh(made, side, hand, joints, first)
         _add_motion(made, clip, times, motion, side, joints, first, centre)
     content["animations"] = [clip]
@@ -137,13 +134,6 @@ def require_skinning(template: TemplateTensors) -> None:
             field="hand_model",
             remedy="Export Gaussians (.ply, .spz), or fit with the free hand.",
         )
-
-
-def _joints(hand: SkinnedHand) -> np.ndarray:
-    """(16, 3) m, of the person at rest."""
-    template = hand.template
-    moved = template.joint_basis.numpy().astype(np.float64) @ hand.betas
-    return np.asarray(template.joints.numpy().astype(np.float64) + moved)
 
 
 def _add_nodes(made: GlbBuilder, side: str, joints: np.ndarray, transl: np.ndarray) -> int:
@@ -166,7 +156,7 @@ def _add_mesh(
     """Add mesh, texture, skin, and the node that shows them."""
     content, template, layout = made.content, hand.template, hand.layout
     rest = template.vertices.numpy().astype(np.float64)
-    rest = rest + template.shape_basis.numpy().astype(np.float64) @ hand.betas
+    rest = rest + template.shape_basis.numpy().astype(np.float64) @ np.asarray(hand.rest.betas)
     # A vertex on a seam has several texture coordinates: one copy for each.
     pairs = np.stack((layout.faces.ravel(), layout.face_uv.ravel()), axis=1)
     kept, corners = np.unique(pairs, axis=0, return_inverse=True)
@@ -174,10 +164,18 @@ def _add_mesh(
     places, uv, weights = rest[vertex], layout.uv[texel], template.weights.numpy()[vertex]
     border = boundary_loop(layout.faces)
     if len(border):
-        cap = wrist_cap(rest[border], template.weights.numpy()[border], hand.texture)
-        corners = np.concatenate([corners.reshape(-1, 3), cap.faces + len(places)])
-        places = np.concatenate([places, cap.places])
-        uv, weights = np.concatenate([uv, cap.uv]), np.concatenate([weights, cap.weights])
+        # A fan around the middle closes the open end of the wrist. Its faces run against the
+        # edges of the skin, so that the surface has one outside.
+        count, skin = len(border), template.weights.numpy()[border]
+        own, following = np.arange(count), (np.arange(count) + 1) % count
+        fan = np.stack([following, own, np.full(count, count)], axis=1)
+        around = 2.0 * np.pi * own / count
+        circle = np.stack([np.cos(around), np.sin(around)], axis=1)
+        circle = np.concatenate([hand.texture.radius * circle, np.zeros((1, 2))])
+        corners = np.concatenate([corners.reshape(-1, 3), fan + len(places)])
+        places = np.concatenate([places, rest[border], rest[border].mean(axis=0, keepdims=True)])
+        uv = np.concatenate([uv, circle + hand.texture.cap])
+        weights = np.concatenate([weights, skin, skin.mean(axis=0, keepdims=True)])
     # glTF counts v from the top.
     uv = np.stack([uv[:, 0], 1.0 - uv[:, 1]], axis=1)
     numbers, shares = strongest(weights)
@@ -218,41 +216,6 @@ def _add_mesh(
     content["nodes"].append({"name": f"{side}_hand", "mesh": place, "skin": place})
 
 
-@dataclass(frozen=True, eq=False)
-class WristCap:
-    """What closes the open end of a wrist: a fan around its middle."""
-
-    #: (L + 1, 3) m, the border's vertices and their middle.
-    places: np.ndarray
-    #: (L + 1, 2) texture coordinates, origin at the bottom left.
-    uv: np.ndarray
-    #: (L + 1, 16) rows sum to 1.
-    weights: np.ndarray
-    #: (L, 3) counter-clockwise seen from outside.
-    faces: np.ndarray
-
-
-def wrist_cap(border: np.ndarray, weights: np.ndarray, texture: SkinTexture) -> WristCap:
-    """Close the open end of a wrist.
-
-    Args:
-        border: (L, 3) m, vertices around it in the direction of the faces' own edges.
-        weights: (L, 16) skinning weights.
-    """
-    count = len(border)
-    around = 2.0 * np.pi * np.arange(count) / count
-    circle = np.stack([np.cos(around), np.sin(around)], axis=1)
-    uv = np.concatenate([texture.radius * circle, np.zeros((1, 2))]) + texture.cap
-    own, following = np.arange(count), (np.arange(count) + 1) % count
-    return WristCap(
-        places=np.concatenate([border, border.mean(axis=0, keepdims=True)]),
-        uv=uv,
-        weights=np.concatenate([weights, weights.mean(axis=0, keepdims=True)]),
-        # Against the edges of the skin, so that the surface has one outside.
-        faces=np.stack([following, own, np.full(count, count)], axis=1),
-    )
-
-
 def _add_motion(
     made: GlbBuilder,
     clip: dict[str, Any],
@@ -283,10 +246,7 @@ def _add_motion(
 
 
 def strongest(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Keep the four largest weights of each vertex.
-
-    Args:
-        weights: (V, 16), rows sum to 1.
+    """Keep the four largest weights of each vertex, of (V, 16) whose rows sum to 1.
 
     Returns:
         (V, 4) uint8 joints and (V, 4) float32 weights that sum to 1; 0 stands at joint 0.

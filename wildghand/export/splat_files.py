@@ -13,7 +13,6 @@ import numpy as np
 
 from hwp_bench.base.errors import BadInput, UsageError
 from wildghand.avatar.avatar import PosedGaussians
-from wildghand.export.splats import SH_CONSTANT
 
 _TYPES = {(): "SCALAR", (2,): "VEC2", (3,): "VEC3", (4,): "VEC4", (4, 4): "MAT4"}
 _COMPONENTS = {"uint8": 5121, "uint16": 5123, "uint32": 5125, "float32": 5126}
@@ -22,14 +21,7 @@ ATTRIBUTES, INDICES, OTHER = 34962, 34963, None
 
 
 class GlbBuilder:
-    """Collects arrays and JSON of one glTF file.
-
-    Args:
-        generator: the program that writes it.
-
-    Attributes:
-        content: the JSON, to which the caller adds nodes, meshes and so on.
-    """
+    """Collects arrays and JSON of one glTF file; the caller adds nodes and so on to `content`."""
 
     def __init__(self, generator: str) -> None:
         asset = {"version": "2.0", "generator": generator}
@@ -39,9 +31,7 @@ class GlbBuilder:
     def array(self, values: np.ndarray, target: int | None = OTHER, *, bounds: bool = False) -> int:
         """Add an array and return the number of its accessor.
 
-        Args:
-            values: (N,), (N, 2), (N, 3), (N, 4) or (N, 4, 4) of a type that glTF has; matrices are
-                given by rows and kept by columns.
+        Matrices (N, 4, 4) are given by rows and kept by columns.
         """
         if not np.isfinite(values).all():
             raise BadInput(
@@ -103,19 +93,10 @@ OPACITIES = (1e-6, 1.0 - 1e-6)
 SMALLEST_SCALE = 1e-12
 
 
-def ply_bytes(
-    splats: PosedGaussians, comments: Sequence[str] = (), harmonics: np.ndarray | None = None
-) -> bytes:
-    """Return N Gaussians as binary little-endian PLY.
-
-    Args:
-        harmonics: (N, K, 3) of their colours (`wildghand.export.splats`); None: the colours of
-            the Gaussians in every direction.
-    """
+def ply_bytes(splats: PosedGaussians, harmonics: np.ndarray, comments: Sequence[str] = ()) -> bytes:
+    """Return N Gaussians as binary little-endian PLY, with the (N, K, 3) harmonics of colours."""
     count = len(splats)
     visible = np.clip(splats.opacities, *OPACITIES)
-    if harmonics is None:
-        harmonics = ((splats.colors - 0.5) / SH_CONSTANT)[:, None]
     rest = harmonics[:, 1:].transpose(0, 2, 1).reshape(count, 3 * (harmonics.shape[1] - 1))
     table = np.concatenate(
         (
@@ -148,12 +129,10 @@ _LOG_SCALES = (-10.0, 16.0)
 _SMALLEST_THREE = 511.0
 
 
-def spz_bytes(splats: PosedGaussians, harmonics: np.ndarray | None = None) -> bytes:
-    """Return N Gaussians as SPZ.
+def spz_bytes(splats: PosedGaussians, harmonics: np.ndarray) -> bytes:
+    """Return N Gaussians as SPZ, with the (N, K, 3) harmonics of their colours.
 
-    Args:
-        harmonics: (N, K, 3) of their colours (`wildghand.export.splats`); None: the colours of
-            the Gaussians in every direction. Those of degree 1 and more are cut to [-1, 1].
+    Those of degree 1 and more are cut to [-1, 1].
     """
     fixed = np.rint(splats.means.astype(np.float64) * 2**FRACTIONAL_BITS)
     if len(fixed) and np.abs(fixed).max() >= 2**23:
@@ -164,8 +143,6 @@ def spz_bytes(splats: PosedGaussians, harmonics: np.ndarray | None = None) -> by
         )
     places = fixed.astype("<i4").view(np.uint8).reshape(-1, 3, 4)[..., :3]
     opacities = _byte(255.0 * splats.opacities)
-    if harmonics is None:
-        harmonics = ((splats.colors - 0.5) / SH_CONSTANT)[:, None]
     degree = math.isqrt(harmonics.shape[1]) - 1
     colors = _byte(harmonics[:, 0] * (COLOR_SCALE * 255.0) + 127.5)
     others = _byte(harmonics[:, 1:] * 128.0 + 128.0)
@@ -178,13 +155,9 @@ def spz_bytes(splats: PosedGaussians, harmonics: np.ndarray | None = None) -> by
 
 
 def packed_rotations(quats: np.ndarray) -> np.ndarray:
-    """Pack unit quaternions: the three smallest components in 10 bits each, and which is missing.
+    """Pack unit quaternions (N, 4) into (N,) uint32.
 
-    Args:
-        quats: (N, 4), (w, x, y, z).
-
-    Returns:
-        (N,) uint32.
+    They hold the three smallest components in 10 bits each, and which one is missing.
     """
     # The format counts components x, y, z, w.
     turned = np.roll(quats.astype(np.float64), -1, axis=1)
@@ -210,16 +183,10 @@ def _byte(values: np.ndarray) -> np.ndarray:
 EXTENSION = "KHR_gaussian_splatting"
 
 
-def splat_glb_bytes(
-    splats: PosedGaussians, generator: str, harmonics: np.ndarray | None = None
-) -> bytes:
-    """Return N Gaussians as one primitive of points.
+def splat_glb_bytes(splats: PosedGaussians, harmonics: np.ndarray, generator: str) -> bytes:
+    """Return N Gaussians as one primitive of points, with the (N, K, 3) harmonics of colours.
 
     Programs that do not know the extension show coloured points.
-
-    Args:
-        harmonics: (N, K, 3) of their colours (`wildghand.export.splats`); None: the colours of
-            the Gaussians in every direction.
     """
     made = GlbBuilder(generator)
     colors = np.concatenate((splats.colors, splats.opacities[:, None]), axis=1).clip(0.0, 1.0)
@@ -229,8 +196,6 @@ def splat_glb_bytes(
         "ROTATION": quats / np.linalg.norm(quats, axis=1, keepdims=True),
         "OPACITY": splats.opacities,
     }
-    if harmonics is None:
-        harmonics = ((splats.colors - 0.5) / SH_CONSTANT)[:, None]
     for number in range(harmonics.shape[1]):
         degree = math.isqrt(number)
         own[f"SH_DEGREE_{degree}_COEF_{number - degree**2}"] = harmonics[:, number]
@@ -248,17 +213,12 @@ def splat_glb_bytes(
         "projection": "perspective",
         "sortingMethod": "cameraDistance",
     }
+    points = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kernel}}
     made.content |= {
         "extensionsUsed": [EXTENSION],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "name": "hand"}],
-        "meshes": [
-            {
-                "primitives": [
-                    {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: kernel}}
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [points]}],
     }
     return made.to_bytes()

@@ -74,12 +74,7 @@ class SeenGaussians:
     facing: np.ndarray
 
     def moved(self, turn: np.ndarray, shift: np.ndarray) -> SeenGaussians:
-        """The Gaussians after x -> turn x + shift, with their colours.
-
-        Args:
-            turn: (3, 3) rotation, or (N, 3, 3).
-            shift: (3,) m, or (N, 3).
-        """
+        """The Gaussians after x -> turn x + shift, one for all or each its own, with colours."""
         turns = np.broadcast_to(turn, (len(self.splats), 3, 3))
         spins = np.roll(Rotation.from_matrix(turns).as_quat(), 1, axis=1).astype(np.float32)
         quats = torch.from_numpy(self.splats.quats.astype(np.float32))
@@ -104,12 +99,7 @@ def standing(avatar: WildGHandAvatar, capture: Capture | None, frame: int) -> St
 def turned(
     avatar: WildGHandAvatar, hands: Mapping[str, HandPose], turn: np.ndarray, centre: np.ndarray
 ) -> dict[str, HandPose]:
-    """Hands after x -> turn (x - centre) + centre.
-
-    Args:
-        turn: (3, 3) rotation.
-        centre: (3,) m.
-    """
+    """Hands after x -> turn (x - centre) + centre."""
     made, rotation = {}, Rotation.from_matrix(turn)
     for side, hand in hands.items():
         pose = np.array(hand.pose, dtype=np.float64)
@@ -224,11 +214,7 @@ _SUPERSPLAT_TURN = 225.0
 
 
 def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
-    """Make Gaussians larger or smaller about the origin.
-
-    Args:
-        splats: the Gaussians, m.
-    """
+    """Make Gaussians larger or smaller about the origin."""
     require_scale(factor)
     with np.errstate(over="ignore"):
         made = replace(
@@ -237,11 +223,8 @@ def scaled(splats: PosedGaussians, factor: float) -> PosedGaussians:
             scales=(splats.scales.astype(np.float64) * factor).astype(np.float32),
         )
     if not (np.isfinite(made.means).all() and np.isfinite(made.scales).all()):
-        raise UsageError(
-            f"is {factor:g}, by which numbers become infinite",
-            field="--scale",
-            remedy="Use a smaller one.",
-        )
+        problem = f"is {factor:g}, by which numbers become infinite"
+        raise UsageError(problem, field="--scale", remedy="Use a smaller one.")
     return made
 
 

@@ -74,13 +74,15 @@ def baked(
         shares = shares[looked] * (covered >= _COVERED)
         total[looked] += shares[:, None] * colors
         weight[looked] += shares
-    rest, _ = _posed(avatar, front)
-    places = (rest[faces[face]] * mix[..., None]).sum(axis=1)
-    colors = _completed(places, total, weight)
-    image = np.zeros((size * size, 3), dtype=np.float64)
-    image[rows] = colors
-    skin = np.zeros(size * size, dtype=bool)
-    skin[rows] = True
+    shown = weight > 1e-6
+    colors = total / np.maximum(weight, 1e-6)[:, None]
+    if shown.any() and not shown.all():
+        rest, _ = _posed(avatar, front)
+        places = (rest[faces[face]] * mix[..., None]).sum(axis=1)
+        _, nearest = kd_tree(places[shown]).query(places[~shown], k=1)
+        colors[~shown] = colors[shown][nearest.reshape(-1)]
+    image, skin = np.zeros((size * size, 3)), np.zeros(size * size, dtype=bool)
+    image[rows], skin[rows] = colors.clip(0.0, 1.0), True
     return _with_cap(avatar, front, image.reshape(size, size, 3), skin.reshape(size, size))
 
 
@@ -145,32 +147,15 @@ def _read(rgba: np.ndarray, camera: Camera, places: np.ndarray) -> tuple[np.ndar
     pixel = places @ camera.K.T
     # OpenCV counts from the middle of the first pixel.
     pixel = (pixel[:, :2] / pixel[:, 2:] - 0.5).astype(np.float32)
-    read = np.zeros((0, 4), dtype=np.float32)
-    if len(places):
-        read = _sampled(rgba, pixel)
-    covered = read[:, 3]
-    return read[:, :3] / np.maximum(covered, 1e-6)[:, None], covered
-
-
-def _sampled(rgba: np.ndarray, pixel: np.ndarray) -> np.ndarray:
-    # OpenCV takes no table with a side above 32,767.
+    # OpenCV takes no table with a side above 32,767, and none without a row.
     width = 1024
-    padded = np.zeros((-(-len(pixel) // width) * width, 2), dtype=np.float32)
-    padded[: len(pixel)] = pixel
-    table = padded.reshape(-1, width, 2)
+    table = np.zeros((len(pixel) // width + 1, width, 2), dtype=np.float32)
+    table.reshape(-1, 2)[: len(pixel)] = pixel
     across, down = (np.ascontiguousarray(table[..., axis]) for axis in range(2))
     read = cv2.remap(rgba, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_CONSTANT)
-    return np.asarray(read.reshape(-1, 4)[: len(pixel)])
-
-
-def _completed(places: np.ndarray, total: np.ndarray, weight: np.ndarray) -> np.ndarray:
-    """(M, 3) means of what pictures show; where none does, that of the nearest skin."""
-    shown = weight > 1e-6
-    colors = total / np.maximum(weight, 1e-6)[:, None]
-    if shown.any() and not shown.all():
-        _, nearest = kd_tree(places[shown]).query(places[~shown], k=1)
-        colors[~shown] = colors[shown][nearest.reshape(-1)]
-    return colors.clip(0.0, 1.0)
+    read = read.reshape(-1, 4)[: len(pixel)]
+    covered = read[:, 3]
+    return read[:, :3] / np.maximum(covered, 1e-6)[:, None], covered
 
 
 def _with_cap(

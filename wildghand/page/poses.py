@@ -164,8 +164,12 @@ def fidelity(
     """Compare both forms with the avatar in frames of a capture; None without frames."""
     if not frames:
         return None
+
+    def mean_only(basis: PoseBasis) -> PoseBasis:
+        return replace(basis, steps=np.zeros_like(basis.steps))
+
     fixed = {
-        side: replace(hand, means=_mean_only(hand.means), colors=_mean_only(hand.colors))
+        side: replace(hand, means=mean_only(hand.means), colors=mean_only(hand.colors))
         for side, hand in hands.items()
     }
     errors: dict[str, list[float]] = {"baked": [], "joints_only": []}
@@ -182,12 +186,8 @@ def fidelity(
             errors[name].append(float(np.square(drawn[box] - truth[..., :3][box]).mean()))
     if not errors["baked"]:
         return None
-    return Fidelity(
-        **{
-            name: round(float(-10.0 * np.log10(np.mean(e) + 1e-12)), 2)
-            for name, e in errors.items()
-        }
-    )
+    means = {name: -10.0 * np.log10(np.mean(each) + 1e-12) for name, each in errors.items()}
+    return Fidelity(**{name: round(float(mean), 2) for name, mean in means.items()})
 
 
 def draw_baked(
@@ -202,17 +202,11 @@ def draw_baked(
     def single(array: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.asarray(array), dtype=torch.float32)
 
-    image, _, _ = rasterize(
-        single(means),
-        matrix_to_quat(single(axes)),
-        single(np.sqrt(power.clip(min=0.0))),
-        single(np.concatenate([hand.opacities for hand in hands.values()])),
-        single(colors),
-        single(camera.viewmat)[None],
-        single(camera.K)[None],
-        camera.width,
-        camera.height,
-    )
+    opacities = np.concatenate([hand.opacities for hand in hands.values()])
+    scales, quats = np.sqrt(power.clip(min=0.0)), matrix_to_quat(single(axes))
+    given = (single(means), quats, single(scales), single(opacities), single(colors))
+    cameras = single(camera.viewmat)[None], single(camera.K)[None]
+    image, _, _ = rasterize(*given, *cameras, camera.width, camera.height)
     return image[0].clamp(0.0, 1.0).numpy()
 
 
@@ -231,22 +225,14 @@ def still_image(avatar: WildGHandAvatar, samples: PoseSamples, size: int) -> byt
     return bytes(cv2.imencode(".png", np.rint(whole * 255.0).astype(np.uint8))[1])
 
 
-def _mean_only(basis: PoseBasis) -> PoseBasis:
-    return replace(basis, steps=np.zeros_like(basis.steps))
-
-
 @torch.no_grad()
 def mean_weights(
     avatar: WildGHandAvatar, capture: Capture, masks: Mapping[int, np.ndarray]
 ) -> dict[str, np.ndarray]:
-    """Average weight masks over the frames that show each Gaussian's anchor.
-
-    Args:
-        masks: (H, W) uint8 weights of some training frames, 255 = full weight.
+    """Average weight masks (255 = full weight) over the frames that show each Gaussian's anchor.
 
     Returns:
-        (N,) by side, in [0, 1]; NaN where no frame of `masks` shows the anchor. Empty without
-        masks.
+        (N,) by side, in [0, 1]; NaN where no frame shows the anchor. Empty without masks.
     """
     rigs = avatar.model.rigs
     sums = {side: np.zeros((2, len(rig))) for side, rig in rigs.items()}

@@ -262,8 +262,7 @@ def _by_frame(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:
         return []
     table = np.array([*avatar.record.temporal.values()])
     largest = table[np.abs(table).argmax(axis=0), np.arange(table.shape[1])]
-    found = dict(zip(avatar.record.frames, largest.tolist(), strict=True))
-    return [round(found[frame], 4) for frame in frames]
+    return _of_frames(avatar, largest.tolist(), frames)
 
 
 def _weights(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:
@@ -271,5 +270,12 @@ def _weights(avatar: WildGHandAvatar, frames: Sequence[int]) -> list[float]:
     weights = avatar.record.frame_weights
     if len(weights) != len(avatar.record.frames) or np.ptp(weights) < 1e-9:
         return []
-    found = dict(zip(avatar.record.frames, weights, strict=True))
+    return _of_frames(avatar, weights, frames)
+
+
+def _of_frames(
+    avatar: WildGHandAvatar, values: Sequence[float], frames: Sequence[int]
+) -> list[float]:
+    """Of values of all fitted frames those of some."""
+    found = dict(zip(avatar.record.frames, values, strict=True))
     return [round(found[frame], 4) for frame in frames]
