@@ -17,7 +17,6 @@ import sys
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextvars import ContextVar, Token
-from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Self, TextIO, TypeVar
 
 from hwp_bench.base.errors import shown
@@ -68,16 +67,10 @@ def expressed(text: str, encoding: str) -> str:
     try:
         text.encode(encoding)
     except UnicodeEncodeError:
-        return "".join(_expressed(char, encoding) for char in text)
+        if len(text) > 1:
+            return "".join(expressed(char, encoding) for char in text)
+        return _FORMS.get(text) or text.encode("ascii", "backslashreplace").decode("ascii")
     return text
-
-
-def _expressed(char: str, encoding: str) -> str:
-    try:
-        char.encode(encoding)
-    except UnicodeEncodeError:
-        return _FORMS.get(char) or char.encode("ascii", "backslashreplace").decode("ascii")
-    return char
 
 
 def print_document(text: str) -> None:
@@ -254,15 +247,10 @@ def progress(description: str, total: int) -> Iterator[Callable[[int], None]]:
             yield update
         return
     if not on_terminal(sys.stderr):
-        reached = 0
-
-        def reach(done: int) -> None:
-            nonlocal reached
-            reached = done
-
-        yield reach
+        reached = [0]
+        yield reached.append
         # Work may end early: by its budget, or because nothing gets better any more.
-        share = f"{total}" if reached == total else f"{reached} of {total}"
+        share = f"{total}" if reached[-1] == total else f"{reached[-1]} of {total}"
         notice(f"{description}: {share} in {time.perf_counter() - start:.1f} s")
         return
     with new_bars() as bars:
@@ -292,7 +280,8 @@ class JobsView:
         self._quiet = quiet
         self._bars = new_bars() if on_terminal(sys.stderr) and not quiet else None
         self._all: TaskID | None = None
-        self._running: dict[int, _Running] = {}
+        #: When each job that runs has begun, and its bar.
+        self._running: dict[int, tuple[float, TaskID | None]] = {}
         self._durations: list[float] = []
         self._count = self._ended = 0
         self._began = time.perf_counter()
@@ -343,9 +332,9 @@ class JobsView:
 
     def steps(self, index: int, done: int, total: int) -> None:
         """Say how far a job is."""
-        job = self._running.get(index)
-        if self._bars is not None and job is not None and job.task is not None:
-            update_bar(self._bars, job.task, job.began, done, total)
+        began, task = self._running.get(index, (0.0, None))
+        if self._bars is not None and task is not None:
+            update_bar(self._bars, task, began, done, total)
             self._update_all()
 
     def end(self, index: int, text: str, problem: str | None = None) -> None:
@@ -371,17 +360,18 @@ class JobsView:
 
     def drop(self, index: int) -> float | None:
         """Take a job out of the view; returns the seconds that it ran, None if it did not."""
-        job = self._running.pop(index, None)
-        if job is None:
+        if index not in self._running:
             return None
-        if job.task is not None and self._bars is not None:
-            self._bars.remove_task(job.task)
-        return time.perf_counter() - job.began
+        began, task = self._running.pop(index)
+        if task is not None and self._bars is not None:
+            self._bars.remove_task(task)
+        return time.perf_counter() - began
 
     def _add(self, index: int, text: str) -> None:
-        job = self._running[index] = _Running()
+        began, task = time.perf_counter(), None
         if self._bars is not None:
-            job.task = self._bars.add_task(f"  [{index + 1}] {text}", total=None, left="")
+            task = self._bars.add_task(f"  [{index + 1}] {text}", total=None, left="")
+        self._running[index] = began, task
         self._update_all()
 
     def _update_all(self) -> None:
@@ -390,17 +380,9 @@ class JobsView:
         left = remaining(self._durations, self._count - self._ended)
         if left is not None and self._running:
             now = time.perf_counter()
-            spent = sum(now - job.began for job in list(self._running.values()))
+            spent = sum(now - began for began, _ in list(self._running.values()))
             left = max(left - spent, 0.0) / len(self._running)
         self._bars.update(self._all, completed=self._ended, left=left_text(left))
-
-
-@dataclass
-class _Running:
-    """A job that runs."""
-
-    began: float = field(default_factory=lambda: time.perf_counter())
-    task: TaskID | None = None
 
 
 def new_bars() -> Progress:

@@ -43,12 +43,8 @@ class HwpError(Exception):
         self.where = None if where is None else os.fspath(where)
         self.field = field
         self.remedy = remedy
-        super().__init__(self._message())
-
-    def _message(self) -> str:
-        parts = [part for part in (self.where, self.field) if part]
-        head = ": ".join([*parts, self.problem])
-        return f"{head}. {self.remedy}" if self.remedy else head
+        head = ": ".join(part for part in (self.where, self.field, problem) if part)
+        super().__init__(f"{head}. {remedy}" if remedy else head)
 
 
 def reason_of(error: OSError) -> str:

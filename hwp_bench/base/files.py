@@ -310,7 +310,7 @@ def read_json(path: str | os.PathLike[str], *, max_bytes: int = MAX_JSON_BYTES) 
         text = _read_bounded(path, max_bytes).decode()
         value = json.loads(
             text,
-            parse_constant=_refuse_constant,
+            parse_constant=_finite,
             parse_float=_finite,
             parse_int=_bounded_int,
             object_pairs_hook=_table,
@@ -386,10 +386,6 @@ def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
             raise _RepeatedKey(name)
         table[name] = value
     return table
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not a JSON number")
 
 
 def _finite(text: str) -> float:

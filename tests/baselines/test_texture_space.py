@@ -20,16 +20,16 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from hwp_bench.sim.produce.suites import suite, suite_names
 from hwp_bench.sim.scene_files import load_scene
 from plain_fit.method import PlainMethod
-from texture_space_fit import build
 from texture_space_fit.method import SpaceMethod, SpaceRecipe, SpaceSettings
 from texture_space_fit.model import SpaceModel, to_srgb
 from texture_space_fit.skins import FILE, shipped_skins, skin_uv
+from tools import paint_skins as build
 from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.training import load_frames
 from wildghand.plain.recipe import Material
 
 ROOT = Path(__file__).resolve().parents[2]
-#: SHA-256 of the file that `python -m texture_space_fit.build` wrote.
+#: SHA-256 of the file that `tools/paint_skins.py` wrote.
 DIGEST = "0e261559ab9e1d26a1cd8e8b7f1c9d3c4ebaeabe1e0fd945b7c2e7a62dc759d8"
 
 

@@ -25,6 +25,7 @@ from wildghand.avatar.studio import REST, Pose, Studio
 from wildghand.gaussians.hand_avatar import HandAvatar, PosedHands
 from wildghand.model.model import WildGHandModel
 from wildghand.model.settings import WildGHandSettings
+from wildghand.splat import rasterize
 from wildghand.splat.threads import denormals_flushed
 
 #: Frames of a turn, and milliseconds of each.
@@ -166,6 +167,18 @@ class PosedGaussians:
                 problem = f"hold {bad:,} numbers that are NaN or infinite"
                 remedy = "The avatar is damaged, or a pose or scale is out of range"
                 raise BadInput(problem, field=item.name, remedy=f"{remedy}; nothing is written.")
+
+
+@denormals_flushed()
+@torch.no_grad()
+def splat(posed: PosedGaussians, camera: Camera, device: str = "cpu") -> np.ndarray:
+    """Draw Gaussians as they are: (H, W, 4) float32, as `WildGHandAvatar.render` gives it."""
+    given = (posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
+    arrays = (*given, camera.viewmat[None], camera.K[None])
+    tensors = (torch.as_tensor(each, dtype=torch.float32, device=device) for each in arrays)
+    colors, coverage, _ = rasterize(*tensors, camera.width, camera.height)
+    rgba = torch.cat((colors, coverage), dim=-1)[0]
+    return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
 
 
 class WildGHandAvatar(HandAvatar):

@@ -15,12 +15,12 @@ from hwp_bench.base.errors import UsageError
 from hwp_bench.capture import Capture
 from hwp_bench.hands import anatomical_limits, load_template, pose_from_joint_angles
 from hwp_bench.methods.contract import Camera, HandPose
-from wildghand.avatar import WildGHandAvatar
+from wildghand.avatar import PosedGaussians, WildGHandAvatar
+from wildghand.avatar.avatar import splat
 from wildghand.avatar.render import shown_sides
 from wildghand.evidence.count import seen_anchors
 from wildghand.gaussians.quaternions import matrix_to_quat
 from wildghand.page.bake import BakedHand, PoseBasis
-from wildghand.splat import rasterize
 
 
 @dataclass(frozen=True)
@@ -199,15 +199,10 @@ def draw_baked(
     power, axes = np.linalg.eigh(covariances)
     axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0
 
-    def single(array: np.ndarray) -> torch.Tensor:
-        return torch.as_tensor(np.asarray(array), dtype=torch.float32)
-
     opacities = np.concatenate([hand.opacities for hand in hands.values()])
-    scales, quats = np.sqrt(power.clip(min=0.0)), matrix_to_quat(single(axes))
-    given = (single(means), quats, single(scales), single(opacities), single(colors))
-    cameras = single(camera.viewmat)[None], single(camera.K)[None]
-    image, _, _ = rasterize(*given, *cameras, camera.width, camera.height)
-    return image[0].clamp(0.0, 1.0).numpy()
+    quats = matrix_to_quat(torch.as_tensor(axes, dtype=torch.float32)).numpy()
+    scales = np.sqrt(power.clip(min=0.0))
+    return splat(PosedGaussians(means, quats, scales, opacities, colors), camera)[..., :3]
 
 
 def still_image(avatar: WildGHandAvatar, samples: PoseSamples, size: int) -> bytes:

@@ -14,17 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import torch
 from scipy.spatial.transform import Rotation
 
 from hwp_bench.capture import Capture
 from hwp_bench.capture.schema import METADATA
 from hwp_bench.methods.contract import Camera, HandPose
-from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar, over
+from wildghand.avatar.avatar import PosedGaussians, WildGHandAvatar, over, splat
 from wildghand.avatar.render import shown_sides
 from wildghand.avatar.studio import HandAngles
-from wildghand.splat import rasterize
-from wildghand.splat.threads import denormals_flushed
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,20 +252,8 @@ class PosedView:
         if self._posed is None or self._posed[0] is not hands:
             self._posed = hands, self.avatar.pose(hands, closed=True)
         entered = time.perf_counter()
-        image = over(self._rasterized(self._posed[1], camera), background)
+        image = over(splat(self._posed[1], camera, self.avatar.device), background)
         return Picture(image, True, time.perf_counter() - entered, entered - began)
-
-    @denormals_flushed()
-    @torch.no_grad()
-    def _rasterized(self, posed: PosedGaussians, camera: Camera) -> np.ndarray:
-        """(H, W, 4) float32, as `WildGHandAvatar.render` gives it."""
-        given = (posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
-        arrays = (*given, camera.viewmat[None], camera.K[None])
-        device = torch.device(self.avatar.device)
-        tensors = (torch.as_tensor(each, dtype=torch.float32, device=device) for each in arrays)
-        colors, coverage, _ = rasterize(*tensors, camera.width, camera.height)
-        rgba = torch.cat((colors, coverage), dim=-1)[0]
-        return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
 
     def set_angle(self, side: str, joint: int, angle: int, degrees: float) -> None:
         """Change an angle, cut to the range of the joint; everything else stays."""

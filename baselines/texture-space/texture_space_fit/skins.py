@@ -14,7 +14,7 @@ from hwp_bench.base.errors import BadInput
 from hwp_bench.hands import HandTemplate, SurfaceAnchors, anchor_uv, load_template
 from wildghand.network.surface import bilinear_taps, mirrored_anchors
 
-#: Where `texture_space_fit.build` put it.
+#: What `tools/paint_skins.py` made.
 FILE = Path(__file__).with_name("skins.npz")
 _MOST_BYTES = 64 * 1024 * 1024
 
