@@ -155,7 +155,7 @@ def test_an_exposure_is_the_mean_of_its_moments(make_training: TrainingMaker) ->
 def test_a_sharp_hand_comes_out_of_blurred_frames(tmp_path: Path) -> None:
     """Training frames are means over up to 6 px; the plain fit must miss by 1 dB at least."""
     training, capture = exposed_training(tmp_path)
-    settings = {**QUICK, "gaussians": 1500, "steps": 250}
+    settings = {**QUICK, "gaussians": 1500, "steps": 150}
     plain = PlainMethod(settings, 0).fit(training, Budget(), SilentReport())
     sharp = ExposureMethod({**settings, "shutter": 1.0}, 0).fit(training, Budget(), SilentReport())
     scores = [masked_psnr(one, training, capture) for one in (plain, sharp)]

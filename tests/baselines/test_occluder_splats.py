@@ -26,7 +26,7 @@ from plain_fit.method import PlainMethod
 from wildghand.gaussians.training import load_frames
 from wildghand.plain.recipe import Batch, Material
 
-STEPS = 400
+STEPS = 250
 
 
 def test_one_occluder_is_the_gaussian_of_its_numbers() -> None:

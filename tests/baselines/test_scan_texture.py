@@ -40,7 +40,7 @@ from wildghand.gaussians.training import load_frames
 from wildghand.plain.recipe import Material
 
 #: A texture that is fine enough for the small captures of these tests.
-SMALL = {**QUICK, "gaussians": 1500, "texture_size": 64, "steps": 200}
+SMALL = {**QUICK, "gaussians": 1500, "texture_size": 64, "steps": 140}
 
 
 @given(st.integers(1, 9), st.integers(0, 2**31))
@@ -143,7 +143,7 @@ def test_a_lamp_that_moves_with_the_camera_is_a_shadow_of_the_view(tmp_path: Pat
     scores = [
         masked_psnr(method.fit(training, Budget(), SilentReport()), training, capture)
         for method in (
-            PlainMethod({**QUICK, "gaussians": 1500, "steps": 200}, 0),
+            PlainMethod({**QUICK, "gaussians": 1500, "steps": 140}, 0),
             ScanMethod(SMALL, 0),
         )
     ]

@@ -186,7 +186,7 @@ def test_shadows_that_move_with_the_pose_are_predicted(tmp_path: Path) -> None:
         capture = formed_capture(tmp_path / "lit", hand, picture)
     assert capture.info.frame_count == FRAMES
     training = training_of(capture, tmp_path / "request")
-    settings = {**QUICK, "gaussians": 1200, "steps": 300}
+    settings = {**QUICK, "gaussians": 1200, "steps": 160}
     plain = PlainMethod(settings, 0).fit(training, Budget(), SilentReport())
     lit = ShadowMethod(settings, 0).fit(training, Budget(), SilentReport())
     unshaded = ShadowMethod({**settings, "shadows": False}, 0).fit(
