@@ -391,7 +391,8 @@ def _table(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
 def _finite(text: str) -> float:
     number = float(text)
     if not math.isfinite(number):
-        raise ValueError(f"{text[:20]} is too large a number")
+        what = "too large a number" if text[-1].isdigit() else "not a JSON number"
+        raise ValueError(f"{text[:20]} is {what}")
     return number
 
 
