@@ -259,8 +259,8 @@ def _expected(kind: Any, metas: tuple[Any, ...]) -> str:
     sides = {"ge": "at least", "gt": "above", "le": "at most", "lt": "below"}
     # The bounds of `_without_denormals` and of every float are no words.
     strict = {("ge", _LEAST): ("gt", 0.0), ("le", -_LEAST): ("lt", 0.0)}
-    found = [strict.get(item, item) for item in rules.items() if abs(item[1]) < _LARGEST]
-    limits = dict(sorted(found, key=lambda item: list(sides).index(item[0]) // 2))
+    found = (strict.get(item, item) for item in rules.items() if abs(item[1]) < _LARGEST)
+    limits: dict[str, float] = dict(found)
     if {"ge", "le"} == limits.keys():
         return f"{words[kind]} from {limits['ge']:g} to {limits['le']:g}"
     bounds = " and ".join(f"{sides[name]} {value:g}" for name, value in limits.items())

@@ -22,7 +22,7 @@ from painted import (
 from scipy.spatial.transform import Rotation
 
 from exposure_fit.method import ExposureMethod, ExposureRecipe
-from exposure_fit.motion import motion_px, nearest_turn, pose_velocities, velocities
+from exposure_fit.motion import motion_px, nearest_turn, velocities
 from hwp_bench.capture import Capture
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget, TrainingCapture
@@ -60,7 +60,7 @@ def test_a_jump_by_a_whole_turn_is_no_motion() -> None:
     axis = np.array([0.6, 0.0, 0.8])
     wrapped = np.where(angles > math.pi, angles - 2.0 * math.pi, angles)
     pose = wrapped[:, None, None] * axis
-    speeds = pose_velocities(pose, np.ones(6, dtype=bool), np.arange(6))
+    speeds = velocities(pose, np.ones(6, dtype=bool), np.arange(6), turns=True)
     np.testing.assert_allclose(speeds, np.broadcast_to(0.1 * axis, (6, 1, 3)), atol=1e-12)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 import dataclasses
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -24,7 +24,6 @@ from wildghand.page.bake import BakedHand, FrameBiases, PoseBasis, bake_biases, 
 from wildghand.page.poses import (
     Fidelity,
     PageSettings,
-    PoseSamples,
     fidelity,
     hand_controls,
     mean_weights,
@@ -102,11 +101,50 @@ def write_page(
         for side, baked in hands.items()
     }
     weights = {} if capture is None else mean_weights(avatar, capture, avatar.weight_masks)
-    html = _html(avatar, hands, samples, measured, settings, biases, weights)
+    content = {
+        "hands": [
+            {
+                **_hand(baked),
+                **hand_controls(avatar, side),
+                "seen": _seen(avatar, side, len(baked)),
+                "biases": _biases(biases[side]),
+                "trusted": _trusted(weights.get(side), len(baked)),
+                "side": side,
+                "start": samples.start[side].pose.tolist(),
+                "transl": samples.start[side].transl.tolist(),
+                "motion": _pack(samples.motion[side].astype("<f4")),
+            }
+            for side, baked in hands.items()
+        ],
+        "viewmat": samples.viewmat.tolist(),
+        "fps": samples.fps,
+        "frames": samples.frames,
+        "omega": _by_frame(avatar, samples.frames),
+        "weights": _weights(avatar, samples.frames),
+    }
+    record, count = avatar.record, sum(len(baked) for baked in hands.values())
+    steps = f"{record.steps:,} steps"
+    if record.chosen_steps is not None:
+        steps = f"the state of step {record.chosen_steps:,} of {record.steps:,}"
+    facts = [f"{count:,} Gaussians", f"{steps} on {len(record.frames)} frames"]
+    if measured is not None:
+        facts.append(f"{measured.baked:.1f} dB from the avatar's own drawing")
+    still = base64.b64encode(still_image(avatar, samples, settings.still_size)).decode()
+    html = render_template(
+        "wildghand.page",
+        "avatar.html.j2",
+        title=f"{' and '.join(avatar.sides).capitalize()} hand",
+        source=str(record.source.get("capture", ""))[:80],
+        facts=", ".join(facts),
+        still=f"data:image/png;base64,{still}",
+        style=_text("style.css"),
+        scripts=[_text(name) for name in _SCRIPTS],
+        content=content,
+    )
     atomic_write(out, html, overwrite=overwrite, flag="--overwrite")
     return PageFacts(
         bytes=len(html.encode()),
-        gaussians=sum(len(baked) for baked in hands.values()),
+        gaussians=count,
         frames=len(samples.frames),
         fidelity=measured,
     )
@@ -130,57 +168,6 @@ def show_page(avatar: WildGHandAvatar, *, size: int = 320) -> InlinePicture:
         path = Path(folder) / "avatar.html"
         write_page(avatar, path)
         return dataclasses.replace(picture, page=path.read_text("utf-8"))
-
-
-def _html(
-    avatar: WildGHandAvatar,
-    hands: Mapping[str, BakedHand],
-    samples: PoseSamples,
-    measured: Fidelity | None,
-    settings: PageSettings,
-    biases: Mapping[str, FrameBiases | None],
-    weights: Mapping[str, np.ndarray],
-) -> str:
-    still = still_image(avatar, samples, settings.still_size)
-    content = {
-        "hands": [
-            {
-                **_hand(baked),
-                **hand_controls(avatar, side),
-                "seen": _seen(avatar, side, len(baked)),
-                "biases": _biases(biases[side]),
-                "trusted": _trusted(weights.get(side), len(baked)),
-                "side": side,
-                "start": samples.start[side].pose.tolist(),
-                "transl": samples.start[side].transl.tolist(),
-                "motion": _pack(samples.motion[side].astype("<f4")),
-            }
-            for side, baked in hands.items()
-        ],
-        "viewmat": samples.viewmat.tolist(),
-        "fps": samples.fps,
-        "frames": samples.frames,
-        "omega": _by_frame(avatar, samples.frames),
-        "weights": _weights(avatar, samples.frames),
-    }
-    facts = [f"{sum(len(baked) for baked in hands.values()):,} Gaussians"]
-    steps = f"{avatar.record.steps:,} steps"
-    if avatar.record.chosen_steps is not None:
-        steps = f"the state of step {avatar.record.chosen_steps:,} of {avatar.record.steps:,}"
-    facts.append(f"{steps} on {len(avatar.record.frames)} frames")
-    if measured is not None:
-        facts.append(f"{measured.baked:.1f} dB from the avatar's own drawing")
-    return render_template(
-        "wildghand.page",
-        "avatar.html.j2",
-        title=f"{' and '.join(avatar.sides).capitalize()} hand",
-        source=str(avatar.record.source.get("capture", ""))[:80],
-        facts=", ".join(facts),
-        still=f"data:image/png;base64,{base64.b64encode(still).decode()}",
-        style=_text("style.css"),
-        scripts=[_text(name) for name in _SCRIPTS],
-        content=content,
-    )
 
 
 def _text(name: str) -> Markup:

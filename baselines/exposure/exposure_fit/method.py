@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import torch
 
-from exposure_fit.motion import motion_px, pose_velocities, velocities
+from exposure_fit.motion import motion_px, velocities
 from hwp_bench.methods.settings import number
 from wildghand.gaussians.rig import CHUNK, AnchorPoses
 from wildghand.gaussians.training import join_hands
@@ -45,7 +45,7 @@ class ExposureRecipe(PlainRecipe[ExposureSettings]):
         self.ends: dict[str, torch.Tensor] = {}
         for side in self.model.rigs:
             hand = material.training.hands[side]
-            turning = pose_velocities(hand.pose, hand.valid, indices)
+            turning = velocities(hand.pose, hand.valid, indices, turns=True)
             going = velocities(hand.transl, hand.valid, indices)
             for name, speed in (("pose", turning), ("transl", going)):
                 speeds = torch.as_tensor(speed, dtype=torch.float32)[:, None]

@@ -21,59 +21,36 @@ def nearest_turn(pose: np.ndarray, to: np.ndarray) -> np.ndarray:
     return np.take_along_axis(candidates, choice[None], axis=0)[0]
 
 
-def velocities(values: np.ndarray, valid: np.ndarray, indices: np.ndarray) -> np.ndarray:
+def velocities(
+    values: np.ndarray, valid: np.ndarray, indices: np.ndarray, *, turns: bool = False
+) -> np.ndarray:
     """Change of numbers from frame to frame by the difference of the valid neighbours.
 
     Args:
         values: (F, ..., C) of every frame of a clip.
         valid: (F,) bool.
         indices: (R,) valid frames.
+        turns: they are axis-angle vectors, whose jumps by a whole turn are none.
 
     Returns:
         (R, ..., C) per frame; from one side where the other is missing, 0 where both are.
     """
-    made = np.zeros_like(values[indices])
-    for row, frame in enumerate(indices.tolist()):
-        before, after = frame, frame
-        if frame > 0 and valid[frame - 1]:
-            before = frame - 1
-        if frame + 1 < len(values) and valid[frame + 1]:
-            after = frame + 1
-        if after > before:
-            made[row] = (values[after] - values[before]) / (after - before)
-    return made
-
-
-def pose_velocities(pose: np.ndarray, valid: np.ndarray, indices: np.ndarray) -> np.ndarray:
-    """`velocities` of axis-angle vectors, free of jumps by a whole turn.
-
-    Args:
-        pose: (F, J, 3) rad.
-
-    Returns:
-        (R, J, 3) rad per frame.
-    """
-    made = np.zeros_like(pose[indices])
-    for row, frame in enumerate(indices.tolist()):
-        first, last = max(0, frame - 1), min(len(pose), frame + 2)
-        near = nearest_turn(pose[first:last], pose[frame])
-        made[row] = velocities(near, valid[first:last], np.array([frame - first]))[0]
-    return made
+    last = len(values) - 1
+    before = indices - ((indices > 0) & valid[indices - 1])
+    after = indices + ((indices < last) & valid[np.minimum(indices + 1, last)])
+    first, second = values[before], values[after]
+    if turns:
+        first, second = (nearest_turn(pose, values[indices]) for pose in (first, second))
+    steps = np.maximum(after - before, 1)
+    return (second - first) / steps.reshape(-1, *[1] * (values.ndim - 1))
 
 
 def motion_px(
     start: torch.Tensor, end: torch.Tensor, viewmats: torch.Tensor, Ks: torch.Tensor
 ) -> torch.Tensor:
-    """How far points move in the image: the distance that a twentieth of them exceeds.
+    """How far points (B, N, 3) in the world move in the image, (B,) px; 0 behind the camera.
 
-    Args:
-        start: (B, N, 3) m, world, when the shutter opens.
-        end: (B, N, 3) m, when it closes.
-        viewmats: (B, 4, 4) world to camera.
-        Ks: (B, 3, 3) px.
-
-    Returns:
-        (B,) px; 0 for points behind the camera.
+    It is the distance that a twentieth of them exceeds.
     """
     places = []
     for points in (start, end):
