@@ -21,8 +21,7 @@ from painted import (
 )
 from scipy.spatial.transform import Rotation
 
-from exposure_fit.method import ExposureMethod, ExposureRecipe
-from exposure_fit.motion import motion_px, nearest_turn, velocities
+from exposure_fit.method import ExposureMethod, ExposureRecipe, motion_px, nearest_turn, velocities
 from hwp_bench.capture import Capture
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget, TrainingCapture

@@ -20,8 +20,14 @@ from painted import (
 )
 
 from hwp_bench.methods.contract import Budget
-from occluder_splats_fit.method import OccluderMethod, OccluderRecipe
-from occluder_splats_fit.occluders import DISTANCE, FrameOccluders, make_occluders, mask_boxes
+from occluder_splats_fit.method import (
+    DISTANCE,
+    FrameOccluders,
+    OccluderMethod,
+    OccluderRecipe,
+    make_occluders,
+    mask_boxes,
+)
 from plain_fit.method import PlainMethod
 from wildghand.gaussians.training import load_frames
 from wildghand.plain.recipe import Batch, Material

@@ -12,12 +12,12 @@ from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Avatar, Budget, TrainingCapture
 from one_shot_prior_fit.method import (
     HALVED_AFTER,
+    OneShotModel,
     OneShotRecipe,
     OneShotSettings,
     choose_frame,
     only,
 )
-from one_shot_prior_fit.model import OneShotModel
 from wildghand.gaussians.training import TrainingFrames, load_frames
 from wildghand.plain.loop import run_fit
 from wildghand.plain.recipe import FitSettings, Material, PlainRecipe

@@ -32,9 +32,16 @@ from hwp_bench.capture.reader import open_capture
 from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget
 from plain_fit.method import PlainMethod
-from scan_texture_fit.method import ScanMethod, ScanRecipe, total_variation
-from scan_texture_fit.model import ScanSettings, _two_columns
-from scan_texture_fit.unwrap import nearest_anchor, read_pixels, weighted_median
+from scan_texture_fit.method import (
+    ScanMethod,
+    ScanRecipe,
+    ScanSettings,
+    _two_columns,
+    nearest_anchor,
+    read_pixels,
+    total_variation,
+    weighted_median,
+)
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.training import load_frames
 from wildghand.plain.recipe import Material

@@ -27,8 +27,7 @@ from hwp_bench.hands.skeleton import HandParameters
 from hwp_bench.methods.contract import Budget
 from hwp_bench.sim.geometry.rays import Tracer
 from plain_fit.method import PlainMethod
-from shadow_albedo_fit.method import ShadowMethod
-from shadow_albedo_fit.model import ShadowedModel, lamp_cameras, visibility
+from shadow_albedo_fit.method import ShadowedModel, ShadowMethod, lamp_cameras, visibility
 from wildghand.gaussians.quaternions import quat_third_axis
 from wildghand.gaussians.rig import AnchorPoses, HandRig
 from wildghand.plain.model import PlainModel

@@ -20,9 +20,16 @@ from hwp_bench.methods.contract import Budget, TrainingCapture
 from hwp_bench.sim.produce.suites import suite, suite_names
 from hwp_bench.sim.scene_files import load_scene
 from plain_fit.method import PlainMethod
-from texture_space_fit.method import SpaceMethod, SpaceRecipe, SpaceSettings
-from texture_space_fit.model import SpaceModel, to_srgb
-from texture_space_fit.skins import FILE, shipped_skins, skin_uv
+from texture_space_fit.method import (
+    FILE,
+    SpaceMethod,
+    SpaceModel,
+    SpaceRecipe,
+    SpaceSettings,
+    shipped_skins,
+    skin_uv,
+    to_srgb,
+)
 from tools import paint_skins as build
 from wildghand.gaussians.rig import make_rig
 from wildghand.gaussians.training import load_frames

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from trimmed_fit.inliers import BINS, ErrorHistogram, chance_of_all, find_inliers, pixel_errors
+from trimmed_fit.method import BINS, ErrorHistogram, chance_of_all, find_inliers, pixel_errors
 
 
 @given(

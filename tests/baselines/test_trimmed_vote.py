@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from trimmed_fit.inliers import (
+from trimmed_fit.method import (
     DIRECTIONS,
     FEATURES,
     LOOK,

@@ -9,8 +9,10 @@ import torch
 from painted import QUICK, TrainingMaker
 from torch.distributions import Laplace, Normal
 
-from wild_fit.frames import (
+from wild_fit.method import (
     OCTAVES,
+    WildMethod,
+    WildRecipe,
     after_drawing,
     appear,
     before_drawing,
@@ -20,7 +22,6 @@ from wild_fit.frames import (
     places_at_rest,
     start_appearance,
 )
-from wild_fit.method import WildMethod, WildRecipe
 from wildghand.gaussians.training import load_frames
 from wildghand.plain.recipe import Batch, Material
 
