@@ -15,13 +15,14 @@ from hwp_bench.hands import load_template
 from wildghand.avatar.avatar import WildGHandAvatar
 from wildghand.avatar.render import shown_sides
 from wildghand.export.mesh import (
+    SIZE,
     SkinnedHand,
+    baked,
     capture_motion,
     closing_motion,
     require_skinning,
     skinned_glb_bytes,
 )
-from wildghand.export.splat_files import ply_bytes, splat_glb_bytes, spz_bytes
 from wildghand.export.splats import (
     HALF_TURN,
     MAX_DEGREE,
@@ -29,12 +30,14 @@ from wildghand.export.splats import (
     for_supersplat,
     harmonics,
     laid_to_rest,
+    ply_bytes,
     require_scale,
     scaled,
     seen,
+    splat_glb_bytes,
+    spz_bytes,
     standing,
 )
-from wildghand.export.texture import SIZE, baked
 
 #: Content by extension.
 FORMATS = {

@@ -33,14 +33,15 @@ from wildghand.avatar.files import save_avatar
 from wildghand.cli.main import main
 from wildghand.export.formats import FORMATS, ExportSettings, export
 from wildghand.export.mesh import quaternions, strongest
-from wildghand.export.splat_files import (
+from wildghand.export.splats import (
     FRACTIONAL_BITS,
+    SH_CONSTANT,
     GlbBuilder,
     packed_rotations,
     ply_bytes,
+    scaled,
     spz_bytes,
 )
-from wildghand.export.splats import SH_CONSTANT, scaled
 
 
 @pytest.fixture(scope="module")
@@ -238,7 +239,7 @@ def attribute(made: pygltflib.GLTF2, name: str) -> np.ndarray:
 @pytest.mark.slow
 def test_a_glb_of_gaussians_is_the_one_that_splat_transform_writes(tmp_path: Path) -> None:
     """Both files are made of the same Gaussians and hold the same arrays."""
-    from wildghand.export.splat_files import EXTENSION, splat_glb_bytes
+    from wildghand.export.splats import EXTENSION, splat_glb_bytes
 
     splats = some_splats()
     mine, theirs = tmp_path / "mine.glb", tmp_path / "theirs.glb"

@@ -25,7 +25,7 @@ from wildghand.fitting.fit import Batch
 from wildghand.model.settings import read_settings
 from wildghand.page import bake_hand, write_page
 from wildghand.page.bake import bake_biases
-from wildghand.page.poses import PageSettings, mean_weights
+from wildghand.page.write import PageSettings, mean_weights
 from wildghand.splat import rasterize
 
 QUICK: dict[str, Any] = {**TINY, "gaussians": 600}

@@ -27,8 +27,8 @@ from wildghand.viewer.posed_view import (
     shown_angles,
     viewpoint,
 )
-from wildghand.viewer.screen import LEAST, MOST, TARGET, Pace
 from wildghand.viewer.server import refusal
+from wildghand.viewer.view import LEAST, MOST, TARGET, Pace
 
 
 def psnr(first: np.ndarray, second: np.ndarray) -> float:
