@@ -175,9 +175,13 @@ def splat(posed: PosedGaussians, camera: Camera, device: str = "cpu") -> np.ndar
     """Draw Gaussians as they are: (H, W, 4) float32, as `WildGHandAvatar.render` gives it."""
     given = (posed.means, posed.quats, posed.scales, posed.opacities, posed.colors)
     arrays = (*given, camera.viewmat[None], camera.K[None])
-    tensors = (torch.as_tensor(each, dtype=torch.float32, device=device) for each in arrays)
-    colors, coverage, _ = rasterize(*tensors, camera.width, camera.height)
-    rgba = torch.cat((colors, coverage), dim=-1)[0]
+    means, quats, scales, opacities, colors, viewmats, Ks = (
+        torch.as_tensor(each, dtype=torch.float32, device=device) for each in arrays
+    )
+    image, coverage, _ = rasterize(
+        means, quats, scales, opacities, colors, viewmats, Ks, camera.width, camera.height
+    )
+    rgba = torch.cat((image, coverage), dim=-1)[0]
     return rgba.clamp(0.0, 1.0).nan_to_num(0.0).cpu().numpy()
 
 

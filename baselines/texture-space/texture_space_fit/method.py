@@ -233,8 +233,8 @@ class SpaceRecipe(Recipe[SpaceSettings]):
             for side, template in templates.items()
         }
         uv = {side: skin_uv(templates[side], rig.anchors) for side, rig in rigs.items()}
-        color = srgb_to_linear(material.frames.mean_color().numpy())
-        color = torch.as_tensor(color, dtype=torch.float32, device=device)
+        linear = srgb_to_linear(material.frames.mean_color().numpy())
+        color = torch.as_tensor(linear, dtype=torch.float32, device=device)
         self.model = SpaceModel(rigs, uv, shipped_skins(), color)
         self.clip = TrainingClip(training, material.frames.indices, rigs, device)
 
