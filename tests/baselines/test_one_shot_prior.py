@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import torch
+from fitted_parts import material_of
 from painted import SilentReport, TrainingMaker, masked_psnr
 
 from hwp_bench.capture import Capture
@@ -18,16 +19,12 @@ from one_shot_prior_fit.method import (
     choose_frame,
     only,
 )
-from wildghand.gaussians.training import TrainingFrames, load_frames
+from wildghand.gaussians.training import TrainingFrames
 from wildghand.plain.loop import run_fit
-from wildghand.plain.recipe import FitSettings, Material, PlainRecipe
+from wildghand.plain.recipe import FitSettings, PlainRecipe
 
 CPU = torch.device("cpu")
 SMALL = OneShotSettings(gaussians=500, steps=3, device="cpu")
-
-
-def material_of(training: TrainingCapture) -> Material:
-    return Material(training, load_frames(training), 0, CPU)
 
 
 def test_one_palm_tells_the_prior_what_the_back_is_like(

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
-from painted import QUICK, SilentReport, TrainingMaker, masked_psnr
+from fitted_parts import scores_of
+from painted import QUICK, SilentReport, TrainingMaker
 
 from hwp_bench.capture import Capture
 from hwp_bench.methods import find_method, read_manifest
@@ -52,8 +53,7 @@ def test_an_object_before_the_hand_is_left_out_by_rules_and_by_the_vote(
 
     def score(method: type[RecipeMethod], settings: Mapping[str, Any]) -> float:
         training = with_an_object(make_training())
-        avatar = method({**SETTINGS, **settings}, 0).fit(training, Budget(), SilentReport())
-        return masked_psnr(avatar, training, make_painted("right"))
+        return scores_of(training, make_painted("right"), method({**SETTINGS, **settings}, 0))[0]
 
     plain = score(PlainMethod, {})
     assert score(TrimmedMethod, {}) > plain + 1.5

@@ -6,13 +6,13 @@ from collections.abc import Callable
 
 import numpy as np
 import torch
-from painted import QUICK, SilentReport, TrainingMaker, masked_psnr
+from fitted_parts import scores_of
+from painted import QUICK, SilentReport, TrainingMaker
 
 from hwp_bench.capture import Capture
 from hwp_bench.methods.contract import Budget, TrainingCapture
 from plain_fit.method import PlainMethod
 from wild_fit.method import WildMethod
-from wildghand.plain.recipe import RecipeMethod
 
 SETTINGS = {**QUICK, "steps": 150}
 
@@ -33,13 +33,10 @@ def test_another_light_is_told_from_the_hand(
     make_training: TrainingMaker, make_painted: Callable[[str], Capture]
 ) -> None:
     """It costs the plain fit some 10 dB; 2.5 dB must come back."""
-    scores = {}
-    methods: tuple[type[RecipeMethod], ...] = (PlainMethod, WildMethod)
-    for method in methods:
-        training = under_another_light(make_training())
-        avatar = method(SETTINGS, 0).fit(training, Budget(), SilentReport())
-        scores[method] = masked_psnr(avatar, training, make_painted("right"))
-    assert scores[WildMethod] > scores[PlainMethod] + 2.5
+    training = under_another_light(make_training())
+    methods = PlainMethod(SETTINGS, 0), WildMethod(SETTINGS, 0)
+    scores = scores_of(training, make_painted("right"), *methods)
+    assert scores[1] > scores[0] + 2.5, scores
 
 
 def test_the_same_seed_gives_the_same_picture(make_training: TrainingMaker) -> None:

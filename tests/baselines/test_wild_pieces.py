@@ -6,6 +6,7 @@ import math
 
 import pytest
 import torch
+from fitted_parts import batch_of, material_of
 from painted import QUICK, TrainingMaker
 from torch.distributions import Laplace, Normal
 
@@ -22,8 +23,6 @@ from wild_fit.method import (
     places_at_rest,
     start_appearance,
 )
-from wildghand.gaussians.training import load_frames
-from wildghand.plain.recipe import Batch, Material
 
 LEAST = 0.1
 
@@ -124,16 +123,7 @@ def test_places_are_in_the_hand_s_own_size() -> None:
 
 
 def wild_recipe(make_training: TrainingMaker, **settings: object) -> WildRecipe:
-    training = make_training()
-    method = WildMethod({**QUICK, **settings})
-    material = Material(training, load_frames(training), 0, method.device)
-    return WildRecipe(material, method.settings)
-
-
-def first_batch(recipe: WildRecipe, fraction: float) -> Batch:
-    frames, device = recipe.material.frames, recipe.material.device
-    rows = torch.arange(2)
-    return Batch(0, fraction, rows, frames.images_on(device)(rows), frames.masks_on(device)(rows))
+    return WildRecipe(material_of(make_training()), WildMethod({**QUICK, **settings}).settings)
 
 
 def test_test_frames_look_like_the_least_uncertain(make_training: TrainingMaker) -> None:
@@ -149,7 +139,7 @@ def test_the_uncertainty_is_drawn_as_one_more_channel(make_training: TrainingMak
     recipe.model.gaussians.logit_opacities.fill_(8.0)
     recipe.tensors["network.layer_3"].zero_()
     recipe.tensors["network.bias_3"][6] = 2.0
-    batch = first_batch(recipe, 0.5)
+    batch = batch_of(recipe.material, 0, 1, fraction=0.5)
     with torch.no_grad():
         drawing = recipe.draw(batch)
         weights = recipe.weights(batch, drawing)
@@ -173,7 +163,7 @@ def test_before_its_share_of_the_fit_nothing_is_left_out(make_training: Training
     recipe.tensors["network.bias_3"][6] = 2.0
     with torch.no_grad():
         for fraction, kept in ((0.2, True), (0.4, False)):
-            batch = first_batch(recipe, fraction)
+            batch = batch_of(recipe.material, 0, 1, fraction=fraction)
             hand = batch.masks > 0.5
             weights = recipe.weights(batch, recipe.draw(batch))
             assert bool((weights[hand] > 0.0).all()) is kept
